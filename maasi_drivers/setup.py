@@ -1,0 +1,28 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+setup(
+    name='maasi_drivers',
+    version='0.1.0',
+    packages=find_packages(),
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/maasi_drivers']),
+        ('share/maasi_drivers', ['package.xml']),
+        ('share/maasi_drivers/launch', glob('launch/*.launch.py')),
+    ],
+    install_requires=['setuptools'],
+    zip_safe=True,
+    maintainer='The MAASI developers',
+    maintainer_email='maasi@users.noreply.github.com',
+    description='One node per robot: sensor to detections, waypoint to motion',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            'mambo_driver = maasi_drivers.mambo_driver:main',
+            'turtlebot_driver = maasi_drivers.turtlebot_driver:main',
+            'ranging_driver = maasi_drivers.ranging_driver:main',
+            'guard_node = maasi_drivers.guard_node:main',
+        ],
+    },
+)

@@ -1,0 +1,25 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+setup(
+    name='maasi_planner',
+    version='0.1.0',
+    packages=find_packages(),
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/maasi_planner']),
+        ('share/maasi_planner', ['package.xml']),
+        ('share/maasi_planner/launch', glob('launch/*.launch.py')),
+    ],
+    install_requires=['setuptools'],
+    zip_safe=True,
+    maintainer='The MAASI developers',
+    maintainer_email='maasi@users.noreply.github.com',
+    description='Where each robot goes: motion models, objective and planners, with the planner node',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            'planner_node = maasi_planner.planner_node:main',
+        ],
+    },
+)

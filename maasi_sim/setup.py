@@ -1,0 +1,26 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+setup(
+    name='maasi_sim',
+    version='0.1.0',
+    packages=find_packages(),
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/maasi_sim']),
+        ('share/maasi_sim', ['package.xml']),
+        ('share/maasi_sim/launch', glob('launch/*.launch.py')),
+    ],
+    install_requires=['setuptools'],
+    zip_safe=True,
+    maintainer='The MAASI developers',
+    maintainer_email='maasi@users.noreply.github.com',
+    description='Stands in for the hardware; the whole search in one process; scenarios, reports',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            'sim_node = maasi_sim.sim_node:main',
+            'run_scenario = maasi_sim.run_scenario:main',
+        ],
+    },
+)
