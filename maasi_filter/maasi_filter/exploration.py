@@ -1,0 +1,343 @@
+"""The exploration function e(x): how much of each place is still unseen.
+
+e is kept at the nodes of a grid that spans the bounds, starts at 1 and is multiplied by 1 - pi at
+each measurement (000, eq. (20), (30)).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.detection_model import DetectionModel, detection_probability_at
+from maasi_filter.pose import Pose
+
+FloatArray = NDArray[np.float64]
+MAXIMUM_NODES = 20_000_000
+
+
+@njit(cache=True)
+def interpolate(
+    values: FloatArray, lower: FloatArray, step: FloatArray, position: FloatArray
+) -> float:  # pragma: no cover - compiled
+    """Return the multilinear interpolation of a grid at one position.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) array
+        Node values; nz is 1 in 2D.
+    lower, step : (3,) arrays
+        Position of node (0, 0, 0) and spacing of the nodes; metres. A step of 0 ignores the axis.
+    position : (d,) array
+        Clamped to the grid, metres.
+    """
+    index = np.zeros(3, np.int64)
+    part = np.zeros(3)
+    for axis in range(position.shape[0]):
+        if step[axis] > 0.0:
+            last = values.shape[axis] - 1
+            u = (position[axis] - lower[axis]) / step[axis]
+            u = min(max(u, 0.0), float(last))
+            cell = min(int(u), last - 1)
+            index[axis] = cell
+            part[axis] = u - cell
+    total = 0.0
+    for corner in range(8):
+        weight = 1.0
+        i = index[0]
+        j = index[1]
+        k = index[2]
+        if corner & 1:
+            weight *= part[0]
+            i += 1
+        else:
+            weight *= 1.0 - part[0]
+        if corner & 2:
+            weight *= part[1]
+            j += 1
+        else:
+            weight *= 1.0 - part[1]
+        if corner & 4:
+            weight *= part[2]
+            k += 1
+        else:
+            weight *= 1.0 - part[2]
+        if weight > 0.0:
+            total += weight * values[i, j, k]
+    return total
+
+
+@njit(cache=True)
+def _interpolate_many(
+    values: FloatArray, lower: FloatArray, step: FloatArray, positions: FloatArray
+) -> FloatArray:  # pragma: no cover - compiled
+    out = np.empty(positions.shape[0])
+    for i in range(positions.shape[0]):
+        out[i] = interpolate(values, lower, step, positions[i])
+    return out
+
+
+@njit(cache=True)
+def _decrease(
+    values: FloatArray,
+    lower: FloatArray,
+    step: FloatArray,
+    kind: int,
+    parameters: FloatArray,
+    sensor_position: FloatArray,
+    yaw: float,
+    dimension: int,
+) -> None:  # pragma: no cover - compiled
+    cos_yaw = math.cos(yaw)
+    sin_yaw = math.sin(yaw)
+    for i in range(values.shape[0]):
+        dx = lower[0] + i * step[0] - sensor_position[0]
+        for j in range(values.shape[1]):
+            dy = lower[1] + j * step[1] - sensor_position[1]
+            for k in range(values.shape[2]):
+                dz = 0.0
+                if dimension == 3:
+                    dz = lower[2] + k * step[2] - sensor_position[2]
+                probability = detection_probability_at(
+                    kind, parameters, dx, dy, dz, cos_yaw, sin_yaw
+                )
+                values[i, j, k] *= 1.0 - probability
+
+
+@njit(cache=True)
+def _expected_unseen_seen(
+    values: FloatArray,
+    cell: FloatArray,
+    lower: FloatArray,
+    step: FloatArray,
+    kind: int,
+    parameters: FloatArray,
+    sensor_positions: FloatArray,
+    yaws: FloatArray,
+    dimension: int,
+) -> float:  # pragma: no cover - compiled
+    cos_yaw = np.cos(yaws)
+    sin_yaw = np.sin(yaws)
+    total = 0.0
+    for i in range(values.shape[0]):
+        x = lower[0] + i * step[0]
+        for j in range(values.shape[1]):
+            y = lower[1] + j * step[1]
+            for k in range(values.shape[2]):
+                z = lower[2] + k * step[2]
+                missed = 1.0
+                for m in range(sensor_positions.shape[0]):
+                    dz = z - sensor_positions[m, 2] if dimension == 3 else 0.0
+                    missed *= 1.0 - detection_probability_at(
+                        kind,
+                        parameters,
+                        x - sensor_positions[m, 0],
+                        y - sensor_positions[m, 1],
+                        dz,
+                        cos_yaw[m],
+                        sin_yaw[m],
+                    )
+                total += cell[i, j, k] * values[i, j, k] * (1.0 - missed)
+    return total
+
+
+def check_bounds(bounds: ArrayLike) -> FloatArray:
+    """Return bounds as a (d, 2) array.
+
+    Raises
+    ------
+    ValueError
+        If they are not finite, or not lower < upper on 2 or 3 axes.
+    """
+    array = np.array(bounds, dtype=float)
+    if array.shape not in ((2, 2), (3, 2)):
+        raise ValueError(f'bounds: got shape {array.shape}, allowed are (2, 2) and (3, 2)')
+    if not np.isfinite(array).all() or not (array[:, 0] < array[:, 1]).all():
+        raise ValueError(
+            f'bounds: got {array.tolist()}, allowed are finite [lower, upper] with lower < upper'
+        )
+    return array
+
+
+class Exploration:
+    """Exploration function on a grid.
+
+    Parameters
+    ----------
+    bounds : (d, 2) array
+        Lower and upper bound on each axis, metres; d = 2 or 3.
+    spacing : float
+        Wanted spacing of the nodes, metres. On each axis the largest spacing up to this one is
+        used that puts nodes on both bounds.
+
+    Attributes
+    ----------
+    values : (nx, ny) or (nx, ny, nz) array
+        e at the nodes, in [0, 1].
+    step : (d,) array
+        Spacing used on each axis, metres.
+
+    Raises
+    ------
+    ValueError
+        If the bounds or the spacing are not usable, or the grid would be too large.
+    """
+
+    def __init__(self, bounds: ArrayLike, spacing: float) -> None:
+        self.bounds = check_bounds(bounds)
+        if not (math.isfinite(spacing) and spacing > 0.0):
+            raise ValueError(f'spacing: got {spacing}, allowed are finite numbers above 0')
+        self.spacing = float(spacing)
+        self.dimension = len(self.bounds)
+        size = self.bounds[:, 1] - self.bounds[:, 0]
+        cells = np.maximum(1.0, np.ceil(size / spacing - 1e-9))
+        if np.prod(cells + 1.0) > MAXIMUM_NODES:
+            raise ValueError(
+                f'spacing: got {spacing}, which needs {np.prod(cells + 1.0):.3g} nodes, '
+                f'allowed are at most {MAXIMUM_NODES}'
+            )
+        self.step = size / cells
+        shape = [int(number) + 1 for number in cells]
+        self._values = np.ones(shape + [1] * (3 - self.dimension))
+        self._lower = np.zeros(3)
+        self._lower[: self.dimension] = self.bounds[:, 0]
+        self._step = np.zeros(3)
+        self._step[: self.dimension] = self.step
+
+    @property
+    def values(self) -> FloatArray:
+        """e at the nodes; a view, write through `values[...] =`."""
+        return self._values if self.dimension == 3 else self._values[:, :, 0]
+
+    def axes(self) -> list[FloatArray]:
+        """Return the coordinates of the nodes along each axis, metres."""
+        return [
+            self._lower[axis] + self._step[axis] * np.arange(self._values.shape[axis])
+            for axis in range(self.dimension)
+        ]
+
+    def nodes(self) -> FloatArray:
+        """Return the positions of all nodes, (n, d), in the order of `values.ravel()`."""
+        grids = np.meshgrid(*self.axes(), indexing='ij')
+        return np.stack([grid.ravel() for grid in grids], axis=1)
+
+    def kernel(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return (values (nx, ny, nz), lower (3,), step (3,)) for `interpolate`."""
+        return self._values, self._lower, self._step
+
+    def update(self, detection: DetectionModel, pose: Pose) -> None:
+        """Multiply e by 1 - pi for one measurement at `pose` (000, eq. (20))."""
+        kernel = detection.kernel()
+        if kernel is None:
+            probability = detection.probability(self.nodes(), pose)
+            self._values *= (1.0 - probability).reshape(self._values.shape)
+            return
+        kind, parameters = kernel
+        _decrease(
+            self._values,
+            self._lower,
+            self._step,
+            kind,
+            parameters,
+            pose.position,
+            pose.yaw,
+            self.dimension,
+        )
+
+    def at(self, positions: ArrayLike) -> FloatArray:
+        """Return e at positions (n, d) by multilinear interpolation, shape (n,).
+
+        Positions outside the bounds are moved to the nearest point on them. Coordinates beyond
+        the problem's dimension are ignored.
+        """
+        array = np.ascontiguousarray(np.atleast_2d(np.asarray(positions, dtype=float)))
+        if array.shape[1] < self.dimension:
+            raise ValueError(
+                f'positions: got shape {array.shape}, allowed is (n, {self.dimension})'
+            )
+        array = np.ascontiguousarray(array[:, : self.dimension])
+        if not np.isfinite(array).all():
+            raise ValueError('positions: got a number that is not finite')
+        return _interpolate_many(self._values, self._lower, self._step, array)
+
+    def cell_volumes(self) -> FloatArray:
+        """Return the volume (2D: area) each node stands for, same shape as `values`.
+
+        The trapezoid rule: half a step at the ends of each axis. They sum to the volume.
+        """
+        volumes = np.ones(())
+        for axis in range(self.dimension):
+            lengths = np.full(self._values.shape[axis], self._step[axis])
+            lengths[0] *= 0.5
+            lengths[-1] *= 0.5
+            volumes = np.multiply.outer(volumes, lengths)
+        return np.asarray(volumes)
+
+    def unseen_fraction(self) -> float:
+        """Return the mean of e over the environment, in [0, 1]."""
+        volumes = self.cell_volumes()
+        return float((volumes * self.values).sum() / volumes.sum())
+
+    def explored_fraction(self) -> float:
+        """Return 1 - mean of e over the environment, in [0, 1]."""
+        return 1.0 - self.unseen_fraction()
+
+    def expected_unseen(self, expected_targets: float) -> float:
+        """Return how many of `expected_targets`, uniform a priori, are expected to be unseen.
+
+        N0 / V times the integral of e.
+        """
+        return float(expected_targets) * self.unseen_fraction()
+
+    def expected_new(
+        self,
+        detection: DetectionModel,
+        positions: ArrayLike,
+        yaws: ArrayLike,
+        expected_targets: float,
+    ) -> float:
+        """Return the expected number of new targets seen from poses (E_vol).
+
+        (N0 / V) sum over nodes of e (1 - prod(1 - pi)) times the node's volume.
+
+        Parameters
+        ----------
+        positions : (m, 3) array
+            Sensor positions of the measurements, metres.
+        yaws : (m,) array
+            Headings, radians.
+        expected_targets : float
+            N0.
+        """
+        sensors = np.ascontiguousarray(np.atleast_2d(np.asarray(positions, dtype=float)))
+        headings = np.ascontiguousarray(np.atleast_1d(np.asarray(yaws, dtype=float)))
+        volumes = self.cell_volumes()
+        kernel = detection.kernel()
+        if kernel is None:
+            nodes = self.nodes()
+            missed = np.ones(len(nodes))
+            for position, yaw in zip(sensors, headings):
+                missed *= 1.0 - detection.probability(nodes, Pose.from_yaw(position, yaw))
+            total = float((volumes.ravel() * self.values.ravel() * (1.0 - missed)).sum())
+        else:
+            total = _expected_unseen_seen(
+                self._values,
+                volumes.reshape(self._values.shape),
+                self._lower,
+                self._step,
+                kernel[0],
+                kernel[1],
+                sensors,
+                headings,
+                self.dimension,
+            )
+        return float(expected_targets) * total / float(volumes.sum())
+
+    def copy(self) -> Exploration:
+        """Return an independent copy."""
+        other = Exploration(self.bounds, self.spacing)
+        other._values[...] = self._values
+        return other
