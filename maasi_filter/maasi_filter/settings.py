@@ -36,35 +36,38 @@ class DetectionSettings(Settings):
     """Probability of detection pi(x, q)."""
 
     kind: Literal['exponential', 'gaussian', 'box'] = Field(
-        'exponential',
+        default='exponential',
         description='Form of pi: G exp(-|zeta|/2), G exp(-|zeta|^2/2), or G inside a box',
     )
     probability: float = Field(
-        0.98, ge=0.0, le=1.0, description='G, the largest probability of detection [1]'
+        default=0.98, ge=0.0, le=1.0, description='G, the largest probability of detection [1]'
     )
     size: list[Positive] = Field(
-        [25.0, 25.0, 25.0],
+        default=[25.0, 25.0, 25.0],
         min_length=2,
         max_length=3,
         description='F, size of the field of view on each map axis, exponential or gaussian [m]',
     )
     lower: list[Finite] = Field(
-        [-0.2, -0.2],
+        default=[-0.2, -0.2],
         min_length=2,
         max_length=3,
         description='Lower corner of a box as offset from the robot [m]',
     )
     upper: list[Finite] = Field(
-        [0.2, 0.2],
+        default=[0.2, 0.2],
         min_length=2,
         max_length=3,
         description='Upper corner of a box as offset from the robot [m]',
     )
     frame: Literal['robot', 'world'] = Field(
-        'robot', description='Whether a box turns with the robot or stays aligned with the map'
+        default='robot',
+        description='Whether a box turns with the robot or stays aligned with the map',
     )
     edge: float = Field(
-        0.0, ge=0.0, description='Half width of a ramp across the faces of a box; 0 is hard [m]'
+        default=0.0,
+        ge=0.0,
+        description='Half width of a ramp across the faces of a box; 0 is hard [m]',
     )
 
     @model_validator(mode='after')
@@ -88,19 +91,27 @@ class DetectionSettings(Settings):
 class NoiseSettings(Settings):
     """Noise of a measurement; nothing about the meaning of the numbers is left to guess."""
 
-    range: float = Field(1.5, gt=0.0, description='Noise of the range [m, or m^2 as variance]')
+    range: float = Field(
+        default=1.5, gt=0.0, description='Noise of the range [m, or m^2 as variance]'
+    )
     bearing: float = Field(
-        0.175, gt=0.0, description='Noise of the bearing [unit of `angles`, squared as variance]'
+        default=0.175,
+        gt=0.0,
+        description='Noise of the bearing [unit of `angles`, squared as variance]',
     )
     elevation: float = Field(
-        0.295, ge=0.0, description='Noise of the elevation, 3D only [unit of `angles`, or squared]'
+        default=0.295,
+        ge=0.0,
+        description='Noise of the elevation, 3D only [unit of `angles`, or squared]',
     )
     as_: Literal['deviation', 'variance'] = Field(
-        'deviation',
+        default='deviation',
         alias='as',
         description='Whether the numbers are standard deviations or variances',
     )
-    angles: Literal['radians', 'degrees'] = Field('radians', description='Unit of the angles')
+    angles: Literal['radians', 'degrees'] = Field(
+        default='radians', description='Unit of the angles'
+    )
 
     def deviations(self, dimension: int) -> FloatArray:
         """Return the standard deviations, (d,), in metres and radians."""
@@ -128,11 +139,11 @@ class SensorSettings(Settings):
         default_factory=NoiseSettings, description='Noise of a measurement'
     )
     clutter: float = Field(
-        0.0,
+        default=0.0,
         ge=0.0,
         description='Intensity of false detections [1/(m rad) in 2D, 1/(m rad^2) in 3D]',
     )
-    period: float = Field(0.0, ge=0.0, description='Time between possible measurements [s]')
+    period: float = Field(default=0.0, ge=0.0, description='Time between possible measurements [s]')
 
     def build(self, name: str, dimension: int) -> Sensor:
         """Return the sensor of robot `name` for a problem of `dimension` 2 or 3.
@@ -199,79 +210,104 @@ class FilterSettings(Settings):
     and a floor of 2.7 m. `docs/filter_presets.md` has the presets side by side.
     """
 
-    preset: Preset = Field('recommended', description='Where values left None come from')
+    preset: Preset = Field(default='recommended', description='Where values left None come from')
     particles: int = Field(
-        10000, ge=1, le=5_000_000, description='Largest number of particles after resampling [1]'
+        default=10000,
+        ge=1,
+        le=5_000_000,
+        description='Largest number of particles after resampling [1]',
     )
     particles_minimum: int | None = Field(
-        None, ge=0, description='Smallest number of particles after resampling, if any mass [1]'
+        default=None,
+        ge=0,
+        description='Smallest number of particles after resampling, if any mass [1]',
     )
     particles_per_target: int | None = Field(
-        None, ge=1, description='Particles for each expected target, within the bounds [1]'
+        default=None, ge=1, description='Particles for each expected target, within the bounds [1]'
     )
     survival_probability: float | None = Field(
-        None, ge=0.0, le=1.0, description='p_s, that a target still exists after one step [1]'
+        default=None,
+        ge=0.0,
+        le=1.0,
+        description='p_s, that a target still exists after one step [1]',
     )
     births: Literal['measurement', 'uniform', 'gaussian'] | None = Field(
-        None, description='Where births are drawn: at each measurement, anywhere, or as in 003'
+        default=None,
+        description='Where births are drawn: at each measurement, anywhere, or as in 003',
     )
     birth_particles: int | None = Field(
-        None, ge=1, le=1_000_000, description='Particles of a birth (measurement: for each) [1]'
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description='Particles of a birth (measurement: for each) [1]',
     )
     birth_prior: Literal['unexplored', 'constant'] | None = Field(
-        None, description='Whether births at measurements have intensity N0/V e(x) or N0/V'
+        default=None, description='Whether births at measurements have intensity N0/V e(x) or N0/V'
     )
     expected_targets: float | None = Field(
-        None, gt=0.0, description='N0, targets expected in all before the search [1]'
+        default=None, gt=0.0, description='N0, targets expected in all before the search [1]'
     )
     birth_targets: float | None = Field(
-        None, ge=0.0, description='Y V, targets expected to appear at a batch (not at z) [1]'
+        default=None,
+        ge=0.0,
+        description='Y V, targets expected to appear at a batch (not at z) [1]',
     )
     corrector: Literal['running', 'predicted'] | None = Field(
-        None, description='Divide by the running intensity (000, eq. 16) or predicted (002, eq. 9)'
+        default=None,
+        description='Divide by the running intensity (000, eq. 16) or predicted (002, eq. 9)',
     )
     resampling: Literal['systematic', 'stratified', 'multinomial'] | None = Field(
-        None, description='Resampling scheme'
+        default=None, description='Resampling scheme'
     )
     jitter_differential: float | None = Field(
-        None, ge=0.0, le=2.0, description='Share of a difference of two particles in a jitter [1]'
+        default=None,
+        ge=0.0,
+        le=2.0,
+        description='Share of a difference of two particles in a jitter [1]',
     )
     jitter_deviation: float | None = Field(
-        None, ge=0.0, description='Deviation of the Gaussian part of the jitter of duplicates [m]'
+        default=None,
+        ge=0.0,
+        description='Deviation of the Gaussian part of the jitter of duplicates [m]',
     )
     extraction: Literal['measurement', 'kmeans'] | None = Field(
-        None, description='Clusters for marking: partition by measurement, or K-means'
+        default=None, description='Clusters for marking: partition by measurement, or K-means'
     )
     found_radius: float | None = Field(
-        None, gt=0.0, description='T_r, largest radius of a cluster that is found [m]'
+        default=None, gt=0.0, description='T_r, largest radius of a cluster that is found [m]'
     )
     found_radius_kind: Literal['rms', 'maximum'] | None = Field(
-        None, description='Radius of a cluster: weighted root mean square, or farthest particle'
+        default=None,
+        description='Radius of a cluster: weighted root mean square, or farthest particle',
     )
     found_mass: float | None = Field(
-        None, ge=0.0, description='T_m, smallest mass of a cluster that is found [1]'
+        default=None, ge=0.0, description='T_m, smallest mass of a cluster that is found [1]'
     )
     removal: Literal['soft', 'closest', 'every', 'none'] | None = Field(
-        None, description='What a found target does to measurements: soft gate, or removal'
+        default=None, description='What a found target does to measurements: soft gate, or removal'
     )
     removal_distance: float | None = Field(
-        None, gt=0.0, description='T_z, largest distance of a removed measurement [m]'
+        default=None, gt=0.0, description='T_z, largest distance of a removed measurement [m]'
     )
     refine_found: bool | None = Field(
-        None, description='Whether found targets go on being refined by their measurements'
+        default=None, description='Whether found targets go on being refined by their measurements'
     )
     pose_error: float | None = Field(
-        None, ge=0.0, description='Deviation of the error of a robot position, per axis [m]'
+        default=None, ge=0.0, description='Deviation of the error of a robot position, per axis [m]'
     )
     use_detection_covariances: bool | None = Field(
-        None, description='Whether covariances of detections win over the covariance of the sensor'
+        default=None,
+        description='Whether covariances of detections win over the covariance of the sensor',
     )
     exploration_spacing: float | None = Field(
-        None, gt=0.0, description='Spacing of the exploration grid [m]'
+        default=None, gt=0.0, description='Spacing of the exploration grid [m]'
     )
     kmeans_iterations: int | None = Field(
-        None, ge=1, le=1000, description='Largest number of K-means iterations [1]'
+        default=None, ge=1, le=1000, description='Largest number of K-means iterations [1]'
     )
     threads: int | None = Field(
-        None, ge=1, le=256, description='Threads for large particle sets; results do not depend [1]'
+        default=None,
+        ge=1,
+        le=256,
+        description='Threads for large particle sets; results do not depend [1]',
     )
