@@ -1,0 +1,436 @@
+"""Write and read rosbag2 recordings (MCAP) from serialised messages, without ROS."""
+
+from __future__ import annotations
+
+import queue
+import tempfile
+import threading
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+IMAGE_TYPE = 'sensor_msgs/msg/Image'
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
+SCENARIO_TOPIC = '/scenario'
+
+ImageFormat = Literal['jpeg', 'png', 'raw']
+
+# Encodings that are compressed, with their number of channels.
+_CHANNELS = {'bgr8': 3, 'rgb8': 3, 'mono8': 1, '8UC1': 1, '8UC3': 3}
+_MAGIC = b'\x89MCAP0\r\n'
+_FOREVER = QosTime(9223372036, 854775807)
+
+
+class BagError(RuntimeError):
+    """A recording cannot be written or read."""
+
+
+@dataclass(frozen=True)
+class TopicQos:
+    """What a player of the recording needs to know of a topic's quality of service."""
+
+    reliable: bool = True
+    latched: bool = False
+    depth: int = 10
+
+    def profile(self) -> Qos:
+        """Return the profile as `rosbags` writes it."""
+        return Qos(
+            QosHistory.KEEP_LAST,
+            max(self.depth, 1),
+            QosReliability.RELIABLE if self.reliable else QosReliability.BEST_EFFORT,
+            QosDurability.TRANSIENT_LOCAL if self.latched else QosDurability.VOLATILE,
+            _FOREVER,
+            _FOREVER,
+            QosLiveliness.AUTOMATIC,
+            _FOREVER,
+            False,
+        )
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """A message of a recording: topic, time [ns, of the run's clock], type and content."""
+
+    topic: str
+    time: int
+    type: str
+    message: Any
+
+
+def interface_folder(package: str) -> Path:
+    """Return the folder of a package's `.msg` files, installed or in this repository.
+
+    Raises
+    ------
+    BagError
+        If the package is in neither.
+    """
+    places = [Path(__file__).resolve().parents[2] / package / 'msg']
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        places.insert(0, Path(get_package_share_directory(package)) / 'msg')
+    except (ImportError, LookupError, OSError):
+        pass
+    for place in places:
+        if place.is_dir():
+            return place
+    raise BagError(f'package {package}: no message definitions in {", ".join(map(str, places))}')
+
+
+def load_types(packages: Collection[str] = ('maasi_msgs',)) -> Typestore:
+    """Return the message types of Jazzy and of `packages`."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for package in packages:
+        types = {}
+        for path in sorted(interface_folder(package).glob('*.msg')):
+            types.update(
+                get_types_from_msg(path.read_text(encoding='utf-8'), f'{package}/msg/{path.stem}')
+            )
+        store.register(types)
+    return store
+
+
+class BagWriter:
+    """Write a recording in a thread of its own; always closable, and readable once closed.
+
+    Images are stored as `sensor_msgs/msg/CompressedImage` on `<topic>/compressed`, in the encoding
+    that image_transport would use. Messages keep the order in which they were handed in: times
+    that do not rise are moved up by a nanosecond.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the recording; must not exist.
+    types : Typestore
+        Message types, from `load_types`.
+    images : {'jpeg', 'png', 'raw'}
+        How images are stored. JPEG has quality 95 without chroma subsampling; PNG is lossless and
+        costs ten times the time.
+    backlog : int
+        Bytes that may wait to be written before `write` waits.
+
+    Raises
+    ------
+    BagError
+        If the folder exists or cannot be made. `write`, `wait` and `close` raise it when the
+        thread could not write (disk full).
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        types: Typestore,
+        images: ImageFormat = 'jpeg',
+        backlog: int = 256 * 2**20,
+    ) -> None:
+        self.path = Path(path)
+        self._types = types
+        self._images = images
+        self._limit = backlog
+        if self.path.exists():
+            raise BagError(f'{path}: exists already')
+        self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        try:
+            self._writer.open()
+        except OSError as error:
+            raise BagError(f'{path}: cannot be written: {error.strerror}') from error
+        self._topics: dict[str, tuple[str, TopicQos]] = {}
+        self._connections: dict[str, Connection] = {}
+        self._time = -1
+        self._queue: queue.SimpleQueue[tuple[str, int, bytes] | None] = queue.SimpleQueue()
+        self._pending = 0
+        self._changed = threading.Condition()
+        self._error: BaseException | None = None
+        self._closed = False
+        self.counts: dict[str, int] = {}
+        self._thread = threading.Thread(target=self._work, name='bag writer', daemon=True)
+        self._thread.start()
+
+    def add_topic(self, topic: str, type_name: str, qos: TopicQos | None = None) -> None:
+        """Announce a topic; it appears in the recording even if nothing comes.
+
+        Raises
+        ------
+        BagError
+            If the type is unknown: neither Jazzy's nor one of the packages loaded.
+        """
+        if type_name not in self._types.fielddefs:
+            raise BagError(f'topic {topic}: unknown message type {type_name}')
+        self._topics[topic] = (type_name, qos or TopicQos())
+
+    def write(self, topic: str, time: int, data: bytes) -> None:
+        """Take a serialised message (CDR) received at `time` [ns]."""
+        self._check()
+        if topic not in self._topics:
+            raise BagError(f'topic {topic}: not announced')
+        with self._changed:
+            self._pending += len(data)
+            if self._pending > self._limit:
+                self._changed.wait_for(lambda: self._pending <= self._limit or self._error)
+        self._queue.put((topic, time, data))
+
+    def write_message(self, topic: str, time: int, message: Any) -> None:
+        """Serialise and take a message of `rosbags`' own classes."""
+        type_name = self._topics[topic][0]
+        self.write(topic, time, bytes(self._types.serialize_cdr(message, type_name)))
+
+    def write_scenario(self, text: str, facts: Mapping[str, str]) -> None:
+        """Store what was run: latched on topic `/scenario`, and as custom data of the recording."""
+        string = self._types.types['std_msgs/msg/String']
+        self.add_topic(SCENARIO_TOPIC, 'std_msgs/msg/String', TopicQos(latched=True, depth=1))
+        for key, value in facts.items():
+            self._writer.set_custom_data(key, value)
+        self.write_message(SCENARIO_TOPIC, 0, string(data=text))
+
+    def wait(self, backlog: int = 0) -> None:
+        """Wait until at most `backlog` bytes are still to be written."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._pending <= backlog or self._error)
+        self._check()
+
+    def close(self) -> None:
+        """Write all that is held, and the index; closing again does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.put(None)
+        self._thread.join()
+        try:
+            for topic in self._topics:
+                self._connect(topic, self._topics[topic][0] == IMAGE_TYPE)
+            self._writer.close()
+        except Exception as error:
+            self._error = self._error or error
+        self._check()
+
+    def __enter__(self) -> BagWriter:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close, whatever happened."""
+        self.close()
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise BagError(f'{self.path}: writing failed: {self._error}') from self._error
+
+    def _work(self) -> None:
+        while True:
+            item = self._queue.get()
+            if item is None:
+                return
+            topic, time, data = item
+            if self._error is None:
+                try:
+                    self._store(topic, time, data)
+                except Exception as error:
+                    self._error = error
+            with self._changed:
+                self._pending -= len(data)
+                self._changed.notify_all()
+
+    def _store(self, topic: str, time: int, data: bytes) -> None:
+        compressed = None
+        if self._topics[topic][0] == IMAGE_TYPE and self._images != 'raw':
+            compressed = self._compress(data)
+        connection = self._connect(topic, compressed is not None)
+        self._time = max(time, self._time + 1)
+        self._writer.write(connection, self._time, data if compressed is None else compressed)
+        self.counts[connection.topic] = self.counts.get(connection.topic, 0) + 1
+
+    def _connect(self, topic: str, compressed: bool) -> Connection:
+        type_name, qos = self._topics[topic]
+        name = topic
+        if compressed and self._images != 'raw':
+            name, type_name = f'{topic}/compressed', COMPRESSED_TYPE
+        if name not in self._connections:
+            self._connections[name] = self._writer.add_connection(
+                name,
+                type_name,
+                typestore=self._types,
+                offered_qos_profiles=[qos.profile()],
+            )
+        return self._connections[name]
+
+    def _compress(self, data: bytes) -> bytes | None:
+        """Return an image compressed, or None if OpenCV cannot hold its encoding."""
+        import cv2
+
+        image: Any = self._types.deserialize_cdr(data, IMAGE_TYPE)
+        channels = _CHANNELS.get(image.encoding)
+        if channels is None or image.height * image.width == 0:
+            return None
+        if image.step < image.width * channels or image.data.size < image.height * image.step:
+            return None
+        rows = image.data[: image.height * image.step].reshape(image.height, image.step)
+        pixels = rows[:, : image.width * channels].reshape(image.height, image.width, channels)
+        if image.encoding == 'rgb8':
+            pixels = pixels[:, :, ::-1]
+        options = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        if self._images == 'jpeg':
+            options = [cv2.IMWRITE_JPEG_QUALITY, 95]
+            options += [
+                cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+                cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+            ]
+        done, encoded = cv2.imencode(f'.{self._images}', np.ascontiguousarray(pixels), options)
+        if not done:
+            return None
+        stored = 'bgr8' if channels == 3 else ''
+        message = self._types.types[COMPRESSED_TYPE](
+            header=image.header,
+            format=f'{image.encoding}; {self._images} compressed {stored}',
+            data=encoded.reshape(-1),
+        )
+        return bytes(self._types.serialize_cdr(message, COMPRESSED_TYPE))
+
+
+def _seal(path: Path, folder: Path) -> Path:
+    """Copy what is whole of an MCAP file that was never closed, and end it as the format asks."""
+    data = path.read_bytes()
+    if not data.startswith(_MAGIC):
+        raise BagError('it is not an MCAP file')
+    end = len(_MAGIC)
+    while end + 9 <= len(data):
+        after = end + 9 + int.from_bytes(data[end + 1 : end + 9], 'little')
+        if after > len(data):
+            break
+        end = after
+    copy = folder / path.name
+    with copy.open('wb') as file:
+        file.write(data[:end])
+        # An empty data end and footer: opcode, length, content.
+        file.write(b'\x0f' + (4).to_bytes(8, 'little') + bytes(4))
+        file.write(b'\x02' + (20).to_bytes(8, 'little') + bytes(20))
+        file.write(_MAGIC)
+    return copy
+
+
+class Bag:
+    """Read a recording, also one that was never closed (a process was killed while writing it).
+
+    Parameters
+    ----------
+    path : Path
+        Its folder, the folder of the run that holds it as `bag`, or its `.mcap` file.
+
+    Raises
+    ------
+    BagError
+        If there is none or it is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path = Path(path)
+        if not path.exists():
+            raise BagError(f'{path}: there is no such recording')
+        if (path / 'bag').is_dir():
+            path = path / 'bag'
+        if path.is_dir() and not (path / 'metadata.yaml').exists():
+            files = sorted(path.glob('*.mcap'))
+            if len(files) != 1:
+                raise BagError(f'{path}: is not a recording: it has no metadata.yaml')
+            path = files[0]
+        self.path = path
+        self._sealed: tempfile.TemporaryDirectory[str] | None = None
+        try:
+            if path.is_file() and not path.read_bytes().endswith(_MAGIC):
+                self._sealed = tempfile.TemporaryDirectory()
+                path = _seal(path, Path(self._sealed.name))
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+            self._reader.open()
+        except Exception as error:
+            raise BagError(f'{self.path}: cannot be read: {error}') from error
+
+    @property
+    def types(self) -> dict[str, str]:
+        """Type name by topic."""
+        return {item.topic: item.msgtype for item in self._reader.connections}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of messages by topic."""
+        return {item.topic: item.msgcount for item in self._reader.connections}
+
+    def raw(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
+        """Yield topic, type, time [ns] and serialised message, in order of time."""
+        chosen = [
+            item for item in self._reader.connections if topics is None or item.topic in topics
+        ]
+        if not chosen:
+            return
+        try:
+            for connection, time, data in self._reader.messages(chosen):
+                yield connection.topic, connection.msgtype, time, data
+        except AnyReaderError as error:
+            raise BagError(f'{self.path}: cannot be read: {error}') from error
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Yield the messages of `topics` (all if None), in order of time."""
+        for topic, type_name, time, data in self.raw(topics):
+            yield BagMessage(topic, time, type_name, self.decode(data, type_name))
+
+    def decode(self, data: bytes, type_name: str) -> Any:
+        """Return the message of serialised bytes."""
+        return self._reader.deserialize(data, type_name)
+
+    def scenario(self) -> dict[str, Any]:
+        """Return what was run: scenario, seed and the parameters of each node.
+
+        Raises
+        ------
+        BagError
+            If the recording does not hold it.
+        """
+        for item in self.messages([SCENARIO_TOPIC]):
+            content = yaml.safe_load(item.message.data)
+            if isinstance(content, dict):
+                return content
+        raise BagError(f'{self.path}: holds no scenario: run_scenario did not record it')
+
+    def close(self) -> None:
+        """Close the files."""
+        if self._sealed is not None:
+            self._sealed.cleanup()
+        if self._reader.stack is not None:
+            self._reader.close()
+
+    def __enter__(self) -> Bag:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the files."""
+        self.close()
