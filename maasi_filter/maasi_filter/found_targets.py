@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from maasi_filter.measurement_model import wrap
+from maasi_filter.phd import MeasurementSet, _invert, _root
+from maasi_filter.pose import Pose
+
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# A detection exists, so the probability of detection of what caused it was not nothing.
+LEAST_PROBABILITY = 0.01
+LEAST_MISS = 0.02
 
 
 @dataclass
@@ -36,3 +47,281 @@ class FoundTarget:
     robot: str
     measurement: int
     time: float
+
+
+@njit(cache=True)
+def _predict(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    position, sensor_position, z, cartesian, centre, error, jacobian
+):
+    """Fill z - g(x) and dg/dx at a target, in place (Cartesian: centre - x and identity)."""
+    d = position.shape[0]
+    if cartesian:
+        for a in range(d):
+            error[a] = centre[a] - position[a]
+            for b in range(d):
+                jacobian[a, b] = 1.0 if a == b else 0.0
+        return
+    dx = position[0] - sensor_position[0]
+    dy = position[1] - sensor_position[1]
+    dz = position[2] - sensor_position[2] if d == 3 else 0.0
+    level = max(math.sqrt(dx * dx + dy * dy), 1e-9)
+    distance = max(math.sqrt(level * level + dz * dz), 1e-9)
+    error[0] = z[0] - distance
+    error[1] = wrap(z[1] - math.atan2(dy, dx))
+    jacobian[0, 0] = dx / distance
+    jacobian[0, 1] = dy / distance
+    jacobian[1, 0] = -dy / (level * level)
+    jacobian[1, 1] = dx / (level * level)
+    if d == 3:
+        error[2] = z[2] - math.atan2(dz, level)
+        jacobian[0, 2] = dz / distance
+        jacobian[1, 2] = 0.0
+        square = distance * distance
+        jacobian[2, 0] = -dx * dz / (square * level)
+        jacobian[2, 1] = -dy * dz / (square * level)
+        jacobian[2, 2] = level / square
+
+
+@njit(cache=True)
+def _innovation(jacobian, covariance, noise, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    d = jacobian.shape[0]
+    for a in range(d):
+        for b in range(d):
+            total = noise[a, b]
+            for i in range(d):
+                for j in range(d):
+                    total += jacobian[a, i] * covariance[i, j] * jacobian[b, j]
+            out[a, b] = total
+
+
+@njit(cache=True)
+def _noise(roots, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    d = roots.shape[0]
+    for a in range(d):
+        for b in range(d):
+            total = 0.0
+            for k in range(min(a, b) + 1):
+                total += roots[a, k] * roots[b, k]
+            out[a, b] = total
+
+
+@njit(cache=True)
+def _intensity(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    positions,
+    covariances,
+    probability,
+    centre_probability,
+    sensor_position,
+    values,
+    cartesian,
+    centres,
+    roots,
+    volume,
+    odds,
+    kappa,
+):
+    number, d = positions.shape
+    error = np.empty(d)
+    jacobian = np.empty((d, d))
+    noise = np.empty((d, d))
+    innovation = np.empty((d, d))
+    inverse = np.empty((d, d))
+    root = np.empty((d, d))
+    for m in range(values.shape[0]):
+        _noise(roots[m], noise)
+        for f in range(number):
+            _predict(
+                positions[f], sensor_position, values[m], cartesian[m], centres[m], error, jacobian
+            )
+            _innovation(jacobian, covariances[f], noise, innovation)
+            log_determinant = _root(innovation, root)
+            _invert(innovation, inverse)
+            q = 0.0
+            for a in range(d):
+                for b in range(d):
+                    q += error[a] * inverse[a, b] * error[b]
+            density = math.exp(-0.5 * (q + log_determinant + d * math.log(2.0 * math.pi)))
+            if cartesian[m]:
+                density *= volume[m]
+            detected = probability[f]
+            if odds:
+                detected = max(detected, max(centre_probability[m], LEAST_PROBABILITY))
+                # The alternative is that the found target was missed.
+                detected /= max(1.0 - detected, LEAST_MISS)
+            kappa[f, m] = detected * density
+
+
+@njit(cache=True)
+def _update(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    position, covariance, sensor_position, z, cartesian, centre, root, out, out_covariance
+):
+    """Update one target with one detection; an iterated extended Kalman filter."""
+    d = position.shape[0]
+    error = np.empty(d)
+    jacobian = np.empty((d, d))
+    noise = np.empty((d, d))
+    innovation = np.empty((d, d))
+    inverse = np.empty((d, d))
+    gain = np.empty((d, d))
+    _noise(root, noise)
+    for a in range(d):
+        out[a] = position[a]
+    for _ in range(3):
+        _predict(out, sensor_position, z, cartesian, centre, error, jacobian)
+        _innovation(jacobian, covariance, noise, innovation)
+        _invert(innovation, inverse)
+        for a in range(d):
+            for b in range(d):
+                total = 0.0
+                for i in range(d):
+                    for j in range(d):
+                        total += covariance[a, i] * jacobian[j, i] * inverse[j, b]
+                gain[a, b] = total
+        for j in range(d):
+            for i in range(d):
+                error[j] -= jacobian[j, i] * (position[i] - out[i])
+        for a in range(d):
+            total = position[a]
+            for j in range(d):
+                total += gain[a, j] * error[j]
+            out_covariance[a, 0] = total
+        for a in range(d):
+            out[a] = out_covariance[a, 0]
+    # Joseph's form keeps it symmetric and positive definite.
+    keep = np.empty((d, d))
+    for a in range(d):
+        for b in range(d):
+            total = 1.0 if a == b else 0.0
+            for j in range(d):
+                total -= gain[a, j] * jacobian[j, b]
+            keep[a, b] = total
+    for a in range(d):
+        for b in range(d):
+            total = 0.0
+            for i in range(d):
+                for j in range(d):
+                    total += keep[a, i] * covariance[i, j] * keep[b, j]
+                    total += gain[a, i] * noise[i, j] * gain[b, j]
+            out_covariance[a, b] = total
+
+
+def found_intensity(
+    positions: FloatArray,
+    covariances: FloatArray,
+    probability: FloatArray,
+    centre_probability: FloatArray,
+    measurements: MeasurementSet,
+    pose: Pose,
+    odds: bool = True,
+) -> FloatArray:
+    """Return kappa (f, m), the intensity of detections that found targets cause.
+
+    kappa = pi N(z; g(x), R + H P H^T), a soft gate: it is added to C(z), so that a detection of a
+    found target gives little mass to anything else.
+
+    Parameters
+    ----------
+    positions, covariances : (f, d), (f, d, d) arrays
+        Of the found targets, metres.
+    probability : (f,) array
+        pi at the found targets.
+    centre_probability : (m,) array
+        pi where the detections point at.
+    odds : bool
+        Whether pi is replaced by pi / (1 - pi): a found target exists, so the alternative to its
+        having caused the detection is that it was missed.
+    """
+    kappa = np.zeros((len(positions), len(measurements)))
+    if kappa.size:
+        _intensity(
+            positions,
+            covariances,
+            probability,
+            centre_probability,
+            pose.position,
+            measurements.values,
+            measurements.cartesian,
+            measurements.centres,
+            measurements.roots,
+            measurements.volume,
+            odds,
+            kappa,
+        )
+    return kappa
+
+
+def exclusive(kappa: FloatArray, other: FloatArray) -> FloatArray:
+    """Return kappa (f, m) with each found target having caused one detection at most.
+
+    Where a found target surely caused one detection of a scan it cannot explain another one.
+
+    Parameters
+    ----------
+    other : (m,) array
+        Intensity of what else could have caused each detection.
+    """
+    if kappa.shape[1] < 2:
+        return kappa
+    out = kappa.copy()
+    total = other + kappa.sum(axis=0)
+    share = kappa / np.where(total > 0.0, total, 1.0)
+    best = share.argmax(axis=1)
+    rows = np.arange(len(kappa))
+    factor = 1.0 - share[rows, best]
+    out *= factor[:, None]
+    out[rows, best] = kappa[rows, best]
+    return out
+
+
+def refine(
+    position: FloatArray,
+    covariance: FloatArray,
+    measurements: MeasurementSet,
+    index: int,
+    pose: Pose,
+) -> tuple[FloatArray, FloatArray]:
+    """Return position and covariance of a found target after one of its detections."""
+    new_position = np.empty_like(position)
+    new_covariance = np.empty_like(covariance)
+    _update(
+        position,
+        covariance,
+        pose.position,
+        measurements.values[index],
+        measurements.cartesian[index],
+        measurements.centres[index],
+        measurements.roots[index],
+        new_position,
+        new_covariance,
+    )
+    return new_position, new_covariance
+
+
+def remove_measurements(
+    centres: FloatArray, positions: FloatArray, distance: float, every: bool
+) -> NDArray[np.bool_]:
+    """Return which of m detections stay once found targets took theirs.
+
+    Parameters
+    ----------
+    centres : (m, d) array
+        g^-1(z), metres.
+    positions : (f, d) array
+        Found targets, metres.
+    distance : float
+        T_z, metres.
+    every : bool
+        Whether all detections within T_z of a found target go (003, algorithm 1), or only the
+        closest one to each found target (000, section 3.3; 001, algorithm 1).
+    """
+    keep = np.ones(len(centres), np.bool_)
+    for position in positions:
+        apart = np.sqrt(((centres - position) ** 2).sum(axis=1))
+        near = keep & (apart <= distance)
+        if not near.any():
+            continue
+        if every:
+            keep &= ~near
+        else:
+            keep[int(np.argmin(np.where(near, apart, np.inf)))] = False
+    return keep

@@ -2,17 +2,48 @@
 
 from __future__ import annotations
 
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.clusters import Cluster
-from maasi_filter.found_targets import FoundTarget
+from maasi_filter import births as birth_models
+from maasi_filter.clusters import Cluster, group_clusters, kmeans, kmeans_clusters
+from maasi_filter.detection_model import BoxDetection, DetectionModel
+from maasi_filter.exploration import Exploration, check_bounds
+from maasi_filter.found_targets import (
+    FoundTarget,
+    exclusive,
+    found_intensity,
+    refine,
+    remove_measurements,
+)
+from maasi_filter.particles import group_moments, jitter, resample, total_weight
+from maasi_filter.phd import MeasurementSet, associate, prepare_measurements
 from maasi_filter.pose import Pose
-from maasi_filter.sensor import Sensor
+from maasi_filter.sensor import Sensor, is_covariance
+from maasi_filter.settings import FilterSettings
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Threads only pay off for sets of this size.
+PARALLEL_PARTICLES = 65_536
+# Lengths that are not given, as multiples of the deviation of the range.
+FOUND_RADIUS_DEVIATIONS = 2.0
+JITTER_DEVIATIONS = 0.03
+# A box's edge is as uncertain as the robot's position; so are its measurements.
+POSE_ERROR_OF_BOX = 0.05
+# Cells along the mean side of the environment.
+EXPLORATION_CELLS = 26
+LEAST_CLUSTER_MASS = 0.1
+# Two estimates whose difference is below this many deviations, squared, may be one target.
+SAME_TARGET = 12.0
+LARGEST_BIRTHS = 50_000
 
 
 @dataclass
@@ -66,3 +97,634 @@ class FilterResult:
     found_changed: bool
     expected_number: float
     dropped: dict[str, int] = field(default_factory=dict)
+
+
+class SearchFilter:
+    """Particle PHD filter with an iterated corrector, births, extraction and found targets.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        What is left None comes from the preset, or is derived from the sensor that measures.
+    bounds : (d, 2) array
+        Of the environment E, metres; d = 2 or 3.
+    generator : numpy.random.Generator
+        Every random draw comes from it.
+
+    Attributes
+    ----------
+    particles : (n, d) array
+        Metres, frame `map`.
+    weights : (n,) array
+        They sum to the expected number of targets that are not found yet.
+    found_targets : list of FoundTarget
+        In the order of being found.
+    clusters : list of Cluster
+        Potential targets, heaviest first.
+    exploration : Exploration
+        e, updated with every measurement.
+    """
+
+    def __init__(
+        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+    ) -> None:
+        self.settings = settings
+        self._numbers = settings.resolved()
+        self.bounds = check_bounds(bounds)
+        self.dimension = len(self.bounds)
+        self.generator = generator
+        size = self.bounds[:, 1] - self.bounds[:, 0]
+        self.volume = float(np.prod(size))
+        spacing = self._numbers.exploration_spacing
+        if spacing is None:
+            spacing = self.volume ** (1.0 / self.dimension) / EXPLORATION_CELLS
+        self.exploration = Exploration(self.bounds, spacing)
+        self.particles: FloatArray = np.empty((0, self.dimension))
+        self.weights: FloatArray = np.empty(0)
+        self.found_targets: list[FoundTarget] = []
+        self.clusters: list[Cluster] = []
+        self._group: IntArray = np.empty(0, np.int64)
+        self._groups = 0
+        self._covariances: list[FloatArray] = []
+        self._centres: FloatArray | None = None
+        self._pool: ThreadPoolExecutor | None = None
+
+    @property
+    def expected_number(self) -> float:
+        """Expected number of targets in the intensity, the mass of the particles."""
+        return total_weight(self.weights)
+
+    # What the settings leave to the sensor.
+
+    def _pose_error(self, sensor: Sensor) -> float:
+        if self._numbers.pose_error is not None:
+            return self._numbers.pose_error
+        if isinstance(sensor.detection, BoxDetection):
+            extent = sensor.detection.upper - sensor.detection.lower
+            return POSE_ERROR_OF_BOX * 0.5 * float(extent[: self.dimension].min())
+        return 0.0
+
+    def _found_radius(self, sensor: Sensor) -> float:
+        if self._numbers.found_radius is not None:
+            return self._numbers.found_radius
+        return FOUND_RADIUS_DEVIATIONS * math.sqrt(
+            sensor.covariance[0, 0] + self._pose_error(sensor) ** 2
+        )
+
+    def _jitter_deviation(self, sensor: Sensor) -> float:
+        if self._numbers.jitter_deviation is not None:
+            return self._numbers.jitter_deviation
+        return JITTER_DEVIATIONS * math.sqrt(sensor.covariance[0, 0])
+
+    def _detection(self, sensor: Sensor) -> DetectionModel:
+        """Return pi as the filter has it: a box's edge is softened by the pose's error."""
+        if isinstance(sensor.detection, BoxDetection):
+            return sensor.detection.softened(2.0 * self._pose_error(sensor))
+        return sensor.detection
+
+    # One step.
+
+    def step(
+        self, measurements: Sequence[AgentMeasurement], steps: int, time: float
+    ) -> FilterResult:
+        """Predict over `steps` control steps, correct with every robot of M_k, extract and mark.
+
+        Parameters
+        ----------
+        measurements : sequence of AgentMeasurement
+            M_k, in any order; they are processed in the order of the robots' names. May be empty.
+        steps : int
+            Control steps since the last batch, from 0.
+        time : float
+            Seconds, kept with what is found.
+
+        Raises
+        ------
+        ValueError
+            If anything is not finite, a covariance is not positive definite, shapes or dimensions
+            do not fit, or a robot is there twice. Nothing has changed then.
+        """
+        if isinstance(steps, bool) or int(steps) != steps or steps < 0:
+            raise ValueError(f'steps: got {steps!r}, allowed are whole numbers from 0')
+        if not math.isfinite(time):
+            raise ValueError(f'time: got {time}, allowed are finite numbers')
+        members = [self._checked(m) for m in sorted(measurements, key=lambda m: m.robot)]
+        names = [member.robot for member in members]
+        if len(set(names)) != len(names):
+            raise ValueError(f'measurements: got robots {names}, allowed is each robot once')
+        numbers = self._numbers
+        survival = numbers.survival_probability
+        assert survival is not None
+        if survival < 1.0:
+            self.weights = self.weights * survival ** int(steps)
+        dropped: dict[str, int] = {}
+        newly_found: list[FoundTarget] = []
+        moved = False
+        detections = 0
+        if numbers.births != 'measurement':
+            members = [self._without_found(member, dropped) for member in members]
+            self._add_births(members)
+        predicted = self.weights.copy() if numbers.corrector == 'predicted' else None
+        for member in members:
+            used, refined = self._correct(member, predicted, newly_found, dropped, time)
+            detections += used
+            moved |= refined
+        if detections:
+            self._resample(members)
+        if numbers.extraction == 'kmeans':
+            self._extract_kmeans(members, newly_found, time)
+        else:
+            self._extract_groups(members)
+        return FilterResult(
+            clusters=list(self.clusters),
+            newly_found=newly_found,
+            found_changed=moved or bool(newly_found),
+            expected_number=self.expected_number,
+            dropped=dropped,
+        )
+
+    def _checked(self, measurement: AgentMeasurement) -> AgentMeasurement:
+        """Return a measurement whose arrays fit, its detections in a fixed order."""
+        name = measurement.robot
+        d = self.dimension
+        if measurement.sensor.dimension != d:
+            raise ValueError(
+                f'{name}: sensor: got {measurement.sensor.dimension} dimensions, allowed is {d}'
+            )
+        values = np.array(measurement.values, dtype=float)
+        if values.size == 0:
+            values = values.reshape(0, d)
+        if values.ndim != 2 or values.shape[1] != d:
+            raise ValueError(f'{name}: values: got shape {values.shape}, allowed is (m, {d})')
+        if not np.isfinite(values).all():
+            raise ValueError(f'{name}: values: got {values.tolist()}, allowed are finite numbers')
+        covariances = None
+        if self._numbers.use_detection_covariances and measurement.covariances is not None:
+            covariances = np.array(measurement.covariances, dtype=float)
+            if covariances.size == 0:
+                covariances = covariances.reshape(0, d, d)
+            if covariances.shape != (len(values), d, d):
+                raise ValueError(
+                    f'{name}: covariances: got shape {covariances.shape}, '
+                    f'allowed is ({len(values)}, {d}, {d})'
+                )
+            for covariance in covariances:
+                if not is_covariance(covariance):
+                    raise ValueError(
+                        f'{name}: covariances: got {covariance.tolist()}, allowed is a symmetric '
+                        'positive definite matrix of finite numbers'
+                    )
+        else:
+            covariances = np.broadcast_to(measurement.sensor.covariance, (len(values), d, d))
+        # The order in which a sensor lists its detections means nothing, so it decides nothing.
+        order = np.lexsort(values.T[::-1])
+        return AgentMeasurement(
+            name,
+            measurement.pose,
+            measurement.sensor,
+            np.ascontiguousarray(values[order]),
+            np.array(covariances[order]),
+            measurement.index,
+        )
+
+    def _without_found(self, member: AgentMeasurement, dropped: dict[str, int]) -> AgentMeasurement:
+        """Return a member without the detections that found targets take (000, section 3.3)."""
+        numbers = self._numbers
+        if numbers.removal not in ('closest', 'every') or not self.found_targets:
+            return member
+        centres = member.sensor.measurement.inverse(member.values, member.pose)
+        positions = np.array([target.position for target in self.found_targets])
+        assert numbers.removal_distance is not None
+        keep = remove_measurements(
+            centres, positions, numbers.removal_distance, numbers.removal == 'every'
+        )
+        _count(dropped, 'found', int((~keep).sum()))
+        assert member.covariances is not None
+        return AgentMeasurement(
+            member.robot,
+            member.pose,
+            member.sensor,
+            member.values[keep],
+            member.covariances[keep],
+            member.index,
+        )
+
+    def _add_births(self, members: Sequence[AgentMeasurement]) -> None:
+        """Add births that do not belong to one measurement: anywhere, or 003's Gaussian."""
+        numbers = self._numbers
+        if not members:
+            return
+        assert numbers.birth_targets is not None and numbers.birth_particles is not None
+        if numbers.births == 'uniform':
+            particles, weights = birth_models.uniform_births(
+                self.bounds, numbers.birth_targets, numbers.birth_particles, self.generator
+            )
+        else:
+            sets = [self._prepared(member) for member in members if len(member.values)]
+            if not sets:
+                return
+            centres = np.concatenate([prepared.centres for prepared in sets])
+            spread = np.zeros((self.dimension, self.dimension))
+            for member, prepared in zip([m for m in members if len(m.values)], sets):
+                for m in range(len(prepared)):
+                    spread += _cartesian_noise(member, prepared, m)
+            particles, weights = birth_models.gaussian_births(
+                centres,
+                spread / len(centres),
+                self.bounds,
+                numbers.birth_targets,
+                numbers.birth_particles,
+                self.generator,
+            )
+        self._append(particles, weights, np.zeros(len(particles), np.int64), max(self._groups, 1))
+
+    def _append(
+        self, particles: FloatArray, weights: FloatArray, group: IntArray, groups: int
+    ) -> None:
+        self.particles = np.concatenate([self.particles, particles])
+        self.weights = np.concatenate([self.weights, weights])
+        self._group = np.concatenate([self._group, group])
+        self._groups = groups
+
+    def _prepared(self, member: AgentMeasurement) -> MeasurementSet:
+        assert member.covariances is not None
+        return prepare_measurements(
+            member.values,
+            member.covariances,
+            member.pose,
+            self._pose_error(member.sensor),
+            handle_poles=self._numbers.births == 'measurement',
+        )
+
+    def _threads(self) -> ThreadPoolExecutor | None:
+        if len(self.weights) < PARALLEL_PARTICLES:
+            return None
+        threads = self._numbers.threads or os.cpu_count() or 1
+        if threads < 2:
+            return None
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(threads)
+        return self._pool
+
+    def _correct(
+        self,
+        member: AgentMeasurement,
+        predicted: FloatArray | None,
+        newly_found: list[FoundTarget],
+        dropped: dict[str, int],
+        time: float,
+    ) -> tuple[int, bool]:
+        """Correct with one robot's detections; return how many were used, and if any target moved.
+
+        000, eq. (16), with the intensity of found targets and of unseen ones in C(z).
+        """
+        numbers = self._numbers
+        sensor = member.sensor
+        detection = self._detection(sensor)
+        reach = member.values[:, 0] <= sensor.maximum_range
+        if not reach.all():
+            _count(dropped, 'range', int((~reach).sum()))
+            assert member.covariances is not None
+            member = AgentMeasurement(
+                member.robot,
+                member.pose,
+                sensor,
+                member.values[reach],
+                member.covariances[reach],
+                member.index,
+            )
+        n = len(self.weights)
+        count = len(member.values)
+        probability = detection.probability(self.particles, member.pose)
+        if count == 0:
+            self.weights = self.weights * (1.0 - probability)
+            self.exploration.update(detection, member.pose)
+            return 0, False
+        pool = self._threads()
+        prepared = self._prepared(member)
+        other = np.full(count, sensor.clutter)
+        born = None
+        kappa = np.zeros((0, count))
+        if numbers.births == 'measurement':
+            assert numbers.birth_particles is not None and numbers.expected_targets is not None
+            each = max(20, min(numbers.birth_particles, LARGEST_BIRTHS // count))
+            born = birth_models.measurement_births(
+                prepared,
+                member.pose,
+                detection,
+                self.exploration,
+                numbers.expected_targets,
+                each,
+                self.generator,
+                unexplored=numbers.birth_prior == 'unexplored',
+            )
+            other = other + born.totals
+        if numbers.removal == 'soft' and self.found_targets:
+            kappa = self._found_intensity(member, detection, prepared, other)
+            other = other + kappa.sum(axis=0)
+        update = associate(
+            self.particles,
+            self.weights,
+            probability,
+            prepared,
+            member.pose,
+            other,
+            denominator_weights=self._denominator(predicted),
+            group=self._group,
+            groups=self._groups,
+            pool=pool,
+        )
+        explained = np.isfinite(update.log_normaliser)
+        if not explained.all():
+            self._count_unexplained(prepared, member, detection, ~explained, dropped)
+        updated = self.weights * update.factor
+        # A particle belongs to the detection that explains most of its weight, if one does; what
+        # a detection leaves of a group that it mostly took belongs to it too.
+        groups = self._groups
+        taken = np.arange(groups)
+        if groups:
+            mass = np.bincount(self._group, weights=updated, minlength=groups)
+            best = update.group_share.argmax(axis=1)
+            most = update.group_share[np.arange(groups), best]
+            taken = np.where(most > 0.5 * mass, groups + best, taken)
+        own = update.share > 0.5 * updated
+        self._group = np.where(own, groups + update.component, taken[self._group])
+        self._groups = groups + count
+        self.weights = updated
+        if born is not None:
+            each = born.intensity.shape[1]
+            self._append(
+                born.particles.reshape(-1, self.dimension),
+                (born.intensity * update.other_scale[:, None]).ravel(),
+                np.repeat(groups + np.arange(count), each),
+                self._groups,
+            )
+        moved = False
+        claims = kappa * update.other_scale
+        if numbers.refine_found and len(claims):
+            moved = self._refine(member, prepared, claims)
+        if numbers.extraction == 'measurement':
+            self._mark(
+                member,
+                update.own_mass,
+                update.means,
+                update.covariances,
+                claims,
+                groups,
+                newly_found,
+                time,
+            )
+        del n
+        self.exploration.update(detection, member.pose)
+        return int(explained.sum()), moved
+
+    def _denominator(self, predicted: FloatArray | None) -> FloatArray | None:
+        if predicted is None:
+            return None
+        return predicted
+
+    def _count_unexplained(
+        self,
+        prepared: MeasurementSet,
+        member: AgentMeasurement,
+        detection: DetectionModel,
+        unexplained: NDArray[np.bool_],
+        dropped: dict[str, int],
+    ) -> None:
+        centres = prepared.centres[unexplained]
+        inside = ((centres >= self.bounds[:, 0]) & (centres <= self.bounds[:, 1])).all(axis=1)
+        _count(dropped, 'outside', int((~inside).sum()))
+        _count(dropped, 'unseen', int(inside.sum()))
+
+    def _found_intensity(
+        self,
+        member: AgentMeasurement,
+        detection: DetectionModel,
+        prepared: MeasurementSet,
+        other: FloatArray,
+    ) -> FloatArray:
+        positions = np.array([target.position for target in self.found_targets])
+        covariances = np.array([target.covariance for target in self.found_targets])
+        kappa = found_intensity(
+            positions,
+            covariances,
+            detection.probability(positions, member.pose),
+            detection.probability(prepared.centres, member.pose),
+            prepared,
+            member.pose,
+        )
+        return exclusive(kappa, other)
+
+    def _refine(
+        self, member: AgentMeasurement, prepared: MeasurementSet, claims: FloatArray
+    ) -> bool:
+        """Update found targets with the detections that most probably are theirs."""
+        moved = False
+        own = self._pose_error(member.sensor) ** 2 * np.eye(self.dimension)
+        best = claims.argmax(axis=1)
+        for f, target in enumerate(self.found_targets):
+            if claims[f, best[f]] <= 0.5:
+                continue
+            position, covariance = refine(
+                target.position, self._covariances[f], prepared, int(best[f]), member.pose
+            )
+            if not (np.isfinite(position).all() and np.isfinite(covariance).all()):
+                continue
+            position = np.clip(position, self.bounds[:, 0], self.bounds[:, 1])
+            self._covariances[f] = covariance
+            self.found_targets[f] = FoundTarget(
+                target.id,
+                position,
+                covariance + own,
+                target.robot,
+                target.measurement,
+                target.time,
+            )
+            moved = True
+        return moved
+
+    def _mark(
+        self,
+        member: AgentMeasurement,
+        own_mass: FloatArray,
+        means: FloatArray,
+        covariances: FloatArray,
+        claims: FloatArray,
+        groups: int,
+        newly_found: list[FoundTarget],
+        time: float,
+    ) -> None:
+        """Mark what detections pinned down: narrow, and known before this measurement."""
+        numbers = self._numbers
+        assert numbers.found_mass is not None
+        radius = self._found_radius(member.sensor)
+        own = self._pose_error(member.sensor) ** 2 * np.eye(self.dimension)
+        floor = (0.05 * radius) ** 2 * np.eye(self.dimension)
+        known = len(claims)
+        for m in range(len(own_mass)):
+            if own_mass[m] <= numbers.found_mass:
+                continue
+            spread = math.sqrt(max(float(np.trace(covariances[m])), 0.0))
+            if spread > radius:
+                continue
+            covariance = covariances[m] + floor
+            if self._is_known(means[m], covariance, claims, known, m):
+                continue
+            target = FoundTarget(
+                len(self.found_targets) + 1,
+                means[m].copy(),
+                covariance + own,
+                member.robot,
+                member.index,
+                time,
+            )
+            self.found_targets.append(target)
+            self._covariances.append(covariance)
+            newly_found.append(target)
+            offset = self.particles - means[m]
+            near = np.sqrt((offset * offset).sum(axis=1)) <= 3.0 * max(spread, 0.05 * radius)
+            here = self._group == groups + m
+            elsewhere = (self._group >= groups) & ~here
+            self.weights = np.where(here | (near & ~elsewhere), 0.0, self.weights)
+
+    def _is_known(
+        self,
+        position: FloatArray,
+        covariance: FloatArray,
+        claims: FloatArray,
+        known: int,
+        measurement: int,
+    ) -> bool:
+        """Return whether a candidate may be a found target that this scan has not seen elsewhere.
+
+        A target causes one detection of a scan at most, so a found target that surely caused
+        another one is not this one.
+        """
+        for f in range(known):
+            others = np.delete(claims[f], measurement)
+            if len(others) and others.max() > 0.5:
+                continue
+            target = self.found_targets[f]
+            offset = position - target.position
+            total = covariance + target.covariance
+            if float(offset @ np.linalg.solve(total, offset)) < SAME_TARGET:
+                return True
+        return False
+
+    def _resample(self, members: Sequence[AgentMeasurement]) -> None:
+        numbers = self._numbers
+        pool = self._threads()
+        expected = total_weight(self.weights)
+        if not expected > 1e-12:
+            self.particles = np.empty((0, self.dimension))
+            self.weights = np.empty(0)
+            self._group = np.empty(0, np.int64)
+            self._groups = 0
+            return
+        assert numbers.particles_per_target is not None and numbers.particles_minimum is not None
+        wanted = max(numbers.particles_minimum, math.ceil(numbers.particles_per_target * expected))
+        number = min(max(wanted, 1), numbers.particles)
+        assert numbers.resampling is not None
+        index = resample(self.weights, number, numbers.resampling, self.generator, pool)
+        particles = self.particles[index]
+        group = self._group[index]
+        present = np.bincount(group, minlength=self._groups) > 0
+        compact = np.cumsum(present) - 1
+        group = compact[group]
+        self._groups = int(present.sum())
+        assert numbers.jitter_differential is not None
+        deviation = max((self._jitter_deviation(member.sensor) for member in members), default=0.0)
+        if numbers.jitter_differential > 0.0 or deviation > 0.0:
+            particles = jitter(
+                particles,
+                index,
+                group,
+                self._groups,
+                numbers.jitter_differential,
+                deviation,
+                self.bounds,
+                self.generator,
+                pool=pool,
+            )
+        self.particles = particles
+        self.weights = np.full(number, expected / number)
+        self._group = group
+
+    def _extract_groups(self, members: Sequence[AgentMeasurement]) -> None:
+        if self._groups == 0 or len(self.weights) == 0:
+            self.clusters = []
+            return
+        mass, means, covariances = group_moments(
+            self.particles, self.weights, self._group, self._groups, self._threads()
+        )
+        least = min((self._found_radius(member.sensor) for member in members), default=0.0)
+        self.clusters = group_clusters(mass, means, covariances, LEAST_CLUSTER_MASS, least)
+
+    def _extract_kmeans(
+        self, members: Sequence[AgentMeasurement], newly_found: list[FoundTarget], time: float
+    ) -> None:
+        """K-means with k the rounded expected number, and marking (000, section 3.3)."""
+        numbers = self._numbers
+        expected = self.expected_number
+        if len(self.weights) == 0 or not expected > 0.0 or not members:
+            self.clusters = [] if len(self.weights) == 0 else self.clusters
+            return
+        count = max(1, round(expected))
+        assert numbers.kmeans_iterations is not None and numbers.found_mass is not None
+        label, centres = kmeans(
+            self.particles,
+            self.weights,
+            count,
+            self.generator,
+            self._centres,
+            numbers.kmeans_iterations,
+        )
+        largest = numbers.found_radius_kind == 'maximum'
+        clusters, labels = kmeans_clusters(
+            self.particles, self.weights, label, len(centres), largest
+        )
+        member = members[-1]
+        remaining = []
+        alive = np.ones(len(self.weights), np.bool_)
+        kept = []
+        for cluster, number in zip(clusters, labels):
+            narrow = cluster.radius <= self._found_radius(member.sensor)
+            if narrow and cluster.mass >= numbers.found_mass:
+                target = FoundTarget(
+                    len(self.found_targets) + 1,
+                    cluster.position,
+                    cluster.covariance,
+                    member.robot,
+                    member.index,
+                    time,
+                )
+                self.found_targets.append(target)
+                self._covariances.append(cluster.covariance)
+                newly_found.append(target)
+                alive &= label != number
+            else:
+                remaining.append(cluster)
+                kept.append(centres[number])
+        if not alive.all():
+            self.particles = self.particles[alive]
+            self.weights = self.weights[alive]
+            self._group = self._group[alive]
+        self._centres = np.array(kept) if kept else None
+        self.clusters = sorted(remaining, key=lambda cluster: -cluster.mass)
+
+
+def _count(dropped: dict[str, int], reason: str, number: int) -> None:
+    if number:
+        dropped[reason] = dropped.get(reason, 0) + number
+
+
+def _cartesian_noise(member: AgentMeasurement, prepared: MeasurementSet, index: int) -> FloatArray:
+    """Return the noise of one detection as a covariance in metres."""
+    root = prepared.roots[index]
+    noise = (root[:, None, :] * root[None, :, :]).sum(axis=-1)
+    if prepared.cartesian[index]:
+        return np.asarray(noise)
+    centre = prepared.centres[index : index + 1]
+    jacobian = member.sensor.measurement.jacobian(centre, member.pose)[0]
+    inverse = np.linalg.pinv(jacobian)
+    return np.asarray(inverse @ noise @ inverse.T)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,6 +202,60 @@ class EnvironmentSettings(Settings):
 Preset = Literal['recommended', 'paper_000', 'paper_001', 'paper_002', 'paper_003']
 
 
+_PAPER: dict[str, Any] = {
+    'particles_minimum': 500,
+    'particles_per_target': 1000,
+    'survival_probability': 1.0,
+    'births': 'uniform',
+    'birth_particles': 2000,
+    'birth_prior': 'constant',
+    'expected_targets': 12.0,
+    'birth_targets': 1.0,
+    'corrector': 'running',
+    'resampling': 'multinomial',
+    'jitter_differential': 0.3,
+    'jitter_deviation': 0.1,
+    'extraction': 'kmeans',
+    'found_radius': 1.1,
+    'found_radius_kind': 'rms',
+    'found_mass': 0.5,
+    'removal': 'closest',
+    'removal_distance': 5.0,
+    'refine_found': False,
+    'pose_error': 0.0,
+    'use_detection_covariances': False,
+    'kmeans_iterations': 20,
+}
+
+# What each preset fills in; `docs/filter_presets.md` says where the numbers are from.
+PRESETS: dict[str, dict[str, Any]] = {
+    'recommended': {
+        'particles_minimum': 1000,
+        'particles_per_target': 2000,
+        'survival_probability': 1.0,
+        'births': 'measurement',
+        'birth_particles': 500,
+        'birth_prior': 'unexplored',
+        'expected_targets': 12.0,
+        'birth_targets': 0.0,
+        'corrector': 'running',
+        'resampling': 'systematic',
+        'jitter_differential': 0.3,
+        'extraction': 'measurement',
+        'found_radius_kind': 'rms',
+        'found_mass': 0.5,
+        'removal': 'soft',
+        'refine_found': True,
+        'use_detection_covariances': True,
+        'kmeans_iterations': 20,
+    },
+    'paper_000': _PAPER,
+    'paper_001': _PAPER,
+    'paper_002': {**_PAPER, 'corrector': 'predicted'},
+    'paper_003': {**_PAPER, 'births': 'gaussian', 'removal': 'every'},
+}
+
+
 class FilterSettings(Settings):
     """Numbers of the search filter. What is left None takes the value of the preset.
 
@@ -311,3 +365,15 @@ class FilterSettings(Settings):
         le=256,
         description='Threads for large particle sets; results do not depend [1]',
     )
+
+    def resolved(self) -> FilterSettings:
+        """Return a copy in which the preset's values stand where nothing was given.
+
+        Lengths that depend on the sensor or the environment may still be None.
+        """
+        values = {
+            name: value
+            for name, value in PRESETS[self.preset].items()
+            if getattr(self, name) is None
+        }
+        return self.model_copy(update=values)
