@@ -17,8 +17,17 @@ from maasi_filter.measurement_model import (
     RangeBearingElevation,
     wrap_angle,
 )
+from maasi_filter.metrics import (
+    Gospa,
+    Match,
+    RestrictedMean,
+    gospa,
+    match_targets,
+    ospa,
+    restricted_mean,
+)
 from maasi_filter.pose import Pose, compose, inverse
-from maasi_filter.search_filter import AgentMeasurement, FilterResult
+from maasi_filter.search_filter import AgentMeasurement, FilterResult, SearchFilter, warm_up
 from maasi_filter.sensor import Sensor
 from maasi_filter.settings import (
     DetectionSettings,
@@ -42,15 +51,24 @@ __all__ = [
     'FoundTarget',
     'FunctionDetection',
     'GaussianDetection',
+    'Gospa',
+    'Match',
     'MeasurementModel',
     'NoiseSettings',
     'Pose',
     'RangeBearing',
     'RangeBearingElevation',
+    'RestrictedMean',
+    'SearchFilter',
     'Sensor',
     'SensorSettings',
     'compose',
     'detection_probability',
+    'gospa',
     'inverse',
+    'match_targets',
+    'ospa',
+    'restricted_mean',
+    'warm_up',
     'wrap_angle',
 ]

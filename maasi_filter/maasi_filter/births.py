@@ -135,7 +135,7 @@ def measurement_births(
         particles,
         jacobian,
     )
-    inside = (jacobian > 0.0).any(axis=1)
+    inside: NDArray[np.bool_] = np.any(jacobian > 0.0, axis=1)
     probability = detection.probability(particles.reshape(-1, d), pose).reshape(count, number)
     values, lower, step = exploration.kernel()
     prior = expected_targets / float(np.prod(bounds[:, 1] - bounds[:, 0]))

@@ -61,12 +61,12 @@ def resampling_points(
     (independent draws, sorted as ratios of sums of exponential ones).
     """
     if scheme == 'systematic':
-        return (np.arange(number) + generator.random()) * (total / number)
+        return np.asarray((np.arange(number) + generator.random()) * (total / number), np.float64)
     if scheme == 'stratified':
         return (np.arange(number) + generator.random(number)) * (total / number)
     if scheme == 'multinomial':
         cumulative = np.cumsum(generator.standard_exponential(number + 1))
-        return cumulative[:-1] * (total / cumulative[-1])
+        return np.asarray(cumulative[:-1] * (total / cumulative[-1]), dtype=float)
     raise ValueError(
         f"resampling: got {scheme!r}, allowed are 'systematic', 'stratified', 'multinomial'"
     )

@@ -13,7 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter import births as birth_models
 from maasi_filter.clusters import Cluster, group_clusters, kmeans, kmeans_clusters
-from maasi_filter.detection_model import BoxDetection, DetectionModel
+from maasi_filter.detection_model import (
+    PARAMETERS,
+    BoxDetection,
+    DetectionModel,
+    detection_probability,
+)
 from maasi_filter.exploration import Exploration, check_bounds
 from maasi_filter.found_targets import (
     FoundTarget,
@@ -26,7 +31,13 @@ from maasi_filter.particles import group_moments, jitter, resample, total_weight
 from maasi_filter.phd import MeasurementSet, associate, prepare_measurements
 from maasi_filter.pose import Pose
 from maasi_filter.sensor import Sensor, is_covariance
-from maasi_filter.settings import FilterSettings
+from maasi_filter.settings import (
+    DetectionSettings,
+    FilterSettings,
+    NoiseSettings,
+    Preset,
+    SensorSettings,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -393,7 +404,6 @@ class SearchFilter:
                 member.covariances[reach],
                 member.index,
             )
-        n = len(self.weights)
         count = len(member.values)
         probability = detection.probability(self.particles, member.pose)
         if count == 0:
@@ -429,14 +439,14 @@ class SearchFilter:
             prepared,
             member.pose,
             other,
-            denominator_weights=self._denominator(predicted),
+            denominator_weights=predicted,
             group=self._group,
             groups=self._groups,
             pool=pool,
         )
         explained = np.isfinite(update.log_normaliser)
         if not explained.all():
-            self._count_unexplained(prepared, member, detection, ~explained, dropped)
+            self._count_unexplained(prepared, ~explained, dropped)
         updated = self.weights * update.factor
         # A particle belongs to the detection that explains most of its weight, if one does; what
         # a detection leaves of a group that it mostly took belongs to it too.
@@ -474,20 +484,12 @@ class SearchFilter:
                 newly_found,
                 time,
             )
-        del n
         self.exploration.update(detection, member.pose)
         return int(explained.sum()), moved
-
-    def _denominator(self, predicted: FloatArray | None) -> FloatArray | None:
-        if predicted is None:
-            return None
-        return predicted
 
     def _count_unexplained(
         self,
         prepared: MeasurementSet,
-        member: AgentMeasurement,
-        detection: DetectionModel,
         unexplained: NDArray[np.bool_],
         dropped: dict[str, int],
     ) -> None:
@@ -728,3 +730,39 @@ def _cartesian_noise(member: AgentMeasurement, prepared: MeasurementSet, index: 
     jacobian = member.sensor.measurement.jacobian(centre, member.pose)[0]
     inverse = np.linalg.pinv(jacobian)
     return np.asarray(inverse @ noise @ inverse.T)
+
+
+def warm_up() -> None:
+    """Compile, or load from the cache, every kernel that a step uses.
+
+    A node calls this before it reports ready, so that no step waits for a compiler.
+    """
+    for dimension in (2, 3):
+        bounds = np.array([[0.0, 10.0]] * dimension)
+        for detection in (
+            DetectionSettings(kind='exponential', size=[5.0] * dimension),
+            DetectionSettings(kind='box', lower=[-5.0, -5.0], upper=[5.0, 5.0]),
+        ):
+            noise = NoiseSettings(range=0.5, bearing=0.1, elevation=0.1)
+            sensor = SensorSettings(detection=detection, noise=noise).build('warm_up', dimension)
+            presets: tuple[Preset, ...] = ('recommended', 'paper_000', 'paper_003')
+            for preset in presets:
+                settings = FilterSettings(
+                    preset=preset, particles=500, birth_particles=50, particles_minimum=50
+                )
+                search = SearchFilter(settings, bounds, np.random.default_rng(0))
+                for step in range(6):
+                    position = np.array([3.0 + 0.2 * step, 3.0, 3.0])
+                    pose = Pose.from_yaw(position, 0.1)
+                    targets = np.array([[5.0, 5.0, 5.0], [2.0, 4.0, 2.0]])[:, :dimension]
+                    values = sensor.measurement.measure(targets, pose)
+                    if step == 3:
+                        values = values[:0]
+                    search.step(
+                        [AgentMeasurement('warm_up', pose, sensor, values, None, step)], 1, step
+                    )
+                positions = np.full((1, 3), 3.0)
+                search.exploration.expected_new(sensor.detection, positions, np.zeros(1), 1.0)
+                search.exploration.at(positions)
+    origin = np.zeros(3)
+    detection_probability(0, np.zeros(PARAMETERS), origin, origin, 0.0)

@@ -1,0 +1,248 @@
+"""How good an estimate of a set of targets is, and how long a search took."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Gospa:
+    """GOSPA with alpha = 2, and its parts (Rahmathullah, Garcia-Fernandez and Svensson, 2017).
+
+    `total` is (localisation + missed + false) to the power 1/p; the parts are powers already.
+
+    Parameters
+    ----------
+    total : float
+        The metric, metres.
+    localisation : float
+        Sum of distances of matched pairs, to the power p.
+    missed, false : float
+        c^p / 2 for each target, or estimate, that is not matched.
+    matched : int
+        Number of pairs.
+    """
+
+    total: float
+    localisation: float
+    missed: float
+    false: float
+    matched: int
+
+
+def _points(name: str, value: ArrayLike) -> FloatArray:
+    array = np.asarray(value, dtype=float)
+    if array.size == 0:
+        return np.empty((0, array.shape[1] if array.ndim == 2 else 0))
+    if array.ndim != 2:
+        raise ValueError(f'{name}: got shape {array.shape}, allowed is (n, d)')
+    if not np.isfinite(array).all():
+        raise ValueError(f'{name}: got a number that is not finite')
+    return array
+
+
+def _distances(estimates: ArrayLike, truth: ArrayLike) -> FloatArray:
+    ours = _points('estimates', estimates)
+    theirs = _points('truth', truth)
+    if len(ours) == 0 or len(theirs) == 0:
+        return np.zeros((len(ours), len(theirs)))
+    if ours.shape[1] != theirs.shape[1]:
+        raise ValueError(
+            f'estimates, truth: got {ours.shape[1]} and {theirs.shape[1]} coordinates, '
+            'allowed is the same number'
+        )
+    return np.sqrt(((ours[:, None, :] - theirs[None, :, :]) ** 2).sum(axis=2))
+
+
+def _positive(name: str, value: float, least: float = 0.0) -> None:
+    if not (math.isfinite(value) and value > 0.0 and value >= least):
+        raise ValueError(f'{name}: got {value}, allowed are finite numbers above {least}')
+
+
+def gospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 2.0) -> Gospa:
+    """Return the GOSPA metric between two sets of points.
+
+    Parameters
+    ----------
+    estimates, truth : (n, d), (m, d) arrays
+        Metres.
+    cutoff : float
+        c, metres: pairs farther apart do not match.
+    power : float
+        p, from 1.
+    """
+    _positive('cutoff', cutoff)
+    _positive('power', power, 1.0)
+    apart = _distances(estimates, truth)
+    cost = np.minimum(apart, cutoff) ** power
+    rows, columns = linear_sum_assignment(cost)
+    matched = apart[rows, columns] < cutoff
+    localisation = float(cost[rows, columns][matched].sum())
+    pairs = int(matched.sum())
+    each = 0.5 * cutoff**power
+    missed = each * (apart.shape[1] - pairs)
+    false = each * (apart.shape[0] - pairs)
+    total = (localisation + missed + false) ** (1.0 / power)
+    return Gospa(float(total), localisation, float(missed), float(false), pairs)
+
+
+def ospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 2.0) -> float:
+    """Return the OSPA metric between two sets of points (Schuhmacher, Vo and Vo, 2008).
+
+    Arguments as for `gospa`. Two empty sets are 0 apart; an empty and another one `cutoff`.
+    """
+    _positive('cutoff', cutoff)
+    _positive('power', power, 1.0)
+    apart = _distances(estimates, truth)
+    larger = max(apart.shape)
+    if larger == 0:
+        return 0.0
+    cost = np.minimum(apart, cutoff) ** power
+    rows, columns = linear_sum_assignment(cost)
+    total = float(cost[rows, columns].sum()) + cutoff**power * (larger - min(apart.shape))
+    return float((total / larger) ** (1.0 / power))
+
+
+@dataclass(frozen=True)
+class Match:
+    """One-to-one matching of found targets to true ones.
+
+    Parameters
+    ----------
+    pairs : list of (int, int)
+        Index of the found, and of the true target.
+    true_found, missed, false_found : int
+        Numbers of pairs, of true targets without, and of found ones without.
+    rmse : float
+        Root mean square distance of the pairs, metres; nan without pairs.
+    """
+
+    pairs: list[tuple[int, int]]
+    true_found: int
+    missed: int
+    false_found: int
+    rmse: float
+
+
+def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Match:
+    """Match found targets to true ones within `radius` metres.
+
+    As many pairs as possible, and among these the smallest sum of squared distances.
+    """
+    _positive('radius', radius)
+    apart = _distances(estimates, truth)
+    # One more pair outweighs any distances.
+    worth = (min(apart.shape) + 1.0) * radius**2 if apart.size else 0.0
+    cost = np.where(apart <= radius, apart**2 - worth, 0.0)
+    rows, columns = linear_sum_assignment(cost)
+    near = apart[rows, columns] <= radius
+    pairs = [(int(i), int(j)) for i, j in zip(rows[near], columns[near])]
+    squares = apart[rows, columns][near] ** 2
+    return Match(
+        pairs=pairs,
+        true_found=len(pairs),
+        missed=apart.shape[1] - len(pairs),
+        false_found=apart.shape[0] - len(pairs),
+        rmse=math.sqrt(float(squares.mean())) if len(squares) else math.nan,
+    )
+
+
+def cardinality_error(expected_number: float, found: int, truth: int) -> float:
+    """Return expected number of targets, found ones included, minus the true number."""
+    return float(expected_number) + found - truth
+
+
+def normalised_error(error: ArrayLike, covariance: ArrayLike) -> float:
+    """Return the normalised estimation error squared (NEES) of one estimate.
+
+    Its mean is d for a consistent covariance.
+    """
+    vector = np.asarray(error, dtype=float)
+    return float(vector @ np.linalg.solve(np.asarray(covariance, dtype=float), vector))
+
+
+@dataclass(frozen=True)
+class RestrictedMean:
+    """Mean time up to a cap, of runs that may not have finished.
+
+    Parameters
+    ----------
+    mean : float
+        Area under the Kaplan-Meier curve up to the cap.
+    standard_error : float
+        Of the mean (Greenwood's plug-in); 0 for a single run.
+    finished, runs : int
+        Runs that finished within the cap, and all.
+    """
+
+    mean: float
+    standard_error: float
+    finished: int
+    runs: int
+
+
+def restricted_mean(
+    times: Sequence[float | None], cap: float, ended: Sequence[float] | None = None
+) -> RestrictedMean:
+    """Return the restricted mean time to find all targets.
+
+    Parameters
+    ----------
+    times : sequence of float or None
+        When each run found all; None for one that did not.
+    cap : float
+        Upper end of the mean.
+    ended : sequence of float, optional
+        When each run ended without having found all; the cap if not given. Runs that were cut
+        short count up to then.
+
+    Raises
+    ------
+    ValueError
+        If there are no runs, or a number is not usable.
+    """
+    _positive('cap', cap)
+    if len(times) == 0:
+        raise ValueError('times: got no runs, allowed is one or more')
+    if ended is not None and len(ended) != len(times):
+        raise ValueError(f'ended: got {len(ended)} numbers, allowed are {len(times)}')
+    last = np.array(
+        [
+            (cap if ended is None else ended[i]) if value is None else value
+            for i, value in enumerate(times)
+        ],
+        dtype=float,
+    )
+    if not (np.isfinite(last).all() and (last >= 0.0).all()):
+        raise ValueError(f'times: got {last.tolist()}, allowed are finite numbers from 0')
+    event = np.array([value is not None for value in times]) & (last <= cap)
+    last = np.minimum(last, cap)
+    moments = np.unique(last[event])
+    survival = 1.0
+    previous = 0.0
+    area = 0.0
+    steps = []
+    for moment in moments:
+        area += survival * (moment - previous)
+        at_risk = int((last >= moment).sum())
+        finished = int(((last == moment) & event).sum())
+        steps.append((moment, at_risk, finished, area))
+        survival *= 1.0 - finished / at_risk
+        previous = moment
+    area += survival * (cap - previous)
+    variance = 0.0
+    for _, at_risk, finished, before in steps:
+        if at_risk > finished:
+            variance += (area - before) ** 2 * finished / (at_risk * (at_risk - finished))
+    runs = len(times)
+    if runs > 1:
+        variance *= runs / (runs - 1)
+    return RestrictedMean(float(area), math.sqrt(variance), int(event.sum()), runs)
