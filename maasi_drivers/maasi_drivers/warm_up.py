@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from maasi_filter.pose import Pose
 
 from maasi_drivers.camera_settings import CameraSettings, SegmentationSettings
 from maasi_drivers.marker_detector import MarkerDetector
+from maasi_filter.pose import Pose
 
 
 def warm_up() -> None:

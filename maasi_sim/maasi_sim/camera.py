@@ -241,7 +241,7 @@ def scene_of(world: World, settings: RenderSettings, seed: int) -> list[Shape]:
     shapes = draw_distractors(settings, world, noise_stream(seed, purpose='distractors'))
     shapes += [
         disc(centre, float(radius), (0.25, 0.24, 0.23))
-        for centre, radius in zip(world.obstacle_centres, world.obstacle_radii)
+        for centre, radius in zip(world.obstacles.centres, world.obstacles.radii)
     ]
     radius = 0.5 * settings.marker_diameter
     return shapes + [disc(target, radius, settings.marker_colour) for target in world.targets]

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from maasi_filter.settings import EnvironmentSettings, Finite, Settings
+from maasi_planner.obstacles import Obstacles
 from maasi_sim.noise_streams import noise_stream
 
 Array = NDArray[np.float64]
@@ -59,17 +60,14 @@ class World:
         Lower and upper bound on each axis of the map [m].
     targets : ndarray, shape (n, d)
         True positions [m].
-    obstacle_centres : ndarray, shape (m, d)
-        [m].
-    obstacle_radii : ndarray, shape (m,)
-        [m].
+    obstacles : Obstacles
+        In their own size.
 
     """
 
     bounds: Array
     targets: Array
-    obstacle_centres: Array = field(default_factory=lambda: np.empty((0, 2)))
-    obstacle_radii: Array = field(default_factory=lambda: np.empty(0))
+    obstacles: Obstacles = field(default_factory=Obstacles.none)
 
     @property
     def dimension(self) -> int:
@@ -95,23 +93,14 @@ class World:
 
         """
         bounds = environment.array()
-        dimension = len(bounds)
-        centres = np.zeros((len(environment.obstacles), dimension))
-        for row, obstacle in zip(centres, environment.obstacles):
-            if len(obstacle.centre) > dimension:
-                raise ValueError(
-                    f'obstacles: got a centre of {len(obstacle.centre)} coordinates, '
-                    f'allowed at most {dimension}'
-                )
-            row[: len(obstacle.centre)] = obstacle.centre
-        radii = np.array([obstacle.radius for obstacle in environment.obstacles], dtype=float)
+        obstacles = Obstacles.from_settings(environment.obstacles)
         if targets.positions is not None:
             positions = check_positions(targets.positions, bounds)
         else:
             positions = draw_targets(
-                targets, bounds, noise_stream(seed, purpose='targets'), centres, radii
+                targets, bounds, noise_stream(seed, purpose='targets'), obstacles
             )
-        return cls(bounds, positions, centres, radii)
+        return cls(bounds, positions, obstacles)
 
 
 def check_positions(positions: ArrayLike, bounds: Array) -> Array:
@@ -142,8 +131,7 @@ def draw_targets(
     settings: TargetSettings,
     bounds: Array,
     generator: np.random.Generator,
-    obstacle_centres: Array | None = None,
-    obstacle_radii: Array | None = None,
+    obstacles: Obstacles | None = None,
 ) -> Array:
     """
     Draw target positions.
@@ -156,8 +144,8 @@ def draw_targets(
         [m].
     generator : numpy.random.Generator
         Where the randomness comes from.
-    obstacle_centres, obstacle_radii : ndarray, shapes (m, d) and (m,), optional
-        No target lies inside one; on a floor within ``margin`` of one neither [m].
+    obstacles : Obstacles, optional
+        No target lies inside one, nor within ``margin`` of one.
 
     Returns
     -------
@@ -178,7 +166,7 @@ def draw_targets(
             f'{0.5 * float((bounds[:, 1] - bounds[:, 0]).min()):g}'
         )
     for _ in range(_RESTARTS):
-        drawn = _draw(settings, count, low, high, generator, obstacle_centres, obstacle_radii)
+        drawn = _draw(settings, count, low, high, generator, obstacles or Obstacles.none())
         if drawn is not None:
             return drawn
     raise ValueError(
@@ -193,8 +181,7 @@ def _draw(
     low: Array,
     high: Array,
     generator: np.random.Generator,
-    obstacle_centres: Array | None,
-    obstacle_radii: Array | None,
+    obstacles: Obstacles,
 ) -> Array | None:
     centres = np.empty((0, len(low)))
     spread = settings.spread or float((high - low).mean()) / 15.0
@@ -214,15 +201,10 @@ def _draw(
                 settings.separation
             ):
                 continue
-            if (
-                obstacle_centres is not None
-                and obstacle_radii is not None
-                and np.any(
-                    np.linalg.norm(obstacle_centres - position, axis=1)
-                    < obstacle_radii + settings.margin
-                )
-            ):
-                continue
+            if len(obstacles):
+                place = np.pad(position, (0, 3 - len(position)))
+                if obstacles.distances(place).min() < settings.margin:
+                    continue
             drawn[index] = position
             break
         else:
