@@ -1,0 +1,443 @@
+"""Scenario files: what is searched, by which robots, how, and when it ends."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import Field
+
+from maasi_drivers.camera_settings import CameraSettings
+from maasi_filter.settings import (
+    EnvironmentSettings,
+    FilterSettings,
+    Finite,
+    SensorSettings,
+    Settings,
+)
+from maasi_planner.candidates import CandidateSet, Viewer, unseen_parts
+from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
+from maasi_sim.camera import RenderSettings
+from maasi_sim.world import TargetSettings, World
+from maasi_sim.yaml_files import (
+    Key,
+    Layer,
+    ScenarioError,
+    dotted,
+    merge,
+    place,
+    read_layer,
+    unknown,
+    validate,
+)
+
+__all__ = ['RobotSettings', 'Scenario', 'ScenarioError', 'load_scenario']
+
+_ROBOT_NAME = re.compile(r'^[a-z][a-z0-9_]*$')
+_RESERVED = ('exploration', 'ground_truth', 'lockstep', 'scenario')
+# How far a time may be from a whole number of steps.
+_STEP_TOLERANCE = 1e-6
+# Farther than any way between two waypoints [m].
+_FAR = 1e9
+
+
+class RobotSettings(Settings):
+    """One robot: its type's settings with the scenario's own on top."""
+
+    type: str = Field(description='Name of the type: a file in config/robots')
+    description: str = Field(default='', description='What it is, in words')
+    driver: Literal['mambo_driver', 'turtlebot_driver', 'ranging_driver'] = Field(
+        description='Executable of maasi_drivers that drives it'
+    )
+    guard: bool = Field(
+        default=False, description='Whether a guard stops it when its driver is gone'
+    )
+    link: Literal['topics'] = Field(
+        default='topics', description='How its driver reaches it; the sim plays the other end'
+    )
+    start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
+        description='Position at the start, x y z [m, map]'
+    )
+    yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
+    radius: float = Field(default=0.1, ge=0.0, description='Of a circle around the robot [m]')
+    candidates: CandidateSettings = Field(description='Waypoints to choose from')
+    motion: MotionSettings = Field(description='How it moves')
+    sensor: SensorSettings = Field(description='What it sees, as the filter believes')
+    camera: CameraSettings | None = Field(
+        default=None, description='Its camera; none: a ranging sensor'
+    )
+
+
+class EventSettings(Settings):
+    """Something that happens to a robot."""
+
+    at: float = Field(ge=0.0, description='When [s]')
+    robot: str = Field(description='To whom')
+    do: Literal['leave', 'back'] = Field(description='It goes silent, or it is there again')
+
+
+class LimitSettings(Settings):
+    """When a run is given up."""
+
+    time: float = Field(default=600.0, gt=0.0, description='Simulated time [s]')
+    start: float = Field(
+        default=60.0, gt=0.0, description='Wall time until all nodes are ready [s]'
+    )
+    silence: float = Field(
+        default=30.0,
+        gt=0.0,
+        description='Wall time without a step until a node counts as hung [s]',
+    )
+    restarts: int = Field(
+        default=3, ge=0, description='Restarts of one node with on_exit: respawn [1]'
+    )
+
+
+class ScoringSettings(Settings):
+    """How found targets are compared with the truth."""
+
+    radius: float | None = Field(
+        default=None,
+        gt=0.0,
+        description='Distance within which a found target is true; none: 3 T_z, at most half the '
+        'smallest distance of two targets [m]',
+    )
+    order: float = Field(default=2.0, ge=1.0, description='p of GOSPA [1]')
+
+
+class RecordSettings(Settings):
+    """What the recording holds."""
+
+    images: Literal['jpeg', 'png', 'raw'] = Field(
+        default='jpeg', description='How images are stored; png is lossless and slower'
+    )
+
+
+class Scenario(Settings):
+    """A whole scenario file, all layers merged."""
+
+    version: Literal[1] = Field(description='Of this format')
+    description: str = Field(default='', description='What it shows, in words')
+    environment: EnvironmentSettings = Field(description='Where the targets are')
+    step: float = Field(default=0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')
+    seed: int = Field(default=1, ge=0, description='Of all random numbers, unless given otherwise')
+    targets: TargetSettings = Field(description='The truth, for the simulation and the report')
+    robots: dict[str, RobotSettings] = Field(min_length=1, description='Robots by name')
+    filter: FilterSettings = Field(default_factory=FilterSettings, description='Search filter')
+    planner: PlannerSettings = Field(default_factory=PlannerSettings, description='Planner')
+    floor: RenderSettings = Field(
+        default_factory=lambda: RenderSettings.model_validate({}),
+        description='What simulated cameras see',
+    )
+    events: list[EventSettings] = Field(default_factory=list, description='What happens to robots')
+    stop: Literal['all_found', 'planner_done'] = Field(
+        default='all_found',
+        description='When the run ends well: all true targets are found, or the planner says that '
+        'nothing is left to gain',
+    )
+    on_exit: Literal['end', 'respawn'] = Field(
+        default='end', description='A node that dies ends the run, or is started again'
+    )
+    limits: LimitSettings = Field(default_factory=LimitSettings, description='When to give up')
+    scoring: ScoringSettings = Field(default_factory=ScoringSettings, description='Scores')
+    record: RecordSettings = Field(default_factory=RecordSettings, description='Recording')
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.environment.dimension
+
+    def names(self) -> list[str]:
+        """Return the robots' names in order."""
+        return sorted(self.robots)
+
+    def world(self, seed: int) -> World:
+        """Return the true world of a run."""
+        return World.from_settings(self.environment, self.targets, seed)
+
+    def content(self) -> dict[str, Any]:
+        """Return all settings as plain values; `load_scenario` reads them back the same."""
+        return self.model_dump(mode='python', by_alias=True)
+
+    def text(self) -> str:
+        """Return all settings as a scenario file that needs no other layer."""
+        return yaml.safe_dump(self.content(), sort_keys=False, default_flow_style=None, width=100)
+
+
+def config_folder() -> Path:
+    """Return the folder of `robots/` and `scenarios/`: installed, or in this repository.
+
+    Raises
+    ------
+    ScenarioError
+        If it is in neither.
+    """
+    places = [Path(__file__).resolve().parents[2] / 'config']
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        places.insert(0, Path(get_package_share_directory('maasi_config')))
+    except (ImportError, LookupError, OSError):
+        pass
+    for folder in places:
+        if (folder / 'robots').is_dir():
+            return folder
+    raise ScenarioError(f'robots: no such folder in {", ".join(map(str, places))}')
+
+
+def find_scenario(name: str | Path) -> Path:
+    """Return the file of a scenario: a path, or the name of one in `config/scenarios`.
+
+    Raises
+    ------
+    ScenarioError
+        If there is none; the known ones are named.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    folder = config_folder() / 'scenarios'
+    known = sorted(item.stem for item in folder.glob('*.yaml'))
+    if path.name not in known:
+        raise ScenarioError(unknown(path.name, known, 'scenario'))
+    return folder / f'{path.name}.yaml'
+
+
+def load_scenario(path: str | Path) -> Scenario:
+    """Read a scenario file with its layers: all robots, then the type, then the robot itself.
+
+    Types are looked for in `robots/` beside the scenario file and beside its folder, then in
+    `config/robots`.
+
+    Raises
+    ------
+    ScenarioError
+        With file, line, key, what was read and what is allowed.
+    """
+    path = find_scenario(path)
+    layer = read_layer(path)
+    robots = layer.data.get('robots')
+    if isinstance(robots, dict):
+        for name in robots:
+            if isinstance(robots[name], dict):
+                key: Key = ('robots', name)
+                place(layer, key, _robot_layer(path, layer.part(key), key))
+    scenario = validate(Scenario, layer)
+    problems = list(_problems(scenario))
+    if problems:
+        raise ScenarioError(
+            '\n'.join(
+                f'{layer.origin(problem)}: {dotted(problem)}: {text}' for problem, text in problems
+            )
+        )
+    return scenario
+
+
+def _robot_layer(path: Path, own: Layer, key: Key) -> Layer:
+    folders = [path.parent / 'robots', path.parent.parent / 'robots', config_folder() / 'robots']
+    files: dict[str, Path] = {}
+    for folder in folders:
+        for file in sorted(folder.glob('*.yaml')):
+            files.setdefault(file.stem, file)
+    layers = [read_layer(files['all'])] if 'all' in files else []
+    kind = own.data.get('type')
+    known = sorted(set(files) - {'all'})
+    if kind is None:
+        raise ScenarioError(
+            f'{own.origin(())}: {dotted((*key, "type"))}: is missing, known are {", ".join(known)}'
+        )
+    if isinstance(kind, str):
+        if kind not in known:
+            raise ScenarioError(
+                f'{own.origin(("type",))}: {dotted((*key, "type"))}: '
+                f'{unknown(kind, known, "robot type")}'
+            )
+        layers.append(read_layer(files[kind]))
+    return merge(*layers, own)
+
+
+def _problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    """Yield what is wrong between the keys: key and text."""
+    yield from _world_problems(scenario)
+    for name, robot in scenario.robots.items():
+        for inner, text in _robot_problems(name, robot, scenario):
+            yield ('robots', name, *inner), text
+    yield from _event_problems(scenario)
+    if scenario.stop == 'all_found' and scenario.targets.count == 0:
+        yield ('stop',), "read 'all_found' but there are no targets, allowed is 'planner_done'"
+
+
+def _world_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    found = False
+    for index, obstacle in enumerate(scenario.environment.obstacles):
+        if len(obstacle.centre) > scenario.dimension:
+            found = True
+            yield (
+                ('environment', 'obstacles', index, 'centre'),
+                f'read {obstacle.centre}, allowed are {scenario.dimension} coordinates, '
+                'as in environment.bounds',
+            )
+    most = _room_for_targets(scenario)
+    if scenario.targets.count is not None and scenario.targets.count > most:
+        found = True
+        yield (
+            ('targets', 'separation'),
+            f'read {scenario.targets.separation}, with which about {most} targets can be drawn '
+            f'at most, not {scenario.targets.count}',
+        )
+    if found:
+        return
+    try:
+        scenario.world(scenario.seed)
+    except ValueError as error:
+        head, _, text = str(error).partition(': ')
+        key: Key = tuple(int(part) if part.isdigit() else part for part in re.findall(r'\w+', head))
+        yield (key, text) if key[:1] == ('targets',) else (('targets',), str(error))
+
+
+def _room_for_targets(scenario: Scenario) -> int:
+    """Return how many targets can be drawn one after the other at their separation, at most.
+
+    Balls that are placed at random, none moved again, fill 0.547 of a plane and 0.382 of space.
+    """
+    targets = scenario.targets
+    bounds = scenario.environment.array()
+    sides = bounds[:, 1] - bounds[:, 0] - 2.0 * targets.margin
+    if targets.separation == 0.0 or sides.min() < 0.0:
+        return targets.count or 0
+    filled, ball = (0.547, math.pi / 4.0) if scenario.dimension == 2 else (0.382, math.pi / 6.0)
+    space = float(np.prod(sides + targets.separation))
+    return max(1, round(1.1 * filled * space / (ball * targets.separation**scenario.dimension)))
+
+
+def _robot_problems(
+    name: str, robot: RobotSettings, scenario: Scenario
+) -> Iterator[tuple[Key, str]]:
+    if not _ROBOT_NAME.match(name) or name.endswith('_') or '__' in name:
+        yield (), f"read '{name}' as a name, allowed are lower case letters, digits and single _"
+    if name in _RESERVED:
+        yield (), f"read '{name}' as a name, which is that of a topic; allowed is any other"
+    bounds = scenario.environment.array()
+    start = np.array(robot.start)
+    if not _inside(start, bounds):
+        yield (
+            ('start',),
+            f'read {robot.start}, allowed is what lies inside environment.bounds, '
+            f'{bounds.tolist()}',
+        )
+    for index, obstacle in enumerate(scenario.environment.obstacles):
+        size = min(len(obstacle.centre), 3)
+        distance = float(np.linalg.norm(start[:size] - np.array(obstacle.centre)[:size]))
+        if distance < obstacle.radius + robot.radius:
+            yield (
+                ('start',),
+                f'read {robot.start}, {distance:.3g} m from the centre of '
+                f'environment.obstacles[{index}], allowed is at least its radius and the '
+                f"robot's, {obstacle.radius + robot.radius:g} m",
+            )
+    try:
+        candidates = robot_candidates(robot, scenario.environment)
+    except ValueError as error:
+        head, _, text = str(error).partition(': ')
+        yield (('candidates', head), text) if head != 'candidates' else (('candidates',), text)
+    else:
+        if not len(candidates.at(robot.start)):
+            yield ('candidates',), 'leave no waypoint inside environment.bounds'
+    yield from _sensor_problems(robot, scenario)
+
+
+def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    detection = robot.sensor.detection
+    used = ('lower', 'upper') if detection.kind == 'box' else ('size',)
+    for name in used:
+        length = len(getattr(detection, name))
+        if length < scenario.dimension:
+            yield (
+                ('sensor', 'detection', name),
+                f'read {length} numbers, allowed are {scenario.dimension}, '
+                'as in environment.bounds',
+            )
+    times: list[tuple[Key, float]] = [(('sensor', 'period'), robot.sensor.period)]
+    if robot.camera is not None:
+        times.append((('camera', 'rate'), 1.0 / robot.camera.rate))
+    for key, time in times:
+        steps = time / scenario.step
+        if abs(steps - round(steps)) > _STEP_TOLERANCE * max(steps, 1.0) or (
+            time > 0.0 and round(steps) == 0
+        ):
+            yield key, f'is every {time:g} s, allowed are whole multiples of step, {scenario.step}'
+    if robot.driver == 'ranging_driver' and robot.camera is not None:
+        yield ('camera',), "read one, but driver 'ranging_driver' has none; allowed is null"
+    if robot.driver != 'ranging_driver' and robot.camera is None:
+        yield ('camera',), f"is missing, driver '{robot.driver}' needs it"
+
+
+def _event_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    away: set[str] = set()
+    order = sorted(range(len(scenario.events)), key=lambda index: scenario.events[index].at)
+    for index in order:
+        event = scenario.events[index]
+        key: Key = ('events', index)
+        if event.robot not in scenario.robots:
+            yield (*key, 'robot'), unknown(event.robot, scenario.names(), 'robot')
+            continue
+        if event.at > scenario.limits.time:
+            yield (
+                (*key, 'at'),
+                f'read {event.at}, allowed is at most limits.time, {scenario.limits.time}',
+            )
+        if (event.do == 'back') != (event.robot in away):
+            state = 'is there' if event.do == 'back' else 'has left'
+            yield (*key, 'do'), f"read '{event.do}', but {event.robot} {state} at that time"
+        (away.add if event.do == 'leave' else away.discard)(event.robot)
+
+
+def _inside(position: Sequence[float] | np.ndarray, bounds: np.ndarray) -> bool:
+    point = np.asarray(position, dtype=float)[: len(bounds)]
+    return bool(((point >= bounds[:, 0]) & (point <= bounds[:, 1])).all())
+
+
+def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> CandidateSet:
+    """Return a robot's candidate waypoints; in 2D at the height of its start."""
+    return CandidateSet(robot.candidates, environment.array(), height=robot.start[2])
+
+
+def never_seen(scenario: Scenario) -> str:
+    """Return a warning that says which parts can never be seen from the candidates, or ''."""
+    if any(robot.candidates.ring is not None for robot in scenario.robots.values()):
+        # Waypoints that move with the robot lead anywhere.
+        return ''
+    bounds = scenario.environment.array()
+    margin = scenario.targets.margin if scenario.targets.positions is None else 0.0
+    # What is seen from the waypoints alone needs no look at the ways between them.
+    standing = {name: _viewer(scenario, name, _FAR) for name in scenario.names()}
+    steady = {name: viewer for name, viewer in standing.items() if viewer.yaw is not None}
+    if steady and not unseen_parts(bounds, steady, margin):
+        return ''
+    moving = {
+        name: _viewer(scenario, name, robot.motion.speed * max(robot.sensor.period, scenario.step))
+        for name, robot in scenario.robots.items()
+    }
+    return unseen_parts(bounds, moving, margin).describe()
+
+
+def _viewer(scenario: Scenario, name: str, spacing: float) -> Viewer:
+    robot = scenario.robots[name]
+    start = np.array(robot.start)
+    return Viewer(
+        candidates=robot_candidates(robot, scenario.environment).at(start),
+        start=start,
+        sensor=robot.sensor.build(name, scenario.dimension),
+        spacing=spacing,
+        yaw=robot.yaw if robot.motion.heading == 'keep' else None,
+    )
+
+
+def steps_of(time: float, step: float) -> int:
+    """Return how many steps a time takes, at least one."""
+    return max(1, math.floor(time / step + 0.5))

@@ -1,0 +1,322 @@
+"""YAML files in layers: read, merged and checked, with errors that say file, line and key."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+Key = tuple[str | int, ...]
+Model = TypeVar('Model', bound=BaseModel)
+
+
+class ScenarioError(ValueError):
+    """Wrong input: says file, key, what was read and what is allowed."""
+
+
+class _Loader(yaml.SafeLoader):
+    """A safe loader that also takes `1e-3` for a number, as YAML 1.2 and ROS do."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: list(pairs) for first, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float',
+    re.compile(r'^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'),
+    list('-+.0123456789'),
+)
+
+
+@dataclass
+class Layer:
+    """A tree of plain values, and for each key the place that it was read from."""
+
+    data: Any
+    origins: dict[Key, str] = field(default_factory=dict)
+
+    def origin(self, key: Key) -> str:
+        """Return `file:line` of a key, or of the closest key above it."""
+        for length in range(len(key), -1, -1):
+            if key[:length] in self.origins:
+                return self.origins[key[:length]]
+        return ''
+
+    def part(self, key: Key) -> Layer:
+        """Return what stands under a key, an empty mapping if there is nothing."""
+        data = self.data
+        for step in key:
+            data = data.get(step) if isinstance(data, dict) else None
+        inner = {
+            path[len(key) :]: origin
+            for path, origin in self.origins.items()
+            if path[: len(key)] == key
+        }
+        return Layer({} if data is None else data, inner)
+
+
+def read_layer(path: Path) -> Layer:
+    """Read a YAML file whose top is a mapping.
+
+    Raises
+    ------
+    ScenarioError
+        If it cannot be read, is not YAML, has a key twice, or its top is no mapping.
+    """
+    try:
+        text = path.read_text(encoding='utf-8')
+    except FileNotFoundError:
+        raise ScenarioError(f'{path}: there is no such file') from None
+    except IsADirectoryError:
+        raise ScenarioError(f'{path}: is a folder, a YAML file is needed') from None
+    except UnicodeDecodeError:
+        raise ScenarioError(f'{path}: is not text in UTF-8') from None
+    except OSError as error:
+        raise ScenarioError(f'{path}: cannot be read: {error.strerror}') from None
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            raise ScenarioError(f'{path}: is empty, a mapping of keys is needed')
+        layer = Layer(None)
+        layer.data = _build(loader, node, (), layer.origins, path)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f':{mark.line + 1}' if mark else ''
+        raise ScenarioError(f'{path}{line}: is not YAML: {error.problem}') from None
+    except yaml.YAMLError as error:
+        raise ScenarioError(f'{path}: is not YAML: {error}') from None
+    finally:
+        loader.dispose()
+    if not isinstance(layer.data, dict):
+        raise ScenarioError(
+            f'{path}: read {_show(layer.data)}, a mapping of keys is needed at the top'
+        )
+    return layer
+
+
+def _build(loader: _Loader, node: yaml.Node, key: Key, origins: dict[Key, str], path: Path) -> Any:
+    origins[key] = f'{path}:{node.start_mark.line + 1}'
+    if isinstance(node, yaml.MappingNode):
+        mapping: dict[Any, Any] = {}
+        for key_node, value_node in node.value:
+            name = loader.construct_object(key_node, deep=True)
+            place = f'{path}:{key_node.start_mark.line + 1}'
+            if not isinstance(name, str):
+                raise ScenarioError(
+                    f'{place}: {dotted(key) or "the whole"}: read {_show(name)} as a key, '
+                    'allowed is text'
+                )
+            inner = (*key, name)
+            if name in mapping:
+                raise ScenarioError(f'{place}: {dotted(inner)}: stands there twice')
+            mapping[name] = _build(loader, value_node, inner, origins, path)
+            origins[inner] = place
+        return mapping
+    if isinstance(node, yaml.SequenceNode):
+        return [
+            _build(loader, item, (*key, index), origins, path)
+            for index, item in enumerate(node.value)
+        ]
+    return loader.construct_object(node, deep=True)
+
+
+def merge(*layers: Layer) -> Layer:
+    """Merge layers: mappings key by key, anything else is replaced by the later one."""
+    result = Layer({})
+    for layer in layers:
+        result.data = _merge(result.data, layer.data, (), result.origins)
+        result.origins.update(layer.origins)
+    return result
+
+
+def _merge(below: Any, above: Any, key: Key, origins: dict[Key, str]) -> Any:
+    if isinstance(below, dict) and isinstance(above, dict):
+        merged = dict(below)
+        for name, value in above.items():
+            merged[name] = (
+                _merge(below[name], value, (*key, name), origins) if name in below else value
+            )
+        return merged
+    for stale in [path for path in origins if path[: len(key)] == key]:
+        del origins[stale]
+    return above
+
+
+def place(target: Layer, key: Key, part: Layer) -> None:
+    """Put a layer's tree under a key of another, with its origins."""
+    data = target.data
+    for step in key[:-1]:
+        data = data[step]
+    data[key[-1]] = part.data
+    for stale in [path for path in target.origins if path[: len(key)] == key and path != key]:
+        del target.origins[stale]
+    for path, origin in part.origins.items():
+        if path:
+            target.origins[key + path] = origin
+
+
+def validate(model: type[Model], layer: Layer) -> Model:
+    """Return the settings of a tree, strictly by type.
+
+    Raises
+    ------
+    ScenarioError
+        One line for each key that is wrong.
+    """
+    try:
+        return model.model_validate(layer.data, strict=True)
+    except ValidationError as error:
+        raise ScenarioError(describe(error, model, layer)) from None
+
+
+def describe(error: ValidationError, model: type[BaseModel], layer: Layer) -> str:
+    """Return a validation error in words, one line for each wrong key."""
+    problems: dict[Key, list[Any]] = {}
+    for item in error.errors(include_url=False):
+        problems.setdefault(_resolve(item['loc'], layer.data, item['type']), []).append(item)
+    lines = []
+    for key, items in problems.items():
+        if len(items) > 1:
+            # Of a union: what went deepest is what the writer meant.
+            depth = max(len(item['loc']) for item in items)
+            items = [item for item in items if len(item['loc']) == depth] or items
+        texts = list(dict.fromkeys(_explain(item, key, model) for item in items))
+        read = f'read {_show(items[0]["input"])}, '
+        texts[1:] = [text.removeprefix(read) for text in texts[1:]]
+        origin = layer.origin(key)
+        lines.append(f'{origin}: {dotted(key) or "the whole"}: ' + '; or '.join(texts))
+    return '\n'.join(lines)
+
+
+def _resolve(loc: Sequence[str | int], data: Any, kind: str) -> Key:
+    """Return the keys of a pydantic location; tags of unions are left out."""
+    key: list[str | int] = []
+    for index, step in enumerate(loc):
+        known = isinstance(data, dict) and step in data
+        if isinstance(data, list) and isinstance(step, int):
+            known = step < len(data)
+        if known:
+            data = data[step]
+        elif not (kind == 'missing' and index == len(loc) - 1):
+            continue
+        key.append(step)
+    return tuple(key)
+
+
+def _explain(item: Any, key: Key, model: type[BaseModel]) -> str:
+    kind, context = item['type'], item.get('ctx', {})
+    read = f'read {_show(item["input"])}, '
+    if kind == 'extra_forbidden':
+        return unknown(str(key[-1]), _known_keys(model, key[:-1]), 'key')
+    if kind == 'missing':
+        return 'is missing'
+    if kind == 'literal_error':
+        expected = re.findall(r"'([^']*)'", context['expected']) or [context['expected']]
+        return unknown(item['input'], expected, 'value')
+    if kind == 'value_error':
+        return str(context['error'])
+    if kind in ('too_short', 'too_long'):
+        few = kind == 'too_short'
+        bound = context['min_length' if few else 'max_length']
+        return (
+            f'read {context["actual_length"]} entries, '
+            f'allowed {"is at least" if few else "are at most"} {bound}'
+        )
+    words = {
+        'greater_than': 'more than {gt}',
+        'greater_than_equal': 'at least {ge}',
+        'less_than': 'less than {lt}',
+        'less_than_equal': 'at most {le}',
+        'finite_number': 'a finite number',
+        'float_type': 'a number',
+        'int_type': 'a whole number',
+        'int_from_float': 'a whole number',
+        'string_type': 'text',
+        'bool_type': 'true or false',
+        'list_type': 'a list',
+        'dict_type': 'a mapping of keys',
+        'model_type': 'a mapping of keys',
+        'model_attributes_type': 'a mapping of keys',
+        'none_required': 'nothing (null)',
+    }
+    if kind in words:
+        return f'{read}allowed is {words[kind].format(**context)}'
+    return f'{read}{item["msg"][0].lower()}{item["msg"][1:]}'
+
+
+def unknown(read: Any, known: Sequence[str], what: str) -> str:
+    """Return the complaint about an unknown name, with the closest known ones first."""
+    close = difflib.get_close_matches(str(read), known, n=1, cutoff=0.6)
+    hint = f" (did you mean '{close[0]}'?)" if close else ''
+    return f'unknown {what} {_show(read)}{hint}, known are {", ".join(known)}'
+
+
+def dotted(key: Key) -> str:
+    """Return a key as text: `robots.mambo.start[2]`."""
+    text = ''
+    for step in key:
+        text += f'[{step}]' if isinstance(step, int) else f'.{step}' if text else step
+    return text
+
+
+def _known_keys(model: type[BaseModel], key: Key) -> list[str]:
+    annotations: list[Any] = [model]
+    for step in key:
+        annotations = [
+            inner
+            for annotation in annotations
+            for candidate in _unfold(annotation)
+            for inner in _inside(candidate, step)
+        ]
+    return [
+        info.alias or name
+        for annotation in annotations
+        for candidate in _unfold(annotation)
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel)
+        for name, info in candidate.model_fields.items()
+    ]
+
+
+def _unfold(annotation: Any) -> Iterator[Any]:
+    origin = typing.get_origin(annotation)
+    if origin in (typing.Union, types.UnionType):
+        for argument in typing.get_args(annotation):
+            yield from _unfold(argument)
+    elif origin is typing.Annotated:
+        yield from _unfold(typing.get_args(annotation)[0])
+    else:
+        yield annotation
+
+
+def _inside(annotation: Any, step: str | int) -> list[Any]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        for name, info in annotation.model_fields.items():
+            if step in (name, info.alias):
+                return [info.annotation]
+        return []
+    if typing.get_origin(annotation) in (list, dict):
+        return [typing.get_args(annotation)[-1]]
+    return []
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, str):
+        return f"'{value}'"
+    if isinstance(value, float) and not math.isfinite(value):
+        return {math.inf: '.inf', -math.inf: '-.inf'}.get(value, '.nan')
+    if value is None:
+        return 'nothing'
+    if isinstance(value, Mapping):
+        return 'a mapping of keys'
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return text if len(text) <= 60 else text[:57] + '...'

@@ -1,0 +1,308 @@
+"""Scenario files: layers, and messages for what is wrong in them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from maasi_sim.scenario import (
+    ScenarioError,
+    config_folder,
+    find_scenario,
+    load_scenario,
+    never_seen,
+    robot_candidates,
+)
+
+SCENARIOS = sorted((config_folder() / 'scenarios').glob('*.yaml'))
+
+PLAIN = {
+    'version': 1,
+    'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+    'step': 0.05,
+    'targets': {'count': 3, 'separation': 0.1, 'margin': 0.1},
+    'robots': {
+        'mambo': {
+            'type': 'mambo',
+            'start': [0.5, 0.5, 1.0],
+            'candidates': {'grid': [6, 6], 'spacing': 0.34, 'corner': [0.15, 0.15]},
+        }
+    },
+}
+
+
+def changed(*changes):
+    """Return the plain scenario with values put in (or taken out: None) at dotted keys."""
+    content = yaml.safe_load(yaml.safe_dump(PLAIN))
+    for key, value in changes:
+        inner = content
+        *above, last = [int(step) if step.isdigit() else step for step in key.split('.')]
+        for step in above:
+            inner = inner[step] if isinstance(inner, list) else inner.setdefault(step, {})
+        if value is None:
+            del inner[last]
+        else:
+            inner[last] = value
+    return content
+
+
+@pytest.fixture
+def load(tmp_path):
+    def write_and_load(content):
+        path = tmp_path / 'my_scenario.yaml'
+        path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+        return load_scenario(path)
+
+    return write_and_load
+
+
+@pytest.mark.parametrize('path', SCENARIOS, ids=lambda path: path.stem)
+def test_our_scenarios_load_and_every_point_can_be_seen(path):
+    scenario = load_scenario(path)
+    assert never_seen(scenario) == ''
+    for seed in range(10):
+        world = scenario.world(seed)
+        assert len(world.targets) == (0 if path.stem == 'no_targets' else 12)
+
+
+def test_our_scenarios_are_those_of_the_papers():
+    assert [path.stem for path in SCENARIOS] == [
+        'mambo',
+        'mambo_turtlebot',
+        'mambo_turtlebot_obstacles',
+        'no_targets',
+        'ranging_drone_3d',
+        'ranging_pair_3d',
+    ]
+
+
+def test_demo_targets_keep_their_distances():
+    scenario = load_scenario('mambo_turtlebot')
+    for seed in range(20):
+        targets = scenario.world(seed).targets
+        distances = np.linalg.norm(targets[:, None] - targets, axis=2)
+        assert distances[np.triu_indices(12, 1)].min() >= 0.15
+        assert targets.min() >= -0.2 and targets.max() <= 2.3
+
+
+def test_layers_are_merged_key_by_key(load):
+    scenario = load(changed(('robots.mambo.motion', {'speed': 0.3}), ('robots.mambo.radius', 0.2)))
+    robot = scenario.robots['mambo']
+    assert robot.motion.speed == 0.3
+    assert robot.motion.model == 'mambo'
+    assert robot.radius == 0.2
+    assert robot.link == 'topics'
+    assert robot.driver == 'mambo_driver'
+
+
+def test_types_beside_the_scenario_win(tmp_path):
+    (tmp_path / 'robots').mkdir()
+    source = (config_folder() / 'robots' / 'mambo.yaml').read_text()
+    (tmp_path / 'robots' / 'mambo.yaml').write_text(source.replace('radius: 0.09', 'radius: 0.5'))
+    path = tmp_path / 'scenario.yaml'
+    path.write_text(yaml.safe_dump(PLAIN))
+    assert load_scenario(path).robots['mambo'].radius == 0.5
+
+
+@pytest.mark.parametrize('path', SCENARIOS, ids=lambda path: path.stem)
+def test_text_of_a_scenario_reads_back_the_same(path, tmp_path):
+    scenario = load_scenario(path)
+    copy = tmp_path / 'scenario.yaml'
+    copy.write_text(scenario.text())
+    assert load_scenario(copy) == scenario
+
+
+def test_text_keeps_numbers_to_the_bit(load):
+    scenario = load(changed(('robots.mambo.start', [0.1 + 0.2, 1 / 3, 1.0]), ('step', 0.05)))
+    assert load(scenario.text()).robots['mambo'].start == [0.1 + 0.2, 1 / 3, 1.0]
+
+
+WRONG = [
+    # What is changed, the key in the message, and words that it must hold.
+    ([('plannr', {'name': 'asi'})], 'plannr', ["did you mean 'planner'", 'known are']),
+    ([('filter.particels', 5)], 'filter.particels', ["did you mean 'particles'"]),
+    ([('robots.mambo.motion.sped', 1.0)], 'robots.mambo.motion.sped', ["did you mean 'speed'"]),
+    ([('robots.mambo.sensor.noise.unit', 1)], 'robots.mambo.sensor.noise.unit', ['as, angles']),
+    ([('filter.preset', 'recomended')], 'filter.preset', ["did you mean 'recommended'", 'paper_0']),
+    ([('planner.name', 'lawnmover')], 'planner.name', ["did you mean 'lawnmower'"]),
+    ([('robots.mambo.type', 'manbo')], 'robots.mambo.type', ["did you mean 'mambo'", 'turtlebot3']),
+    ([('robots.mambo.driver', 'driver')], 'robots.mambo.driver', ['mambo_driver']),
+    ([('robots.mambo.link', 'serial')], 'robots.mambo.link', ['topics']),
+    ([('step', 'fast')], 'step', ["read 'fast'", 'a number']),
+    ([('step', True)], 'step', ['read true', 'a number']),
+    ([('step', float('nan'))], 'step', ['.nan', 'finite']),
+    ([('step', -0.1)], 'step', ['read -0.1', 'more than 0']),
+    ([('version', 2)], 'version', ['unknown value 2', '1']),
+    ([('version', None)], 'version', ['is missing']),
+    ([('targets', None)], 'targets', ['is missing']),
+    ([('robots', {})], 'robots', ['read 0 entries', 'at least 1']),
+    ([('robots', [1])], 'robots', ['a mapping']),
+    ([('robots.mambo', 3)], 'robots.mambo', ['a mapping']),
+    ([('robots.mambo.type', None)], 'robots.mambo.type', ['is missing']),
+    ([('robots.mambo.start', [0.5, 0.5])], 'robots.mambo.start', ['read 2 entries', 'at least 3']),
+    ([('robots.mambo.start.1', 'x')], 'robots.mambo.start[1]', ["read 'x'", 'a number']),
+    ([('robots.mambo.start', [0.5, 2.5, 1.0])], 'robots.mambo.start', ['environment.bounds']),
+    ([('robots.mambo.candidates', None)], 'robots.mambo.candidates', ['is missing']),
+    ([('robots.mambo.candidates.grid', [0, 6])], 'robots.mambo.candidates.grid[0]', ['at least 1']),
+    ([('robots.mambo.candidates.grid', [6, 2.5])], 'robots.mambo.candidates.grid[1]', ['whole']),
+    ([('robots.mambo.candidates.grid', [60, 6])], 'robots.mambo.candidates', ['waypoints inside']),
+    ([('robots.mambo.candidates.spacing', None)], 'robots.mambo.candidates', ['a grid needs it']),
+    (
+        [('robots.mambo.candidates', {'grid': [2, 2, 2], 'spacing': 0.1})],
+        'robots.mambo.candidates.grid',
+        ['allowed in 2D'],
+    ),
+    (
+        [('robots.mambo.candidates', {'ring': 6, 'distance': 0.2})],
+        'robots.mambo.candidates.ring',
+        ['allowed in 2D'],
+    ),
+    ([('environment.bounds.0', [2.0, 0.0])], 'environment', ['lower < upper']),
+    (
+        [('environment.obstacles', [{'centre': [0.5, 0.6], 'radius': 0.1}])],
+        'robots.mambo.start',
+        ['environment.obstacles[0]'],
+    ),
+    (
+        [('environment.obstacles', [{'centre': [1.5, 1.6, 0.0], 'radius': 0.1}])],
+        'environment.obstacles[0].centre',
+        ['2 coordinates'],
+    ),
+    ([('targets.margin', 1.5)], 'targets.margin', ['at most half']),
+    ([('targets.count', 500)], 'targets.separation', ['not 500']),
+    ([('targets', {'positions': [[0.5, 3.0]]})], 'targets.positions[0]', ['within the bounds']),
+    ([('targets', {})], 'targets', ['count or positions']),
+    ([('targets.count', 0)], 'stop', ['planner_done']),
+    ([('robots.mambo.sensor.period', 0.12)], 'robots.mambo.sensor.period', ['multiples of step']),
+    ([('robots.mambo.camera.rate', 30.0)], 'robots.mambo.camera.rate', ['multiples of step']),
+    ([('robots.mambo.sensor.detection', {'lower': [0.0, 0.0, 0.0], 'upper': [1.0, 1.0]})],
+     'robots.mambo.sensor.detection', ['same length']),
+    ([('robots.mambo.driver', 'ranging_driver')], 'robots.mambo.camera', ['has none']),
+    ([('events', [{'at': 5.0, 'robot': 'mamba', 'do': 'leave'}])], 'events[0].robot', ["'mambo'"]),
+    ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'back'}])], 'events[0].do', ['is there']),
+    ([('events', [{'at': 900.0, 'robot': 'mambo', 'do': 'leave'}])], 'events[0].at', ['limits']),
+    ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'go'}])], 'events[0].do', ['leave, back']),
+    ([('on_exit', 'restart')], 'on_exit', ['end, respawn']),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    'changes, key, words', WRONG, ids=[f'{i}-{w[1]}' for i, w in enumerate(WRONG)]
+)
+def test_wrong_files_get_a_message_with_file_line_and_key(load, changes, key, words):
+    with pytest.raises(ScenarioError) as caught:
+        load(changed(*changes))
+    message = str(caught.value)
+    assert '\n' not in message
+    place, _, rest = message.partition(': ')
+    assert 'my_scenario.yaml:' in place or '.yaml:' in place
+    assert place.rpartition(':')[2].isdigit()
+    assert rest.startswith(f'{key}: '), message
+    for word in words:
+        assert word in message
+
+
+def test_each_wrong_key_gets_a_line(load):
+    with pytest.raises(ScenarioError) as caught:
+        load(changed(('step', 'fast'), ('stopp', 1)))
+    assert len(str(caught.value).splitlines()) == 2
+
+
+def test_the_line_is_that_of_the_key(load):
+    text = yaml.safe_dump(changed(('stepp', 3)), sort_keys=False)
+    line = text.splitlines().index('stepp: 3') + 1
+    with pytest.raises(ScenarioError, match=f'my_scenario.yaml:{line}: stepp'):
+        load(text)
+
+
+def test_a_wrong_type_file_is_named_with_its_line(tmp_path):
+    (tmp_path / 'robots').mkdir()
+    source = (config_folder() / 'robots' / 'mambo.yaml').read_text()
+    (tmp_path / 'robots' / 'slow.yaml').write_text(source.replace('speed: 0.4', 'speed: -1'))
+    path = tmp_path / 'scenario.yaml'
+    path.write_text(yaml.safe_dump(changed(('robots.mambo.type', 'slow'))))
+    with pytest.raises(ScenarioError, match=r'robots/slow\.yaml:\d+: robots\.mambo\.motion\.speed'):
+        load_scenario(path)
+
+
+@pytest.mark.parametrize('name', ['Mambo', '1st', 'a-b', 'lockstep', 'two__bars'])
+def test_names_of_robots_must_serve_as_namespaces(load, name):
+    content = changed()
+    content['robots'] = {name: content['robots']['mambo']}
+    with pytest.raises(ScenarioError, match=f"robots.{name}: read '{name}' as a name"):
+        load(content)
+
+
+@pytest.mark.parametrize(
+    'text, words',
+    [
+        ('', 'is empty'),
+        ('- a\n- b\n', 'a mapping of keys is needed'),
+        ('version: 1\nstep: [0.05\n', 'is not YAML'),
+        ('version: 1\nversion: 1\n', 'version: stands there twice'),
+        ('version: 1\n3: 1\n', 'read 3 as a key'),
+        ('version: !!python/object:os.system 1\n', 'is not YAML'),
+    ],
+)
+def test_what_is_no_scenario_is_refused(load, text, words):
+    with pytest.raises(ScenarioError, match=words) as caught:
+        load(text)
+    assert 'my_scenario.yaml' in str(caught.value)
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path):
+    with pytest.raises(ScenarioError, match='there is no such file'):
+        load_scenario(tmp_path / 'missing.yaml')
+    with pytest.raises(ScenarioError, match='is a folder'):
+        load_scenario(tmp_path)
+    binary = tmp_path / 'binary.yaml'
+    binary.write_bytes(b'\xff\xfe\x00')
+    with pytest.raises(ScenarioError, match='not text'):
+        load_scenario(binary)
+
+
+def test_scenarios_are_found_by_name():
+    assert find_scenario('mambo').name == 'mambo.yaml'
+    with pytest.raises(ScenarioError, match="did you mean 'mambo'"):
+        find_scenario('mamb')
+    assert find_scenario('some/where.yaml') == Path('some/where.yaml')
+
+
+def test_numbers_with_exponents_are_numbers(load):
+    text = yaml.safe_dump(changed(('planner.gain_threshold', 0.5)))
+    scenario = load(text.replace('gain_threshold: 0.5', 'gain_threshold: 1e-4'))
+    assert scenario.planner.gain_threshold == 1e-4
+
+
+def test_waypoints_on_one_side_get_a_warning_that_names_the_unseen_part(load):
+    scenario = load(
+        changed(
+            ('robots.mambo.candidates', {'points': [[0.3, 0.2], [0.3, 1.8]]}),
+            ('robots.mambo.start', [0.3, 1.0, 1.0]),
+        )
+    )
+    warning = never_seen(scenario)
+    assert 'can never be seen' in warning
+    assert 'x 0.494 to 1.9 m' in warning
+
+
+def test_candidates_that_move_with_the_robot_get_no_warning(load):
+    scenario = load(changed(('robots.mambo.candidates', {'ring': 4, 'distance': 0.25})))
+    assert never_seen(scenario) == ''
+
+
+def test_waypoints_of_a_flying_robot_are_at_its_height(load):
+    scenario = load(changed())
+    candidates = robot_candidates(scenario.robots['mambo'], scenario.environment).at([0, 0, 0])
+    assert candidates.shape == (36, 3)
+    assert set(candidates[:, 2]) == {1.0}
+
+
+def test_events_in_turn_are_taken(load):
+    events = [
+        {'at': 20.0, 'robot': 'mambo', 'do': 'back'},
+        {'at': 10.0, 'robot': 'mambo', 'do': 'leave'},
+        {'at': 30.0, 'robot': 'mambo', 'do': 'leave'},
+    ]
+    assert len(load(changed(('events', events))).events) == 3
