@@ -54,7 +54,7 @@ def _distort(x, y, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _project(points, centre, turn, matrix, k, largest_radius):  # type: ignore[no-untyped-def]
+def project_points(points, centre, turn, matrix, k, largest_radius):  # type: ignore[no-untyped-def]
     """Pixels (n, 2) of points (n, 3); turn (3, 3) from the optical frame to the map."""
     pixels = np.full((points.shape[0], 2), np.nan)
     for i in range(points.shape[0]):
@@ -232,7 +232,7 @@ class Camera:
 
         """
         return np.asarray(
-            _project(
+            project_points(
                 _points('positions', positions, 3),
                 self.centre(pose),
                 pose.rotation() @ self.rotation,

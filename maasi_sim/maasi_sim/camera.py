@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from maasi_drivers.projection import Camera
+from maasi_drivers.projection import Camera, project_points
 from maasi_filter.pose import Pose
 from maasi_filter.settings import Finite, Settings
 from maasi_sim.noise_streams import noise_stream
@@ -248,34 +248,100 @@ def scene_of(world: World, settings: RenderSettings, seed: int) -> list[Shape]:
 
 
 @njit(cache=True)
-def _cell_speckle(x, y):  # type: ignore[no-untyped-def]
-    """Speckle of a cell of the floor, -1 to 1, from its coordinates alone (integer hash)."""
-    a = np.uint32(np.int64(np.floor(x / _TEXTURE_CELL)) & 0xFFFFFFFF)
-    b = np.uint32(np.int64(np.floor(y / _TEXTURE_CELL)) & 0xFFFFFFFF)
-    h = np.uint32(a * np.uint32(0x8DA6B343) ^ b * np.uint32(0xD8163841))
-    h = np.uint32((h ^ (h >> np.uint32(13))) * np.uint32(0x5BD1E995))
-    h = np.uint32(h ^ (h >> np.uint32(15)))
-    return np.float64(h & np.uint32(0xFFFF)) / 32767.5 - 1.0
-
-
-@njit(cache=True)
 def _floor_points(rays, turn, centre, floor_x, floor_y):  # type: ignore[no-untyped-def]
     """Where each pixel's ray meets the floor; NaN above the horizon."""
     for row in range(floor_x.shape[0]):
         for column in range(floor_x.shape[1]):
-            u, v = rays[row, column, 0], rays[row, column, 1]
+            u, v = rays[0, row, column], rays[1, row, column]
             down = turn[2, 0] * u + turn[2, 1] * v + turn[2, 2]
-            if down < -1e-6 and centre[2] > 0.0:
-                scale = -centre[2] / down
-                floor_x[row, column] = centre[0] + scale * (
-                    turn[0, 0] * u + turn[0, 1] * v + turn[0, 2]
-                )
-                floor_y[row, column] = centre[1] + scale * (
-                    turn[1, 0] * u + turn[1, 1] * v + turn[1, 2]
-                )
+            scale = -centre[2] / down if down < -1e-6 and centre[2] > 0.0 else np.nan
+            floor_x[row, column] = centre[0] + scale * (
+                turn[0, 0] * u + turn[0, 1] * v + turn[0, 2]
+            )
+            floor_y[row, column] = centre[1] + scale * (
+                turn[1, 0] * u + turn[1, 1] * v + turn[1, 2]
+            )
+
+
+@njit(cache=True)
+def _place(  # type: ignore[no-untyped-def]
+    shapes,
+    rims,
+    floor_x,
+    floor_y,
+    centre,
+    origin,
+    turn,
+    matrix,
+    distortion,
+    largest,
+    velocity,
+    rotation_rate,
+    exposure_time,
+    margin,
+    boxes,
+    drift,
+):
+    """
+    Find the pixels that each shape may touch, and how far it moves during the exposure.
+
+    boxes (n, 4): left, top, right, bottom; empty where the shape is out of view. drift (n, 2): in
+    the floor's coordinates of mid exposure [m].
+    """
+    height, width = floor_x.shape
+    left = bottom = np.inf
+    right = top = -np.inf
+    horizon = False
+    # The outline bounds what the image sees: the floor is a smooth map of the image.
+    for row in range(height):
+        step = 1 if row == 0 or row == height - 1 else max(width - 1, 1)
+        for column in range(0, width, step):
+            x, y = floor_x[row, column], floor_y[row, column]
+            if np.isnan(x):
+                horizon = True
             else:
-                floor_x[row, column] = np.nan
-                floor_y[row, column] = np.nan
+                left, right = min(left, x), max(right, x)
+                bottom, top = min(bottom, y), max(top, y)
+    slack = 0.02 * (right - left + top - bottom) if right > left else 0.0
+    for i in range(shapes.shape[0]):
+        boxes[i, :] = 0
+        drift[i, :] = 0.0
+        x, y = shapes[i, 1], shapes[i, 2]
+        a, b = shapes[i, 3], shapes[i, 4]
+        reach = slack + (a if shapes[i, 0] == _DISC else np.sqrt(a * a + b * b))
+        if not horizon and (
+            x < left - reach or x > right + reach or y < bottom - reach or y > top + reach
+        ):
+            continue
+        spread = 0.0
+        if exposure_time > 0.0 and centre[2] > 0.0:
+            # The floor's point under a pixel moves with the camera, the shape against it.
+            ax, ay, az = x - origin[0], y - origin[1], -origin[2]
+            moved_x = velocity[0] + rotation_rate[1] * az - rotation_rate[2] * ay
+            moved_y = velocity[1] + rotation_rate[2] * ax - rotation_rate[0] * az
+            moved_z = velocity[2] + rotation_rate[0] * ay - rotation_rate[1] * ax
+            drift[i, 0] = -exposure_time * (moved_x + (x - centre[0]) / centre[2] * moved_z)
+            drift[i, 1] = -exposure_time * (moved_y + (y - centre[1]) / centre[2] * moved_z)
+            move = np.sqrt(drift[i, 0] ** 2 + drift[i, 1] ** 2)
+            spread = move * max(matrix[0, 0], matrix[1, 1]) / centre[2]
+        pixels = project_points(rims[i], centre, turn, matrix, distortion, largest)
+        low_x = low_y = np.inf
+        high_x = high_y = -np.inf
+        lost = False
+        for k in range(pixels.shape[0]):
+            if np.isnan(pixels[k, 0]):
+                lost = True
+            else:
+                low_x, high_x = min(low_x, pixels[k, 0]), max(high_x, pixels[k, 0])
+                low_y, high_y = min(low_y, pixels[k, 1]), max(high_y, pixels[k, 1])
+        if lost:
+            boxes[i, 2], boxes[i, 3] = width, height
+            continue
+        more = margin + spread
+        boxes[i, 0] = int(min(max(np.floor(low_x - more), 0.0), width))
+        boxes[i, 1] = int(min(max(np.floor(low_y - more), 0.0), height))
+        boxes[i, 2] = int(min(max(np.ceil(high_x + more) + 1.0, boxes[i, 0]), width))
+        boxes[i, 3] = int(min(max(np.ceil(high_y + more) + 1.0, boxes[i, 1]), height))
 
 
 @njit(cache=True)
@@ -341,51 +407,61 @@ def _paint(albedo, floor_x, floor_y, shapes, boxes, drift, blur):  # type: ignor
                 cover /= count
                 if cover > 0.0:
                     for channel in range(3):
-                        albedo[row, column, channel] += cover * (
-                            shapes[index, 7 + channel] - albedo[row, column, channel]
+                        albedo[channel, row, column] += cover * (
+                            shapes[index, 7 + channel] - albedo[channel, row, column]
                         )
 
 
 @njit(cache=True)
 def _floor_albedo(floor_x, floor_y, colour, texture, albedo):  # type: ignore[no-untyped-def]
-    for row in range(floor_x.shape[0]):
-        for column in range(floor_x.shape[1]):
+    """Fill albedo (3, h, w) with the floor's colour, speckled by an integer hash of its place."""
+    height, width = floor_x.shape
+    for channel in range(3):
+        albedo[channel] = colour[channel]
+    if texture == 0.0:
+        return
+    per_cell = 1.0 / _TEXTURE_CELL
+    for row in range(height):
+        for column in range(width):
             x, y = floor_x[row, column], floor_y[row, column]
-            factor = 1.0
-            if texture > 0.0 and not np.isnan(x):
-                factor += texture * _cell_speckle(x, y)
-            for channel in range(3):
-                albedo[row, column, channel] = colour[channel] * factor
+            if x == x:
+                a = np.uint32(np.int32(np.floor(per_cell * x)))
+                b = np.uint32(np.int32(np.floor(per_cell * y)))
+                h = np.uint32(a * np.uint32(0x8DA6B343) ^ b * np.uint32(0xD8163841))
+                h = np.uint32((h ^ (h >> np.uint32(13))) * np.uint32(0x5BD1E995))
+                h = np.uint32(h ^ (h >> np.uint32(15)))
+                level = np.float32(h & np.uint32(0xFFFF)) / np.float32(32767.5)
+                factor = np.float32(1.0) + np.float32(texture) * (level - np.float32(1.0))
+                for channel in range(3):
+                    albedo[channel, row, column] *= factor
 
 
 @njit(cache=True)
-def _wave(turns):  # type: ignore[no-untyped-def]
-    """A smooth wave of period 1 between -1 and 1, much like a sine but without its cost."""
-    t = 2.0 * (turns - np.floor(turns)) - 1.0
-    return 4.0 * t * (1.0 - abs(t))
-
-
-@njit(cache=True)
-def _expose(albedo, floor_x, floor_y, lens, light, gains, noise, offsets, deviations, image):  # type: ignore[no-untyped-def]
+def _expose(albedo, floor_x, floor_y, lens, light, gains, noise, offsets, read, shot, image):  # type: ignore[no-untyped-def]
     """
-    Turn albedo into grey levels: light, gains, noise, quantisation.
+    Turn albedo (3, h, w) into grey levels (h, w, 3): light, gains, noise, quantisation.
 
-    light: amplitude, wave vector x and y [turns/m], phase [turns]. deviations (256,): of the noise
-    by grey level.
+    light: amplitude, wave vector x and y [turns/m], phase [turns]. The light is a smooth wave of
+    parabolas, much like a sine but without its cost.
     """
-    mask = noise.shape[0] - 1
-    for row in range(image.shape[0]):
-        start = offsets[row]
-        for column in range(image.shape[1]):
-            brightness = 255.0 * lens[row, column]
-            x, y = floor_x[row, column], floor_y[row, column]
-            if light[0] > 0.0 and x == x:
-                brightness *= 1.0 + light[0] * _wave(light[1] * x + light[2] * y + light[3])
-            for channel in range(3):
-                value = brightness * gains[channel] * albedo[row, column, channel]
-                level = min(int(value), 255)
-                value += deviations[level] * noise[(start + 3 * column + channel) & mask]
-                image[row, column, channel] = np.uint8(min(max(value + 0.5, 0.0), 255.0))
+    height, width = floor_x.shape
+    brightness = np.empty(width, dtype=np.float32)
+    read2, shot1 = np.float32(read * read), np.float32(shot)
+    zero, half, full = np.float32(0.0), np.float32(0.5), np.float32(255.0)
+    for row in range(height):
+        for column in range(width):
+            turns = light[1] * floor_x[row, column] + light[2] * floor_y[row, column] + light[3]
+            t = 2.0 * (turns - np.floor(turns)) - 1.0
+            wave = light[0] * 4.0 * t * (1.0 - abs(t))
+            wave = wave if wave == wave else 0.0
+            brightness[column] = np.float32(255.0 * lens[row, column] * (1.0 + wave))
+        for channel in range(3):
+            gain = np.float32(gains[channel])
+            start = offsets[row, channel]
+            for column in range(width):
+                value = brightness[column] * gain * albedo[channel, row, column]
+                value += noise[start + column] * np.sqrt(read2 + shot1 * max(value, zero))
+                image[row, column, channel] = np.uint8(np.int32(min(max(value + half, zero), full)))
 
 
 def _noise_table() -> NDArray[np.float32]:
@@ -427,7 +503,7 @@ class CameraRenderer:
         self.robot = robot
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         points, _ = camera.undistort(np.stack([columns.ravel(), rows.ravel()], axis=1))
-        self._rays = np.ascontiguousarray(points.reshape(camera.height, camera.width, 2))
+        self._rays = np.ascontiguousarray(points.T.reshape(2, camera.height, camera.width))
         radius = np.hypot(
             (columns - 0.5 * (camera.width - 1)) / camera.width,
             (rows - 0.5 * (camera.height - 1)) / camera.height,
@@ -439,30 +515,21 @@ class CameraRenderer:
             row[1:3], row[3:5] = shape.centre, shape.half_size
             row[5], row[6] = np.cos(shape.angle), np.sin(shape.angle)
             row[7:10] = shape.colour
-        self._reach = np.where(
-            self._shapes[:, 0] == _DISC,
-            self._shapes[:, 3],
-            np.hypot(self._shapes[:, 3], self._shapes[:, 4]),
-        )
         self._rims = self._shape_rims()
         # Light belongs to the room, the drift of exposure and white balance to each camera.
         room = noise_stream(seed, purpose='light')
         direction, phase = room.uniform(0.0, 2.0 * np.pi), room.uniform(0.0, 1.0)
         wave = np.array([np.cos(direction), np.sin(direction)]) / settings.light_wavelength
         self._light = np.array([settings.light_variation, *wave, phase])
-        self._deviations = np.sqrt(
-            settings.read_noise**2 + settings.shot_noise * np.arange(256, dtype=float)
-        )
         drift = noise_stream(seed, robot, purpose='camera drift')
         self._drift_phases = drift.uniform(0.0, 2.0 * np.pi, size=4)
         self._drift_rates = 2.0 * np.pi / settings.drift_period * drift.uniform(0.7, 1.4, size=4)
         self._noise = _noise_table()
-        outline = np.zeros((camera.height, camera.width), dtype=bool)
-        outline[[0, -1]] = outline[:, [0, -1]] = True
-        self._outline = np.nonzero(outline)
         self._floor_x = np.empty((camera.height, camera.width))
         self._floor_y = np.empty_like(self._floor_x)
-        self._albedo = np.empty((camera.height, camera.width, 3))
+        self._albedo = np.empty((3, camera.height, camera.width), dtype=np.float32)
+        self._boxes = np.zeros((len(shapes), 4), dtype=np.int64)
+        self._drift = np.zeros((len(shapes), 2))
         self._floor_colour = np.array(settings.floor_colour, dtype=float)
 
     def _shape_rims(self) -> Array:
@@ -484,31 +551,6 @@ class CameraRenderer:
         waves = np.sin(self._drift_phases + self._drift_rates * time)
         exposure = 1.0 + self.settings.exposure_drift * waves[0]
         return exposure * (1.0 + self.settings.white_balance_drift * waves[1:])
-
-    def _visible(self) -> NDArray[np.intp]:
-        """Shapes that may be in view: near the part of the floor that the image covers."""
-        if np.isnan(self._floor_x).any():
-            return np.arange(len(self._shapes))
-        x, y = self._shapes[:, 1], self._shapes[:, 2]
-        # The outline bounds what the image sees: the floor is a smooth map of the image.
-        seen_x, seen_y = self._floor_x[self._outline], self._floor_y[self._outline]
-        left, right, bottom, top = seen_x.min(), seen_x.max(), seen_y.min(), seen_y.max()
-        reach = self._reach + 0.02 * (right - left + top - bottom)
-        near = (x > left - reach) & (x < right + reach) & (y > bottom - reach) & (y < top + reach)
-        return np.flatnonzero(near)
-
-    def _boxes(self, visible: NDArray[np.intp], pose: Pose, spread: Array) -> NDArray[np.int64]:
-        """Pixel boxes (n, 4) that hold the visible shapes: left, top, right, bottom."""
-        camera = self.camera
-        pixels = camera.project(self._rims[visible].reshape(-1, 3), pose).reshape(-1, 16, 2)
-        lost = np.asarray(np.isnan(pixels).any(axis=(1, 2)))[:, None]
-        margin = 3.0 + 2.0 * self.settings.blur + spread[:, None]
-        low = np.floor(np.where(lost, 0.0, pixels.min(axis=1)) - margin)
-        size = np.array([camera.width, camera.height], dtype=float)
-        high = np.ceil(np.where(lost, size, pixels.max(axis=1)) + margin) + 1.0
-        low = np.minimum(np.maximum(low, 0.0), size)
-        high = np.minimum(np.maximum(high, low), size)
-        return np.concatenate([low, high], axis=1).astype(np.int64)
 
     def render(
         self,
@@ -540,12 +582,11 @@ class CameraRenderer:
             R, G, B.
 
         """
-        settings = self.settings
+        settings, camera = self.settings, self.camera
         rotation = pose.rotation()
-        centre = self.camera.centre(pose)
-        _floor_points(
-            self._rays, rotation @ self.camera.rotation, centre, self._floor_x, self._floor_y
-        )
+        turn = rotation @ camera.rotation
+        centre = pose.position + rotation @ camera.position
+        _floor_points(self._rays, turn, centre, self._floor_x, self._floor_y)
         _floor_albedo(
             self._floor_x,
             self._floor_y,
@@ -553,20 +594,37 @@ class CameraRenderer:
             settings.floor_texture,
             self._albedo,
         )
-        visible = self._visible()
-        if visible.size:
-            shapes = self._shapes[visible]
-            drift = np.zeros((len(visible), 2))
-            if settings.exposure_time > 0:
-                turn = rotation @ np.asarray(angular_velocity, dtype=float)
-                drift = self._motion(shapes, pose, centre, np.asarray(velocity, float), turn)
-            spread = np.hypot(drift[:, 0], drift[:, 1]) * self._scale(centre)
-            boxes = self._boxes(visible, pose, spread)
-            _paint(self._albedo, self._floor_x, self._floor_y, shapes, boxes, drift, settings.blur)
-        offsets = noise_stream(self.seed, self.robot, step, 'camera').integers(
-            0, _NOISE_TABLE_SIZE, size=self.camera.height
+        _place(
+            self._shapes,
+            self._rims,
+            self._floor_x,
+            self._floor_y,
+            centre,
+            pose.position,
+            turn,
+            camera.matrix,
+            camera.distortion,
+            camera.largest_radius,
+            np.asarray(velocity, dtype=float),
+            rotation @ np.asarray(angular_velocity, dtype=float),
+            settings.exposure_time,
+            3.0 + 2.0 * settings.blur,
+            self._boxes,
+            self._drift,
         )
-        image = np.empty(self._albedo.shape, dtype=np.uint8)
+        _paint(
+            self._albedo,
+            self._floor_x,
+            self._floor_y,
+            self._shapes,
+            self._boxes,
+            self._drift,
+            settings.blur,
+        )
+        offsets = noise_stream(self.seed, self.robot, step, 'camera').integers(
+            0, len(self._noise) - camera.width, size=(camera.height, 3)
+        )
+        image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
         _expose(
             self._albedo,
             self._floor_x,
@@ -576,30 +634,13 @@ class CameraRenderer:
             self.gains(time),
             self._noise,
             offsets,
-            self._deviations,
+            settings.read_noise,
+            settings.shot_noise,
             image,
         )
         return (
             image if settings.jpeg_quality is None else through_jpeg(image, settings.jpeg_quality)
         )
-
-    def _scale(self, centre: Array) -> float:
-        """Upper estimate of pixels for a metre on the floor under the camera [px/m]."""
-        focal = float(max(self.camera.matrix[0, 0], self.camera.matrix[1, 1]))
-        return focal / max(float(centre[2]), 1e-3)
-
-    def _motion(
-        self, shapes: Array, pose: Pose, centre: Array, velocity: Array, turn: Array
-    ) -> Array:
-        """How far shapes move, in the floor's coordinates of mid exposure, during it (n, 2) [m]."""
-        points = np.zeros((len(shapes), 3))
-        points[:, :2] = shapes[:, 1:3]
-        moved = velocity + np.cross(turn, points - pose.position)
-        rays = points - centre
-        with np.errstate(divide='ignore', invalid='ignore'):
-            slope = rays[:, :2] / rays[:, 2:]
-        flat = moved[:, :2] - slope * moved[:, 2:]
-        return -self.settings.exposure_time * np.nan_to_num(flat, posinf=0.0, neginf=0.0)
 
 
 def through_jpeg(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
