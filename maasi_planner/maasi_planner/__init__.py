@@ -1,0 +1,35 @@
+"""Where each robot goes: motion models, objective and planners. No ROS in here."""
+
+from __future__ import annotations
+
+from maasi_planner.candidates import CandidateSet, Unseen, Viewer, unseen_parts
+from maasi_planner.measurement_trigger import MeasurementTrigger
+from maasi_planner.motion import MotionModel, RobotState, Trajectories, make_motion
+from maasi_planner.obstacles import Obstacles
+from maasi_planner.planners import Planner, make_planner
+from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
+from maasi_planner.warm_up import warm_up
+
+__all__ = [
+    'CandidateSet',
+    'CandidateSettings',
+    'Decision',
+    'MeasurementTrigger',
+    'MotionModel',
+    'MotionSettings',
+    'Obstacles',
+    'Planner',
+    'PlannerSettings',
+    'RobotDecision',
+    'RobotState',
+    'RobotView',
+    'TeamView',
+    'Trajectories',
+    'Unseen',
+    'Viewer',
+    'make_motion',
+    'make_planner',
+    'unseen_parts',
+    'warm_up',
+]

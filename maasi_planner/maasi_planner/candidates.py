@@ -1,0 +1,294 @@
+"""Candidate waypoints, and what can never be seen from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.exploration import Exploration, check_bounds
+from maasi_filter.pose import Pose
+from maasi_filter.sensor import Sensor
+from maasi_planner.settings import CandidateSettings
+
+FloatArray = NDArray[np.float64]
+
+
+class CandidateSet:
+    """Candidate waypoints of one robot.
+
+    Parameters
+    ----------
+    settings : CandidateSettings
+        Grid, ring or list.
+    bounds : (d, 2) array
+        Of the environment, metres.
+    height : float
+        z of the waypoints in 2D problems, metres (the flying height, or 0).
+
+    Raises
+    ------
+    ValueError
+        If a waypoint of a grid or list lies outside the bounds, or the numbers of axes differ.
+    """
+
+    def __init__(self, settings: CandidateSettings, bounds: ArrayLike, height: float = 0.0) -> None:
+        self.settings = settings
+        self.bounds = check_bounds(bounds)
+        self.height = float(height)
+        if not math.isfinite(self.height):
+            raise ValueError(f'height: got {height}, allowed are finite numbers')
+        self._fixed = None
+        if settings.grid is not None:
+            self._fixed = self._complete(self._grid())
+        elif settings.points is not None:
+            self._fixed = self._complete(np.array(settings.points, dtype=float))
+        else:
+            self._ring = self._directions()
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return len(self.bounds)
+
+    def _grid(self) -> FloatArray:
+        settings = self.settings
+        numbers = settings.grid or []
+        if len(numbers) != self.dimension:
+            raise ValueError(
+                f'grid: got {numbers}, allowed in {self.dimension}D are {self.dimension} numbers'
+            )
+        spacing = np.broadcast_to(np.array(settings.spacing, dtype=float), (self.dimension,))
+        size = spacing * (np.array(numbers) - 1)
+        if settings.corner is not None:
+            corner = np.array(settings.corner, dtype=float)
+        else:
+            corner = self.bounds.mean(axis=1) - 0.5 * size
+        axes = [
+            corner[axis] + spacing[axis] * np.arange(numbers[axis])
+            for axis in range(self.dimension)
+        ]
+        return np.stack([grid.ravel() for grid in np.meshgrid(*axes, indexing='ij')], axis=1)
+
+    def _complete(self, points: FloatArray) -> FloatArray:
+        if points.ndim != 2 or points.shape[1] not in (self.dimension, 3):
+            raise ValueError(
+                f'points: got shape {points.shape}, allowed in {self.dimension}D are '
+                f'(n, {self.dimension})'
+            )
+        inside = points[:, : self.dimension]
+        slack = 1e-9 * (1.0 + np.abs(self.bounds))
+        outside = (inside < self.bounds[:, 0] - slack[:, 0]) | (
+            inside > self.bounds[:, 1] + slack[:, 1]
+        )
+        if outside.any():
+            first = points[outside.any(axis=1)][0]
+            raise ValueError(
+                f'candidates: got a waypoint at {first.tolist()}, allowed are waypoints inside '
+                f'{self.bounds.tolist()}'
+            )
+        complete = np.full((len(points), 3), self.height)
+        complete[:, : points.shape[1]] = points
+        return complete
+
+    def _directions(self) -> FloatArray:
+        distance = self.settings.distance or 0.0
+        half = math.sqrt(0.5)
+        steps = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)]
+        if self.settings.ring == 6:
+            if self.dimension == 2:
+                raise ValueError('ring: got 6, allowed in 2D are 4 and 8')
+            steps += [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
+        elif self.settings.ring == 8:
+            steps += [
+                (half, half, 0.0),
+                (-half, half, 0.0),
+                (-half, -half, 0.0),
+                (half, -half, 0.0),
+            ]
+        return distance * np.array(steps)
+
+    def at(self, position: ArrayLike) -> FloatArray:
+        """Return the candidates of a robot at `position` (3,), as a (W, 3) array.
+
+        A ring loses what would lie outside the bounds.
+        """
+        if self._fixed is not None:
+            return self._fixed.copy()
+        points = np.asarray(position, dtype=float)[None, :] + self._ring
+        if self.dimension == 2:
+            points[:, 2] = self.height
+        inside = points[:, : self.dimension]
+        keep = ((inside >= self.bounds[:, 0]) & (inside <= self.bounds[:, 1])).all(axis=1)
+        return points[keep]
+
+
+@dataclass
+class Unseen:
+    """Parts of the environment that no robot can ever see from its candidates.
+
+    Attributes
+    ----------
+    fraction : float
+        Of the environment.
+    boxes : list of (d, 2) arrays
+        Around each connected part, the largest first, metres.
+    """
+
+    fraction: float
+    boxes: list[FloatArray]
+
+    def __bool__(self) -> bool:
+        return bool(self.boxes)
+
+    def describe(self) -> str:
+        """Return a warning that says which parts, or an empty text."""
+        if not self.boxes:
+            return ''
+        parts = []
+        for box in self.boxes[:6]:
+            axes = ', '.join(
+                f'{name} {low:.3g} to {high:.3g} m' for name, (low, high) in zip('xyz', box)
+            )
+            parts.append(f'({axes})')
+        more = f' and {len(self.boxes) - 6} more' if len(self.boxes) > 6 else ''
+        return (
+            f'{100.0 * self.fraction:.2g} % of the environment can never be seen from the '
+            f'candidates: {"; ".join(parts)}{more}'
+        )
+
+
+@dataclass
+class Viewer:
+    """One robot for `unseen_parts`.
+
+    Parameters
+    ----------
+    candidates : (W, 3) array
+        All waypoints it can be sent to, metres.
+    start : (3,) array
+        Where it starts, metres.
+    sensor : Sensor
+        What it sees with.
+    spacing : float
+        Distance between measurements on the way, metres.
+    yaw : float or None
+        The heading it keeps, radians; None if it faces its travel.
+    """
+
+    candidates: FloatArray
+    start: FloatArray
+    sensor: Sensor
+    spacing: float
+    yaw: float | None = None
+
+
+def unseen_parts(
+    bounds: ArrayLike,
+    viewers: Mapping[str, Viewer] | Sequence[Viewer],
+    margin: float = 0.0,
+    probability: float = 0.01,
+    cells: int = 80,
+) -> Unseen:
+    """Return what can never be seen on the straight ways between the candidates.
+
+    Parameters
+    ----------
+    bounds : (d, 2) array
+        Of the environment, metres.
+    viewers : mapping or sequence of Viewer
+        The robots.
+    margin : float
+        Targets are at least this far from the bounds, metres.
+    probability : float
+        A place counts as seen where some measurement detects with at least this probability.
+    cells : int
+        Cells along the longest side.
+    """
+    box = check_bounds(bounds)
+    box = np.stack([box[:, 0] + margin, box[:, 1] - margin], axis=1)
+    size = float((box[:, 1] - box[:, 0]).max())
+    grid = Exploration(box, size / (cells if len(box) == 2 else min(cells, 40)))
+    nodes = grid.nodes()
+    seen = np.zeros(len(nodes), dtype=bool)
+    members = list(viewers.values()) if isinstance(viewers, Mapping) else list(viewers)
+    for viewer in members:
+        for pose in _poses(viewer, size):
+            rest = np.flatnonzero(~seen)
+            if not len(rest):
+                break
+            found = viewer.sensor.detection.probability(nodes[rest], pose) >= probability
+            seen[rest[found]] = True
+    return _parts(grid, seen, nodes)
+
+
+def _poses(viewer: Viewer, size: float) -> list[Pose]:
+    """Return the poses on all ways between candidates, thinned to about 1/100 of `size`."""
+    points = np.vstack([viewer.start[None, :], viewer.candidates])
+    turns = viewer.yaw is None
+    # A sensor whose view does not depend on the heading needs each place only once.
+    probe = np.array([[0.1, 0.03, 0.0], [-0.07, 0.11, 0.0], [0.02, -0.1, 0.0]])
+    probe = probe[:, : viewer.sensor.dimension]
+    scales = size * np.array([1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0])
+    if turns:
+        turns = any(
+            not np.allclose(
+                viewer.sensor.detection.probability(probe * scale, Pose.from_yaw(np.zeros(3), 0.0)),
+                viewer.sensor.detection.probability(probe * scale, Pose.from_yaw(np.zeros(3), yaw)),
+            )
+            for scale in scales
+            for yaw in (0.7, 2.0, -1.5)
+        )
+    fine = size / 100.0
+    keep: dict[tuple[int, ...], Pose] = {}
+    for start in points:
+        ways = viewer.candidates - start
+        lengths = np.sqrt((ways * ways).sum(axis=1))
+        for way, length in zip(ways, lengths):
+            yaw = viewer.yaw if viewer.yaw is not None else math.atan2(way[1], way[0])
+            number = max(1, math.ceil(length / viewer.spacing)) if length > 0.0 else 1
+            along = np.minimum(np.arange(number + 1) * viewer.spacing / max(length, 1e-12), 1.0)
+            places = start + along[:, None] * way
+            rounded = np.round(places / fine).astype(int)
+            sector = round(yaw / (math.pi / 8.0)) % 16 if turns else 0
+            for place, key in zip(places, rounded):
+                keep.setdefault((*key.tolist(), sector), Pose.from_yaw(place, yaw))
+    return list(keep.values())
+
+
+def _parts(grid: Exploration, seen: NDArray[np.bool_], nodes: FloatArray) -> Unseen:
+    """Return the connected parts of nodes not seen."""
+    hidden = ~seen.reshape(grid.values.shape)
+    volumes = grid.cell_volumes()
+    fraction = float(volumes[hidden].sum() / volumes.sum())
+    labels = np.zeros(hidden.shape, dtype=int)
+    boxes: list[tuple[int, FloatArray]] = []
+    half = 0.5 * grid.step
+    for first in zip(*np.nonzero(hidden)):
+        if labels[first]:
+            continue
+        number = len(boxes) + 1
+        labels[first] = number
+        pending = [first]
+        members = []
+        while pending:
+            node = pending.pop()
+            members.append(node)
+            for axis in range(grid.dimension):
+                for change in (-1, 1):
+                    other = list(node)
+                    other[axis] += change
+                    key = tuple(other)
+                    if 0 <= key[axis] < hidden.shape[axis] and hidden[key] and not labels[key]:
+                        labels[key] = number
+                        pending.append(key)
+        flat = np.ravel_multi_index(tuple(np.array(members).T), hidden.shape)
+        inside = nodes[flat]
+        low = np.maximum(inside.min(axis=0) - half, grid.bounds[:, 0])
+        high = np.minimum(inside.max(axis=0) + half, grid.bounds[:, 1])
+        boxes.append((len(members), np.stack([low, high], axis=1)))
+    boxes.sort(key=lambda item: -item[0])
+    return Unseen(fraction, [box for _, box in boxes])

@@ -1,0 +1,132 @@
+"""When to measure: periodically, or only when it is expected to be worth it (000, (24), (33))."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maasi_filter.clusters import Cluster
+from maasi_filter.exploration import Exploration
+from maasi_filter.pose import Pose
+from maasi_filter.sensor import Sensor
+from maasi_planner.settings import PlannerSettings
+
+
+def expected_use(
+    sensor: Sensor,
+    pose: Pose,
+    clusters: Sequence[Cluster],
+    exploration: Exploration,
+    gamma: float,
+) -> float:
+    """Return the left side of 000, eq. (24) and (33): the sum of pi at centres plus gamma e.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Of the robot.
+    pose : Pose
+        Where it would measure.
+    clusters : sequence of Cluster
+        After the last measurement.
+    exploration : Exploration
+        e after the last measurement.
+    gamma : float
+        Weight of e at the robot's position.
+    """
+    use = gamma * float(exploration.at(pose.position)[0])
+    if clusters:
+        centres = np.stack([cluster.position for cluster in clusters])
+        use += float(sum(sensor.detection.probability(centres, pose).tolist()))
+    return use
+
+
+class MeasurementTrigger:
+    """Decides at each possible measurement of a robot whether it measures.
+
+    At its decision (index 0) a robot always measures. `relative` compares with the mean of the
+    same quantity along the predicted trajectory, as known at the decision.
+
+    Parameters
+    ----------
+    settings : PlannerSettings
+        `measurement`, `trigger`, `gamma` and `threshold`.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        self.settings = settings
+        self._means: dict[str, float] = {}
+
+    def reset(self) -> None:
+        """Forget all trajectories."""
+        self._means.clear()
+
+    def begin(
+        self,
+        robot: str,
+        sensor: Sensor,
+        positions: ArrayLike,
+        yaws: ArrayLike,
+        period_steps: int,
+        clusters: Sequence[Cluster],
+        exploration: Exploration,
+    ) -> None:
+        """Take note of a new trajectory; call it at each decision of the robot.
+
+        Parameters
+        ----------
+        robot : str
+            Name.
+        sensor : Sensor
+            Of the robot.
+        positions, yaws : (K + 1, 3), (K + 1,) arrays
+            Predicted trajectory, metres and radians.
+        period_steps : int
+            Steps between possible measurements.
+        clusters, exploration
+            As known at the decision.
+        """
+        if self.settings.measurement == 'periodic' or self.settings.trigger == 'absolute':
+            return
+        places = np.asarray(positions, dtype=float)[::period_steps]
+        headings = np.asarray(yaws, dtype=float)[::period_steps]
+        uses = [
+            expected_use(
+                sensor, Pose.from_yaw(place, yaw), clusters, exploration, self.settings.gamma
+            )
+            for place, yaw in zip(places, headings)
+        ]
+        self._means[robot] = sum(uses) / len(uses)
+
+    def measures(
+        self,
+        robot: str,
+        index: int,
+        sensor: Sensor,
+        pose: Pose,
+        clusters: Sequence[Cluster],
+        exploration: Exploration,
+    ) -> bool:
+        """Return whether the robot measures now.
+
+        Parameters
+        ----------
+        robot : str
+            Name.
+        index : int
+            m, of this possible measurement since the robot's decision, which is 0.
+        sensor, pose
+            The robot's sensor and where it is.
+        clusters, exploration
+            After the last measurement of anybody.
+        """
+        settings = self.settings
+        if settings.measurement == 'periodic' or index == 0:
+            return True
+        use = expected_use(sensor, pose, clusters, exploration, settings.gamma)
+        threshold = settings.threshold
+        if settings.trigger == 'relative':
+            threshold *= self._means.get(robot, 0.0)
+        return use > threshold

@@ -1,0 +1,49 @@
+"""Motion models: each has its controller, its prediction and its body."""
+
+from __future__ import annotations
+
+from maasi_planner.motion.base import Body, MotionModel, RobotState, Trajectories
+from maasi_planner.motion.constant_speed import ConstantSpeed, ConstantSpeedBody
+from maasi_planner.motion.mambo import Mambo, MamboBody
+from maasi_planner.motion.unicycle import Unicycle, UnicycleBody
+from maasi_planner.obstacles import Obstacles
+from maasi_planner.settings import MotionSettings
+
+__all__ = [
+    'Body',
+    'ConstantSpeed',
+    'ConstantSpeedBody',
+    'Mambo',
+    'MamboBody',
+    'MotionModel',
+    'RobotState',
+    'Trajectories',
+    'Unicycle',
+    'UnicycleBody',
+    'make_motion',
+]
+
+_MODELS: dict[str, type[MotionModel]] = {
+    'constant_speed': ConstantSpeed,
+    'mambo': Mambo,
+    'unicycle': Unicycle,
+}
+
+
+def make_motion(
+    settings: MotionSettings,
+    obstacles: Obstacles | None = None,
+    radius: float = 0.0,
+) -> MotionModel:
+    """Return the motion model that `settings.model` names.
+
+    Parameters
+    ----------
+    settings : MotionSettings
+        Model, limits and controller.
+    obstacles : Obstacles, optional
+        What its ways lead around.
+    radius : float
+        Of the robot, metres.
+    """
+    return _MODELS[settings.model](settings, obstacles, radius)

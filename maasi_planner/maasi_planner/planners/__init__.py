@@ -1,0 +1,37 @@
+"""Planners by name."""
+
+from __future__ import annotations
+
+from maasi_planner.planners.base import Planner
+from maasi_planner.planners.intermittent import Intermittent
+from maasi_planner.planners.lawnmower import Lawnmower
+from maasi_planner.settings import PlannerSettings
+
+__all__ = ['Intermittent', 'Lawnmower', 'Planner', 'make_planner']
+
+_PLANNERS: dict[str, type[Planner]] = {
+    'maasi': Intermittent,
+    'asi': Intermittent,
+    'lawnmower': Lawnmower,
+}
+
+
+def make_planner(name: str, settings: PlannerSettings | None = None) -> Planner:
+    """Return the planner called `name`.
+
+    Parameters
+    ----------
+    name : str
+        As in `PlannerSettings.name`.
+    settings : PlannerSettings, optional
+        Its numbers; `name` wins over the name in there.
+
+    Raises
+    ------
+    ValueError
+        If there is no planner of that name.
+    """
+    if name not in _PLANNERS:
+        raise ValueError(f'planner: got {name!r}, allowed are {", ".join(sorted(_PLANNERS))}')
+    own = settings or PlannerSettings()
+    return _PLANNERS[name](own.model_copy(update={'name': name}))

@@ -1,0 +1,199 @@
+"""What all planners share: the interface, and getting candidates into shape."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import Decision, RobotView, TeamView
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+class Planner(ABC):
+    """Decides where the robots that plan at a step go next.
+
+    Parameters
+    ----------
+    settings : PlannerSettings
+        Which planner, and its numbers.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        self.settings = settings
+
+    @abstractmethod
+    def decide(self, team: TeamView) -> Decision:
+        """Return a decision for every robot in the team that plans.
+
+        A robot for which nothing is admissible is told to stay, with the reason.
+
+        Raises
+        ------
+        ValueError
+            If the view of the team itself is wrong: not finite, no step time, periods below 1.
+        """
+
+    def reset(self) -> None:  # noqa: B027
+        """Forget everything about the search so far."""
+
+    def finished(self, team: TeamView) -> str | None:
+        """Return why nothing is left to gain, or None while something is.
+
+        That is when the environment is explored to `explored_threshold` and no cluster with a
+        mass of `mass_threshold` or more is left.
+        """
+        explored = team.exploration.explored_fraction()
+        if explored < self.settings.explored_threshold:
+            return None
+        return self._settled(team, f'{100.0 * explored:.1f} % of the environment is explored')
+
+    def _settled(self, team: TeamView, reason: str) -> str | None:
+        heavy = [
+            cluster for cluster in team.clusters if cluster.mass >= self.settings.mass_threshold
+        ]
+        if heavy:
+            return None
+        return f'{reason} and no potential target is left'
+
+
+def check_team(team: TeamView) -> None:
+    """Refuse a team that cannot be planned for.
+
+    Raises
+    ------
+    ValueError
+        Naming the robot and field, what was read, and what is allowed.
+    """
+    if not (math.isfinite(team.step_time) and team.step_time > 0.0):
+        raise ValueError(f'step_time: got {team.step_time}, allowed are numbers above 0 [s]')
+    for name in team.names():
+        view = team.robots[name]
+        if view.period_steps < 1:
+            raise ValueError(
+                f'{name}: period_steps: got {view.period_steps}, allowed are integers from 1'
+            )
+        if not (math.isfinite(view.radius) and view.radius >= 0.0):
+            raise ValueError(
+                f'{name}: radius: got {view.radius}, allowed are finite numbers from 0 [m]'
+            )
+        for field, value, width in (
+            ('candidates', view.candidates, 3),
+            ('tail', view.tail, 3),
+        ):
+            if value is None:
+                continue
+            array = np.asarray(value, dtype=float)
+            if array.ndim != 2 or array.shape[1] != width:
+                raise ValueError(
+                    f'{name}: {field}: got shape {array.shape}, allowed is (n, {width})'
+                )
+        if view.tail is not None and not np.isfinite(view.tail).all():
+            raise ValueError(f'{name}: tail: got a number that is not finite')
+        if view.tail_yaws is not None and (
+            view.tail is None
+            or np.shape(view.tail_yaws) != (len(view.tail),)
+            or not np.isfinite(view.tail_yaws).all()
+        ):
+            raise ValueError(f'{name}: tail_yaws: allowed is one finite heading per tail position')
+    for index, cluster in enumerate(team.clusters):
+        if not (
+            np.isfinite(cluster.position).all()
+            and np.isfinite(cluster.covariance).all()
+            and math.isfinite(cluster.mass)
+        ):
+            raise ValueError(f'clusters[{index}]: got a number that is not finite')
+
+
+def state_problem(view: RobotView) -> str | None:
+    """Return what is wrong with a robot's state, if anything."""
+    state = view.state
+    if not (
+        np.isfinite(state.pose.position).all()
+        and np.isfinite(state.pose.orientation).all()
+        and np.isfinite(state.velocity).all()
+        and np.isfinite(state.angular_velocity).all()
+    ):
+        return 'the state of the robot is not finite'
+    return None
+
+
+def in_bounds(points: FloatArray, bounds: FloatArray) -> BoolArray:
+    """Return which points (n, 3) lie within the bounds (d, 2), with a little slack."""
+    d = len(bounds)
+    slack = 1e-9 * (1.0 + np.abs(bounds))
+    inside = (points[:, :d] >= bounds[:, 0] - slack[:, 0]) & (
+        points[:, :d] <= bounds[:, 1] + slack[:, 1]
+    )
+    return np.asarray(inside.all(axis=1))
+
+
+def usable_candidates(
+    team: TeamView, name: str, extra: FloatArray | None = None
+) -> tuple[FloatArray, str]:
+    """Return a robot's candidates moved out of obstacles, and what was left out.
+
+    Parameters
+    ----------
+    team : TeamView
+        The team.
+    name : str
+        The robot.
+    extra : (n, 3) array, optional
+        Further waypoints; left out where they do not fit, without a word.
+    """
+    view = team.robots[name]
+    points = np.ascontiguousarray(view.candidates, dtype=float).reshape(-1, 3)
+    dropped: list[str] = []
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        dropped.append(f'{int((~finite).sum())} not finite')
+        points = points[finite]
+    inside = in_bounds(points, team.bounds)
+    if not inside.all():
+        dropped.append(f'{int((~inside).sum())} outside the bounds')
+        points = points[inside]
+    position = view.state.pose.position
+    number = len(points)
+    if extra is not None and len(extra):
+        points = np.vstack([points, extra[in_bounds(extra, team.bounds)]])
+    if len(view.motion.keep_out):
+        moved = [view.motion.keep_out.moved_out(position, point) for point in points]
+        lost = sum(point is None for point in moved[:number])
+        if lost:
+            dropped.append(f'{lost} in obstacles')
+        points = np.array([point for point in moved if point is not None]).reshape(-1, 3)
+    return points, ', '.join(dropped)
+
+
+def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
+    """Return where robots that do not plan will stand, with their radii."""
+    places = []
+    for name in team.names():
+        view = team.robots[name]
+        if view.planning:
+            continue
+        if view.tail is not None and len(view.tail):
+            place = np.asarray(view.tail[-1], dtype=float)
+        else:
+            place = np.array(view.state.pose.position)
+        places.append((place, view.radius))
+    return places
+
+
+def free_of_robots(
+    points: FloatArray, radius: float, places: list[tuple[FloatArray, float]]
+) -> BoolArray:
+    """Return which waypoints (W, 3) keep the radii away from where others will stand."""
+    free = np.ones(len(points), dtype=bool)
+    for place, other in places:
+        reach = radius + other
+        if reach > 0.0:
+            offset = points - place
+            free &= (offset * offset).sum(axis=1) >= reach * reach
+    return free

@@ -1,0 +1,234 @@
+"""Lawnmower: lanes that cover the environment evenly (000, sections 5 and 7).
+
+With two robots they start from the two ends and meet in the middle, wherever that turns out to
+be; more robots share the lanes out in blocks, two to a block.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.detection_model import BOX
+from maasi_planner.planners.base import Planner, check_team, state_problem
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import Decision, RobotDecision, TeamView, stay
+
+FloatArray = NDArray[np.float64]
+
+
+def lanes(
+    bounds: FloatArray, spacing: float, layer_spacing: float, margin: float
+) -> list[FloatArray]:
+    """Return the lanes that cover an environment.
+
+    Parameters
+    ----------
+    bounds : (d, 2) array
+        Metres.
+    spacing, layer_spacing : float
+        Largest distance between lanes, and between layers in 3D, metres; evened out.
+    margin : float
+        Distance of the outer lanes from the bounds, metres.
+
+    Returns
+    -------
+    list of (2, 3) arrays
+        Start and end of each lane along x, boustrophedon: each starts near the end of the one
+        before. z is 0 in 2D.
+    """
+    d = len(bounds)
+    low = bounds[:, 0] + margin
+    high = bounds[:, 1] - margin
+    middle = bounds.mean(axis=1)
+    low = np.minimum(low, middle)
+    high = np.maximum(high, middle)
+
+    def places(axis: int, distance: float) -> list[float]:
+        length = float(high[axis] - low[axis])
+        number = math.ceil(length / distance - 1e-9) + 1 if length > 1e-12 else 1
+        if number == 1:
+            return [float(middle[axis])]
+        return [float(low[axis]) + length * i / (number - 1) for i in range(number)]
+
+    out = []
+    backwards_x = False
+    backwards_y = False
+    for z in places(2, layer_spacing) if d == 3 else [0.0]:
+        rows = places(1, spacing)
+        for y in reversed(rows) if backwards_y else rows:
+            ends = [(float(low[0]), y, z), (float(high[0]), y, z)]
+            out.append(np.array(ends[::-1] if backwards_x else ends))
+            backwards_x = not backwards_x
+        backwards_y = not backwards_y
+    return out
+
+
+class Lawnmower(Planner):
+    """Lanes one after the other; the candidates are not used.
+
+    Each robot takes its next lane when it has finished one, so that a faster robot takes more.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        super().__init__(settings)
+        self.reset()
+
+    def reset(self) -> None:
+        """See `Planner.reset`."""
+        self._blocks: list[list[FloatArray]] = []
+        self._side: dict[str, tuple[int, int]] = {}
+        self._pending: dict[str, list[FloatArray]] = {}
+        self._started = False
+
+    def _spacing(self, team: TeamView) -> float:
+        if self.settings.lane_spacing is not None:
+            return self.settings.lane_spacing
+        widths = []
+        for name in team.names():
+            kernel = team.robots[name].sensor.detection.kernel()
+            if kernel is None:
+                continue
+            kind, parameters = kernel
+            if kind == BOX:
+                widths.append(
+                    float(min(parameters[4] - parameters[1], parameters[5] - parameters[2]))
+                )
+            else:
+                scale = parameters[1:3]
+                widths.append(2.0 / float(scale.max()) if scale.max() > 0.0 else math.inf)
+        finite = [width for width in widths if math.isfinite(width)]
+        size = float((team.bounds[:, 1] - team.bounds[:, 0]).max())
+        return max(min([*finite, size]), size / 1000.0)
+
+    def _start(self, team: TeamView) -> None:
+        spacing = self._spacing(team)
+        margin = self.settings.margin
+        all_lanes = lanes(
+            team.bounds,
+            spacing,
+            self.settings.layer_spacing or spacing,
+            0.5 * spacing if margin is None else margin,
+        )
+        names = team.names()
+        blocks = max(1, math.ceil(len(names) / 2))
+        blocks = min(blocks, len(all_lanes))
+        self._blocks = [
+            all_lanes[len(all_lanes) * i // blocks : len(all_lanes) * (i + 1) // blocks]
+            for i in range(blocks)
+        ]
+        ends = []
+        for block, members in enumerate(self._blocks):
+            ends.append((block, 0, members[0][0]))
+            ends.append((block, 1, members[-1][1]))
+        free = list(ends)
+        # Each robot, in the order of names, starts from the free end nearest to it.
+        for name in names:
+            position = team.robots[name].state.pose.position
+            if not free:
+                free = list(ends)
+            best = min(
+                free,
+                key=lambda end: (
+                    float(((end[2] - position)[: team.dimension] ** 2).sum()),
+                    end[0],
+                    end[1],
+                ),
+            )
+            free.remove(best)
+            self._side[name] = (best[0], best[1])
+            self._pending[name] = []
+        self._started = True
+
+    def _next(self, team: TeamView, name: str) -> FloatArray | None:
+        if name not in self._side:
+            self._side[name] = (len(self._side) % len(self._blocks), len(self._side) % 2)
+            self._pending[name] = []
+        if self._pending[name]:
+            return self._pending[name].pop(0)
+        own, side = self._side[name]
+        order = [own] + [i for i in range(len(self._blocks)) if i != own]
+        for block in order:
+            members = self._blocks[block]
+            if not members:
+                continue
+            lane = members.pop(0 if side == 0 else -1)
+            view = team.robots[name]
+            here = view.state.pose.position
+            ends = [lane[0].copy(), lane[1].copy()]
+            if team.dimension == 2:
+                height = view.candidates[0, 2] if len(view.candidates) else here[2]
+                for end in ends:
+                    end[2] = height
+            # From the end that is nearer.
+            gaps = [float(((end - here) ** 2).sum()) for end in ends]
+            if gaps[1] < gaps[0]:
+                ends.reverse()
+            self._pending[name] = [ends[1]]
+            return ends[0]
+        return None
+
+    def decide(self, team: TeamView) -> Decision:
+        """See `Planner.decide`."""
+        check_team(team)
+        decision = Decision(step=team.step)
+        if not self._started:
+            self._start(team)
+        for name in team.planning():
+            view = team.robots[name]
+            problem = state_problem(view)
+            if problem is not None:
+                decision.robots[name] = stay(view, f'stays: {problem}')
+                continue
+            decision.robots[name] = self._decide_one(team, name)
+        decision.reason = '; '.join(
+            f'{name}: {robot.reason}' for name, robot in decision.robots.items()
+        )
+        return decision
+
+    def _decide_one(self, team: TeamView, name: str) -> RobotDecision:
+        view = team.robots[name]
+        here = view.state.pose.position
+        while True:
+            target = self._next(team, name)
+            if target is None:
+                return stay(view, 'stays: all lanes are done')
+            point = view.motion.keep_out.moved_out(here, target)
+            if point is None:
+                continue
+            prediction = view.motion.predict(view.state, point[None, :], team.step_time)
+            if not prediction.reached[0] or prediction.lengths[0] == 0:
+                continue
+            return single_choice(point[None, :], prediction, 'next point of the lawnmower')
+
+    def finished(self, team: TeamView) -> str | None:
+        """See `Planner.finished`; also when every lane is done."""
+        if self._started and not any(self._blocks) and not any(self._pending.values()):
+            standing = all(
+                view.tail is None or len(view.tail) <= 1 for view in team.robots.values()
+            )
+            if standing:
+                return 'all lanes of the lawnmower are done'
+        return super().finished(team)
+
+
+def single_choice(points: FloatArray, prediction, reason: str, chosen: int = 0) -> RobotDecision:
+    """Return a decision without terms, for planners that do not compare by J."""
+    length = int(prediction.lengths[chosen])
+    none = np.zeros(len(points))
+    return RobotDecision(
+        chosen=chosen,
+        waypoint=points[chosen].copy(),
+        positions=prediction.positions[chosen, : length + 1].copy(),
+        yaws=prediction.yaws[chosen, : length + 1].copy(),
+        candidates=points,
+        control_cost=prediction.control_cost,
+        target_refinement=none,
+        exploration=none.copy(),
+        objective=none.copy(),
+        lengths=prediction.lengths,
+        measurements=np.zeros(len(points), np.int64),
+        reason=reason,
+    )

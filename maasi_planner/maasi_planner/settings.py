@@ -1,0 +1,241 @@
+"""Settings of candidates, robot motion and planners: checked models for files, parameters, code."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from maasi_filter.settings import Settings
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+PositiveInt = Annotated[int, Field(ge=1, le=10_000)]
+
+MODELS = ('constant_speed', 'mambo', 'unicycle', 'quadrotor')
+
+
+class CandidateSettings(Settings):
+    """Candidate waypoints of a robot: exactly one of `grid`, `ring` and `points`."""
+
+    grid: list[PositiveInt] | None = Field(
+        default=None, min_length=2, max_length=3, description='Waypoints on each map axis [1]'
+    )
+    spacing: Positive | list[Positive] | None = Field(
+        default=None, description='Distance of neighbours in the grid, one or one per axis [m]'
+    )
+    corner: list[Finite] | None = Field(
+        default=None,
+        min_length=2,
+        max_length=3,
+        description='First waypoint of the grid [m, map]; left out, the grid is centred',
+    )
+    ring: Literal[4, 6, 8] | None = Field(
+        default=None,
+        description='Waypoints around the robot: 4 or 8 level directions, or 6 with up and down',
+    )
+    distance: Positive | None = Field(
+        default=None, description='Distance of the ring from the robot [m]'
+    )
+    points: list[Annotated[list[Finite], Field(min_length=2, max_length=3)]] | None = Field(
+        default=None, min_length=1, description='Waypoints, one by one [m, map]'
+    )
+
+    @model_validator(mode='after')
+    def _one_kind(self) -> CandidateSettings:
+        kinds = [name for name in ('grid', 'ring', 'points') if getattr(self, name) is not None]
+        if len(kinds) != 1:
+            raise ValueError(
+                f'candidates: got {kinds or "none"} of grid, ring and points, allowed is one'
+            )
+        if self.grid is not None and self.spacing is None:
+            raise ValueError('spacing: got nothing, a grid needs it [m]')
+        if self.grid is None and (self.spacing is not None or self.corner is not None):
+            raise ValueError('spacing, corner: allowed only with grid')
+        if (self.ring is None) != (self.distance is None):
+            raise ValueError('ring, distance: allowed are both or none')
+        if self.grid is not None:
+            for name, value in (('spacing', self.spacing), ('corner', self.corner)):
+                if isinstance(value, list) and len(value) != len(self.grid):
+                    raise ValueError(
+                        f'{name}: got {len(value)} numbers, allowed are {len(self.grid)}'
+                    )
+        return self
+
+
+class MotionSettings(Settings):
+    """How a robot moves to a waypoint: model, limits and controller."""
+
+    model: Literal['constant_speed', 'mambo', 'unicycle', 'quadrotor'] = Field(
+        default='constant_speed', description='Motion model and controller'
+    )
+    speed: float = Field(default=0.4, gt=0.0, le=100.0, description='Largest speed [m/s]')
+    acceleration: float | None = Field(
+        default=None, gt=0.0, le=100.0, description='Largest acceleration; none: no limit [m/s^2]'
+    )
+    tolerance: float = Field(
+        default=0.05, gt=0.0, description='Distance at which a waypoint counts as reached [m]'
+    )
+    approach_rate: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=20.0,
+        description='Speed per metre left near the waypoint; none: of the controller [1/s]',
+    )
+    heading: Literal['keep', 'travel'] = Field(
+        default='keep',
+        description='Whether a robot that can move sideways keeps its heading or faces its travel',
+    )
+    yaw_rate: float = Field(default=1.5, gt=0.0, le=20.0, description='Largest turn rate [rad/s]')
+    yaw_acceleration: float | None = Field(
+        default=None,
+        gt=0.0,
+        description='Largest change of the turn rate; none: no limit [rad/s^2]',
+    )
+    tilt: float = Field(
+        default=0.5, gt=0.0, lt=1.5, description='Largest tilt of a flying robot, each axis [rad]'
+    )
+    state_weights: list[NotNegative] = Field(
+        default=[1.0] * 12,
+        min_length=12,
+        max_length=12,
+        description='LQR weights of position, roll pitch yaw, velocity, angular velocity [1]',
+    )
+    input_weights: list[Positive] = Field(
+        default=[1000.0, 1000.0, 1000.0, 100.0],
+        min_length=4,
+        max_length=4,
+        description='LQR weights of roll, pitch and yaw torque and of the collective force [1]',
+    )
+    control_inputs: Literal['all', 'torques'] = Field(
+        default='all', description='Inputs of a flying robot that the control cost C counts'
+    )
+    clearance: float = Field(
+        default=0.05, gt=0.0, description='Kept from obstacles beyond the radius of the robot [m]'
+    )
+    obstacle_term: Literal['none', 'printed', 'away'] = Field(
+        default='none',
+        description='001, eq. (14), (15): none, as printed, or pushing away from the obstacle',
+    )
+    obstacle_distance: float = Field(
+        default=0.12,
+        gt=0.0,
+        description='d_l, distance to an obstacle below which the term acts [m]',
+    )
+    obstacle_gain: float = Field(
+        default=0.002, ge=0.0, description='k_obs, gain of the term [unit of the input]'
+    )
+    avoidance: Literal['steer', 'dynamic_window'] = Field(
+        default='steer', description='How a ground robot gets around obstacles'
+    )
+
+
+class PlannerSettings(Settings):
+    """Which planner decides, and its numbers. What is left None takes the objective's value."""
+
+    name: Literal[
+        'maasi', 'asi', 'maas', 'as', 'mutual_information', 'nearest_widest', 'lawnmower'
+    ] = Field(default='maasi', description='Planner')
+    objective: Literal['paper', 'information'] = Field(
+        default='information',
+        description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
+        'expected new targets',
+    )
+    alpha: float = Field(
+        default=0.5, ge=0.0, description='Weight of target refinement T (001: of exploration) [1]'
+    )
+    beta: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='Weight of exploration E; none: 0.5 paper, 1 information [1]',
+    )
+    control_weight: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='Weight of the control cost C; none: 1 paper, 1e-6 information [1]',
+    )
+    normalisation: Literal['steps', 'distance'] = Field(
+        default='steps', description='What J is divided by: steps K, or metres of the trajectory'
+    )
+    measure_at_arrival: bool | None = Field(
+        default=None,
+        description='Whether T and E count the measurement at the waypoint itself; none: only '
+        'information does',
+    )
+    count_present: bool | None = Field(
+        default=None,
+        description='Whether T and E count the measurement at the present place, the same for all '
+        'candidates; none: only paper does',
+    )
+    own_measurement: bool | None = Field(
+        default=None,
+        description='Whether e in E at a measurement includes that measurement itself, as (21), '
+        '(22) do; none: true. With pi = 1 around the robot that makes E vanish',
+    )
+    extension: Literal['measuring', 'silent'] = Field(
+        default='measuring',
+        description='Whether robots that wait at the end of a predicted trajectory go on measuring',
+    )
+    cluster_candidates: bool | None = Field(
+        default=None,
+        description='Whether cluster centres are candidates too; none: only information',
+    )
+    expected_targets: float = Field(
+        default=12.0, gt=0.0, description='N0, targets expected before the search [1]'
+    )
+    exploration_nodes: int = Field(
+        default=4096, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
+    )
+    enumeration_limit: int = Field(
+        default=50_000,
+        ge=1,
+        description='Most joint candidates searched exactly; above, robots choose in turn [1]',
+    )
+    improvement_rounds: int = Field(
+        default=3,
+        ge=0,
+        le=100,
+        description='Most rounds of improvement when robots choose in turn [1]',
+    )
+    measurement: Literal['periodic', 'event'] = Field(
+        default='periodic', description='Measure at every period, or only when worth it (24), (33)'
+    )
+    trigger: Literal['absolute', 'relative'] = Field(
+        default='absolute',
+        description='Compare (24) with the threshold, or with the threshold times its mean along '
+        'the trajectory',
+    )
+    gamma: float = Field(default=1.0, ge=0.0, description='Weight of e in the trigger [1]')
+    threshold: float = Field(
+        default=4.0, ge=0.0, description='T_delta, threshold of the trigger [1]'
+    )
+    explored_threshold: float = Field(
+        default=0.995, gt=0.0, le=1.0, description='Explored share at which the search may end [1]'
+    )
+    mass_threshold: float = Field(
+        default=0.1, gt=0.0, description='Mass of a cluster that is still worth a visit [1]'
+    )
+    gain_threshold: float = Field(
+        default=1e-3,
+        ge=0.0,
+        description='Gain of all candidates below which nothing is left, information only [1]',
+    )
+    horizon: int = Field(default=1, ge=1, le=3, description='maas: waypoints planned ahead [1]')
+    refinement: Literal['centres', 'mutual_information'] = Field(
+        default='centres', description='maas: T by centre probabilities or by mutual information'
+    )
+    coordination: Literal['centralized', 'independent'] = Field(
+        default='centralized', description='maas: joint choice, or each robot for itself'
+    )
+    lane_spacing: float | None = Field(
+        default=None, gt=0.0, description='lawnmower: distance of lanes; none: size of the view [m]'
+    )
+    layer_spacing: float | None = Field(
+        default=None, gt=0.0, description='lawnmower: distance of layers in 3D; none: as lanes [m]'
+    )
+    margin: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='lawnmower: distance of the outer lanes from the bounds; none: half a lane [m]',
+    )

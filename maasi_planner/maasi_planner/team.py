@@ -1,0 +1,190 @@
+"""What a planner sees of the team, and what it decides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.clusters import Cluster
+from maasi_filter.exploration import Exploration
+from maasi_filter.sensor import Sensor
+from maasi_planner.motion.base import MotionModel, RobotState
+from maasi_planner.obstacles import Obstacles
+
+if TYPE_CHECKING:
+    from maasi_filter.search_filter import FoundTarget
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass
+class RobotView:
+    """One robot, as the planner sees it at a step.
+
+    Parameters
+    ----------
+    state : RobotState
+        Present pose and velocity.
+    candidates : (W, 3) array
+        Waypoints to choose from, metres, frame `map`; used when `planning`.
+    motion : MotionModel
+        Predicts trajectories; knows the obstacles.
+    sensor : Sensor
+        With its probability of detection and noise.
+    period_steps : int
+        Steps between possible measurements, Delta.
+    planning : bool
+        Whether the robot is in P_k: it chooses a waypoint now.
+    tail : (n, 3) array, optional
+        Rest of the trajectory of a robot that is not planning: positions at steps now, now + 1
+        and so on. None: it stands at its present position.
+    tail_yaws : (n,) array, optional
+        Headings along the tail, radians. None: the present one.
+    phase : int
+        Steps from now to the next possible measurement of a robot that is not planning. (One
+        that plans measures now.)
+    radius : float
+        Of a circle around the robot, metres; keeps waypoints apart.
+    """
+
+    state: RobotState
+    candidates: FloatArray
+    motion: MotionModel
+    sensor: Sensor
+    period_steps: int
+    planning: bool = True
+    tail: FloatArray | None = None
+    tail_yaws: FloatArray | None = None
+    phase: int = 0
+    radius: float = 0.0
+
+
+@dataclass
+class TeamView:
+    """The whole team at one step.
+
+    Parameters
+    ----------
+    step : int
+        k.
+    step_time : float
+        Seconds per step.
+    robots : dict
+        By name; taken in the order of names, however they were put in.
+    clusters : list of Cluster
+        Potential targets now.
+    exploration : Exploration
+        e after the last measurements.
+    found_targets : sequence
+        Not used by the objective; for planners that want to stay away from them.
+    obstacles : Obstacles, optional
+        In their own size, not inflated.
+    """
+
+    step: int
+    step_time: float
+    robots: dict[str, RobotView]
+    clusters: list[Cluster]
+    exploration: Exploration
+    found_targets: Sequence[FoundTarget] = ()
+    obstacles: Obstacles | None = None
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Bounds of the environment, (d, 2), metres."""
+        return self.exploration.bounds
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.exploration.dimension
+
+    def names(self) -> list[str]:
+        """Return the names of all robots in order."""
+        return sorted(self.robots)
+
+    def planning(self) -> list[str]:
+        """Return the names of the robots that plan now, in order."""
+        return [name for name in self.names() if self.robots[name].planning]
+
+
+@dataclass
+class RobotDecision:
+    """What one robot is to do, and what it could have done.
+
+    Attributes
+    ----------
+    chosen : int
+        Index into `candidates`; -1 means stay where it is (see `reason`).
+    waypoint : (3,) array
+        Where to go, metres, frame `map`; the present position when it stays.
+    positions, yaws : (K + 1, 3), (K + 1,) arrays
+        Predicted trajectory, from the present state.
+    candidates : (W, 3) array
+        Waypoints that were compared, after moving them out of obstacles.
+    control_cost, target_refinement, exploration, objective : (W,) arrays
+        C, T, E and J of each, given what the other robots do; J is -inf for what is not allowed.
+    lengths, measurements : (W,) integer arrays
+        Steps K and measurements M of each predicted trajectory.
+    reason : str
+        Why this one, in words.
+    """
+
+    chosen: int
+    waypoint: FloatArray
+    positions: FloatArray
+    yaws: FloatArray
+    candidates: FloatArray
+    control_cost: FloatArray
+    target_refinement: FloatArray
+    exploration: FloatArray
+    objective: FloatArray
+    lengths: IntArray
+    measurements: IntArray
+    reason: str
+
+    @property
+    def stays(self) -> bool:
+        """Whether the robot is to stay where it is."""
+        return self.chosen < 0
+
+    @property
+    def length(self) -> int:
+        """Steps of the chosen trajectory."""
+        return len(self.positions) - 1
+
+
+@dataclass
+class Decision:
+    """One decision of a planner, for all robots that planned."""
+
+    step: int
+    robots: dict[str, RobotDecision] = field(default_factory=dict)
+    objective: float = 0.0
+    exact: bool = True
+    evaluated: int = 0
+    reason: str = ''
+
+
+def stay(view: RobotView, reason: str) -> RobotDecision:
+    """Return the decision to stay, which is safe whatever is wrong with the candidates."""
+    empty = np.zeros(0)
+    return RobotDecision(
+        chosen=-1,
+        waypoint=np.array(view.state.pose.position),
+        positions=np.array(view.state.pose.position)[None, :],
+        yaws=np.array([view.state.pose.yaw]),
+        candidates=np.zeros((0, 3)),
+        control_cost=empty,
+        target_refinement=empty,
+        exploration=empty,
+        objective=empty,
+        lengths=np.zeros(0, np.int64),
+        measurements=np.zeros(0, np.int64),
+        reason=reason,
+    )

@@ -1,0 +1,53 @@
+"""Compile, or load from the cache, every kernel that a decision uses."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from maasi_filter.clusters import Cluster
+from maasi_filter.detection_model import BoxDetection, ExponentialDetection
+from maasi_filter.exploration import Exploration
+from maasi_filter.sensor import Sensor
+from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.obstacles import Obstacles
+from maasi_planner.planners import make_planner
+from maasi_planner.settings import MotionSettings, PlannerSettings
+from maasi_planner.team import RobotView, TeamView
+
+Model = Literal['constant_speed', 'mambo', 'unicycle', 'quadrotor']
+
+
+def warm_up() -> None:
+    """Run small decisions of every kind, so that the first real one is not the slow one."""
+    obstacles = Obstacles(np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.array([False]))
+    pairs: tuple[tuple[int, tuple[Model, Model]], ...] = (
+        (2, ('mambo', 'unicycle')),
+        (3, ('constant_speed', 'mambo')),
+    )
+    for dimension, models in pairs:
+        exploration = Exploration(np.array([[0.0, 2.0]] * dimension), 0.25)
+        clusters = [Cluster(np.full(dimension, 0.6), 0.01 * np.eye(dimension), 0.1, 0.5)]
+        noise = np.diag([0.02, 0.05, 0.05][:dimension]) ** 2
+        size = [0.2] * dimension
+        for detection in (ExponentialDetection(0.98, size), BoxDetection([-0.2] * 2, [0.2] * 2)):
+            robots = {}
+            for index, model in enumerate(models):
+                settings = MotionSettings(model=model, speed=0.4)
+                motion = make_motion(settings, obstacles, 0.05)
+                state = RobotState.at_rest([0.2 + index, 0.2, 0.3])
+                motion.body(state).step(motion.command(state, [0.5, 0.5, 0.3]), 0.05)
+                robots[f'{index}'] = RobotView(
+                    state=state,
+                    candidates=np.array([[0.5, 1.5, 0.3], [1.5, 0.5, 0.3]]),
+                    motion=motion,
+                    sensor=Sensor.ranging('warm', detection, noise),
+                    period_steps=5,
+                )
+            team = TeamView(0, 0.05, robots, clusters, exploration)
+            for planner_settings in (
+                PlannerSettings(objective='paper'),
+                PlannerSettings(objective='information'),
+            ):
+                make_planner('maasi', planner_settings).decide(team)
