@@ -370,6 +370,11 @@ class Bag:
             raise BagError(f'{self.path}: cannot be read: {error}') from error
 
     @property
+    def store(self) -> Typestore:
+        """Message types as they were when the recording was made."""
+        return self._reader.typestore
+
+    @property
     def types(self) -> dict[str, str]:
         """Type name by topic."""
         return {item.topic: item.msgtype for item in self._reader.connections}

@@ -23,6 +23,9 @@ from maasi_filter.settings import (
 from maasi_planner.candidates import CandidateSet, Viewer, unseen_parts
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 from maasi_sim.camera import RenderSettings
+from maasi_sim.laser_scan import LaserSettings
+from maasi_sim.odometry_model import OdometrySettings
+from maasi_sim.robots import BatterySettings
 from maasi_sim.world import TargetSettings, World
 from maasi_sim.yaml_files import (
     Key,
@@ -70,6 +73,13 @@ class RobotSettings(Settings):
     sensor: SensorSettings = Field(description='What it sees, as the filter believes')
     camera: CameraSettings | None = Field(
         default=None, description='Its camera; none: a ranging sensor'
+    )
+    laser: LaserSettings | None = Field(default=None, description='Its laser scanner, if any')
+    odometry: OdometrySettings = Field(
+        default_factory=OdometrySettings, description='How good its odometry is, simulated'
+    )
+    battery: BatterySettings = Field(
+        default_factory=BatterySettings, description='Its battery, simulated'
     )
 
 
@@ -155,6 +165,16 @@ class Scenario(Settings):
     def names(self) -> list[str]:
         """Return the robots' names in order."""
         return sorted(self.robots)
+
+    def removal_distance(self) -> float:
+        """Return T_z [m]: the filter's, or four deviations of the coarsest range without."""
+        distance = self.filter.resolved().removal_distance
+        if distance is not None:
+            return distance
+        return 4.0 * max(
+            float(robot.sensor.noise.deviations(self.dimension)[0])
+            for robot in self.robots.values()
+        )
 
     def world(self, seed: int) -> World:
         """Return the true world of a run."""
@@ -365,6 +385,8 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple
     times: list[tuple[Key, float]] = [(('sensor', 'period'), robot.sensor.period)]
     if robot.camera is not None:
         times.append((('camera', 'rate'), 1.0 / robot.camera.rate))
+    if robot.laser is not None:
+        times.append((('laser', 'rate'), 1.0 / robot.laser.rate))
     for key, time in times:
         steps = time / scenario.step
         if abs(steps - round(steps)) > _STEP_TOLERANCE * max(steps, 1.0) or (

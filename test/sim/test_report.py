@@ -1,0 +1,463 @@
+"""Reports: what is gathered from a run's messages, how it is scored, what is written."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from maasi_sim.bag import Bag, BagWriter, load_types
+from maasi_sim.observer import RunObserver, observe_bag
+from maasi_sim.report import END_REASONS, build_report, path_length, plot_report, summary
+from maasi_sim.report import write_report as write
+from maasi_sim.scenario import load_scenario
+from maasi_sim.scoring import matching_radius, score
+
+KEYS = [
+    'scenario',
+    'seed',
+    'planner',
+    'agents',
+    'targets',
+    'found',
+    'true_found',
+    'missed',
+    'false_found',
+    'rmse',
+    'gospa',
+    'measurements',
+    'measurements_to_find_all',
+    'time_to_find_all',
+    'decisions',
+    'distance',
+    'end_reason',
+    'wall_time',
+    'real_time_factor',
+    'events',
+    'scoring',
+]
+
+
+class Run:
+    """Messages of a run in which everything is put in by hand."""
+
+    def __init__(self, scenario, types, sink=None):
+        self.types = types
+        self.scenario = scenario
+        self.observer = RunObserver('hand', scenario, 7, types)
+        self.sink = sink
+        self.found = []
+        self.batch = 0
+
+    def make(self, name, **fields):
+        return self.types.types[name](**fields)
+
+    def stamp(self, time):
+        nanoseconds = round(time * 1e9)
+        return self.make(
+            'builtin_interfaces/msg/Time',
+            sec=nanoseconds // 10**9,
+            nanosec=nanoseconds % 10**9,
+        )
+
+    def header(self, time):
+        return self.make('std_msgs/msg/Header', stamp=self.stamp(time), frame_id='map')
+
+    def point(self, position):
+        x, y, z = [*map(float, position), 0.0, 0.0][:3]
+        return self.make('geometry_msgs/msg/Point', x=x, y=y, z=z)
+
+    def pose(self, position):
+        orientation = self.make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
+        pose = self.make(
+            'geometry_msgs/msg/Pose', position=self.point(position), orientation=orientation
+        )
+        return self.make('geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=np.zeros(36))
+
+    def send(self, topic, name, **fields):
+        message = self.make(f'maasi_msgs/msg/{name}', **fields)
+        data = bytes(self.types.serialize_cdr(message, f'maasi_msgs/msg/{name}'))
+        self.observer.add(topic, data)
+        if self.sink is not None:
+            if topic not in self.sink._topics:
+                self.sink.add_topic(topic, f'maasi_msgs/msg/{name}')
+            self.sink.write(topic, 0, data)
+
+    def state(self, time, robot, position, status=1, reason=''):
+        zero = self.make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
+        self.send(
+            f'/{robot}/state',
+            'AgentState',
+            header=self.header(time),
+            step=round(time / self.scenario.step),
+            robot=robot,
+            pose=self.pose(position),
+            twist=self.make('geometry_msgs/msg/Twist', linear=zero, angular=zero),
+            battery=1.0,
+            goal_id=1,
+            goal_status=status,
+            reason=reason,
+        )
+
+    def decide(self, time, robots, explored=0.0):
+        """Publish a decision; `robots`: name to waypoint, or None for one that stays."""
+        made = [
+            self.make(
+                'maasi_msgs/msg/RobotDecision',
+                robot=name,
+                decision=0,
+                chosen=-1 if waypoint is None else 0,
+                waypoint=self.point(waypoint or [0.0, 0.0]),
+                candidates=[],
+            )
+            for name, waypoint in robots.items()
+        ]
+        self.send(
+            '/decisions',
+            'PlanDecision',
+            header=self.header(time),
+            step=round(time / self.scenario.step),
+            planner='maasi',
+            batch_id=self.batch,
+            objective=0.0,
+            explored=explored,
+            reason='',
+            robots=made,
+        )
+
+    def declare(self, time, position, robot='mambo', deviation=0.01):
+        """Add a found target to what the next update publishes."""
+        covariance = np.zeros((3, 3))
+        size = self.scenario.dimension
+        covariance[:size, :size] = deviation**2 * np.eye(size)
+        self.found.append(
+            self.make(
+                'maasi_msgs/msg/FoundTarget',
+                id=len(self.found) + 1,
+                position=self.point(position),
+                covariance=covariance.reshape(-1),
+                robot=robot,
+                measurement=3,
+                batch_id=self.batch + 1,
+                stamp=self.stamp(time),
+            )
+        )
+
+    def update(self, time, robots=('mambo',), latched=True):
+        self.batch += 1
+        new = [item for item in self.found if item.batch_id == self.batch]
+        if latched:
+            self.send(
+                '/found_targets',
+                'FoundTargetArray',
+                header=self.header(time),
+                batch_id=self.batch,
+                targets=self.found,
+            )
+        member = 'maasi_msgs/msg/BatchMember'
+        self.send(
+            '/filter_update',
+            'FilterUpdate',
+            header=self.header(time),
+            batch_id=self.batch,
+            step=round(time / self.scenario.step),
+            members=[self.make(member, robot=name, decision=0, measurement=0) for name in robots],
+            missing=[],
+            expected_number=1.5,
+            found=len(self.found),
+            newly_found=new,
+            clusters=[],
+        )
+        self.observer.settle()
+
+    def step(self, time, robots):
+        self.send(
+            '/lockstep/step',
+            'LockstepStep',
+            step=round(time / self.scenario.step),
+            stamp=self.stamp(time),
+            robots=robots,
+            imaging=[],
+        )
+
+
+@pytest.fixture(scope='module')
+def types():
+    return load_types()
+
+
+def scenario_of(tmp_path, targets, **changes):
+    content = {
+        'version': 1,
+        'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+        'step': 0.05,
+        'targets': {'positions': targets} if targets else {'count': 0},
+        'robots': {
+            'mambo': {
+                'type': 'mambo',
+                'start': [0.5, 0.5, 1.0],
+                'candidates': {'grid': [6, 6], 'spacing': 0.34},
+            },
+            'second': {
+                'type': 'mambo',
+                'start': [1.5, 1.5, 1.0],
+                'candidates': {'grid': [6, 6], 'spacing': 0.34},
+            },
+        },
+        'filter': {'removal_distance': 0.05},
+        'stop': 'all_found' if targets else 'planner_done',
+    }
+    content.update(changes)
+    path = tmp_path / 'hand.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return load_scenario(path)
+
+
+TARGETS = [[0.5, 0.5], [1.5, 0.5], [1.0, 1.5]]
+
+
+@pytest.fixture
+def run(types, tmp_path):
+    return Run(scenario_of(tmp_path, TARGETS), types)
+
+
+def test_radius_is_three_times_the_removal_distance():
+    assert matching_radius(0.05, TARGETS) == pytest.approx(0.15)
+
+
+def test_radius_is_at_most_half_the_smallest_distance():
+    assert matching_radius(0.05, [[0.0, 0.0], [0.2, 0.0], [1.0, 1.0]]) == pytest.approx(0.1)
+
+
+def test_radius_of_one_target_or_none():
+    assert matching_radius(0.05, [[0.0, 0.0]]) == pytest.approx(0.15)
+    assert matching_radius(0.05, np.zeros((0, 2))) == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize(
+    'distance, truth, words',
+    [
+        (math.nan, TARGETS, 'removal_distance'),
+        (0.0, TARGETS, 'removal_distance'),
+        (0.05, [[1.0, 1.0], [1.0, 1.0]], 'same place'),
+    ],
+)
+def test_radius_refuses(distance, truth, words):
+    with pytest.raises(ValueError, match=words):
+        matching_radius(distance, truth)
+
+
+def test_matching_is_one_to_one():
+    scores = score([[0.5, 0.51], [0.5, 0.52], [1.5, 0.5]], TARGETS, 0.15)
+    assert (scores.match.true_found, scores.match.false_found, scores.match.missed) == (2, 1, 1)
+    assert not scores.complete
+
+
+def test_report_has_the_keys_of_the_contract(run):
+    run.update(1.0)
+    assert list(build_report(run.observer.record('time_limit', 2.0, 1.0))) == KEYS
+
+
+def test_report_of_a_complete_run(run):
+    run.decide(0.0, {'mambo': [0.5, 0.5], 'second': [1.0, 1.5]}, explored=0.1)
+    for step, position in enumerate(([0.5, 0.5, 1.0], [0.5, 0.8, 1.0], [0.9, 0.8, 1.0])):
+        run.state(0.05 * step, 'mambo', position)
+    run.declare(0.5, [0.51, 0.5])
+    run.update(0.5, ['mambo', 'second'])
+    run.declare(0.7, [1.5, 0.49], 'second')
+    run.declare(0.7, [1.0, 1.0])
+    run.update(0.7, ['second'])
+    assert run.observer.completed is None
+    run.decide(0.7, {'mambo': None, 'second': [1.5, 0.5]}, explored=0.4)
+    run.declare(0.9, [1.0, 1.51])
+    run.update(0.9, ['mambo'])
+    assert run.observer.completed.batch == 3
+    report = build_report(run.observer.record('all_found', 1.0, 0.3))
+    assert report['true_found'] == 3
+    assert report['missed'] == 0
+    assert report['false_found'] == 1
+    assert report['rmse'] == pytest.approx(0.01)
+    assert report['measurements'] == {'mambo': 2, 'second': 2}
+    assert report['measurements_to_find_all'] == 4
+    assert report['time_to_find_all'] == pytest.approx(0.9)
+    assert report['decisions'] == 3
+    assert report['distance'] == {'mambo': pytest.approx(0.7), 'second': 0.0}
+    assert report['real_time_factor'] == pytest.approx(3.0)
+    assert report['found'][1]['agent'] == 'second'
+    assert report['found'][1]['covariance'][0][0] == pytest.approx(1e-4)
+    assert report['scoring']['radius'] == pytest.approx(0.15)
+    gospa = report['gospa']
+    assert gospa['false'] == pytest.approx(0.5 * 0.15**2)
+    assert gospa['missed'] == 0.0
+    assert gospa['total'] == pytest.approx(math.sqrt(3e-4 + gospa['false']))
+
+
+def test_what_comes_after_the_end_does_not_count(run):
+    for time, position in zip((0.5, 0.6, 0.7), TARGETS):
+        run.declare(time, position)
+        run.decide(time, {'mambo': position})
+        run.state(time, 'mambo', [time, 0.0, 1.0])
+        run.update(time)
+    run.declare(0.8, [0.2, 0.2])
+    run.decide(0.8, {'mambo': [2.0, 2.0]})
+    run.state(0.8, 'mambo', [2.0, 2.0, 1.0])
+    run.update(0.8)
+    record = run.observer.record('all_found', 5.0, 1.0)
+    report = build_report(record)
+    assert len(report['found']) == 3
+    assert report['measurements']['mambo'] == 3
+    assert report['decisions'] == 3
+    assert report['distance']['mambo'] == pytest.approx(0.2)
+    assert record.end_time == pytest.approx(0.7)
+
+
+def test_refined_positions_win_over_those_first_declared(run):
+    run.declare(0.5, [0.6, 0.5])
+    run.update(0.5)
+    run.found[0].position.x = 0.501
+    run.update(0.6)
+    (found,) = run.observer.record('time_limit', 1.0, 1.0).found
+    assert found.position[0] == pytest.approx(0.501)
+
+
+def test_updates_alone_tell_what_was_found(run):
+    run.declare(0.5, [0.5, 0.5])
+    run.update(0.5, latched=False)
+    assert run.observer.found == 1
+    assert run.observer.progress[-1].true_found == 1
+
+
+def test_completeness_that_is_lost_again_does_not_count(types, tmp_path):
+    run = Run(scenario_of(tmp_path, TARGETS[:1], stop='planner_done'), types)
+    run.declare(0.5, [0.5, 0.5])
+    run.update(0.5)
+    run.found[0].position.x = 1.9
+    run.update(0.6)
+    run.found[0].position.x = 0.5
+    run.update(0.7)
+    report = build_report(run.observer.record('planner_done', 1.0, 1.0))
+    assert report['measurements_to_find_all'] == 3
+
+
+def test_report_without_targets(types, tmp_path):
+    run = Run(scenario_of(tmp_path, []), types)
+    run.decide(0.0, {'mambo': [0.5, 0.5]}, explored=0.99)
+    run.update(0.5)
+    report = write(run.observer.record('planner_done', 1.0, 1.0), tmp_path)
+    assert report['targets'] == []
+    assert report['rmse'] is None
+    assert report['measurements_to_find_all'] is None
+    assert report['gospa']['total'] == 0.0
+
+
+def test_report_of_a_run_in_which_nothing_happened(run, tmp_path):
+    report = write(run.observer.record('interrupted', 0.0, 0.0), tmp_path)
+    assert report['true_found'] == 0
+    assert report['missed'] == 3
+    assert report['real_time_factor'] is None
+    assert (tmp_path / 'report.png').stat().st_size > 10_000
+
+
+def test_robots_that_leave_and_come_back_are_events(run):
+    run.step(0.0, ['mambo', 'second'])
+    run.step(0.05, ['second'])
+    run.step(0.1, ['second'])
+    run.step(0.15, ['mambo', 'second'])
+    node = {'time': 0.12, 'node': '/filter_node', 'event': 'restarted'}
+    report = build_report(run.observer.record('time_limit', 1.0, 1.0, [node]))
+    assert report['events'] == [
+        {'time': 0.05, 'agent': 'mambo', 'event': 'lost'},
+        node,
+        {'time': 0.15, 'agent': 'mambo', 'event': 'joined'},
+    ]
+
+
+def test_robots_that_say_they_cannot_go_on_are_events_without_lockstep(run):
+    run.state(0.0, 'mambo', [0.5, 0.5, 1.0])
+    run.state(0.5, 'mambo', [0.5, 0.5, 1.0], status=5, reason='odometry is stale')
+    run.state(0.6, 'mambo', [0.5, 0.5, 1.0], status=5, reason='odometry is stale')
+    run.state(0.9, 'mambo', [0.5, 0.5, 1.0])
+    assert run.observer.record('time_limit', 1.0, 1.0).events == [
+        {'time': 0.5, 'agent': 'mambo', 'event': 'lost', 'reason': 'odometry is stale'},
+        {'time': 0.9, 'agent': 'mambo', 'event': 'joined'},
+    ]
+
+
+def test_a_recording_gives_the_same_report(types, tmp_path):
+    scenario = scenario_of(tmp_path, TARGETS)
+    with BagWriter(tmp_path / 'bag', types) as writer:
+        run = Run(scenario, types, writer)
+        for time, position in zip((0.5, 0.6, 0.7), TARGETS):
+            run.decide(time, {'mambo': position})
+            run.state(time, 'mambo', [*position, 1.0])
+            run.declare(time, position)
+            run.update(time)
+    live = build_report(run.observer.record('all_found', 1.0, 0.5))
+    with Bag(tmp_path) as bag:
+        observer = observe_bag(bag, 'hand', scenario, 7)
+        assert build_report(observer.record('all_found', 1.0, 0.5)) == live
+
+
+def test_written_files_can_be_read(run, tmp_path):
+    run.declare(0.5, [0.5, 0.52])
+    run.declare(0.5, [1.9, 1.9])
+    run.update(0.5)
+    report = write(run.observer.record('time_limit', 1.0, 1.0), tmp_path)
+    assert json.loads((tmp_path / 'report.json').read_text()) == report
+    picture = cv2.imread(str(tmp_path / 'report.png'))
+    assert picture.shape[0] > 600 and picture.shape[1] > 1000
+    # Something of every kind of mark is there: found (red) and false (violet).
+    for colour in ((0x28, 0x27, 0xD6), (0x94, 0x32, 0x7B)):
+        assert (np.abs(picture.astype(int) - colour).max(axis=2) < 12).sum() > 20
+
+
+def test_picture_in_space(types, tmp_path):
+    scenario = load_scenario('ranging_pair_3d')
+    run = Run(scenario, types)
+    for name in scenario.names():
+        run.state(0.0, name, [1.0, 1.0, 1.0])
+        run.state(1.0, name, [100.0, 50.0, 30.0])
+    run.declare(0.5, run.observer.truth[0] + 0.5, 'drone1', deviation=1.0)
+    run.update(0.5, ['drone1', 'drone2'])
+    record = run.observer.record('time_limit', 1.0, 1.0)
+    figure = plot_report(record)
+    (world,) = [axes for axes in figure.axes if axes.name == '3d']
+    labels = [text.get_text() for text in world.get_legend().get_texts()]
+    assert {'drone1', 'drone2', 'true target', 'found target', '3 sigma'} <= set(labels)
+
+
+def test_picture_with_obstacles_names_them(types, tmp_path):
+    obstacles = [{'centre': [1.0, 1.0], 'radius': 0.1}]
+    environment = {'bounds': [[0.0, 2.0], [0.0, 2.0]], 'obstacles': obstacles}
+    run = Run(scenario_of(tmp_path, TARGETS, environment=environment), types)
+    figure = plot_report(run.observer.record('time_limit', 1.0, 1.0))
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert 'obstacle' in labels
+
+
+def test_summary_says_what_matters(run):
+    run.declare(0.5, [0.5, 0.5])
+    run.declare(0.5, [1.9, 1.9])
+    run.update(0.5)
+    text = summary(build_report(run.observer.record('time_limit', 1.0, 0.5)))
+    assert '1 of 3 targets found, 1 false' in text
+    assert END_REASONS['time_limit'] in text
+    assert '2.0 times real time' in text
+
+
+def test_length_of_a_path():
+    path = np.array([[0.0, 0, 0, 0], [1.0, 3, 4, 0], [2.0, 3, 4, 12]])
+    assert path_length(path) == pytest.approx(17.0)
+    assert path_length(path[:1]) == 0.0
+    assert path_length(np.zeros((0, 4))) == 0.0
+
+
+def test_radius_of_the_scenario_wins(types, tmp_path):
+    run = Run(scenario_of(tmp_path, TARGETS, scoring={'radius': 0.3}), types)
+    run.declare(0.5, [0.5, 0.75])
+    run.update(0.5)
+    report = build_report(run.observer.record('time_limit', 1.0, 1.0))
+    assert report['true_found'] == 1
+    assert report['scoring'] == {'radius': 0.3, 'c': 0.3, 'p': 2.0}
