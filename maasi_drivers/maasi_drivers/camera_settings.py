@@ -134,9 +134,10 @@ class CameraSettings(Settings):
     )
     marker_diameter: float = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
     pixel_noise: float = Field(
-        default=0.15,
+        default=0.1,
         gt=0,
-        description='Deviation of a centroid beyond what image noise explains [px]',
+        description='Deviation of a centroid beyond what image noise explains; about 0.03 for raw '
+        'images and the robust rule, 0.1 for JPEG or the paper rule [px]',
     )
     position_noise: float = Field(
         default=0.0,

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_drivers.camera_settings import CameraSettings
-from maasi_drivers.projection import Camera, range_bearing
+from maasi_drivers.projection import Camera, propagate, range_bearing
 from maasi_drivers.segmentation import Blobs, segment
 from maasi_filter.pose import Pose
 
 Array = NDArray[np.float64]
+
+# Part of a marker's area that must be seen where the image's border cuts it.
+_LEAST_CUT = 0.4
 
 
 @dataclass(frozen=True)
@@ -112,32 +115,39 @@ class MarkerDetector:
         blobs = segment(image, settings.segmentation)
         if pose_covariance is None:
             pose_covariance = self._pose_covariance
-        positions, by_pixel = camera.floor_jacobian(blobs.centroids, pose, self.floor_height)
+        positions, by_pixel, by_pose = camera.back_project(blobs.centroids, pose, self.floor_height)
         on_floor = np.isfinite(positions).all(axis=1)
-        # An area in the image to a diameter on the floor.
+        # Areas and extents in the image, in those of a marker there.
         with np.errstate(invalid='ignore'):
-            scale = np.abs(np.linalg.det(by_pixel))
-            diameters = np.sqrt(4.0 / np.pi * blobs.areas * scale) / settings.marker_diameter
+            scale = np.abs(
+                by_pixel[:, 0, 0] * by_pixel[:, 1, 1] - by_pixel[:, 0, 1] * by_pixel[:, 1, 0]
+            )
+            parts = 4.0 / np.pi * blobs.areas * scale / settings.marker_diameter**2
+            reach = blobs.extents.max(axis=1, initial=0.0) * np.sqrt(scale)
+            reach /= settings.marker_diameter
         sized = np.ones(len(blobs), dtype=bool)
         if settings.segmentation.rule == 'robust':
-            sized = (diameters <= settings.segmentation.maximum_diameter) & (
-                blobs.border_cut | (diameters >= settings.segmentation.minimum_diameter)
+            least, most = (
+                settings.segmentation.minimum_diameter,
+                settings.segmentation.maximum_diameter,
             )
+            # Of a marker that the border cuts enough must be left to tell it from other things.
+            sized = (parts <= most**2) & (parts >= np.where(blobs.border_cut, _LEAST_CUT, least**2))
+            sized &= ~blobs.border_cut | (reach <= most)
         whole = ~blobs.border_cut if settings.cut_blobs == 'drop' else np.ones(len(blobs), bool)
         dropped = {
             'not on the floor': int(np.count_nonzero(~on_floor)),
             'size': int(np.count_nonzero(on_floor & ~sized)),
             'cut by the border': int(np.count_nonzero(on_floor & sized & ~whole)),
         }
-        blobs = blobs.select(on_floor & sized & whole)
+        keep = on_floor & sized & whole
+        blobs, positions = blobs.select(keep), positions[keep]
         pixel_covariances = blobs.covariances + settings.pixel_noise**2 * np.eye(2)
         if blobs.border_cut.any():
             # A cut marker's centroid is off by up to its radius: a uniform error, in any direction.
             radius = 0.5 * settings.marker_diameter * camera.pixels_per_metre(pose)
             pixel_covariances[blobs.border_cut] += radius**2 / 3.0 * np.eye(2)
-        positions, covariances = camera.floor_covariance(
-            blobs.centroids, pixel_covariances, pose, pose_covariance, self.floor_height
-        )
+        covariances = propagate(by_pixel[keep], pixel_covariances, by_pose[keep], pose_covariance)
         values, value_covariances = range_bearing(
             positions, covariances, pose, self.dimension, self.floor_height
         )

@@ -278,23 +278,31 @@ class Camera:
             x, y in the map frame [m]; NaN where the ray does not meet the plane.
 
         """
-        return self._floor(pixels, pose, height)[0]
+        return self.back_project(pixels, pose, height)[0]
 
-    def floor_jacobian(
+    def back_project(
         self, pixels: ArrayLike, pose: Pose, height: float = 0.0
-    ) -> tuple[Array, Array]:
-        """Return `to_floor` (n, 2) [m] and its derivatives by the pixels (n, 2, 2) [m/px]."""
-        positions, by_pixel, _ = self._floor(pixels, pose, height)
-        return positions, by_pixel
+    ) -> tuple[Array, Array, Array]:
+        """
+        Back-project pixels (n, 2) to the plane z = height, as `to_floor`, with derivatives.
 
-    def _floor(self, pixels: ArrayLike, pose: Pose, height: float) -> tuple[Array, Array, Array]:
-        """Floor positions (n, 2), their derivatives by pixel (n, 2, 2) and by pose (n, 2, 6)."""
+        Returns
+        -------
+        positions : ndarray, shape (n, 2)
+            In the map frame [m].
+        by_pixel : ndarray, shape (n, 2, 2)
+            Derivatives by the pixel [m/px].
+        by_pose : ndarray, shape (n, 2, 6)
+            Derivatives by x, y, z of the robot and by rotations about the map's axes [m/m, m/rad].
+
+        """
+        rotation = pose.rotation()
         points, by_pixel = self.undistort(pixels)
         positions, jacobian_pixel, jacobian_pose = _to_floor(
             points,
             by_pixel,
-            self.centre(pose),
-            pose.rotation() @ self.rotation,
+            pose.position + rotation @ self.position,
+            rotation @ self.rotation,
             pose.position,
             float(height),
         )
@@ -334,19 +342,8 @@ class Camera:
             [m^2].
 
         """
-        positions, by_pixel, by_pose = self._floor(pixels, pose, height)
-        covariances = by_pixel @ np.asarray(pixel_covariances, dtype=np.float64)
-        covariances = covariances @ by_pixel.transpose(0, 2, 1)
-        if pose_covariance is not None:
-            matrix = np.asarray(pose_covariance, dtype=np.float64)
-            if matrix.shape != (6, 6) or not np.all(np.isfinite(matrix)):
-                raise ValueError(
-                    f'pose_covariance: got an array of shape {matrix.shape}'
-                    f'{"" if np.all(np.isfinite(matrix)) else " with non-finite values"}, '
-                    'allowed (6, 6) and finite'
-                )
-            covariances = covariances + by_pose @ matrix @ by_pose.transpose(0, 2, 1)
-        return positions, covariances
+        positions, by_pixel, by_pose = self.back_project(pixels, pose, height)
+        return positions, propagate(by_pixel, pixel_covariances, by_pose, pose_covariance)
 
     def sees(self, positions: ArrayLike, pose: Pose, radius: float = 0.0) -> NDArray[np.bool_]:
         """
@@ -396,7 +393,9 @@ class Camera:
 
     def pixels_per_metre(self, pose: Pose) -> float:
         """Return the image's scale on the floor at its centre [px/m]; NaN above the horizon."""
-        _, by_pixel, _ = self._floor([[(self.width - 1) / 2.0, (self.height - 1) / 2.0]], pose, 0.0)
+        _, by_pixel, _ = self.back_project(
+            [[(self.width - 1) / 2.0, (self.height - 1) / 2.0]], pose, 0.0
+        )
         return float(1.0 / np.sqrt(np.abs(np.linalg.det(by_pixel[0]))))
 
 
@@ -486,6 +485,42 @@ def _quaternion_from_rotation_vector(x: float, y: float, z: float) -> Array:
     return np.array([np.cos(angle / 2.0), sine * x, sine * y, sine * z])
 
 
+def propagate(
+    by_pixel: Array,
+    pixel_covariances: ArrayLike,
+    by_pose: Array,
+    pose_covariance: ArrayLike | None = None,
+) -> Array:
+    """
+    Return the covariances (n, 2, 2) of floor positions, from those of pixels and pose [m^2].
+
+    Parameters
+    ----------
+    by_pixel, by_pose : ndarray, shapes (n, 2, 2) and (n, 2, 6)
+        Derivatives, from `Camera.back_project`.
+    pixel_covariances : array_like, shape (n, 2, 2) or (2, 2)
+        [px^2].
+    pose_covariance : array_like, shape (6, 6), optional
+        Of x, y, z [m] and of rotations about the map's axes [rad].
+
+    Raises
+    ------
+    ValueError
+        If the pose's covariance has another shape or is not finite.
+
+    """
+    pixel = np.asarray(pixel_covariances, dtype=np.float64)
+    covariances = by_pixel @ pixel @ by_pixel.transpose(0, 2, 1)
+    if pose_covariance is not None:
+        matrix = np.asarray(pose_covariance, dtype=np.float64)
+        if matrix.shape != (6, 6):
+            raise ValueError(f'pose_covariance: got shape {matrix.shape}, allowed is (6, 6)')
+        if not np.isfinite(matrix).all():
+            raise ValueError('pose_covariance: got a number that is not finite')
+        covariances = covariances + by_pose @ matrix @ by_pose.transpose(0, 2, 1)
+    return np.asarray(covariances)
+
+
 def range_bearing(
     positions: Array,
     covariances: Array,
@@ -523,35 +558,49 @@ def range_bearing(
     """
     if dimension not in (2, 3):
         raise ValueError(f'dimension: got {dimension}, allowed 2 or 3')
-    offset = positions - np.asarray(pose.position)[:2]
-    horizontal = np.hypot(offset[:, 0], offset[:, 1])
-    bearing = np.arctan2(offset[:, 1], offset[:, 0])
-    cosine, sine = np.cos(bearing), np.sin(bearing)
-    turn = np.empty((len(offset), 2, 2))
-    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = cosine, sine, -sine, cosine
-    local = turn @ covariances @ turn.transpose(0, 2, 1)
-    across = local[:, 1, 1]
-    tiny = np.finfo(np.float64).tiny
-    per_metre = np.minimum(
-        1.0 / np.maximum(horizontal, tiny),
-        np.sqrt(_BEARING_VARIANCE_LIMIT / np.maximum(across, tiny)),
+    values = np.empty((len(positions), dimension))
+    result = np.empty((len(positions), dimension, dimension))
+    _range_bearing(
+        positions, covariances, pose.position, floor_height, floor_deviation, values, result
     )
-    curved = np.minimum(0.75 * (across * per_metre) ** 2, across)
-    if dimension == 2:
-        scale = np.zeros((len(offset), 2, 2))
-        scale[:, 0, 0], scale[:, 1, 1] = 1.0, per_metre
-        result = scale @ local @ scale
-        result[:, 0, 0] += curved
-        return np.stack([horizontal, bearing], axis=1), result
-    rise = floor_height - pose.position[2]
-    distance = np.maximum(np.hypot(horizontal, rise), tiny)
-    full = np.zeros((len(offset), 3, 3))
-    full[:, :2, :2] = local
-    full[:, 0, 0] += curved
-    full[:, 2, 2] = floor_deviation**2
-    jacobian = np.zeros((len(offset), 3, 3))
-    jacobian[:, 0, 0], jacobian[:, 0, 2] = horizontal / distance, rise / distance
-    jacobian[:, 1, 1] = per_metre
-    jacobian[:, 2, 0], jacobian[:, 2, 2] = -rise / distance**2, horizontal / distance**2
-    values = np.stack([distance, bearing, np.arcsin(np.clip(rise / distance, -1, 1))], axis=1)
-    return values, jacobian @ full @ jacobian.transpose(0, 2, 1)
+    return values, result
+
+
+@njit(cache=True)
+def _range_bearing(  # type: ignore[no-untyped-def]
+    positions, covariances, origin, height, deviation, values, result
+):
+    dimension = values.shape[1]
+    for i in range(positions.shape[0]):
+        dx, dy = positions[i, 0] - origin[0], positions[i, 1] - origin[1]
+        horizontal = np.sqrt(dx * dx + dy * dy)
+        bearing = np.arctan2(dy, dx)
+        cosine, sine = np.cos(bearing), np.sin(bearing)
+        xx, yy = covariances[i, 0, 0], covariances[i, 1, 1]
+        xy = 0.5 * (covariances[i, 0, 1] + covariances[i, 1, 0])
+        # Variances along the line of sight and across it.
+        along = cosine * cosine * xx + 2.0 * cosine * sine * xy + sine * sine * yy
+        across = sine * sine * xx - 2.0 * cosine * sine * xy + cosine * cosine * yy
+        both = cosine * sine * (yy - xx) + (cosine * cosine - sine * sine) * xy
+        limit = np.sqrt(_BEARING_VARIANCE_LIMIT / across) if across > 0.0 else np.inf
+        per_metre = min(1.0 / horizontal, limit) if horizontal > 0.0 else min(limit, 1e9)
+        along += min(0.75 * (across * per_metre) ** 2, across)
+        values[i, 1] = bearing
+        result[i, 1, 1] = across * per_metre * per_metre
+        if dimension == 2:
+            values[i, 0] = horizontal
+            result[i, 0, 0] = along
+            result[i, 0, 1] = result[i, 1, 0] = both * per_metre
+            continue
+        rise = height - origin[2]
+        distance = max(np.sqrt(horizontal * horizontal + rise * rise), 1e-12)
+        # Derivatives of range and elevation along the horizontal line of sight, and upwards.
+        by_along, by_up = horizontal / distance, rise / distance
+        up = deviation * deviation
+        values[i, 0] = distance
+        values[i, 2] = np.arcsin(min(max(rise / distance, -1.0), 1.0))
+        result[i, 0, 0] = by_along * by_along * along + by_up * by_up * up
+        result[i, 2, 2] = (by_up * by_up * along + by_along * by_along * up) / distance**2
+        result[i, 0, 2] = result[i, 2, 0] = by_along * by_up * (up - along) / distance
+        result[i, 0, 1] = result[i, 1, 0] = by_along * both * per_metre
+        result[i, 1, 2] = result[i, 2, 1] = -by_up / distance * both * per_metre

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +19,8 @@ from maasi_drivers.camera_settings import SegmentationSettings
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
+# Labels of pixels that are no marker, and of those not yet reached.
+_BACKGROUND, _UNLABELLED = -1, -2
 # About how many pixels the colour of the floor is taken from.
 _FLOOR_SAMPLES = 4096
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
@@ -37,6 +38,8 @@ class Blobs:
         (column, row), pixel centres at whole numbers [px].
     areas : ndarray, shape (n,)
         [px].
+    extents : ndarray, shape (n, 2)
+        Width and height of the bounding box [px].
     border_cut : ndarray of bool, shape (n,)
         True where the blob touches the image's border, so that its centroid is biased inwards.
     covariances : ndarray, shape (n, 2, 2)
@@ -47,6 +50,7 @@ class Blobs:
 
     centroids: Array
     areas: Array
+    extents: Array
     border_cut: NDArray[np.bool_]
     covariances: Array
 
@@ -56,7 +60,11 @@ class Blobs:
     def select(self, mask: NDArray[np.bool_]) -> Blobs:
         """Return the blobs where ``mask`` (n,) is true."""
         return Blobs(
-            self.centroids[mask], self.areas[mask], self.border_cut[mask], self.covariances[mask]
+            self.centroids[mask],
+            self.areas[mask],
+            self.extents[mask],
+            self.border_cut[mask],
+            self.covariances[mask],
         )
 
 
@@ -75,20 +83,20 @@ def check_image(image: NDArray[np.generic]) -> Image:
             f'image: got an array of shape {image.shape} and type {image.dtype}, '
             'allowed (height, width, 3) of uint8, channels R, G, B'
         )
-    return image.view(np.uint8)
+    # One memory layout: kernels are compiled for the layouts that they meet.
+    return np.ascontiguousarray(image, dtype=np.uint8)
 
 
 @njit(cache=True)
-def _paper_mask(image, limit, mask):  # type: ignore[no-untyped-def]
-    height, width = mask.shape
-    for row in range(height):
-        for column in range(width):
+def _paper_mask(red, green, blue, limit, mask):  # type: ignore[no-untyped-def]
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
             excess = (
-                2 * np.int32(image[row, column, 2])
-                - np.int32(image[row, column, 0])
-                - np.int32(image[row, column, 1])
+                np.int16(2) * np.int16(blue[row, column])
+                - np.int16(red[row, column])
+                - np.int16(green[row, column])
             )
-            mask[row, column] = 1 if excess > limit else 0
+            mask[row, column] = np.uint8(excess > limit)
 
 
 def paper_mask(image: Image, threshold: float = 35.0) -> NDArray[np.uint8]:
@@ -97,16 +105,84 @@ def paper_mask(image: Image, threshold: float = 35.0) -> NDArray[np.uint8]:
 
     Computed in whole numbers of half grey levels, so nothing is rounded or clipped.
     """
+    red, green, blue = _planes(check_image(image))
     mask = np.empty(image.shape[:2], dtype=np.uint8)
-    _paper_mask(check_image(image), int(np.floor(2.0 * threshold)), mask)
+    _paper_mask(red, green, blue, np.int16(np.floor(2.0 * threshold)), mask)
     return mask
 
 
-def _border_cut(statistics: NDArray[Any], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    left, top = statistics[:, cv2.CC_STAT_LEFT], statistics[:, cv2.CC_STAT_TOP]
-    right = left + statistics[:, cv2.CC_STAT_WIDTH]
-    bottom = top + statistics[:, cv2.CC_STAT_HEIGHT]
-    return np.asarray((left <= 0) | (top <= 0) | (right >= shape[1]) | (bottom >= shape[0]))
+def _planes(image: Image) -> list[Image]:
+    # The masks are computed plane by plane: that is what compilers make fast code of.
+    return [np.asarray(plane, dtype=np.uint8) for plane in cv2.split(image)]
+
+
+@njit(cache=True)
+def _fill(marked, labels, members, starts, boxes):  # type: ignore[no-untyped-def]
+    """See `_components`; returns their number."""
+    height, width = labels.shape
+    count = 0
+    reached = 0
+    for index in marked:
+        if labels[index // width, index % width] != _UNLABELLED:
+            continue
+        starts[count] = reached
+        row, column = index // width, index % width
+        labels[row, column] = count
+        members[reached] = index
+        done = reached
+        reached += 1
+        left, right, bottom = column, column, row
+        while done < reached:
+            r, c = members[done] // width, members[done] % width
+            done += 1
+            left, right, bottom = min(left, c), max(right, c), max(bottom, r)
+            for nr in range(max(r - 1, 0), min(r + 2, height)):
+                for nc in range(max(c - 1, 0), min(c + 2, width)):
+                    if labels[nr, nc] == _UNLABELLED:
+                        labels[nr, nc] = count
+                        members[reached] = nr * width + nc
+                        reached += 1
+        boxes[count, 0], boxes[count, 1] = left, row
+        boxes[count, 2], boxes[count, 3] = right - left + 1, bottom - row + 1
+        count += 1
+    starts[count] = reached
+    return count
+
+
+def _components(
+    mask: NDArray[np.uint8],
+) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """
+    Find the 8-connected components of a mask (h, w), in the order of rows.
+
+    Markers are few pixels of an image: filling each from its first pixel beats the passes over the
+    whole image that a general algorithm takes.
+
+    Returns
+    -------
+    labels : ndarray, shape (h, w)
+        Component from 0 on, or _BACKGROUND.
+    members : ndarray
+        Pixels, as row * w + column, one component after the other.
+    starts : ndarray, shape (n + 1,)
+        Where each component's members start.
+    boxes : ndarray, shape (n, 4)
+        Left, top, width, height.
+
+    """
+    marked = np.flatnonzero(mask.view(np.bool_))
+    labels = np.full(mask.shape, _BACKGROUND, dtype=np.int32)
+    labels.reshape(-1)[marked] = _UNLABELLED
+    members = np.empty(len(marked), dtype=np.int64)
+    starts = np.empty(len(marked) + 1, dtype=np.int64)
+    boxes = np.empty((len(marked), 4), dtype=np.int64)
+    count = _fill(marked, labels, members, starts, boxes)
+    return labels, members, starts[: count + 1], boxes[:count]
+
+
+def _border_cut(boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    return np.asarray(((low <= 0) | (high >= np.array([shape[1], shape[0]]))).any(axis=1))
 
 
 def segment_paper(image: Image, settings: SegmentationSettings) -> Blobs:
@@ -122,12 +198,19 @@ def segment_paper(image: Image, settings: SegmentationSettings) -> Blobs:
 
     """
     mask = paper_mask(image, settings.threshold)
-    _, _, boxes, means = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    # The first component is the background.
-    statistics, centroids = np.asarray(boxes)[1:], np.asarray(means, dtype=np.float64)[1:]
-    areas = statistics[:, cv2.CC_STAT_AREA].astype(np.float64)
+    _, members, starts, boxes = _components(mask)
+    areas = np.diff(starts).astype(np.float64)
+    centroids = np.empty((len(areas), 2))
+    if len(areas):
+        rows, columns = np.divmod(members, mask.shape[1])
+        centroids[:, 0] = np.add.reduceat(columns, starts[:-1]) / areas
+        centroids[:, 1] = np.add.reduceat(rows, starts[:-1]) / areas
     blobs = Blobs(
-        centroids, areas, _border_cut(statistics, mask.shape), np.zeros((len(areas), 2, 2))
+        centroids,
+        areas,
+        boxes[:, 2:].astype(np.float64),
+        _border_cut(boxes, mask.shape),
+        np.zeros((len(areas), 2, 2)),
     )
     return blobs.select(areas >= settings.minimum_area)
 
@@ -188,9 +271,8 @@ def _blueness(image, row, column, gain_r, gain_g, gain_b):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def _robust_mask(image, gains, threshold, mask):  # type: ignore[no-untyped-def]
+def _robust_mask(red, green, blue, gains, threshold, mask):  # type: ignore[no-untyped-def]
     """Set mask to 1 where the blueness exceeds the threshold (no division per pixel)."""
-    height, width = mask.shape
     red_gain, green_gain, blue_gain = (
         np.float32(gains[0]),
         np.float32(gains[1]),
@@ -198,14 +280,13 @@ def _robust_mask(image, gains, threshold, mask):  # type: ignore[no-untyped-def]
     )
     slope = np.float32(threshold / 3.0)
     offset = np.float32(threshold * _DARK)
-    for row in range(height):
-        for column in range(width):
-            red = red_gain * np.float32(image[row, column, 0])
-            green = green_gain * np.float32(image[row, column, 1])
-            blue = blue_gain * np.float32(image[row, column, 2])
-            largest = red if red > green else green
-            excess = blue - largest - offset
-            mask[row, column] = 1 if excess > slope * (red + green + blue) else 0
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
+            r = red_gain * np.float32(red[row, column])
+            g = green_gain * np.float32(green[row, column])
+            b = blue_gain * np.float32(blue[row, column])
+            excess = b - max(r, g) - offset
+            mask[row, column] = np.uint8(excess > slope * (r + g + b))
 
 
 @njit(cache=True)
@@ -217,63 +298,58 @@ def _excess(image, row, column, gains):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _blob_statistics(image, labels, boxes, gains, result, centroids, variances):  # type: ignore[no-untyped-def]
+def _measure_blobs(  # type: ignore[no-untyped-def]
+    image, labels, members, starts, boxes, gains, gates, keep, centroids, areas, variances
+):
     """
-    Measure each blob.
+    Measure each blob, and keep those within the gates: least peak blueness, aspect, solidity.
 
-    result (n, 4): peak blueness, aspect, solidity, area with part pixels counted in part.
-    centroids (n, 2): weighted by the part of each pixel that is marker. variances (n, 2): of the
-    centroids, from the noise of the surroundings.
+    centroids (n, 2) and areas (n,) are weighted by the part of each pixel that is marker;
+    variances (n, 2) of the centroids follow from the noise of the surroundings.
     """
     height, width = labels.shape
-    largest = 0
     for blob in range(boxes.shape[0]):
-        largest = max(largest, boxes[blob, 2] * boxes[blob, 3])
-    values = np.empty(largest, dtype=np.float64)
-    for blob in range(boxes.shape[0]):
-        label = blob + 1
         left, top = boxes[blob, 0], boxes[blob, 1]
         right, bottom = left + boxes[blob, 2], top + boxes[blob, 3]
+        first, last = starts[blob], starts[blob + 1]
+        count = last - first
+        keep[blob] = False
         # Moments of the mask, for the shape, and the peak.
-        count = 0
+        values = np.empty(count)
         sx = sy = sxx = syy = sxy = 0.0
         peak = 0.0
-        inside = 0
-        for row in range(top, bottom):
-            for column in range(left, right):
-                if labels[row, column] == label:
-                    x, y = float(column - left), float(row - top)
-                    count += 1
-                    sx += x
-                    sy += y
-                    sxx += x * x
-                    syy += y * y
-                    sxy += x * y
-                    peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
-                    values[inside] = _excess(image, row, column, gains)
-                    inside += 1
+        for index in range(first, last):
+            row, column = members[index] // width, members[index] % width
+            x, y = float(column - left), float(row - top)
+            sx += x
+            sy += y
+            sxx += x * x
+            syy += y * y
+            sxy += x * y
+            peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
+            values[index - first] = _excess(image, row, column, gains)
         mx, my = sx / count, sy / count
         # A pixel is a square: it has a second moment of 1/12 of its own.
         vxx = sxx / count - mx * mx + 1.0 / 12.0
         vyy = syy / count - my * my + 1.0 / 12.0
         vxy = sxy / count - mx * my
         middle = 0.5 * (vxx + vyy)
-        radius = np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
-        small = max(middle - radius, 1e-9)
-        result[blob, 0] = peak
-        result[blob, 1] = np.sqrt((middle + radius) / small)
-        result[blob, 2] = count / (4.0 * np.pi * np.sqrt((middle + radius) * small))
+        apart = np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
+        long, short = middle + apart, max(middle - apart, 1e-9)
+        # Lengths of the axes go as the roots of the moments; an ellipse has area 4 pi root(l s).
+        if peak < gates[0] or long > gates[1] * gates[1] * short:
+            continue
+        if count < gates[2] * 4.0 * np.pi * np.sqrt(long * short):
+            continue
         # The excess of a pixel that is all marker: the mean of the upper half inside the blob.
-        inside_values = np.sort(values[:inside])
-        upper = inside_values[inside // 2 :].mean()
-        # The floor around, from the frame of the box widened by three pixels, blobs left out.
+        upper = np.sort(values)[count // 2 :].mean()
+        # The floor around: the frame of the box widened by three pixels, other blobs left out.
         around = 0
-        square = 0.0
-        total = 0.0
+        square = total = 0.0
         for row in range(max(top - 3, 0), min(bottom + 3, height)):
             for column in range(max(left - 3, 0), min(right + 3, width)):
                 frame = row < top - 1 or row > bottom or column < left - 1 or column > right
-                if frame and labels[row, column] == 0:
+                if frame and labels[row, column] == _BACKGROUND:
                     value = _excess(image, row, column, gains)
                     around += 1
                     total += value
@@ -281,41 +357,32 @@ def _blob_statistics(image, labels, boxes, gains, result, centroids, variances):
         background = total / around if around > 0 else 0.0
         noise = square / around - background * background if around > 1 else 0.0
         contrast = max(upper - background, 1e-6)
-        # Weights in the blob and the ring of one pixel around it: what belongs to no other blob.
+        # Weights in the blob and the ring of one pixel around it, other blobs left out.
         weight_sum = wx = wy = 0.0
-        members = 0
-        wxx = wyy = 0.0
+        spread_x = spread_y = 0.0
         for row in range(max(top - 1, 0), min(bottom + 1, height)):
             for column in range(max(left - 1, 0), min(right + 1, width)):
-                near = False
-                other = False
-                for r in range(max(row - 1, 0), min(row + 2, height)):
-                    for c in range(max(column - 1, 0), min(column + 2, width)):
-                        if labels[r, c] == label:
-                            near = True
-                if labels[row, column] != 0 and labels[row, column] != label:
-                    other = True
-                if near and not other:
+                near = labels[row, column] == blob
+                if labels[row, column] == _BACKGROUND:
+                    for r in range(max(row - 1, 0), min(row + 2, height)):
+                        for c in range(max(column - 1, 0), min(column + 2, width)):
+                            near |= labels[r, c] == blob
+                if near:
                     weight = (_excess(image, row, column, gains) - background) / contrast
                     x, y = float(column - left), float(row - top)
                     weight_sum += weight
                     wx += weight * x
                     wy += weight * y
-                    members += 1
-                    wxx += (x - mx) * (x - mx)
-                    wyy += (y - my) * (y - my)
-        if weight_sum > 0.25 * count:
-            centroids[blob, 0] = left + wx / weight_sum
-            centroids[blob, 1] = top + wy / weight_sum
-            scale = max(noise, 0.0) / (contrast * weight_sum) ** 2
-            variances[blob, 0] = scale * wxx
-            variances[blob, 1] = scale * wyy
-            result[blob, 3] = weight_sum
-        else:
-            centroids[blob, 0] = left + mx
-            centroids[blob, 1] = top + my
-            variances[blob, 0] = variances[blob, 1] = 0.25
-            result[blob, 3] = count
+                    spread_x += (x - mx) * (x - mx)
+                    spread_y += (y - my) * (y - my)
+        if weight_sum < 0.25 * count:
+            continue
+        keep[blob] = True
+        areas[blob] = weight_sum
+        centroids[blob, 0] = left + wx / weight_sum
+        centroids[blob, 1] = top + wy / weight_sum
+        scale = max(noise, 0.0) / (contrast * weight_sum) ** 2
+        variances[blob, 0], variances[blob, 1] = scale * spread_x, scale * spread_y
 
 
 def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
@@ -341,21 +408,32 @@ def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
     gains, centre, deviation = _floor_statistics(image, _FLOOR_SAMPLES)
     threshold = max(settings.saturation, centre + settings.noise_factor * deviation)
     mask = np.empty(image.shape[:2], dtype=np.uint8)
-    _robust_mask(image, gains, threshold, mask)
-    _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    boxes = np.asarray(statistics)[1:]
-    measured = np.zeros((len(boxes), 4))
-    centroids = np.zeros((len(boxes), 2))
-    variances = np.zeros((len(boxes), 2))
-    _blob_statistics(image, labels, boxes, gains, measured, centroids, variances)
-    cut = _border_cut(boxes, mask.shape)
-    keep = measured[:, 0] >= max(settings.peak_saturation, threshold)
-    # What the border cuts has any aspect.
-    keep &= cut | (measured[:, 1] <= settings.maximum_aspect)
-    keep &= measured[:, 2] >= settings.minimum_solidity
-    covariances = np.zeros((len(boxes), 2, 2))
+    red, green, blue = _planes(image)
+    _robust_mask(red, green, blue, gains, threshold, mask)
+    labels, members, starts, boxes = _components(mask)
+    count = len(boxes)
+    keep = np.zeros(count, dtype=np.bool_)
+    centroids, areas, variances = np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2))
+    gates = np.array(
+        [
+            max(settings.peak_saturation, threshold),
+            settings.maximum_aspect,
+            settings.minimum_solidity,
+        ]
+    )
+    _measure_blobs(
+        image, labels, members, starts, boxes, gains, gates, keep, centroids, areas, variances
+    )
+    covariances = np.zeros((count, 2, 2))
     covariances[:, 0, 0], covariances[:, 1, 1] = variances[:, 0], variances[:, 1]
-    return Blobs(centroids, measured[:, 3].copy(), cut, covariances).select(keep)
+    blobs = Blobs(
+        centroids,
+        areas,
+        boxes[:, 2:].astype(np.float64),
+        _border_cut(boxes, mask.shape),
+        covariances,
+    )
+    return blobs.select(keep)
 
 
 RULES: dict[str, Callable[[Image, SegmentationSettings], Blobs]] = {

@@ -1,0 +1,147 @@
+"""Rendered sequences that are hard to segment, and how a detector does on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.marker_detector import MarkerDetector
+from maasi_drivers.projection import Camera
+from maasi_filter.pose import Pose
+from maasi_filter.settings import EnvironmentSettings
+from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.world import TargetSettings, World
+
+BOX = 0.2
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image, where it was taken, and the markers in it."""
+
+    image: np.ndarray
+    pose: Pose
+    in_box: np.ndarray
+    targets: np.ndarray
+
+
+@dataclass(frozen=True)
+class Score:
+    """Recall inside the box, false blobs per frame, RMSE [m], mean NEES."""
+
+    recall: float
+    false_per_frame: float
+    rmse: float
+    nees: float
+
+
+def drone_camera(**changes: object) -> CameraSettings:
+    """Return the drone's camera."""
+    values = {'focal_length': [220.0, 220.0], 'distortion': [-0.12, 0.03, 0.001, -0.001]}
+    return CameraSettings.model_validate(values | changes)
+
+
+def hard_floor(seed: int) -> RenderSettings:
+    """Return light and distractors of one sequence, drawn anew for each seed."""
+    generator = np.random.default_rng([seed, 77])
+    return RenderSettings.model_validate(
+        {
+            'marker_diameter': 0.03,
+            'floor_colour': (generator.uniform(0.3, 0.6) * generator.uniform(0.93, 1.07, 3)),
+            'floor_texture': generator.uniform(0.02, 0.08),
+            'light_variation': generator.uniform(0.2, 0.5),
+            'light_wavelength': generator.uniform(0.6, 3.0),
+            'vignetting': generator.uniform(0.0, 0.3),
+            'exposure_drift': 0.3,
+            'white_balance_drift': 0.15,
+            'shot_noise': generator.uniform(0.05, 0.2),
+            'read_noise': generator.uniform(1.0, 4.0),
+            'exposure_time': generator.uniform(0.0, 0.02),
+            'blur': generator.uniform(0.3, 1.0),
+            'jpeg_quality': int(generator.integers(80, 96)) if generator.random() < 0.5 else None,
+            'distractors': {'sheets': 6, 'lines': 8, 'purple': 8, 'cyan': 8, 'large': 3},
+        }
+    )
+
+
+def sequence(
+    settings: CameraSettings, floor: RenderSettings, seed: int, frames: int, tilt: float = 0.02
+) -> Iterator[Frame]:
+    """Render images of a drone that darts over a floor of 2.7 m with 30 markers."""
+    world = World.from_settings(
+        EnvironmentSettings(bounds=[[-0.3, 2.4], [-0.3, 2.4]]),
+        TargetSettings(count=30, separation=0.15, margin=0.1),
+        seed,
+    )
+    camera = Camera.from_settings(settings)
+    renderer = CameraRenderer(camera, floor, scene_of(world, floor, seed), seed, 'drone')
+    generator = np.random.default_rng([seed, 78])
+    for step in range(frames):
+        half = 0.5 * generator.normal(0.0, tilt, size=2)
+        heading = generator.uniform(-np.pi, np.pi)
+        level = Pose.from_yaw([*generator.uniform(-0.1, 2.2, size=2), 1.0], heading)
+        turn = Pose([0.0, 0.0, 0.0], [1.0, half[0], half[1], 0.0])
+        pose = Pose(level.position, _product(level.orientation, turn.orientation))
+        image = renderer.render(
+            pose,
+            step,
+            0.7 * step,
+            generator.normal(0.0, 0.25, size=3) * [1.0, 1.0, 0.3],
+            generator.normal(0.0, 0.3, size=3),
+        )
+        offset = (world.targets - pose.position[:2]) @ level.rotation()[:2, :2]
+        in_box = np.all(np.abs(offset) <= BOX, axis=1)
+        in_box &= camera.sees(world.targets, pose, 0.5 * floor.marker_diameter)
+        yield Frame(image, pose, world.targets[in_box], world.targets)
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    from maasi_filter.pose import quaternion_product
+
+    return quaternion_product(a, b)
+
+
+def score(detector: MarkerDetector, frames: Iterator[Frame], gate: float = 0.03) -> Score:
+    """Match detections to markers, one to one by distance, and count."""
+    expected = found = false = count = 0
+    squares: list[float] = []
+    nees: list[float] = []
+    for frame in frames:
+        count += 1
+        seen = detector.detect(frame.image, frame.pose)
+        expected += len(frame.in_box)
+        distances = np.linalg.norm(frame.targets[:, None] - seen.positions[None], axis=2)
+        nearest = distances.min(axis=0) if len(seen) else np.empty(0)
+        false += int(np.count_nonzero(nearest > gate))
+        for target in frame.in_box:
+            if not len(seen):
+                continue
+            errors = seen.positions - target
+            best = int(np.argmin(np.linalg.norm(errors, axis=1)))
+            if np.linalg.norm(errors[best]) <= gate:
+                found += 1
+                squares.append(float(errors[best] @ errors[best]))
+                if not seen.blobs.border_cut[best]:
+                    covariance = seen.position_covariances[best]
+                    nees.append(float(errors[best] @ np.linalg.solve(covariance, errors[best])))
+    return Score(
+        found / max(expected, 1),
+        false / max(count, 1),
+        float(np.sqrt(np.mean(squares))) if squares else np.inf,
+        float(np.mean(nees)) if nees else np.inf,
+    )
+
+
+@pytest.fixture
+def hard_score() -> Callable[[str, int, int], Score]:
+    """Return a function: score of a rule on the hard sequence of a seed."""
+
+    def run(rule: str, seed: int, frames: int) -> Score:
+        settings = drone_camera(segmentation={'rule': rule})
+        return score(MarkerDetector(settings), sequence(settings, hard_floor(seed), seed, frames))
+
+    return run
