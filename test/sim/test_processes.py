@@ -1,0 +1,201 @@
+"""Processes of a run: domains, endings, and that nothing is left over."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from maasi_sim.processes import Domain, NodeProcess, ProcessError, find_executable, stop
+
+LIMIT = 30.0
+
+
+def until(condition):
+    """Wait for a condition; a minute that never ends is a failure."""
+    deadline = time.monotonic() + LIMIT
+    while not condition():
+        assert time.monotonic() < deadline
+        os.sched_yield()
+
+
+def alive(pid):
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except OSError:
+        return False
+
+
+def python(tmp_path, code, name='/node'):
+    log = tmp_path / f'{name.strip("/")}.log'
+    return NodeProcess(name, [sys.executable, '-u', '-c', code], log)
+
+
+READY = 'print("ready", flush=True)\n'
+WAIT = 'import signal\n' + READY + 'signal.pause()\n'
+IGNORE_INTERRUPT = (
+    'import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n'
+    + READY
+    + 'while True: signal.pause()\n'
+)
+IGNORE_ALL = IGNORE_INTERRUPT.replace(
+    'signal.SIG_IGN)\n', 'signal.SIG_IGN)\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n', 1
+)
+
+
+def started(process):
+    process.start()
+    until(lambda: 'ready' in process.last_words())
+    return process
+
+
+def test_domains_are_not_shared(tmp_path):
+    with Domain(folder=tmp_path) as first, Domain(folder=tmp_path) as second:
+        assert first.number != second.number
+        assert 1 <= first.number <= 101
+        assert first.environment() == {
+            'ROS_DOMAIN_ID': str(first.number),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        }
+
+
+def test_a_domain_that_was_asked_for_is_given_once(tmp_path):
+    with Domain(57, tmp_path) as domain:
+        assert domain.number == 57
+        with pytest.raises(ProcessError, match='57 is used by another run'):
+            Domain(57, tmp_path)
+    Domain(57, tmp_path).release()
+
+
+@pytest.mark.parametrize('number', [-1, 102])
+def test_domains_that_do_not_exist_are_refused(tmp_path, number):
+    with pytest.raises(ProcessError, match='0 to 101'):
+        Domain(number, tmp_path)
+
+
+def test_a_domain_with_other_nodes_is_left_to_them(tmp_path):
+    with Domain(folder=tmp_path) as domain:
+        number = domain.number
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('', 7400 + 250 * number))
+        with Domain(folder=tmp_path) as domain:
+            assert domain.number != number
+
+
+def test_the_lock_ends_with_the_process(tmp_path):
+    code = (
+        'import os, sys\nfrom pathlib import Path\nfrom maasi_sim.processes import Domain\n'
+        'Domain(33, Path(sys.argv[1]))\nos.kill(os.getpid(), 9)\n'
+    )
+    done = subprocess.run([sys.executable, '-c', code, str(tmp_path)], check=False, timeout=LIMIT)
+    assert done.returncode == -signal.SIGKILL
+    Domain(33, tmp_path).release()
+
+
+def test_a_process_writes_its_log_and_says_how_it_ended(tmp_path):
+    process = python(tmp_path, 'print("hello"); raise SystemExit(3)')
+    process.start()
+    until(lambda: not process.running)
+    assert process.code == 3
+    assert process.how_it_ended() == 'exited with 3'
+    assert process.last_words() == 'hello'
+
+
+def test_a_restart_goes_on_in_the_same_log(tmp_path):
+    process = python(tmp_path, 'print("hello")')
+    process.start()
+    until(lambda: not process.running)
+    process.restart()
+    until(lambda: not process.running)
+    assert process.restarts == 1
+    assert process.last_words().splitlines() == ['hello', '--- start number 2 ---', 'hello']
+
+
+def test_environment_is_passed_on(tmp_path):
+    code = 'import os; print(os.environ["ROS_DOMAIN_ID"])'
+    process = NodeProcess(
+        '/node', [sys.executable, '-c', code], tmp_path / 'log', {'ROS_DOMAIN_ID': '44'}
+    )
+    process.start()
+    until(lambda: not process.running)
+    assert process.last_words() == '44'
+
+
+def test_what_cannot_be_started_is_named(tmp_path):
+    process = NodeProcess('/node', [str(tmp_path / 'missing')], tmp_path / 'log')
+    with pytest.raises(ProcessError, match='/node: cannot be started'):
+        process.start()
+    assert process.code is None and not process.running
+
+
+def test_interrupt_ends_what_listens(tmp_path):
+    processes = [started(python(tmp_path, WAIT, f'/node{i}')) for i in range(2)]
+    assert stop(processes) == []
+    assert [process.code for process in processes] == [-signal.SIGINT] * 2
+
+
+def test_what_does_not_listen_is_told_again(tmp_path):
+    process = started(python(tmp_path, IGNORE_INTERRUPT))
+    assert stop([process], [(signal.SIGINT, 0.05), (signal.SIGTERM, LIMIT)]) == []
+    assert process.how_it_ended() == 'was killed by SIGTERM'
+
+
+def test_what_listens_to_nothing_is_killed(tmp_path):
+    process = started(python(tmp_path, IGNORE_ALL))
+    ending = [(signal.SIGINT, 0.05), (signal.SIGTERM, 0.05), (signal.SIGKILL, LIMIT)]
+    assert stop([process], ending) == ['/node']
+    assert process.how_it_ended() == 'was killed by SIGKILL'
+
+
+def test_stopping_what_has_ended_or_never_started_does_nothing(tmp_path):
+    ended = python(tmp_path, '')
+    ended.start()
+    until(lambda: not ended.running)
+    assert stop([ended, python(tmp_path, '', '/other')]) == []
+
+
+def test_ctrl_c_in_the_terminal_does_not_reach_the_node(tmp_path):
+    process = started(python(tmp_path, WAIT))
+    assert os.getpgid(process.pid) != os.getpgid(0)
+    stop([process])
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
+def test_nodes_do_not_outlive_a_killed_run(tmp_path, number):
+    code = (
+        'import signal, sys\nfrom pathlib import Path\n'
+        'from maasi_sim.processes import NodeProcess\n'
+        f'node = NodeProcess("/node", [sys.executable, "-u", "-c", {IGNORE_ALL!r}],'
+        ' Path(sys.argv[1]) / "log")\n'
+        'node.start()\nprint(node.pid, flush=True)\nsignal.pause()\n'
+    )
+    run = subprocess.Popen(
+        [sys.executable, '-u', '-c', code, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    pid = int(run.stdout.readline())
+    until(lambda: 'ready' in (tmp_path / 'log').read_text())
+    assert alive(pid)
+    run.send_signal(number)
+    run.wait(LIMIT)
+    run.stdout.close()
+    until(lambda: not alive(pid))
+
+
+def test_unknown_packages_and_executables_are_named(tmp_path, monkeypatch):
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    with pytest.raises(ProcessError, match='maasi_nowhere is not installed'):
+        find_executable('maasi_nowhere', 'node')
+    marker = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages' / 'maasi_here'
+    marker.parent.mkdir(parents=True)
+    marker.write_text('')
+    with pytest.raises(ProcessError, match='maasi_here: has no executable some_node'):
+        find_executable('maasi_here', 'some_node')
+    executable = tmp_path / 'lib' / 'maasi_here' / 'some_node'
+    executable.parent.mkdir(parents=True)
+    executable.write_text('#!/bin/sh\n')
+    executable.chmod(0o755)
+    assert find_executable('maasi_here', 'some_node') == executable
