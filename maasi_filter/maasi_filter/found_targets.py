@@ -106,6 +106,55 @@ def _noise(roots, out):  # type: ignore[no-untyped-def]  # pragma: no cover - co
 
 
 @njit(cache=True)
+def _information(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    positions, sensor_position, values, cartesian, centres, information, out
+):
+    number, d = positions.shape
+    error = np.empty(d)
+    jacobian = np.empty((d, d))
+    for m in range(number):
+        _predict(
+            positions[m], sensor_position, values[m], cartesian[m], centres[m], error, jacobian
+        )
+        for a in range(d):
+            for b in range(d):
+                total = 0.0
+                for i in range(d):
+                    for j in range(d):
+                        total += jacobian[i, a] * information[m, i, j] * jacobian[j, b]
+                out[m, a, b] = total
+
+
+def detection_information(
+    positions: FloatArray, measurements: MeasurementSet, pose: Pose
+) -> FloatArray:
+    """Return H^T R^-1 H (m, d, d) of each detection, with H at `positions` (m, d)."""
+    out = np.empty((len(measurements), positions.shape[1], positions.shape[1]))
+    _information(
+        positions,
+        pose.position,
+        measurements.values,
+        measurements.cartesian,
+        measurements.centres,
+        measurements.information,
+        out,
+    )
+    return out
+
+
+def bounded_below(covariance: FloatArray, information: FloatArray) -> FloatArray:
+    """Return the covariance widened, where it is narrower, to what the data can tell.
+
+    No unbiased estimate is better than the inverse of the information of its data (Cramer-Rao).
+    """
+    values, vectors = np.linalg.eigh(information)
+    root = vectors * np.sqrt(np.maximum(values, 1e-12 * max(float(values[-1]), 1e-300)))
+    white, turn = np.linalg.eigh((root.T @ covariance @ root + (root.T @ covariance @ root).T) / 2)
+    back = np.linalg.inv(root.T) @ turn
+    return np.asarray((back * np.maximum(white, 1.0)) @ back.T)
+
+
+@njit(cache=True)
 def _intensity(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     positions,
     covariances,

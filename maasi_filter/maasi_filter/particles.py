@@ -227,6 +227,8 @@ def _jitter_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
     shrink,
     differential,
     deviation,
+    fill,
+    filled,
     bounds,
     target,
 ):
@@ -258,6 +260,16 @@ def _jitter_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
         else:
             for axis in range(d):
                 target[i, axis] = means[g, axis] + shrink[g] * (source[i, axis] - means[g, axis])
+        if filled[g]:
+            bits = _mix(~(seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1)))
+            for axis in range(d):
+                # The sum of four uniform numbers on (-1/2, 1/2) has variance 1/3.
+                bits = _mix(bits + np.uint64(axis + 1))
+                total = (bits & np.uint64(0xFFFF)) + ((bits >> np.uint64(16)) & np.uint64(0xFFFF))
+                total += ((bits >> np.uint64(32)) & np.uint64(0xFFFF)) + (bits >> np.uint64(48))
+                normal = (np.float64(total) * 2.0**-16 - 2.0) * math.sqrt(3.0)
+                for other in range(d):
+                    target[i, other] += fill[g, other, axis] * normal
         for axis in range(d):
             if not bounds[axis, 0] <= target[i, axis] <= bounds[axis, 1]:
                 inside = False
@@ -276,6 +288,7 @@ def jitter(
     bounds: FloatArray,
     generator: np.random.Generator,
     keep_covariance: bool = True,
+    fill: FloatArray | None = None,
     pool: ThreadPoolExecutor | None = None,
 ) -> FloatArray:
     """Move the duplicates among resampled particles apart, within their group.
@@ -299,6 +312,8 @@ def jitter(
         Of the noise on each axis, metres; its density is triangular.
     keep_covariance : bool
         Whether to draw in.
+    fill : (g, d, d) array, optional
+        For each group a root of a covariance: noise of this covariance is added to all of it.
     """
     n, d = particles.shape
     seed = np.uint64(generator.integers(0, 2**63))
@@ -310,6 +325,9 @@ def jitter(
     if keep_covariance:
         _, means, _ = group_moments(particles, np.ones(n), group, groups, pool)
         shrink = 1.0 / np.sqrt(1.0 + copies / size * differential**2)
+    if fill is None:
+        fill = np.zeros((groups, d, d))
+    filled = fill.reshape(groups, -1).any(axis=1)
     out = np.empty_like(particles)
 
     def move(_: int, start: int, stop: int) -> None:
@@ -326,6 +344,8 @@ def jitter(
             shrink,
             differential,
             deviation,
+            fill,
+            filled,
             bounds,
             out,
         )

@@ -22,6 +22,8 @@ from maasi_filter.detection_model import (
 from maasi_filter.exploration import Exploration, check_bounds
 from maasi_filter.found_targets import (
     FoundTarget,
+    bounded_below,
+    detection_information,
     exclusive,
     found_intensity,
     refine,
@@ -156,6 +158,8 @@ class SearchFilter:
         self.clusters: list[Cluster] = []
         self._group: IntArray = np.empty(0, np.int64)
         self._groups = 0
+        # What the detections that a group explains tell about where it is.
+        self._information: FloatArray = np.empty((0, self.dimension, self.dimension))
         self._covariances: list[FloatArray] = []
         self._centres: FloatArray | None = None
         self._pool: ThreadPoolExecutor | None = None
@@ -347,6 +351,8 @@ class SearchFilter:
                 numbers.birth_particles,
                 self.generator,
             )
+        if self._groups == 0:
+            self._information = np.zeros((1, self.dimension, self.dimension))
         self._append(particles, weights, np.zeros(len(particles), np.int64), max(self._groups, 1))
 
     def _append(
@@ -461,6 +467,12 @@ class SearchFilter:
         self._group = np.where(own, groups + update.component, taken[self._group])
         self._groups = groups + count
         self.weights = updated
+        information = detection_information(update.means, prepared, member.pose)
+        if groups:
+            source = update.group_share.argmax(axis=0)
+            inherits = update.own_mass > 0.5
+            information[inherits] += self._information[source[inherits]]
+        self._information = np.concatenate([self._information, information])
         if born is not None:
             each = born.intensity.shape[1]
             self._append(
@@ -561,7 +573,6 @@ class SearchFilter:
         assert numbers.found_mass is not None
         radius = self._found_radius(member.sensor)
         own = self._pose_error(member.sensor) ** 2 * np.eye(self.dimension)
-        floor = (0.05 * radius) ** 2 * np.eye(self.dimension)
         known = len(claims)
         for m in range(len(own_mass)):
             if own_mass[m] <= numbers.found_mass:
@@ -569,7 +580,12 @@ class SearchFilter:
             spread = math.sqrt(max(float(np.trace(covariances[m])), 0.0))
             if spread > radius:
                 continue
-            covariance = covariances[m] + floor
+            covariance = covariances[m]
+            if numbers.births == 'measurement':
+                covariance = bounded_below(covariance, self._information[groups + m])
+                spread = math.sqrt(float(np.trace(covariance)))
+                if spread > radius:
+                    continue
             if self._is_known(means[m], covariance, claims, known, m):
                 continue
             target = FoundTarget(
@@ -584,7 +600,7 @@ class SearchFilter:
             self._covariances.append(covariance)
             newly_found.append(target)
             offset = self.particles - means[m]
-            near = np.sqrt((offset * offset).sum(axis=1)) <= 3.0 * max(spread, 0.05 * radius)
+            near = np.sqrt((offset * offset).sum(axis=1)) <= 3.0 * spread
             here = self._group == groups + m
             elsewhere = (self._group >= groups) & ~here
             self.weights = np.where(here | (near & ~elsewhere), 0.0, self.weights)
@@ -622,6 +638,7 @@ class SearchFilter:
             self.weights = np.empty(0)
             self._group = np.empty(0, np.int64)
             self._groups = 0
+            self._information = np.empty((0, self.dimension, self.dimension))
             return
         assert numbers.particles_per_target is not None and numbers.particles_minimum is not None
         wanted = max(numbers.particles_minimum, math.ceil(numbers.particles_per_target * expected))
@@ -634,6 +651,7 @@ class SearchFilter:
         compact = np.cumsum(present) - 1
         group = compact[group]
         self._groups = int(present.sum())
+        self._information = self._information[present]
         assert numbers.jitter_differential is not None
         deviation = max((self._jitter_deviation(member.sensor) for member in members), default=0.0)
         if numbers.jitter_differential > 0.0 or deviation > 0.0:
@@ -646,11 +664,32 @@ class SearchFilter:
                 deviation,
                 self.bounds,
                 self.generator,
+                fill=self._fill(particles, group, pool),
                 pool=pool,
             )
         self.particles = particles
         self.weights = np.full(number, expected / number)
         self._group = group
+
+    def _fill(
+        self, particles: FloatArray, group: IntArray, pool: ThreadPoolExecutor | None
+    ) -> FloatArray | None:
+        """Return roots of what groups of particles lack to the bound their data sets.
+
+        Resampling leaves few ancestors where the noise is narrow; their spread is no posterior.
+        """
+        if self._numbers.births != 'measurement':
+            return None
+        _, _, covariances = group_moments(
+            particles, np.ones(len(particles)), group, self._groups, pool
+        )
+        fill = np.zeros_like(covariances)
+        for g in range(self._groups):
+            lack = bounded_below(covariances[g], self._information[g]) - covariances[g]
+            values, vectors = np.linalg.eigh(lack)
+            if values[-1] > 0.01 * np.trace(covariances[g]):
+                fill[g] = vectors * np.sqrt(np.maximum(values, 0.0))
+        return fill
 
     def _extract_groups(self, members: Sequence[AgentMeasurement]) -> None:
         if self._groups == 0 or len(self.weights) == 0:
