@@ -24,7 +24,13 @@ class SegmentationSettings(Settings):
         le=255,
         description='Paper rule: blue excess over this is marker [grey levels]',
     )
-    minimum_area: int = Field(default=1, ge=1, description='Paper rule: smallest blob kept [px]')
+    minimum_area: float = Field(
+        default=2e-4,
+        ge=0,
+        lt=1,
+        description="Paper rule: smallest blob kept, as a share of the image's pixels; 4 px of "
+        '160 x 120; 0 keeps single pixels [-]',
+    )
     saturation: float = Field(
         default=0.40,
         gt=0,

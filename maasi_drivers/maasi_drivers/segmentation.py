@@ -212,7 +212,7 @@ def segment_paper(image: Image, settings: SegmentationSettings) -> Blobs:
         _border_cut(boxes, mask.shape),
         np.zeros((len(areas), 2, 2)),
     )
-    return blobs.select(areas >= settings.minimum_area)
+    return blobs.select(areas >= settings.minimum_area * mask.size)
 
 
 @njit(cache=True)

@@ -11,7 +11,7 @@ import pytest
 from maasi_drivers.camera_settings import CameraSettings
 from maasi_drivers.marker_detector import MarkerDetector
 from maasi_drivers.projection import Camera
-from maasi_filter.pose import Pose
+from maasi_filter.pose import Pose, quaternion_product
 from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
 from maasi_sim.world import TargetSettings, World
@@ -84,8 +84,8 @@ def sequence(
         half = 0.5 * generator.normal(0.0, tilt, size=2)
         heading = generator.uniform(-np.pi, np.pi)
         level = Pose.from_yaw([*generator.uniform(-0.1, 2.2, size=2), 1.0], heading)
-        turn = Pose([0.0, 0.0, 0.0], [1.0, half[0], half[1], 0.0])
-        pose = Pose(level.position, _product(level.orientation, turn.orientation))
+        turn = Pose(np.zeros(3), np.array([1.0, half[0], half[1], 0.0]))
+        pose = Pose(level.position, quaternion_product(level.orientation, turn.orientation))
         image = renderer.render(
             pose,
             step,
@@ -97,12 +97,6 @@ def sequence(
         in_box = np.all(np.abs(offset) <= BOX, axis=1)
         in_box &= camera.sees(world.targets, pose, 0.5 * floor.marker_diameter)
         yield Frame(image, pose, world.targets[in_box], world.targets)
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    from maasi_filter.pose import quaternion_product
-
-    return quaternion_product(a, b)
 
 
 def score(detector: MarkerDetector, frames: Iterator[Frame], gate: float = 0.03) -> Score:
@@ -134,6 +128,22 @@ def score(detector: MarkerDetector, frames: Iterator[Frame], gate: float = 0.03)
         float(np.sqrt(np.mean(squares))) if squares else np.inf,
         float(np.mean(nees)) if nees else np.inf,
     )
+
+
+@pytest.fixture
+def drone() -> Callable[..., CameraSettings]:
+    """Return `drone_camera`."""
+    return drone_camera
+
+
+@pytest.fixture
+def rendered_score() -> Callable[..., Score]:
+    """Return a function: score of a camera's detector on frames of a floor."""
+
+    def run(settings: CameraSettings, floor: RenderSettings, seed: int, frames: int) -> Score:
+        return score(MarkerDetector(settings), sequence(settings, floor, seed, frames))
+
+    return run
 
 
 @pytest.fixture

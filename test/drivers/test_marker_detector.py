@@ -1,0 +1,131 @@
+"""From a rendered image to detections."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from maasi_drivers.marker_detector import MarkerDetector
+from maasi_filter.pose import Pose
+from maasi_filter.settings import EnvironmentSettings
+from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.world import TargetSettings, World
+
+
+def one_image(settings, targets, pose, floor=None, seed=1):
+    floor = floor or RenderSettings.ideal()
+    world = World.from_settings(
+        EnvironmentSettings(bounds=[[-1, 1], [-1, 1]]), TargetSettings(positions=targets), seed
+    )
+    renderer = CameraRenderer(
+        MarkerDetector(settings).camera, floor, scene_of(world, floor, seed), seed, 'drone'
+    )
+    return renderer.render(pose, 0, 0.0)
+
+
+@pytest.mark.parametrize('rule', ['paper', 'robust'])
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_a_marker_is_measured_to_millimetres(drone, rule, dimension):
+    settings = drone(segmentation={'rule': rule})
+    pose = Pose.from_yaw([0.1, 0.2, 1.0], 0.8)
+    target = np.array([0.16, 0.11, 0.0])
+    seen = MarkerDetector(settings, dimension).detect(
+        one_image(settings, [target[:2].tolist()], pose), pose
+    )
+    offset = target - pose.position
+    expected = [np.hypot(*offset[:2]), np.arctan2(offset[1], offset[0])]
+    if dimension == 3:
+        distance = np.linalg.norm(offset)
+        expected = [distance, expected[1], np.arcsin(offset[2] / distance)]
+    assert len(seen) == 1
+    assert_allclose(seen.values[0], expected, atol=0.01)
+    assert_allclose(seen.positions[0], target[:2], atol=0.001)
+    assert seen.covariances.shape == (1, dimension, dimension)
+
+
+@pytest.mark.parametrize('seed', range(900, 908))
+def test_the_robust_rule_on_hard_sequences(hard_score, seed):
+    result = hard_score('robust', seed, 30)
+    assert result.recall >= 0.98
+    assert result.false_per_frame <= 0.2
+    assert result.rmse <= 0.005
+
+
+def test_the_papers_rule_on_hard_sequences_sees_what_is_not_there(hard_score):
+    assert hard_score('paper', 900, 15).false_per_frame > 1.0
+
+
+@pytest.mark.parametrize('rule', ['paper', 'robust'])
+def test_both_rules_on_a_moderate_floor(drone, rendered_score, rule):
+    result = rendered_score(drone(segmentation={'rule': rule}), RenderSettings(), 31, 60)
+    assert result.recall >= 0.98
+    assert result.false_per_frame <= 0.02
+    assert result.rmse <= 0.001
+
+
+@pytest.mark.parametrize('noise', [6.0, 9.0, 12.0])
+def test_covariances_are_honest_about_image_noise(drone, rendered_score, noise):
+    floor = RenderSettings.ideal(read_noise=noise, blur=0.5)
+    result = rendered_score(drone(pixel_noise=0.03), floor, 32, 150)
+    # Two coordinates: the mean is 2 where the covariance says what the error is.
+    assert 1.2 < result.nees < 3.0
+
+
+def test_covariances_cover_jpeg(drone, rendered_score):
+    floor = RenderSettings.ideal(jpeg_quality=90, blur=0.5)
+    assert rendered_score(drone(), floor, 33, 80).nees < 3.0
+
+
+def test_a_cut_marker_is_kept_with_more_covariance_or_dropped(drone):
+    pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
+    settings = drone(distortion=[])
+    edge = MarkerDetector(settings).camera.to_floor([[80.0, 0.5]], pose)[0]
+    image = one_image(settings, [edge.tolist(), [0.0, 0.0]], pose)
+    kept = MarkerDetector(settings).detect(image, pose)
+    assert kept.blobs.border_cut.tolist() == [True, False]
+    assert kept.position_covariances[0, 0, 0] > 100 * kept.position_covariances[1, 0, 0]
+    error = kept.positions[0] - edge
+    assert error @ np.linalg.solve(kept.position_covariances[0], error) < 9.0
+    dropped = MarkerDetector(drone(distortion=[], cut_blobs='drop')).detect(image, pose)
+    assert len(dropped) == 1
+    assert dropped.dropped == {'not on the floor': 0, 'size': 0, 'cut by the border': 1}
+
+
+def test_markers_of_the_wrong_size_are_dropped_and_counted(drone):
+    pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
+    image = one_image(drone(), [[0.0, 0.0]], pose, RenderSettings.ideal(marker_diameter=0.08))
+    seen = MarkerDetector(drone()).detect(image, pose)
+    assert len(seen) == 0
+    assert seen.dropped['size'] == 1
+    assert len(MarkerDetector(drone(segmentation={'rule': 'paper'})).detect(image, pose)) == 1
+
+
+def test_the_pose_covariance_of_the_message_wins_over_the_settings(drone):
+    pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
+    image = one_image(drone(), [[0.1, 0.0]], pose)
+    none = MarkerDetector(drone()).detect(image, pose)
+    own = MarkerDetector(drone(position_noise=0.02)).detect(image, pose)
+    given = MarkerDetector(drone(position_noise=0.02)).detect(image, pose, 0.05**2 * np.eye(6))
+    variances = [result.position_covariances[0, 0, 0] for result in (none, own, given)]
+    assert_allclose(variances[1], variances[0] + 0.02**2 * (1 + 0.1**2), rtol=0.01)
+    assert variances[2] > 0.05**2
+
+
+def test_an_image_of_another_size_is_refused(drone):
+    with pytest.raises(ValueError, match='image: got 80 x 60 px, allowed is the size'):
+        MarkerDetector(drone()).detect(
+            np.zeros((60, 80, 3), np.uint8), Pose.from_yaw([0, 0, 1.0], 0.0)
+        )
+
+
+def test_blobs_above_the_horizon_are_no_detections(drone):
+    settings = drone(mount={'position': [0, 0, 0.2], 'rpy': [0, 0, 0]}, distortion=[])
+    image = np.full((120, 160, 3), 120, dtype=np.uint8)
+    image[20:26, 40:46] = (20, 45, 160)
+    seen = MarkerDetector(settings).detect(image, Pose.from_yaw([0, 0, 0.0], 0.0))
+    assert len(seen) == 0
+    assert seen.dropped['not on the floor'] == 1
+
+
+def test_a_dimension_other_than_2_and_3_is_refused(drone):
+    with pytest.raises(ValueError, match='dimension: got 1'):
+        MarkerDetector(drone(), 1)

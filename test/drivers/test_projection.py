@@ -1,0 +1,285 @@
+"""From pixels to the floor and back."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.projection import (
+    Camera,
+    box_in_view,
+    box_view_margin,
+    range_bearing,
+    rotation_from_rpy,
+)
+from maasi_filter.measurement_model import RangeBearing, RangeBearingElevation
+from maasi_filter.pose import Pose
+
+DISTORTION = [-0.21, 0.06, 0.002, -0.003, 0.01]
+DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
+# A camera on a mast behind a ground robot's middle, tilted to look at its front.
+TILTED = {
+    'focal_length': [140.0, 140.0],
+    'mount': {'position': [-0.1, 0.05, 0.4], 'rpy': [0.0, 1.25, 0.0]},
+}
+
+
+def camera(**changes):
+    return Camera.from_settings(CameraSettings.model_validate(changes))
+
+
+def tilted_pose(seed):
+    generator = np.random.default_rng(seed)
+    quaternion = np.array([1.0, *generator.normal(0.0, 0.1, 2), generator.normal()])
+    return Pose(np.array([*generator.uniform(-3, 3, 2), generator.uniform(0.5, 2)]), quaternion)
+
+
+def test_a_camera_looking_down_has_the_front_up_and_the_left_on_the_left():
+    pixels = camera().project([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], DOWN)
+    assert_allclose(pixels, [[79.5, 59.5], [79.5, 33.5], [53.5, 59.5]], atol=1e-9)
+
+
+def test_the_nominal_focal_length_shows_040_by_053_m_from_1_m():
+    corners = camera(focal_length=[300, 300]).to_floor([[-0.5, -0.5], [159.5, 119.5]], DOWN)
+    assert_allclose(corners[0] - corners[1], [0.40, 160 / 300], atol=1e-9)
+
+
+def test_projection_agrees_with_opencv():
+    view = camera(distortion=DISTORTION, principal_point=[77.1, 63.2], focal_length=[210, 230])
+    pose = tilted_pose(3)
+    generator = np.random.default_rng(2)
+    points = np.append(
+        pose.position[:2] + generator.uniform(-0.4, 0.4, (50, 2)), np.zeros((50, 1)), axis=1
+    )
+    turn = (pose.rotation() @ view.rotation).T
+    shift = -turn @ view.centre(pose)
+    expected, _ = cv2.projectPoints(
+        points, cv2.Rodrigues(turn)[0], shift, view.matrix, view.distortion
+    )
+    assert_allclose(view.project(points, pose), expected[:, 0], atol=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), x=st.floats(-0.5, 159.5), y=st.floats(-0.5, 119.5))
+def test_back_projection_inverts_projection(seed, x, y):
+    view = camera(distortion=DISTORTION)
+    pose = tilted_pose(seed)
+    position = view.to_floor([[x, y]], pose, height=0.02)
+    assert_allclose(view.project([[*position[0], 0.02]], pose), [[x, y]], atol=1e-7)
+
+
+def test_what_cannot_be_seen_is_nan():
+    view = camera()
+    assert np.isnan(view.project([[0, 0, 1.5]], DOWN)).all()
+    level = camera(mount={'position': [0, 0, 0.2], 'rpy': [0, 0, 0]})
+    ground = Pose.from_yaw([0.0, 0.0, 0.0], 0.0)
+    positions = level.to_floor([[80, 10], [80, 110]], ground)
+    assert np.isnan(positions[0]).all()
+    assert np.isfinite(positions[1]).all()
+    strong = camera(distortion=[-0.8, 0.0, 0.0, 0.0])
+    assert np.isnan(strong.project([[3.0, 0, 0]], DOWN)).all()
+
+
+def test_the_lens_model_does_not_fold_far_points_into_the_image():
+    strong = camera(distortion=[-0.8, 0.0, 0.0, 0.0])
+    far = np.stack([np.linspace(0.0, 5.0, 400), np.zeros(400), np.zeros(400)], axis=1)
+    pixels = strong.project(far, DOWN)
+    known = ~np.isnan(pixels[:, 1])
+    assert (np.diff(pixels[known, 1]) < 0).all()
+    assert known[:50].all()
+    assert not strong.sees(far[~known], DOWN).any()
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_derivatives_of_back_projection(seed):
+    view = camera(distortion=DISTORTION, mount={'position': [0.1, -0.05, 0.03], 'rpy': [0, 1.4, 1]})
+    pose = tilted_pose(seed)
+    pixel = np.array([[30.0, 100.0]])
+    _, by_pixel, by_pose = view.back_project(pixel, pose, 0.05)
+    step = 1e-5
+    for axis in range(2):
+        shift = np.eye(2)[axis] * step
+        high = view.to_floor(pixel + shift, pose, 0.05)
+        low = view.to_floor(pixel - shift, pose, 0.05)
+        assert_allclose(by_pixel[0, :, axis], (high - low)[0] / (2 * step), rtol=1e-6, atol=1e-9)
+    for axis in range(6):
+        moved = []
+        for sign in (1, -1):
+            position, turn = pose.position.copy(), np.zeros(3)
+            if axis < 3:
+                position[axis] += sign * step
+            else:
+                turn[axis - 3] = sign * step
+            rotation = cv2.Rodrigues(turn)[0] @ pose.rotation()
+            shifted = Pose(position, quaternion(rotation))
+            moved.append(view.to_floor(pixel, shifted, 0.05)[0])
+        numeric = (moved[0] - moved[1]) / (2 * step)
+        assert_allclose(by_pose[0, :, axis], numeric, rtol=1e-5, atol=1e-7)
+
+
+def quaternion(matrix):
+    """Quaternion of a rotation with a positive real part."""
+    w = 0.5 * np.sqrt(1.0 + np.trace(matrix))
+    return np.array(
+        [
+            w,
+            (matrix[2, 1] - matrix[1, 2]) / (4 * w),
+            (matrix[0, 2] - matrix[2, 0]) / (4 * w),
+            (matrix[1, 0] - matrix[0, 1]) / (4 * w),
+        ]
+    )
+
+
+def test_covariance_covers_the_noise_of_pixels_and_pose():
+    view = camera(distortion=DISTORTION)
+    generator = np.random.default_rng(11)
+    pose_covariance = np.diag([0.01, 0.02, 0.015, 0.01, 0.02, 0.03]) ** 2
+    root = np.sqrt(pose_covariance)
+    true = Pose.from_yaw([1.0, -0.5, 1.1], 0.7)
+    point = np.array([[1.1, -0.4, 0.0]])
+    nees = []
+    for _ in range(600):
+        pixel = view.project(point, true) + generator.normal(0.0, 0.8, (1, 2))
+        error = root @ generator.standard_normal(6)
+        rotation = cv2.Rodrigues(error[3:])[0] @ true.rotation()
+        believed = Pose(true.position + error[:3], quaternion(rotation))
+        position, covariance = view.floor_covariance(
+            pixel, 0.64 * np.eye(2), believed, pose_covariance
+        )
+        offset = position[0] - point[0, :2]
+        nees.append(offset @ np.linalg.solve(covariance[0], offset))
+    assert 1.75 < np.mean(nees) < 2.25
+
+
+@pytest.mark.parametrize('wrong', [np.eye(3), np.full((6, 6), np.nan), np.full((6, 6), np.inf)])
+def test_a_wrong_pose_covariance_is_refused(wrong):
+    with pytest.raises(ValueError, match='pose_covariance: got'):
+        camera().floor_covariance([[80, 60]], np.eye(2), DOWN, wrong)
+
+
+def test_positions_of_a_wrong_shape_are_refused():
+    with pytest.raises(ValueError, match='positions: got an array of shape'):
+        camera().project([[1.0, 2.0]], DOWN)
+
+
+def test_nothing_in_nothing_out():
+    view = camera(distortion=DISTORTION)
+    assert view.project(np.empty((0, 3)), DOWN).shape == (0, 2)
+    assert view.to_floor(np.empty((0, 2)), DOWN).shape == (0, 2)
+    values, covariances = range_bearing(np.empty((0, 2)), np.empty((0, 2, 2)), DOWN)
+    assert values.shape == (0, 2)
+    assert covariances.shape == (0, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ('dimension', 'model'), [(2, RangeBearing()), (3, RangeBearingElevation())]
+)
+def test_range_and_bearing_agree_with_the_filters_model(dimension, model):
+    generator = np.random.default_rng(1)
+    pose = tilted_pose(5)
+    positions = pose.position[:2] + generator.uniform(-0.5, 0.5, (20, 2))
+    covariances = np.repeat(np.array([[[4e-6, 1e-6], [1e-6, 9e-6]]]), 20, axis=0)
+    values, result = range_bearing(positions, covariances, pose, dimension, floor_deviation=0.004)
+    floor = np.append(positions, np.zeros((20, 1)), axis=1)[:, :dimension]
+    assert_allclose(values, model.measure(floor, pose), atol=1e-12)
+    jacobian = model.jacobian(floor, pose)
+    full = np.zeros((20, 3, 3))
+    full[:, :2, :2] = covariances
+    full[:, 2, 2] = 0.004**2
+    expected = jacobian @ full[:, :dimension, :dimension] @ jacobian.transpose(0, 2, 1)
+    assert_allclose(result, expected, rtol=1e-2, atol=1e-9)
+    assert_allclose(result, result.transpose(0, 2, 1))
+    assert (np.linalg.eigvalsh(result) > 0).all()
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+@pytest.mark.parametrize('offset', [0.0, 1e-9, 1e-4, 1e-3, 1e-2])
+def test_right_over_a_target_the_bearing_says_nothing(dimension, offset):
+    sigma = 0.003
+    positions = np.array([[offset, 0.0]])
+    values, covariance = range_bearing(
+        positions, sigma**2 * np.eye(2)[None], DOWN, dimension, floor_deviation=0.005
+    )
+    assert np.isfinite(values).all()
+    assert np.isfinite(covariance).all()
+    assert (np.linalg.eigvalsh(covariance[0]) > 0).all()
+    expected = min((sigma / max(offset, 1e-12)) ** 2, np.pi**2 / 3)
+    assert_allclose(covariance[0, 1, 1], expected, rtol=1e-6)
+
+
+def test_a_third_kind_of_dimension_is_refused():
+    with pytest.raises(ValueError, match='dimension: got 4'):
+        range_bearing(np.zeros((1, 2)), np.eye(2)[None], DOWN, 4)
+
+
+def test_the_default_camera_sees_the_drones_box_with_whole_markers():
+    box = ([-0.2, -0.2], [0.2, 0.2])
+    assert box_in_view(camera(), *box, 1.0, 0.015)
+    assert not box_in_view(camera(focal_length=[300, 300]), *box, 1.0, 0.015)
+    # Lower down it sees less.
+    assert not box_in_view(camera(), *box, 0.9, 0.015)
+    # Turned by a quarter, the image's width lies along the robot.
+    turned = camera(mount={'rpy': [0.0, np.pi / 2, np.pi / 2]})
+    assert_allclose(
+        box_view_margin(turned, [-0.2, -0.27], [0.2, 0.27], 1.0),
+        box_view_margin(camera(), [-0.27, -0.2], [0.27, 0.2], 1.0),
+        atol=1e-9,
+    )
+
+
+def test_a_drone_that_tilts_needs_a_wider_view():
+    box = ([-0.2, -0.2], [0.2, 0.2], 1.0, 0.015)
+    assert not box_in_view(camera(), *box, tilt=0.05)
+    assert box_in_view(camera(focal_length=[220, 220]), *box, tilt=0.05)
+    margins = [box_view_margin(camera(), *box, tilt=tilt) for tilt in (0.0, 0.02, 0.05)]
+    assert margins == sorted(margins, reverse=True)
+
+
+def test_a_tilted_front_camera_sees_the_ground_robots_box():
+    assert box_in_view(camera(**TILTED), [-0.1, -0.1], [0.2, 0.2], 0.0, 0.015)
+    assert not box_in_view(camera(**TILTED), [-0.3, -0.1], [0.2, 0.2], 0.0, 0.015)
+    level = camera(mount={'position': [0.05, 0.0, 0.1], 'rpy': [0.0, 0.0, 0.0]})
+    assert box_view_margin(level, [-0.1, -0.1], [0.2, 0.2], 0.0) == -np.inf
+
+
+@pytest.mark.parametrize('changes', [{}, TILTED, {'distortion': DISTORTION}])
+def test_the_margin_of_a_box_is_that_of_its_worst_marker(changes):
+    view = camera(**changes)
+    height = 0.0 if 'mount' in changes else 1.0
+    pose = Pose.from_yaw([0.3, -0.2, height], 1.1)
+    low, high = np.array([-0.1, -0.1]), np.array([0.2, 0.2])
+    margin = box_view_margin(view, low, high, height, 0.015)
+    generator = np.random.default_rng(0)
+    inside = generator.uniform(low, high, (500, 2))
+    world = pose.position[:2] + inside @ pose.rotation()[:2, :2].T
+    assert (margin >= 0) == view.sees(world, pose, 0.015).all()
+
+
+@pytest.mark.parametrize(
+    ('lower', 'upper'), [([0.2, 0], [0.1, 1]), ([np.nan, 0], [1, 1]), ([0, 0], [np.inf, 1])]
+)
+def test_a_box_without_inside_is_refused(lower, upper):
+    with pytest.raises(ValueError, match='box field of view: got'):
+        box_view_margin(camera(), lower, upper, 1.0)
+
+
+def test_sees_asks_for_whole_discs():
+    view = camera()
+    edge = view.to_floor([[79.5, -0.4]], DOWN)
+    assert view.sees(edge, DOWN)[0]
+    assert not view.sees(edge, DOWN, 0.015)[0]
+    assert view.sees(np.empty((0, 2)), DOWN).shape == (0,)
+    assert_array_equal(view.sees([[0, 0], [5, 0]], DOWN), [True, False])
+
+
+def test_fixed_axis_angles():
+    roll, pitch, yaw = 0.3, -0.4, 1.2
+    expected = (
+        cv2.Rodrigues(np.array([0, 0, yaw]))[0]
+        @ cv2.Rodrigues(np.array([0, pitch, 0]))[0]
+        @ cv2.Rodrigues(np.array([roll, 0, 0]))[0]
+    )
+    assert_allclose(rotation_from_rpy(roll, pitch, yaw), expected, atol=1e-12)
