@@ -27,7 +27,7 @@ Colour = Sequence[float]
 
 _DISC, _RECTANGLE = 0, 1
 _NOISE_TABLE_SIZE = 1 << 16
-_MAXIMUM_SUBSAMPLES = 9
+_MAXIMUM_SUBSAMPLES = 33
 _TEXTURE_CELL = 0.01
 
 
@@ -605,7 +605,7 @@ class CameraRenderer:
             camera.matrix,
             camera.distortion,
             camera.largest_radius,
-            np.asarray(velocity, dtype=float),
+            np.array(velocity, dtype=float),
             rotation @ np.asarray(angular_velocity, dtype=float),
             settings.exposure_time,
             3.0 + 2.0 * settings.blur,

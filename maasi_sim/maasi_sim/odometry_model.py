@@ -94,6 +94,11 @@ class OdometryModel:
         self._last = compose(self._to_start, start)
         self._offset = np.zeros(2)
         self._turn = 0.0
+        self._noise_covariance = np.diag(
+            [settings.position_noise**2 + _LEAST_VARIANCE] * 3
+            + [_LEAST_VARIANCE] * 2
+            + [settings.heading_noise**2 + _LEAST_VARIANCE]
+        )
         # Covariance of the drift: x and y of the estimate, heading.
         self._drift = np.zeros((3, 3))
 
@@ -153,11 +158,9 @@ class OdometryModel:
         )
 
     def _covariance(self) -> Array:
-        covariance = np.diag(
-            [self.settings.position_noise**2 + _LEAST_VARIANCE] * 3
-            + [_LEAST_VARIANCE] * 2
-            + [self.settings.heading_noise**2 + _LEAST_VARIANCE]
-        )
-        planar = np.ix_([0, 1, 5], [0, 1, 5])
-        covariance[planar] += self._drift
+        covariance = self._noise_covariance.copy()
+        covariance[:2, :2] += self._drift[:2, :2]
+        covariance[:2, 5] += self._drift[:2, 2]
+        covariance[5, :2] += self._drift[2, :2]
+        covariance[5, 5] += self._drift[2, 2]
         return covariance

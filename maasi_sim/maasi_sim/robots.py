@@ -225,6 +225,16 @@ class SimulatedRobot:
             raise ValueError(f'{self.name}: has no ranging sensor')
         return self.ranging.measure(self.state.pose, step)
 
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, what this robot uses; nothing changes."""
+        self._motion.body(self.state).step(np.zeros(4), 0.05)
+        if self.camera is not None:
+            self.image(0, 0.0)
+        if self.laser is not None:
+            self.scan(0)
+        if self.ranging is not None:
+            self.ranges(0)
+
     def _halt(self, pose: Pose) -> None:
         self._body = self._motion.body(RobotState(Pose.from_yaw(pose.position, pose.yaw)))
         self.state = self._body.robot_state()

@@ -16,9 +16,9 @@ from maasi_sim.noise_streams import noise_stream
 Array = NDArray[np.float64]
 
 # Draws for one target before the space is said to be too full.
-_ATTEMPTS = 10_000
+_ATTEMPTS = 1000
 # Whole sets of targets drawn anew where the last ones found no room.
-_RESTARTS = 20
+_RESTARTS = 10
 
 
 class TargetSettings(Settings):

@@ -1,0 +1,129 @@
+"""Odometry in the map, and poses at a stamp."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from maasi_drivers.odometry import MapOdometry, PoseHistory, StampedPose, interpolate
+from maasi_filter.pose import Pose
+
+
+def stamped(stamp, position=(0.0, 0.0, 0.0), yaw=0.0):
+    zero = np.zeros(3)
+    return StampedPose(stamp, Pose.from_yaw(position, yaw), np.zeros((6, 6)), zero, zero)
+
+
+def test_odometry_that_starts_at_zero_starts_at_the_initial_pose():
+    odometry = MapOdometry(Pose.from_yaw([1.9, 1.8, 1.0], np.pi / 2))
+    start = odometry.apply(0, Pose.from_yaw([0.0, 0.0, 0.0], 0.0))
+    assert_allclose(start.pose.position, [1.9, 1.8, 1.0])
+    assert_allclose(start.pose.yaw, np.pi / 2)
+    ahead = odometry.apply(1, Pose.from_yaw([0.5, 0.1, 0.2], 0.3), velocity=[0.4, 0.0, 0.1])
+    assert_allclose(ahead.pose.position, [1.8, 2.3, 1.2])
+    assert_allclose(ahead.pose.yaw, np.pi / 2 + 0.3)
+    assert_allclose(
+        ahead.velocity, [0.4 * np.cos(np.pi / 2 + 0.3), 0.4 * np.sin(np.pi / 2 + 0.3), 0.1]
+    )
+
+
+def test_odometry_that_does_not_start_at_zero_is_taken_from_its_origin():
+    origin = Pose.from_yaw([3.0, -1.0, 0.0], 0.7)
+    odometry = MapOdometry(Pose.from_yaw([1.0, 2.0, 0.0], -0.4), origin)
+    start = odometry.apply(0, origin)
+    assert_allclose(start.pose.position, [1.0, 2.0, 0.0], atol=1e-12)
+    assert_allclose(start.pose.yaw, -0.4)
+
+
+def test_covariance_turns_with_the_frame():
+    odometry = MapOdometry(Pose.from_yaw([0.0, 0.0, 0.0], np.pi / 2))
+    covariance = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
+    turned = odometry.apply(0, Pose.from_yaw([0.0, 0.0, 0.0], 0.0), covariance).covariance
+    assert_allclose(turned, np.diag([4.0, 1.0, 9.0, 0.2, 0.1, 0.3]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('covariance', np.full((6, 6), np.nan)),
+        ('covariance', np.eye(3)),
+        ('velocity', [np.inf, 0, 0]),
+        ('angular_velocity', [0, 0]),
+    ],
+)
+def test_what_is_not_finite_is_refused(name, value):
+    odometry = MapOdometry(Pose.from_yaw([0.0, 0.0, 0.0], 0.0))
+    with pytest.raises(ValueError, match=f'{name}: got'):
+        odometry.apply(0, Pose.from_yaw([0.0, 0.0, 0.0], 0.0), **{name: value})
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    first=st.floats(-np.pi, np.pi),
+    turn=st.floats(-3.0, 3.0),
+    part=st.integers(0, 1000),
+)
+def test_interpolation_goes_the_short_way_round(first, turn, part):
+    a = stamped(0, [1.0, 2.0, 3.0], first)
+    b = stamped(1000, [2.0, 0.0, 3.5], first + turn)
+    pose = interpolate(a, b, part).pose
+    assert_allclose(pose.position, [1 + part / 1e3, 2 - part / 500, 3 + part / 2e3], atol=1e-9)
+    difference = pose.yaw - (first + turn * part / 1000)
+    assert_allclose(np.mod(difference + np.pi, 2 * np.pi), np.pi, atol=1e-6)
+
+
+def test_the_sign_of_a_quaternion_does_not_matter():
+    a, b = stamped(0), stamped(10, yaw=1.0)
+    flipped = StampedPose(
+        10, Pose(b.pose.position, -b.pose.orientation), b.covariance, b.velocity, b.velocity
+    )
+    assert_allclose(interpolate(a, flipped, 5).pose.yaw, 0.5)
+
+
+def test_a_stamp_outside_is_refused_by_interpolation():
+    with pytest.raises(ValueError, match='stamp: got 11, allowed from 0 to 10'):
+        interpolate(stamped(0), stamped(10), 11)
+
+
+def test_the_history_gives_exact_poses_at_their_stamps_and_nothing_outside():
+    history = PoseHistory()
+    assert history.latest is None
+    assert history.at(0) is None
+    poses = [stamped(stamp, [0.001 * stamp, 0.0, 0.0]) for stamp in (100, 200, 400)]
+    for pose in poses:
+        assert history.add(pose)
+    for pose in poses:
+        assert history.at(pose.stamp) is pose
+    assert history.at(99) is None
+    assert history.at(401) is None
+    middle = history.at(250)
+    assert middle is not None
+    assert_allclose(middle.pose.position, [0.25, 0.0, 0.0])
+    assert history.latest is poses[-1]
+
+
+def test_what_comes_twice_or_late_is_not_added():
+    history = PoseHistory()
+    assert history.add(stamped(100))
+    assert not history.add(stamped(100, [5.0, 0.0, 0.0]))
+    assert not history.add(stamped(50))
+    assert len(history) == 1
+    assert history.latest is not None
+    assert_array_equal(history.latest.pose.position, [0.0, 0.0, 0.0])
+    history.clear()
+    assert history.add(stamped(50))
+
+
+def test_the_history_forgets_the_oldest():
+    history = PoseHistory(3)
+    for stamp in range(10):
+        history.add(stamped(stamp))
+    assert len(history) == 3
+    assert history.at(6) is None
+    assert history.at(7) is not None
+
+
+def test_a_history_of_one_is_refused():
+    with pytest.raises(ValueError, match='length: got 1'):
+        PoseHistory(1)

@@ -1,0 +1,225 @@
+"""The rendered camera."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pydantic import ValidationError
+
+from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.projection import Camera
+from maasi_filter.pose import Pose
+from maasi_filter.settings import EnvironmentSettings
+from maasi_sim.camera import CameraRenderer, RenderSettings, disc, draw_distractors, scene_of
+from maasi_sim.noise_streams import noise_stream
+from maasi_sim.world import TargetSettings, World
+
+IDEAL = RenderSettings.ideal()
+DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
+MARKER = [0.08, 0.17, 0.62]
+
+
+def camera(**changes):
+    return Camera.from_settings(CameraSettings.model_validate(changes))
+
+
+def renderer(shapes, settings=IDEAL, view=None, seed=1, robot='drone'):
+    return CameraRenderer(view or camera(), settings, shapes, seed, robot)
+
+
+def coverage(image):
+    """How much of each pixel is marker, from its red channel."""
+    floor, marker = 255 * 0.47, 255 * MARKER[0]
+    return (floor - image[..., 0].astype(float)) / (floor - marker)
+
+
+def centroid(image):
+    weights = np.where(coverage(image) > 0.02, coverage(image), 0.0)
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
+    return np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
+
+
+def test_an_empty_floor_is_one_colour():
+    image = renderer([]).render(DOWN, 0, 0.0)
+    assert image.shape == (120, 160, 3)
+    assert image.dtype == np.uint8
+    assert_array_equal(image, np.broadcast_to([120, 120, 117], image.shape))
+
+
+@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {},
+        {'distortion': [-0.25, 0.08, 0.003, -0.002, 0.0]},
+        {'mount': {'position': [0.02, 0.01, -0.05], 'rpy': [0.1, 1.3, 0.4]}},
+        {'width': 320, 'height': 240, 'focal_length': [500, 520]},
+    ],
+)
+def test_a_marker_appears_where_the_projection_says(changes, seed):
+    generator = np.random.default_rng(seed)
+    view = camera(**changes)
+    tilt = generator.normal(0.0, 0.05, 2)
+    pose = Pose(
+        np.array([*generator.uniform(-1, 1, 2), 1.0]), np.array([1.0, *tilt, generator.normal()])
+    )
+    pixel = generator.uniform(0.2, 0.8, 2) * [view.width, view.height]
+    centre = view.to_floor([pixel], pose)[0]
+    image = renderer([disc(centre, 0.015, MARKER)], view=view).render(pose, 0, 0.0)
+    assert_allclose(centroid(image), pixel, atol=0.08)
+
+
+@pytest.mark.parametrize('focal', [150.0, 260.0, 520.0])
+def test_a_marker_covers_its_area(focal):
+    view = camera(focal_length=[focal, focal])
+    image = renderer([disc([0.011, -0.007], 0.015, MARKER)], view=view).render(DOWN, 0, 0.0)
+    expected = np.pi * (0.015 * focal) ** 2
+    assert_allclose(coverage(image)[coverage(image) > 0.02].sum(), expected, rtol=0.03)
+
+
+def test_a_marker_half_outside_is_drawn_to_the_border():
+    view = camera()
+    edge = view.to_floor([[-0.5, 59.5]], DOWN)[0]
+    image = renderer([disc(edge, 0.015, MARKER)]).render(DOWN, 0, 0.0)
+    assert coverage(image)[59, 0] > 0.95
+    seen = coverage(image)[coverage(image) > 0.02].sum()
+    assert_allclose(seen, 0.5 * np.pi * (0.015 * 260) ** 2, rtol=0.05)
+
+
+def test_above_the_horizon_there_are_no_markers():
+    view = camera(mount={'position': [0.0, 0.0, 0.2], 'rpy': [0.0, 0.0, 0.0]})
+    ground = Pose.from_yaw([0.0, 0.0, 0.0], 0.0)
+    image = renderer([disc([1.5, 0.0], 0.3, MARKER)], view=view).render(ground, 0, 0.0)
+    assert (coverage(image)[:59] < 0.02).all()
+    assert coverage(image)[60:].max() > 0.9
+
+
+def test_under_the_floor_nothing_is_seen_and_nothing_breaks():
+    image = renderer([disc([0.0, 0.0], 0.3, MARKER)]).render(
+        Pose.from_yaw([0.0, 0.0, -1.0], 0.0), 0, 0.0, (1.0, 0.0, 0.0)
+    )
+    assert (coverage(image) < 0.02).all()
+
+
+def test_what_lies_on_top_hides_what_lies_below():
+    shapes = [disc([0, 0], 0.05, [1.0, 0.0, 0.0]), disc([0, 0], 0.02, [0.0, 1.0, 0.0])]
+    image = renderer(shapes).render(DOWN, 0, 0.0)
+    assert_array_equal(image[59, 79], [0, 255, 0])
+    assert_array_equal(image[59, 79 + 10], [255, 0, 0])
+
+
+@pytest.mark.parametrize('velocity', [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, -0.5, 0.0)])
+def test_motion_smears_a_marker_along_the_way_about_its_place_at_mid_exposure(velocity):
+    settings = RenderSettings.ideal(exposure_time=0.05)
+    shapes = [disc([0.02, 0.03], 0.015, MARKER)]
+    sharp = renderer(shapes).render(DOWN, 0, 0.0)
+    smeared = renderer(shapes, settings).render(DOWN, 0, 0.0, velocity)
+    assert_allclose(centroid(smeared), centroid(sharp), atol=0.05)
+    # The image's columns lie along -y, its rows along -x.
+    length = np.abs(np.array(velocity[:2])[::-1]) * 0.05 * 260
+    for axis in range(2):
+        extent = [
+            np.ptp(np.nonzero((coverage(image) > 0.02).any(axis=axis))[0])
+            for image in (sharp, smeared)
+        ]
+        # The very tips are too faint to count.
+        assert -2.5 <= extent[1] - extent[0] - length[axis] <= 0.5
+
+
+def test_turning_smears_like_moving():
+    settings = RenderSettings.ideal(exposure_time=0.05)
+    shapes = [disc([0.0, 0.1], 0.015, MARKER)]
+    turned = renderer(shapes, settings).render(DOWN, 0, 0.0, angular_velocity=(0, 0, 5.0))
+    moved = renderer(shapes, settings).render(DOWN, 0, 0.0, (-0.5, 0.0, 0.0))
+    assert np.abs(coverage(turned) - coverage(moved)).max() < 0.02
+    pitched = renderer(shapes, settings).render(DOWN, 0, 0.0, angular_velocity=(0, 0.5, 0.0))
+    assert np.abs(coverage(pitched) - coverage(moved)).max() < 0.02
+
+
+def test_noise_has_the_deviation_that_is_set_and_is_keyed():
+    settings = RenderSettings.ideal(read_noise=3.0, shot_noise=0.1)
+    one = renderer([], settings)
+    image = one.render(DOWN, 5, 0.0)
+    assert_allclose(image.std(axis=(0, 1)), np.sqrt(9 + 0.1 * 120), rtol=0.03)
+    assert_allclose(image.mean(axis=(0, 1)), [119.85, 119.85, 117.3], atol=0.2)
+    assert_array_equal(renderer([], settings).render(DOWN, 5, 0.0), image)
+    for other in (
+        one.render(DOWN, 6, 0.0),
+        renderer([], settings, seed=2).render(DOWN, 5, 0.0),
+        renderer([], settings, robot='other').render(DOWN, 5, 0.0),
+    ):
+        both = np.stack([image[..., 0].ravel(), other[..., 0].ravel()]).astype(float)
+        assert abs(np.corrcoef(both)[0, 1]) < 0.02
+
+
+def test_the_order_of_rendering_does_not_matter():
+    settings = RenderSettings()
+    shapes = [disc([0.1, 0.0], 0.015, MARKER)]
+    other = Pose.from_yaw([0.5, 0.5, 1.2], 1.0)
+    first, second = renderer(shapes, settings), renderer(shapes, settings)
+    a = first.render(DOWN, 1, 0.1)
+    second.render(other, 2, 0.2)
+    assert_array_equal(second.render(DOWN, 1, 0.1), a)
+
+
+def test_light_vignetting_and_drift_change_brightness_as_set():
+    light = renderer([], RenderSettings.ideal(light_variation=0.4, light_wavelength=0.4))
+    image = light.render(DOWN, 0, 0.0)[..., 0]
+    assert_allclose([image.max(), image.min()], [120 * 1.4, 120 * 0.6], atol=4)
+    corner = renderer([], RenderSettings.ideal(vignetting=0.5)).render(DOWN, 0, 0.0)[0, 0, 0]
+    assert_allclose(corner, 60, atol=2)
+    drifting = renderer([], RenderSettings.ideal(white_balance_drift=0.2, exposure_drift=0.1))
+    gains = np.array([drifting.gains(time) for time in np.linspace(0, 100, 400)])
+    assert_allclose(np.ptp(gains, axis=0), 0.5, atol=0.12)
+    assert gains.min() >= 0.9 * 0.8 - 1e-9
+    assert abs(np.corrcoef(gains.T)[0, 2]) < 0.9
+
+
+def test_texture_stays_on_the_floor():
+    one = renderer([], RenderSettings.ideal(floor_texture=0.1))
+    image = one.render(DOWN, 0, 0.0)
+    assert 4 < image[..., 0].std() < 12
+    shifted = one.render(Pose.from_yaw([0.1, 0.0, 1.0], 0.0), 0, 0.0)
+    assert_array_equal(shifted[26:, :, 0], image[:-26, :, 0])
+
+
+def test_jpeg_changes_little():
+    sharp = [disc([0.0, 0.0], 0.015, MARKER)]
+    plain = renderer(sharp).render(DOWN, 0, 0.0).astype(int)
+    coded = renderer(sharp, RenderSettings.ideal(jpeg_quality=90)).render(DOWN, 0, 0.0)
+    assert 0 < np.abs(coded - plain).mean() < 2
+
+
+def test_a_scene_holds_all_and_markers_on_top():
+    settings = RenderSettings.model_validate(
+        {'distractors': {'sheets': 2, 'lines': 3, 'purple': 4, 'cyan': 1, 'large': 2}}
+    )
+    world = World.from_settings(
+        EnvironmentSettings.model_validate(
+            {'bounds': [[0, 3], [0, 3]], 'obstacles': [{'centre': [1, 1], 'radius': 0.1}]}
+        ),
+        TargetSettings(count=5),
+        3,
+    )
+    shapes = scene_of(world, settings, 3)
+    assert len(shapes) == 12 + 1 + 5
+    assert_allclose([shape.centre for shape in shapes[-5:]], world.targets)
+    assert shapes[12].half_size == (0.1, 0.1)
+    again = draw_distractors(settings, world, noise_stream(3, purpose='distractors'))
+    assert again == shapes[:12]
+
+
+@pytest.mark.parametrize(
+    'values',
+    [
+        {'marker_colour': [0, 0, 2]},
+        {'floor_colour': [0, 0]},
+        {'light_variation': 1.0},
+        {'shot_noise': -1},
+        {'jpeg_quality': 0},
+        {'distractors': {'cats': 1}},
+        {'read_noise': float('nan')},
+    ],
+)
+def test_wrong_settings_are_refused(values):
+    with pytest.raises(ValidationError):
+        RenderSettings.model_validate(values)

@@ -1,0 +1,86 @@
+"""The simulated laser scanner."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pydantic import ValidationError
+
+from maasi_filter.pose import Pose
+from maasi_sim.laser_scan import LaserScanner, LaserSettings
+
+BOUNDS = np.array([[0.0, 3.0], [0.0, 2.0]])
+EXACT = LaserSettings(noise=0.0, wall_margin=0.0, minimum_range=0.0)
+
+
+def scanner(settings=EXACT, centres=(), radii=(), seed=1, robot='ground'):
+    return LaserScanner(settings, BOUNDS, centres, radii, seed, robot)
+
+
+def test_walls_are_where_they_are():
+    ranges = scanner().scan(Pose.from_yaw([1.0, 0.5, 0.0], 0.0), 0)
+    assert ranges.shape == (360,)
+    assert ranges.dtype == np.float32
+    assert_allclose(ranges[[0, 90, 180, 270]], [2.0, 1.5, 1.0, 0.5], rtol=1e-6)
+    assert_allclose(ranges[45], 1.5 * np.sqrt(2), rtol=1e-6)
+
+
+def test_beams_turn_with_the_robot_anticlockwise():
+    turned = scanner().scan(Pose.from_yaw([1.0, 0.5, 0.0], np.pi / 2), 0)
+    assert_allclose(turned[[0, 90, 180, 270]], [1.5, 1.0, 0.5, 2.0], rtol=1e-6)
+
+
+def test_walls_stand_off_by_their_margin():
+    settings = LaserSettings(noise=0.0, wall_margin=0.25)
+    assert_allclose(scanner(settings).scan(Pose.from_yaw([1, 0.5, 0], 0.0), 0)[0], 2.25)
+
+
+def test_circles_agree_with_a_fine_march_along_each_beam():
+    centres, radii = np.array([[1.5, 1.0], [2.2, 0.4], [0.5, 1.6]]), np.array([0.2, 0.1, 0.3])
+    pose = Pose.from_yaw([0.9, 0.8, 0.0], 0.4)
+    ranges = scanner(centres=centres, radii=radii).scan(pose, 0)
+    along = np.arange(0.0, 3.5, 0.0005)
+    for beam in range(0, 360, 3):
+        angle = 0.4 + np.deg2rad(beam)
+        points = pose.position[:2] + along[:, None] * [np.cos(angle), np.sin(angle)]
+        hit = (np.linalg.norm(points[:, None] - centres, axis=2) < radii).any(axis=1)
+        hit |= ((points < BOUNDS[:, 0]) | (points > BOUNDS[:, 1])).any(axis=1)
+        assert abs(ranges[beam] - along[np.argmax(hit)]) < 0.02
+
+
+def test_far_is_infinite_and_near_is_minus_infinite():
+    settings = LaserSettings(noise=0.0, wall_margin=0.0, minimum_range=0.6, maximum_range=1.9)
+    ranges = scanner(settings).scan(Pose.from_yaw([1.0, 0.5, 0.0], 0.0), 0)
+    assert_array_equal(ranges[[0, 270]], [np.inf, -np.inf])
+    assert_allclose(ranges[90], 1.5)
+
+
+def test_outside_its_walls_it_sees_nothing_behind_and_inside_a_circle_zero():
+    ranges = scanner().scan(Pose.from_yaw([4.0, 3.0, 0.0], 0.0), 0)
+    assert np.isinf(ranges[[0, 90]]).all()
+    inside = scanner(centres=[[1.0, 0.5]], radii=[0.3]).scan(Pose.from_yaw([1, 0.5, 0], 0.0), 0)
+    assert_array_equal(inside, np.zeros(360))
+
+
+def test_other_robots_are_seen():
+    pose = Pose.from_yaw([1.0, 0.5, 0.0], 0.0)
+    ranges = scanner().scan(pose, 0, centres=[[1.6, 0.5]], radii=[0.1])
+    assert_allclose(ranges[0], 0.5, rtol=1e-6)
+    assert_allclose(ranges[90], 1.5, rtol=1e-6)
+
+
+def test_noise_is_keyed_and_as_large_as_set():
+    noisy = scanner(LaserSettings(noise=0.05, wall_margin=0.0, beams=4000, maximum_range=9.0))
+    pose = Pose.from_yaw([1.0, 1.0, 0.0], 0.0)
+    exact = scanner(LaserSettings(noise=0.0, wall_margin=0.0, beams=4000, maximum_range=9.0))
+    difference = noisy.scan(pose, 3) - exact.scan(pose, 3)
+    assert_allclose([difference.mean(), difference.std()], [0.0, 0.05], atol=0.003)
+    assert_array_equal(noisy.scan(pose, 3), noisy.scan(pose, 3))
+    assert (noisy.scan(pose, 4) != noisy.scan(pose, 3)).all()
+
+
+@pytest.mark.parametrize(
+    'values', [{'beams': 0}, {'maximum_range': 0.1}, {'noise': -1}, {'typo': 1}]
+)
+def test_wrong_settings_are_refused(values):
+    with pytest.raises(ValidationError):
+        LaserSettings.model_validate(values)

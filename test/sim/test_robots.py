@@ -1,0 +1,221 @@
+"""Simulated robots: odometry, battery, obstacles, sensors."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.marker_detector import MarkerDetector
+from maasi_drivers.odometry import MapOdometry
+from maasi_filter.pose import Pose
+from maasi_filter.settings import EnvironmentSettings, SensorSettings
+from maasi_planner.motion import RobotState
+from maasi_planner.settings import MotionSettings
+from maasi_sim.camera import RenderSettings
+from maasi_sim.laser_scan import LaserSettings
+from maasi_sim.odometry_model import OdometryModel, OdometrySettings
+from maasi_sim.robots import BatterySettings, Equipment, SimulatedRobot
+from maasi_sim.world import TargetSettings, World
+
+PERFECT = OdometrySettings(position_noise=0.0, heading_noise=0.0, velocity_noise=0.0)
+DRONE = Pose.from_yaw([1.0, 1.0, 1.0], 0.3)
+GROUND = Pose.from_yaw([0.2, 0.3, 0.0], 0.0)
+
+
+def world(**environment):
+    return World.from_settings(
+        EnvironmentSettings.model_validate({'bounds': [[-0.3, 2.4], [-0.3, 2.4]], **environment}),
+        TargetSettings(positions=[[1.1, 1.05], [0.3, 0.4]]),
+        1,
+    )
+
+
+def robot(model='mambo', start=DRONE, seed=1, name='robot', place=None, **changes):
+    values: dict[str, Any] = {
+        'motion': MotionSettings(model=model, speed=0.4),
+        'radius': 0.1,
+        'camera': CameraSettings(focal_length=[220.0, 220.0]) if model == 'mambo' else None,
+        'sensor': None,
+        'laser': None,
+        'odometry': PERFECT,
+        'battery': BatterySettings(),
+    }
+    equipment = Equipment(**(values | changes))
+    return SimulatedRobot(name, equipment, start, place or world(), RenderSettings(), seed)
+
+
+def drive(one, steps, command=(0.3, 0.0, 0.0, 0.2), dt=0.05, first=1):
+    one.command(command)
+    for step in range(first, first + steps):
+        one.step(step, dt)
+
+
+@pytest.mark.parametrize(('model', 'start'), [('mambo', DRONE), ('unicycle', GROUND)])
+def test_perfect_odometry_placed_by_the_initial_pose_is_the_true_pose(model, start):
+    one = robot(model, start)
+    assert_allclose(one.odometry.pose.position, np.zeros(3), atol=1e-12)
+    assert_allclose(one.odometry.pose.yaw, 0.0, atol=1e-12)
+    drive(one, 80)
+    placed = MapOdometry(start).apply(
+        0, one.odometry.pose, one.odometry.covariance, one.odometry.velocity
+    )
+    assert_allclose(placed.pose.position, one.state.pose.position, atol=1e-9)
+    assert_allclose(placed.pose.rotation(), one.state.pose.rotation(), atol=1e-9)
+    assert_allclose(placed.velocity, one.state.velocity, atol=1e-9)
+    assert np.linalg.norm(one.state.pose.position - start.position) > 0.5
+
+
+def test_the_covariance_of_odometry_is_honest_about_noise_and_drift():
+    settings = OdometrySettings(
+        position_noise=0.003, heading_noise=0.004, position_drift=0.02, heading_drift=0.05
+    )
+    start = Pose.from_yaw([2.0, -1.0, 0.0], 0.8)
+    nees = []
+    for seed in range(120):
+        model = OdometryModel(settings, start, seed, 'robot')
+        for step in range(1, 60):
+            angle = 0.03 * step
+            place = start.position + np.array([np.sin(angle), 1 - np.cos(angle), 0.0])
+            state = RobotState(Pose.from_yaw(place, 0.8 + angle))
+            reading = model.step(state, step)
+        true = MapOdometry(start)
+        placed = true.apply(0, reading.pose, reading.covariance)
+        error = np.append(
+            (placed.pose.position - state.pose.position)[:2], placed.pose.yaw - state.pose.yaw
+        )
+        planar = placed.covariance[np.ix_([0, 1, 5], [0, 1, 5])]
+        nees.append(error @ np.linalg.solve(planar, error))
+    assert 2.5 < np.mean(nees) < 3.5
+
+
+def test_a_robot_at_rest_does_not_drift():
+    settings = OdometrySettings(
+        position_noise=0.0, heading_noise=0.0, position_drift=1.0, heading_drift=1.0
+    )
+    model = OdometryModel(settings, GROUND, 1, 'robot')
+    for step in range(50):
+        reading = model.step(RobotState(GROUND), step)
+    assert_allclose(reading.pose.position, np.zeros(3), atol=1e-12)
+
+
+def test_height_and_attitude_do_not_drift():
+    one = robot(odometry=OdometrySettings(position_drift=0.3, heading_drift=0.5))
+    drive(one, 100, (0.3, 0.2, 0.05, 0.0))
+    placed = MapOdometry(DRONE).apply(0, one.odometry.pose).pose
+    true = one.state.pose
+    assert abs(placed.position[2] - true.position[2]) < 0.02
+    assert_allclose(placed.rotation()[2], true.rotation()[2], atol=0.01)
+    assert np.linalg.norm(placed.position[:2] - true.position[:2]) > 0.02
+
+
+def test_two_runs_are_the_same_to_the_bit_and_another_robot_is_not():
+    noisy = OdometrySettings(position_drift=0.05, heading_drift=0.05)
+    runs = [robot(odometry=noisy, name=name) for name in ('a', 'a', 'b')]
+    for one in runs:
+        drive(one, 40)
+    positions = [one.odometry.pose.position for one in runs]
+    assert_array_equal(positions[0], positions[1])
+    assert np.abs(positions[0] - positions[2]).min() > 1e-6
+    assert_array_equal(runs[0].image(40, 2.0), runs[1].image(40, 2.0))
+
+
+def test_the_last_command_holds():
+    one = robot('unicycle', GROUND)
+    drive(one, 40, (0.2, 0.0, 0.0, 0.0))
+    before = one.state.pose.position[0]
+    one.step(41, 0.05)
+    assert one.state.pose.position[0] - before > 0.005
+
+
+@pytest.mark.parametrize('command', [(np.nan, 0, 0, 0), (np.inf, 0, 0, 0), (0.1, 0.2)])
+def test_an_unfit_command_is_refused_and_the_old_one_stays(command):
+    one = robot('unicycle', GROUND)
+    drive(one, 20, (0.2, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match='velocity command: got'):
+        one.command(command)
+    before = one.state.pose.position[0]
+    one.step(21, 0.05)
+    assert one.state.pose.position[0] > before
+
+
+def test_an_obstacle_stops_a_robot_short_of_it():
+    place = world(obstacles=[{'centre': [1.0, 0.3], 'radius': 0.2}])
+    one = robot('unicycle', GROUND, place=place)
+    drive(one, 400, (0.2, 0.0, 0.0, 0.0))
+    gap = np.linalg.norm(one.state.pose.position[:2] - [1.0, 0.3]) - 0.2
+    assert 0.1 <= gap < 0.13
+    assert one.collisions > 0
+    assert_allclose(one.state.velocity, np.zeros(3), atol=1e-12)
+    # It can leave again.
+    drive(one, 100, (-0.2, 0.0, 0.0, 0.0), first=401)
+    assert one.state.pose.position[0] < 0.6
+
+
+def test_a_start_inside_an_obstacle_is_refused():
+    place = world(obstacles=[{'centre': [0.2, 0.3], 'radius': 0.2}])
+    with pytest.raises(ValueError, match='robot: got start'):
+        robot('unicycle', GROUND, place=place)
+
+
+def test_a_battery_drains_faster_in_motion_and_stops_the_robot_when_empty():
+    battery = BatterySettings(capacity=20.0, idle_power=2.0, motion_power=10.0)
+    still, moving = (robot('unicycle', GROUND, battery=battery) for _ in range(2))
+    drive(still, 60, (0.0, 0.0, 0.0, 0.0))
+    drive(moving, 60, (0.2, 0.0, 0.0, 0.5))
+    assert_allclose(still.battery.charge, 1 - 2 * 3 / 20)
+    assert moving.battery.charge < still.battery.charge - 0.1
+    drive(moving, 200, (0.2, 0.0, 0.0, 0.5), first=61)
+    assert moving.battery.empty
+    assert_allclose(moving.state.velocity, np.zeros(3), atol=1e-9)
+
+
+def test_a_drone_with_an_empty_battery_comes_down_and_stays():
+    one = robot(battery=BatterySettings(capacity=10.0, idle_power=5.0))
+    drive(one, 400, (0.3, 0.0, 0.0, 0.0))
+    assert one.battery.empty
+    assert one.state.pose.position[2] == 0.0
+    where = one.state.pose.position.copy()
+    drive(one, 20, (0.3, 0.0, 0.5, 0.0), first=401)
+    assert_array_equal(one.state.pose.position, where)
+
+
+def test_the_camera_shows_the_markers_where_they_are():
+    one = robot()
+    seen = MarkerDetector(one.equipment.camera).detect(one.image(0, 0.0), one.state.pose)
+    assert_allclose(seen.positions, [[1.1, 1.05]], atol=0.002)
+
+
+def test_moving_and_tilting_the_camera_still_shows_them():
+    one = robot()
+    detector = MarkerDetector(one.equipment.camera)
+    errors = []
+    one.command((0.25, 0.1, 0.0, 0.4))
+    for step in range(1, 12):
+        one.step(step, 0.05)
+        seen = detector.detect(one.image(step, 0.05 * step), one.state.pose)
+        errors += list(np.linalg.norm(seen.positions - [1.1, 1.05], axis=1))
+    assert len(errors) >= 10
+    assert max(errors) < 0.003
+
+
+def test_each_sensor_is_there_only_where_it_is_fitted():
+    one = robot('unicycle', GROUND, laser=LaserSettings())
+    assert one.scan(0).shape == (360,)
+    for read in (lambda: one.image(0, 0.0), lambda: one.ranges(0)):
+        with pytest.raises(ValueError, match='robot: has no'):
+            read()
+    flying = robot('constant_speed', DRONE, sensor=SensorSettings().build('ranging', 2))
+    assert flying.ranges(0).shape[1] == 2
+    with pytest.raises(ValueError, match='robot: has no laser'):
+        flying.scan(0)
+
+
+def test_warming_up_changes_nothing():
+    one, other = robot(laser=LaserSettings()), robot(laser=LaserSettings())
+    one.warm_up()
+    for each in (one, other):
+        drive(each, 5)
+    assert_array_equal(one.state.pose.position, other.state.pose.position)
+    assert_array_equal(one.image(5, 0.25), other.image(5, 0.25))

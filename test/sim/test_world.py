@@ -1,0 +1,138 @@
+"""Bounds, targets, obstacles and noise streams."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pydantic import ValidationError
+from scipy.spatial.distance import pdist
+
+from maasi_filter.settings import EnvironmentSettings
+from maasi_sim.noise_streams import noise_stream
+from maasi_sim.world import TargetSettings, World
+
+FLOOR = {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]}
+CUBE = {'bounds': [[0, 260], [0, 260], [0, 260]]}
+
+
+def world(environment, seed=1, **targets):
+    return World.from_settings(
+        EnvironmentSettings.model_validate(environment), TargetSettings(**targets), seed
+    )
+
+
+@pytest.mark.parametrize('environment', [FLOOR, CUBE])
+@pytest.mark.parametrize('distribution', ['uniform', 'clustered'])
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_drawn_targets_keep_separation_and_margin(environment, distribution, seed):
+    scale = np.ptp(environment['bounds'][0])
+    separation, margin = 0.05 * scale, 0.04 * scale
+    built = world(
+        environment,
+        seed,
+        count=12,
+        distribution=distribution,
+        separation=separation,
+        margin=margin,
+    )
+    assert built.targets.shape == (12, len(environment['bounds']))
+    assert pdist(built.targets).min() >= separation
+    assert (built.targets >= built.bounds[:, 0] + margin).all()
+    assert (built.targets <= built.bounds[:, 1] - margin).all()
+
+
+def test_clustered_targets_are_closer_than_uniform_ones():
+    spread = [
+        np.median(pdist(world(CUBE, seed, count=30, distribution=kind, clusters=1).targets))
+        for kind in ('clustered', 'uniform')
+        for seed in range(3)
+    ]
+    assert max(spread[:3]) < min(spread[3:])
+
+
+def test_no_target_lies_in_an_obstacle():
+    environment = FLOOR | {'obstacles': [{'centre': [1.0, 1.0], 'radius': 0.8}]}
+    built = world(environment, count=40, margin=0.1)
+    assert np.linalg.norm(built.targets - 1.0, axis=1).min() >= 0.9
+    assert built.obstacles.radii.tolist() == [0.8]
+
+
+def test_the_same_seed_gives_the_same_world_and_another_one_another():
+    first = world(FLOOR, 7, count=5).targets
+    assert_array_equal(world(FLOOR, 7, count=5).targets, first)
+    assert np.abs(world(FLOOR, 8, count=5).targets - first).min() > 1e-6
+
+
+def test_given_positions_are_taken():
+    built = world(FLOOR, positions=[[0.5, 0.6], [1.0, 2.0]])
+    assert_array_equal(built.targets, [[0.5, 0.6], [1.0, 2.0]])
+    assert_array_equal(built.targets_3d, [[0.5, 0.6, 0.0], [1.0, 2.0, 0.0]])
+
+
+def test_a_world_without_targets_is_a_world():
+    assert world(FLOOR, count=0).targets.shape == (0, 2)
+    assert world(FLOOR, positions=[]).targets_3d.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ('targets', 'message'),
+    [
+        ({'positions': [[0.5, 0.6, 0.7]]}, r'targets.positions\[0\]: got 3 coordinates'),
+        ({'positions': [[0.5, 0.6], [0.5]]}, r'targets.positions\[1\]: got 1 coordinates'),
+        ({'positions': [[0.5, 2.6]]}, r'targets.positions\[0\]: got .* within the bounds'),
+        ({'count': 3, 'margin': 1.5}, 'targets.margin: got 1.5, allowed at most half'),
+        ({'count': 30, 'separation': 1.0}, 'targets: got count 30 .* do not fit'),
+    ],
+)
+def test_targets_that_do_not_fit_are_refused(targets, message):
+    with pytest.raises(ValueError, match=message):
+        world(FLOOR, **targets)
+
+
+@pytest.mark.parametrize(
+    'values', [{}, {'count': 1, 'positions': [[0, 0]]}, {'count': -1}, {'count': 1, 'typo': 2}]
+)
+def test_settings_that_contradict_are_refused(values):
+    with pytest.raises(ValidationError):
+        TargetSettings.model_validate(values)
+
+
+def test_noise_streams_are_keyed_by_each_part():
+    keys = [
+        (1, 'a', 2, 'x'),
+        (2, 'a', 2, 'x'),
+        (1, 'b', 2, 'x'),
+        (1, 'a', 3, 'x'),
+        (1, 'a', 2, 'y'),
+    ]
+    draws = [noise_stream(*key).random(4) for key in keys]
+    for index, draw in enumerate(draws):
+        assert_array_equal(noise_stream(*keys[index]).random(4), draw)
+        for other in draws[index + 1 :]:
+            assert not np.isclose(draw, other).any()
+
+
+def test_noise_streams_are_the_same_in_another_process():
+    code = (
+        'from maasi_sim.noise_streams import noise_stream as n;'
+        "print(n(3, 'mambo', 17, 'camera').random().hex())"
+    )
+    environment = {'PYTHONHASHSEED': '99', 'PYTHONPATH': ':'.join(sys.path)}
+    output = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True, env=environment
+    ).stdout
+    assert output.strip() == noise_stream(3, 'mambo', 17, 'camera').random().hex()
+
+
+@pytest.mark.parametrize('key', [(-1, 'a', 0), (0, 'a', -1)])
+def test_negative_keys_are_refused(key):
+    with pytest.raises(ValueError, match='got -1, allowed'):
+        noise_stream(*key)
+
+
+def test_draws_of_a_stream_are_uncorrelated_from_step_to_step():
+    draws = np.array([noise_stream(1, 'a', step, 'x').standard_normal() for step in range(2000)])
+    assert_allclose([draws.mean(), draws.std()], [0.0, 1.0], atol=0.06)
+    assert abs(np.corrcoef(draws[:-1], draws[1:])[0, 1]) < 0.06
