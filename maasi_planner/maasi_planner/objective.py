@@ -315,7 +315,8 @@ def _entries(
     corners = 4 if dimension == 2 else 8
     index = np.zeros(3, np.int64)
     part = np.zeros(3)
-    node = np.zeros(3)
+    nodes = np.zeros((8, 3))
+    weights = np.zeros(8)
     for w in range(places.shape[0]):
         begin = number
         for m in range(first, own[w]):
@@ -326,6 +327,7 @@ def _entries(
                 cell = min(int(u), last - 1)
                 index[axis] = cell
                 part[axis] = u - cell
+            kept = 0
             for corner in range(corners):
                 weight = 1.0
                 i = index[0] + (corner & 1)
@@ -337,33 +339,41 @@ def _entries(
                     else:
                         weight *= 1.0 - part[axis]
                 weight *= values[i, j, k]
-                if weight <= 0.0:
-                    continue
-                node[0] = lower[0] + i * step[0]
-                node[1] = lower[1] + j * step[1]
-                node[2] = lower[2] + k * step[2]
-                count = m + 1 if own_counts else m
-                for before in range(count):
-                    dz = node[2] - places[w, before, 2] if dimension == 3 else 0.0
-                    weight *= 1.0 - detection_probability_at(
+                if weight > 0.0:
+                    weights[kept] = weight
+                    nodes[kept, 0] = lower[0] + i * step[0]
+                    nodes[kept, 1] = lower[1] + j * step[1]
+                    nodes[kept, 2] = lower[2] + k * step[2]
+                    kept += 1
+            # The latest first: with a sharp view it ends the product at once.
+            before = m if own_counts else m - 1
+            while before >= 0 and kept > 0:
+                x = places[w, before, 0]
+                y = places[w, before, 1]
+                z = places[w, before, 2] if dimension == 3 else 0.0
+                left = 0.0
+                for corner in range(kept):
+                    weights[corner] *= 1.0 - detection_probability_at(
                         kind,
                         parameters,
-                        node[0] - places[w, before, 0],
-                        node[1] - places[w, before, 1],
-                        dz,
+                        nodes[corner, 0] - x,
+                        nodes[corner, 1] - y,
+                        (nodes[corner, 2] - z) if dimension == 3 else 0.0,
                         turns[w, before, 0],
                         turns[w, before, 1],
                     )
-                    if weight <= 0.0:
-                        break
-                if weight <= 0.0:
-                    continue
-                entry_value[number] = weight
-                entry_node[number, 0] = node[0]
-                entry_node[number, 1] = node[1]
-                entry_node[number, 2] = node[2]
-                entry_time[number] = times[w, m]
-                number += 1
+                    left += weights[corner]
+                if left <= 0.0:
+                    break
+                before -= 1
+            for corner in range(kept):
+                if weights[corner] > 0.0:
+                    entry_value[number] = weights[corner]
+                    entry_node[number, 0] = nodes[corner, 0]
+                    entry_node[number, 1] = nodes[corner, 1]
+                    entry_node[number, 2] = nodes[corner, 2]
+                    entry_time[number] = times[w, m]
+                    number += 1
         entry_count[w] = number - begin
     return number
 

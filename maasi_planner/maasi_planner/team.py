@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from maasi_filter.clusters import Cluster
 from maasi_filter.exploration import Exploration
 from maasi_filter.sensor import Sensor
-from maasi_planner.motion.base import MotionModel, RobotState
+from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 from maasi_planner.obstacles import Obstacles
 
 if TYPE_CHECKING:
@@ -50,6 +50,10 @@ class RobotView:
         that plans measures now.)
     radius : float
         Of a circle around the robot, metres; keeps waypoints apart.
+    clusters : list of Cluster, optional
+    exploration : Exploration, optional
+        What this robot alone believes, for independent planning with a filter of its own; None:
+        what the team believes.
     """
 
     state: RobotState
@@ -62,6 +66,8 @@ class RobotView:
     tail_yaws: FloatArray | None = None
     phase: int = 0
     radius: float = 0.0
+    clusters: list[Cluster] | None = None
+    exploration: Exploration | None = None
 
 
 @dataclass
@@ -84,6 +90,8 @@ class TeamView:
         Not used by the objective; for planners that want to stay away from them.
     obstacles : Obstacles, optional
         In their own size, not inflated.
+    particles, weights : (n, d), (n,) arrays, optional
+        The intensity, for mutual information; without them the clusters stand for it.
     """
 
     step: int
@@ -93,6 +101,8 @@ class TeamView:
     exploration: Exploration
     found_targets: Sequence[FoundTarget] = ()
     obstacles: Obstacles | None = None
+    particles: FloatArray | None = None
+    weights: FloatArray | None = None
 
     @property
     def bounds(self) -> FloatArray:
@@ -169,6 +179,39 @@ class Decision:
     exact: bool = True
     evaluated: int = 0
     reason: str = ''
+
+
+def single_choice(
+    points: FloatArray, prediction: Trajectories, chosen: int, reason: str
+) -> RobotDecision:
+    """Return a decision without terms, for planners that do not compare by J.
+
+    Parameters
+    ----------
+    points : (W, 3) array
+        Waypoints, metres.
+    prediction : Trajectories
+        To them.
+    chosen : int
+        Which.
+    reason : str
+        Why.
+    """
+    length = int(prediction.lengths[chosen])
+    return RobotDecision(
+        chosen=chosen,
+        waypoint=points[chosen].copy(),
+        positions=prediction.positions[chosen, : length + 1].copy(),
+        yaws=prediction.yaws[chosen, : length + 1].copy(),
+        candidates=points,
+        control_cost=prediction.control_cost,
+        target_refinement=np.zeros(len(points)),
+        exploration=np.zeros(len(points)),
+        objective=np.zeros(len(points)),
+        lengths=prediction.lengths,
+        measurements=np.zeros(len(points), np.int64),
+        reason=reason,
+    )
 
 
 def stay(view: RobotView, reason: str) -> RobotDecision:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from maasi_planner.motion.base import Body, MotionModel, RobotState, Trajectories
 from maasi_planner.motion.constant_speed import ConstantSpeed, ConstantSpeedBody
 from maasi_planner.motion.mambo import Mambo, MamboBody
+from maasi_planner.motion.quadrotor import Quadrotor, QuadrotorBody
 from maasi_planner.motion.unicycle import Unicycle, UnicycleBody
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
@@ -16,6 +17,8 @@ __all__ = [
     'Mambo',
     'MamboBody',
     'MotionModel',
+    'Quadrotor',
+    'QuadrotorBody',
     'RobotState',
     'Trajectories',
     'Unicycle',
@@ -27,6 +30,7 @@ _MODELS: dict[str, type[MotionModel]] = {
     'constant_speed': ConstantSpeed,
     'mambo': Mambo,
     'unicycle': Unicycle,
+    'quadrotor': Quadrotor,
 }
 
 

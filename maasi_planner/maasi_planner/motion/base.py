@@ -159,7 +159,8 @@ class MotionModel(ABC):
     def arrived(self, position: ArrayLike, waypoint: ArrayLike) -> bool:
         """Return whether `position` is within the tolerance of `waypoint`, both (3,)."""
         offset = np.asarray(position, dtype=float) - np.asarray(waypoint, dtype=float)
-        return math.sqrt(float(offset @ offset)) <= self.settings.tolerance
+        tolerance = self.settings.tolerance
+        return float(offset @ offset) <= tolerance * tolerance
 
     def steps_limit(self, state: RobotState, waypoints: FloatArray, step: float) -> int:
         """Return the steps after which a waypoint counts as out of reach."""
@@ -261,6 +262,47 @@ def trimmed(
 
 
 @njit(cache=True)
+def turn_towards(
+    dx: float, dy: float, yaw: float, yaw_rate: float
+) -> float:  # pragma: no cover - compiled
+    """Return the yaw rate that turns the heading towards (dx, dy)."""
+    turn = math.atan2(dy, dx) - yaw
+    turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+    return min(max(2.0 * turn, -yaw_rate), yaw_rate)
+
+
+@njit(cache=True)
+def straight_command(
+    dx: float,
+    dy: float,
+    dz: float,
+    yaw: float,
+    rate: float,
+    speed: float,
+    face_travel: bool,
+    yaw_rate: float,
+) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
+    """Return the command vx, vy, vz (body axes), yaw rate towards a waypoint at (dx, dy, dz).
+
+    The speed is `rate` times the distance, at most `speed`.
+    """
+    size = math.sqrt(dx * dx + dy * dy + dz * dz)
+    scale = rate
+    if rate * size > speed:
+        scale = speed / size
+    vx = scale * dx
+    vy = scale * dy
+    turn = 0.0
+    if face_travel and dx * dx + dy * dy > 1e-6:
+        turn = turn_towards(dx, dy, yaw, yaw_rate)
+    if yaw == 0.0:
+        return vx, vy, scale * dz, turn
+    cos_yaw = math.cos(yaw)
+    sin_yaw = math.sin(yaw)
+    return cos_yaw * vx + sin_yaw * vy, cos_yaw * vy - sin_yaw * vx, scale * dz, turn
+
+
+@njit(cache=True)
 def sideways_command(
     position: FloatArray,
     yaw: float,
@@ -281,6 +323,18 @@ def sideways_command(
 
     The velocity is `rate` times the way left, at most `speed`; `work` (2, 3) is scratch.
     """
+    if circles.shape[0] == 0:
+        out[0], out[1], out[2], out[3] = straight_command(
+            goal[0] - position[0],
+            goal[1] - position[1],
+            goal[2] - position[2],
+            yaw,
+            rate,
+            speed,
+            face_travel,
+            yaw_rate,
+        )
+        return
     target = work[0]
     velocity = work[1]
     left = next_point(position, goal, circles, vertices, to_goal, clearance, target)
@@ -294,20 +348,17 @@ def sideways_command(
     velocity[0] = scale * dx
     velocity[1] = scale * dy
     velocity[2] = scale * dz
-    if circles.shape[0] > 0:
-        hold_back(position, circles, barrier, velocity)
-        after = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
-        if after > speed:
-            velocity[0] *= speed / after
-            velocity[1] *= speed / after
-            velocity[2] *= speed / after
+    hold_back(position, circles, barrier, velocity)
+    after = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+    if after > speed:
+        velocity[0] *= speed / after
+        velocity[1] *= speed / after
+        velocity[2] *= speed / after
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
     out[0] = cos_yaw * velocity[0] + sin_yaw * velocity[1]
     out[1] = cos_yaw * velocity[1] - sin_yaw * velocity[0]
     out[2] = velocity[2]
     out[3] = 0.0
-    if face_travel and math.hypot(dx, dy) > 1e-3:
-        turn = math.atan2(dy, dx) - yaw
-        turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
-        out[3] = min(max(2.0 * turn, -yaw_rate), yaw_rate)
+    if face_travel and dx * dx + dy * dy > 1e-6:
+        out[3] = turn_towards(dx, dy, yaw, yaw_rate)

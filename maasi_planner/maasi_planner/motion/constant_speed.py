@@ -18,6 +18,7 @@ from maasi_planner.motion.base import (
     check_step,
     check_waypoints,
     sideways_command,
+    straight_command,
     trimmed,
 )
 from maasi_planner.obstacles import Obstacles
@@ -29,52 +30,59 @@ APPROACH_RATE = 5.0
 
 @njit(cache=True)
 def point_step(
-    position: FloatArray,
-    velocity: FloatArray,
+    x: float,
+    y: float,
+    z: float,
+    vx: float,
+    vy: float,
+    vz: float,
     yaw: float,
-    command: FloatArray,
+    command: tuple[float, float, float, float],
     speed: float,
     acceleration: float,
     yaw_rate: float,
     dt: float,
-) -> float:  # pragma: no cover - compiled
-    """Move a point for `dt`, in place, and return its new heading.
+) -> tuple[float, float, float, float, float, float, float]:  # pragma: no cover - compiled
+    """Move a point for `dt`; return its new position, velocity and heading.
 
     The velocity changes by at most `acceleration` per second, and the position by its mean.
     """
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    wx = cos_yaw * command[0] - sin_yaw * command[1]
-    wy = sin_yaw * command[0] + cos_yaw * command[1]
+    wx = command[0]
+    wy = command[1]
     wz = command[2]
-    size = math.sqrt(wx * wx + wy * wy + wz * wz)
-    if size > speed:
-        wx *= speed / size
-        wy *= speed / size
-        wz *= speed / size
-    if acceleration < np.inf:
-        ax = wx - velocity[0]
-        ay = wy - velocity[1]
-        az = wz - velocity[2]
-        change = math.sqrt(ax * ax + ay * ay + az * az)
-        share = 1.0
-        if change > acceleration * dt:
-            share = acceleration * dt / change
-        wx = velocity[0] + share * ax
-        wy = velocity[1] + share * ay
-        wz = velocity[2] + share * az
-        position[0] += 0.5 * dt * (velocity[0] + wx)
-        position[1] += 0.5 * dt * (velocity[1] + wy)
-        position[2] += 0.5 * dt * (velocity[2] + wz)
-    else:
-        position[0] += dt * wx
-        position[1] += dt * wy
-        position[2] += dt * wz
-    velocity[0] = wx
-    velocity[1] = wy
-    velocity[2] = wz
-    turn = min(max(command[3], -yaw_rate), yaw_rate)
-    return yaw + dt * turn
+    if yaw != 0.0:
+        cos_yaw = math.cos(yaw)
+        sin_yaw = math.sin(yaw)
+        wx = cos_yaw * command[0] - sin_yaw * command[1]
+        wy = sin_yaw * command[0] + cos_yaw * command[1]
+    square = wx * wx + wy * wy + wz * wz
+    if square > speed * speed:
+        scale = speed / math.sqrt(square)
+        wx *= scale
+        wy *= scale
+        wz *= scale
+    turned = yaw + dt * min(max(command[3], -yaw_rate), yaw_rate)
+    if acceleration == np.inf:
+        return x + dt * wx, y + dt * wy, z + dt * wz, wx, wy, wz, turned
+    ax = wx - vx
+    ay = wy - vy
+    az = wz - vz
+    change = math.sqrt(ax * ax + ay * ay + az * az)
+    if change > acceleration * dt:
+        share = acceleration * dt / change
+        wx = vx + share * ax
+        wy = vy + share * ay
+        wz = vz + share * az
+    half = 0.5 * dt
+    return (
+        x + half * (vx + wx),
+        y + half * (vy + wy),
+        z + half * (vz + wz),
+        wx,
+        wy,
+        wz,
+        turned,
+    )
 
 
 @njit(cache=True)
@@ -102,47 +110,78 @@ def _roll_out(
     costs: FloatArray,
 ) -> None:  # pragma: no cover - compiled
     work = np.zeros((2, 3))
-    command = np.zeros(4)
+    out = np.zeros(4)
     position = np.zeros(3)
-    velocity = np.zeros(3)
+    obstacles = circles.shape[0] > 0
+    plain = not obstacles and not face_travel and acceleration == np.inf
     for w in range(waypoints.shape[0]):
-        position[:] = start
-        velocity[:] = start_velocity
+        x, y, z = start[0], start[1], start[2]
+        vx, vy, vz = start_velocity[0], start_velocity[1], start_velocity[2]
         yaw = start_yaw
-        goal = waypoints[w]
+        gx, gy, gz = waypoints[w, 0], waypoints[w, 1], waypoints[w, 2]
         length = limit + 1
         cost = 0.0
+        if plain:
+            # Straight at a speed that only depends on the distance left: the same without
+            # square roots.
+            left = math.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+            scale = 1.0 / left if left > 0.0 else 0.0
+            ux, uy, uz = (gx - x) * scale, (gy - y) * scale, (gz - z) * scale
+            for k in range(limit + 1):
+                positions[w, k, 0] = gx - ux * left
+                positions[w, k, 1] = gy - uy * left
+                positions[w, k, 2] = gz - uz * left
+                yaws[w, k] = yaw
+                if left <= tolerance:
+                    length = k
+                    break
+                forward = min(rate * left, speed)
+                cost += forward * forward
+                left -= dt * forward
+            positions[w, 0, 0] = x
+            positions[w, 0, 1] = y
+            positions[w, 0, 2] = z
+            lengths[w] = length
+            costs[w] = cost
+            continue
         for k in range(limit + 1):
-            positions[w, k, 0] = position[0]
-            positions[w, k, 1] = position[1]
-            positions[w, k, 2] = position[2]
+            positions[w, k, 0] = x
+            positions[w, k, 1] = y
+            positions[w, k, 2] = z
             yaws[w, k] = yaw
-            gap = math.sqrt(
-                (position[0] - goal[0]) ** 2
-                + (position[1] - goal[1]) ** 2
-                + (position[2] - goal[2]) ** 2
-            )
-            if gap <= tolerance:
+            dx = gx - x
+            dy = gy - y
+            dz = gz - z
+            if dx * dx + dy * dy + dz * dz <= tolerance * tolerance:
                 length = k
                 break
-            sideways_command(
-                position,
-                yaw,
-                goal,
-                rate,
-                speed,
-                barrier,
-                face_travel,
-                yaw_rate,
-                circles,
-                vertices,
-                tables[w],
-                clearance,
-                work,
-                command,
-            )
+            if obstacles:
+                position[0] = x
+                position[1] = y
+                position[2] = z
+                sideways_command(
+                    position,
+                    yaw,
+                    waypoints[w],
+                    rate,
+                    speed,
+                    barrier,
+                    face_travel,
+                    yaw_rate,
+                    circles,
+                    vertices,
+                    tables[w],
+                    clearance,
+                    work,
+                    out,
+                )
+                command = (out[0], out[1], out[2], out[3])
+            else:
+                command = straight_command(dx, dy, dz, yaw, rate, speed, face_travel, yaw_rate)
             cost += command[0] ** 2 + command[1] ** 2 + command[2] ** 2 + command[3] ** 2
-            yaw = point_step(position, velocity, yaw, command, speed, acceleration, yaw_rate, dt)
+            x, y, z, vx, vy, vz, yaw = point_step(
+                x, y, z, vx, vy, vz, yaw, command, speed, acceleration, yaw_rate, dt
+            )
         lengths[w] = length
         costs[w] = cost
 
@@ -170,18 +209,23 @@ class ConstantSpeedBody(Body):
         command = check_command(velocity_command)
         limit = self.settings.yaw_rate
         self._turn = min(max(float(command[3]), -limit), limit)
-        self.yaw = float(
-            point_step(
-                self.position,
-                self.velocity,
-                self.yaw,
-                command,
-                self.settings.speed,
-                self.settings.acceleration or math.inf,
-                limit,
-                check_step(dt),
-            )
+        moved = point_step(
+            self.position[0],
+            self.position[1],
+            self.position[2],
+            self.velocity[0],
+            self.velocity[1],
+            self.velocity[2],
+            self.yaw,
+            (command[0], command[1], command[2], command[3]),
+            self.settings.speed,
+            self.settings.acceleration or math.inf,
+            limit,
+            check_step(dt),
         )
+        self.position[:] = moved[:3]
+        self.velocity[:] = moved[3:6]
+        self.yaw = float(moved[6])
 
     def robot_state(self) -> RobotState:
         """See `Body.robot_state`."""

@@ -150,9 +150,9 @@ def _response_size(a: FloatArray, b: FloatArray, gain: FloatArray) -> tuple[Floa
         if k > 400 and abs(state).max() < 1e-12:
             break
     angle = np.zeros(2)
-    for _ in range(4000):
+    for k in range(4000):
         push = -float(gain[1] * angle[0] + gain[2] * angle[1])
-        if _ == 0:
+        if k == 0:
             push += float(gain[1])
         angle = np.array([angle[0] + a3[1, 2] * angle[1] + b3[1] * push, angle[1] + b3[2] * push])
         tilt += abs(float(angle[0]))
@@ -164,9 +164,100 @@ K_VX, K_PITCH, K_Q, K_VY, K_ROLL, K_P, K_VZ, K_R = range(8)
 TILT, LIFT, SPEED, YAW_RATE, COUNT_FORCE = range(8, 13)
 
 
+# Rows of the tables of `closed_loop`: the chains, and the entries of each.
+PITCH_CHAIN, ROLL_CHAIN, HEIGHT_CHAIN = range(3)
+MATRIX, TRAVEL, COST, BOUND, ENTRIES = 0, 9, 12, 21, 24
+
+
+@njit(cache=True)
+def _chain(
+    row: FloatArray,
+    gains: FloatArray,
+    gravity: float,
+    inertia: float,
+    periods: int,
+    h: float,
+) -> None:  # pragma: no cover - compiled
+    """Fill one row of `closed_loop` from the response to each unit deviation."""
+    states = np.zeros((3, 3))
+    inputs = np.zeros(3)
+    for j in range(3):
+        states[j, j] = 1.0
+    for _ in range(periods):
+        for j in range(3):
+            v, a, w = states[j, 0], states[j, 1], states[j, 2]
+            row[BOUND + j] = max(row[BOUND + j], abs(v))
+            u = -gains[0] * v - gains[1] * a - gains[2] * w
+            inputs[j] = u
+            s = u / inertia
+            row[TRAVEL + j] += v * h + gravity * (
+                a * h * h / 2.0 + w * h * h * h / 6.0 + s * h * h * h * h / 24.0
+            )
+            states[j, 0] = v + gravity * (a * h + w * h * h / 2.0 + s * h * h * h / 6.0)
+            states[j, 1] = a + w * h + s * h * h / 2.0
+            states[j, 2] = w + s * h
+        for i in range(3):
+            for j in range(3):
+                row[COST + 3 * i + j] += inputs[i] * inputs[j]
+    for i in range(3):
+        for j in range(3):
+            row[MATRIX + 3 * i + j] = states[j, i]
+
+
+@njit(cache=True)
+def closed_loop(
+    parameters: FloatArray, periods: int, h: float
+) -> FloatArray:  # pragma: no cover - compiled
+    """Return what `periods` control periods do at once while nothing is cut off, (3, 24).
+
+    For deviations s = (velocity - command, angle, rate) of a chain: the matrix of the deviations
+    afterwards, the travel beyond command times time, the sum of u'u as a quadratic form, and the
+    largest |velocity - command| on the way for each unit deviation.
+    """
+    out = np.zeros((3, ENTRIES))
+    gains = np.zeros(3)
+    gains[:] = parameters[0:3]
+    _chain(out[PITCH_CHAIN], gains, GRAVITY, INERTIA[1], periods, h)
+    gains[:] = parameters[3:6]
+    _chain(out[ROLL_CHAIN], gains, -GRAVITY, INERTIA[0], periods, h)
+    # The height has one deviation only.
+    v = 1.0
+    height = out[HEIGHT_CHAIN]
+    for _ in range(periods):
+        force = -parameters[6] * v
+        height[COST] += force * force
+        height[TRAVEL] += v * h + force / MASS * h * h / 2.0
+        v += force / MASS * h
+    height[MATRIX] = v
+    height[BOUND] = 1.0
+    return out
+
+
+@njit(cache=True)
+def _lateral(
+    row: FloatArray, v: float, a: float, w: float
+) -> tuple[float, float, float, float, float]:  # pragma: no cover - compiled
+    """Return the deviations afterwards, the travel, and the sum of u'u of one chain."""
+    return (
+        row[0] * v + row[1] * a + row[2] * w,
+        row[3] * v + row[4] * a + row[5] * w,
+        row[6] * v + row[7] * a + row[8] * w,
+        row[9] * v + row[10] * a + row[11] * w,
+        row[12] * v * v
+        + row[16] * a * a
+        + row[20] * w * w
+        + 2.0 * (row[13] * v * a + row[14] * v * w + row[17] * a * w),
+    )
+
+
 @njit(cache=True)
 def mambo_step(
-    state: FloatArray, command: FloatArray, parameters: FloatArray, periods: int, h: float
+    state: FloatArray,
+    command: FloatArray,
+    parameters: FloatArray,
+    table: FloatArray,
+    periods: int,
+    h: float,
 ) -> float:  # pragma: no cover - compiled
     """Fly `periods` control periods of `h` seconds, in place; return the sum of u'u.
 
@@ -178,6 +269,8 @@ def mambo_step(
         vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
     parameters : (13,) array
         Gains and limits.
+    table : (3, 24) array
+        From `closed_loop` for the same periods: where no limit acts, all periods at once.
     """
     cx = command[0]
     cy = command[1]
@@ -212,6 +305,43 @@ def mambo_step(
     h4 = h * h * h * h / 24.0
     turning = cr != 0.0 or r != 0.0
     cost = 0.0
+    if not turning:
+        df = vf - cx
+        dl = vl - cy
+        dz = vz - cz
+        front = table[PITCH_CHAIN]
+        side = table[ROLL_CHAIN]
+        up = table[HEIGHT_CHAIN]
+        most_front = (
+            front[BOUND] * abs(df) + front[BOUND + 1] * abs(pitch) + front[BOUND + 2] * abs(q)
+        )
+        most_side = side[BOUND] * abs(dl) + side[BOUND + 1] * abs(roll) + side[BOUND + 2] * abs(p)
+        if (
+            abs(to_pitch) * most_front <= tilt
+            and abs(to_roll) * most_side <= tilt
+            and parameters[K_VZ] * abs(dz) <= parameters[LIFT]
+        ):
+            time = periods * h
+            df, pitch, q, forward, spent = _lateral(front, df, pitch, q)
+            cost += spent
+            dl, roll, p, left, spent = _lateral(side, dl, roll, p)
+            cost += spent
+            cost += parameters[COUNT_FORCE] * up[COST] * dz * dz
+            forward += cx * time
+            left += cy * time
+            state[0] = x + cos_yaw * forward - sin_yaw * left
+            state[1] = y + sin_yaw * forward + cos_yaw * left
+            state[2] = z + cz * time + up[TRAVEL] * dz
+            vf = cx + df
+            vl = cy + dl
+            state[3] = roll
+            state[4] = pitch
+            state[6] = cos_yaw * vf - sin_yaw * vl
+            state[7] = sin_yaw * vf + cos_yaw * vl
+            state[8] = cz + up[MATRIX] * dz
+            state[9] = p
+            state[10] = q
+            return cost
     for _ in range(periods):
         pitch_wanted = min(max(to_pitch * (cx - vf), -tilt), tilt)
         roll_wanted = min(max(to_roll * (cy - vl), -tilt), tilt)
@@ -281,6 +411,7 @@ def _roll_out(
     term: int,
     term_distance: float,
     term_gain: float,
+    table: FloatArray,
     periods: int,
     h: float,
     limit: int,
@@ -336,7 +467,7 @@ def _roll_out(
                     parameters,
                     command,
                 )
-            cost += mambo_step(state, command, parameters, periods, h)
+            cost += mambo_step(state, command, parameters, table, periods, h)
         lengths[w] = length
         costs[w] = cost
 
@@ -371,11 +502,23 @@ class MamboBody(Body):
         self.settings = settings
         self.parameters = mambo_parameters(settings)
         self.state = twelve_states(state)
+        self._periods = (0, 0.0)
+        self._table = np.zeros((3, ENTRIES))
 
     def step(self, velocity_command: ArrayLike, dt: float) -> None:
         """See `Body.step`."""
         periods, h = control_periods(check_step(dt))
-        mambo_step(self.state, check_command(velocity_command), self.parameters, periods, h)
+        if (periods, h) != self._periods:
+            self._periods = (periods, h)
+            self._table = closed_loop(self.parameters, periods, h)
+        mambo_step(
+            self.state,
+            check_command(velocity_command),
+            self.parameters,
+            self._table,
+            periods,
+            h,
+        )
 
     def robot_state(self) -> RobotState:
         """See `Body.robot_state`."""
@@ -435,15 +578,7 @@ def _mambo_parameters(settings: MotionSettings) -> FloatArray:
         *lateral_system(INERTIA[1], 1.0), gains['pitch'][1:]
     )
     roll_response, roll_tilt = _response_size(*lateral_system(INERTIA[0], -1.0), gains['roll'][1:])
-    height = 1.0 - (1.0 - PERIOD * out[K_VZ] / MASS) ** np.arange(4000)
-    height_response = np.diff(height)
-    length = min(len(pitch_response), len(roll_response), len(height_response))
-    largest = np.maximum(
-        np.maximum(np.abs(pitch_response[:length]), np.abs(roll_response[:length])),
-        np.abs(height_response[:length]),
-    )
     overshoot = max(float(np.abs(pitch_response).sum()), float(np.abs(roll_response).sum()), 1.0)
-    del largest
     acceleration = settings.acceleration or math.inf
     # Both axes together stay below the limits.
     tilt = min(settings.tilt, acceleration / GRAVITY / math.sqrt(2.0))
@@ -503,6 +638,7 @@ class Mambo(MotionModel):
             self._term,
             self.settings.obstacle_distance,
             self.settings.obstacle_gain,
+            closed_loop(self.parameters, periods, h),
             periods,
             h,
             limit,

@@ -28,6 +28,15 @@ from maasi_planner.motion.base import (
     check_waypoints,
     trimmed,
 )
+from maasi_planner.motion.dynamic_window import (
+    ACCELERATION,
+    BRAKING,
+    RATE,
+    SPEED,
+    YAW_ACCELERATION,
+    YAW_RATE,
+    window_command,
+)
 from maasi_planner.obstacles import Obstacles, next_point
 from maasi_planner.settings import MotionSettings
 
@@ -40,38 +49,43 @@ AHEAD = 0.6
 
 @njit(cache=True)
 def unicycle_step(
-    state: FloatArray,
+    x: float,
+    y: float,
+    yaw: float,
     forward: float,
     turn: float,
+    command_forward: float,
+    command_turn: float,
     speed: float,
     acceleration: float,
     yaw_rate: float,
     yaw_acceleration: float,
     dt: float,
-) -> None:  # pragma: no cover - compiled
-    """Move for `dt`, in place; `state` (5,) is x, y, heading, speed, turn rate.
+) -> tuple[float, float, float, float, float]:  # pragma: no cover - compiled
+    """Move for `dt`; return new x, y, heading, forward speed and turn rate.
 
     Both speeds change by at most their acceleration, and the robot follows the arc of the mean
     of old and new.
     """
-    forward = min(max(forward, -speed), speed)
-    turn = min(max(turn, -yaw_rate), yaw_rate)
-    forward = min(max(forward, state[3] - acceleration * dt), state[3] + acceleration * dt)
-    turn = min(max(turn, state[4] - yaw_acceleration * dt), state[4] + yaw_acceleration * dt)
-    if acceleration < np.inf:
-        mean = 0.5 * (forward + state[3])
-    else:
-        mean = forward
-    angle = (0.5 * (turn + state[4]) if yaw_acceleration < np.inf else turn) * dt
+    wanted = min(max(command_forward, -speed), speed)
+    change = acceleration * dt
+    wanted = min(max(wanted, forward - change), forward + change)
+    mean = 0.5 * (wanted + forward) if acceleration < np.inf else wanted
+    wanted_turn = min(max(command_turn, -yaw_rate), yaw_rate)
+    change = yaw_acceleration * dt
+    wanted_turn = min(max(wanted_turn, turn - change), turn + change)
+    angle = (0.5 * (wanted_turn + turn) if yaw_acceleration < np.inf else wanted_turn) * dt
     chord = mean * dt
-    if abs(angle) > 1e-9:
+    if abs(angle) > 1e-6:
         chord *= math.sin(0.5 * angle) / (0.5 * angle)
-    heading = state[2] + 0.5 * angle
-    state[0] += chord * math.cos(heading)
-    state[1] += chord * math.sin(heading)
-    state[2] += angle
-    state[3] = forward
-    state[4] = turn
+    heading = yaw + 0.5 * angle
+    return (
+        x + chord * math.cos(heading),
+        y + chord * math.sin(heading),
+        yaw + angle,
+        wanted,
+        wanted_turn,
+    )
 
 
 @njit(cache=True)
@@ -98,51 +112,92 @@ def way_ahead(
 
 
 @njit(cache=True)
+def drive(
+    dx: float,
+    dy: float,
+    left: float,
+    yaw: float,
+    rate: float,
+    speed: float,
+    yaw_rate: float,
+    least: float,
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Return forward speed and turn rate towards a point at (dx, dy), with `left` m to go.
+
+    At a point on the way the robot keeps its speed, but for turning it counts at least `least`.
+    """
+    rho = math.sqrt(dx * dx + dy * dy)
+    if rho < 1e-9:
+        return 0.0, 0.0
+    alpha = math.atan2(dy, dx) - yaw
+    alpha -= 2.0 * math.pi * math.floor((alpha + math.pi) / (2.0 * math.pi))
+    forward = 0.0
+    turn = K_ALPHA * alpha
+    if abs(alpha) < AHEAD:
+        # cos(alpha) and sin(alpha) without trigonometry.
+        cosine = (math.cos(yaw) * dx + math.sin(yaw) * dy) / rho
+        sine = (math.cos(yaw) * dy - math.sin(yaw) * dx) / rho
+        forward = min(rate * left, speed) * cosine
+        forward = min(forward, rate * max(rho, least))
+        turn += forward / max(rho, 1e-3) * sine
+    return forward, min(max(turn, -yaw_rate), yaw_rate)
+
+
+@njit(cache=True)
 def unicycle_command(
     x: float,
     y: float,
     yaw: float,
+    forward: float,
+    turn: float,
     goal: FloatArray,
-    rate: float,
-    speed: float,
-    braking: float,
-    yaw_rate: float,
+    limits: FloatArray,
+    window: bool,
     circles: FloatArray,
     vertices: FloatArray,
     to_goal: FloatArray,
     clearance: float,
     work: FloatArray,
-    out: FloatArray,
-) -> None:  # pragma: no cover - compiled
-    """Write the command into `out` (4,): forward speed, 0, 0, turn rate."""
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Return the command of a robot among obstacles: forward speed and turn rate.
+
+    Parameters
+    ----------
+    x, y, yaw, forward, turn : float
+        State.
+    goal : (3,) array
+        Waypoint.
+    limits : (6,) array
+        Approach rate, speed, braking rate, yaw rate, acceleration, yaw acceleration.
+    window : bool
+        Whether the dynamic window chooses the speeds near obstacles.
+    circles, vertices, to_goal, clearance
+        See `next_point`.
+    work : (2, 3) array
+        Scratch.
+    """
     position = work[0]
     target = work[1]
     position[0] = x
     position[1] = y
     position[2] = goal[2]
     left = next_point(position, goal, circles, vertices, to_goal, clearance, target)
-    dx = target[0] - x
-    dy = target[1] - y
-    rho = math.hypot(dx, dy)
-    out[0] = 0.0
-    out[1] = 0.0
-    out[2] = 0.0
-    out[3] = 0.0
-    if rho < 1e-9:
-        return
-    alpha = math.atan2(dy, dx) - yaw
-    alpha -= 2.0 * math.pi * math.floor((alpha + math.pi) / (2.0 * math.pi))
-    forward = 0.0
-    if abs(alpha) < AHEAD:
-        forward = min(rate * left, speed) * math.cos(alpha)
-        # Never faster than the robot can turn towards the point.
-        forward = min(forward, rate * max(rho, clearance))
-        if circles.shape[0] > 0:
-            free = way_ahead(x, y, yaw, 4.0 * clearance + speed, circles)
-            forward = min(forward, braking * free)
-    turn = K_ALPHA * alpha + forward / max(rho, 1e-3) * math.sin(alpha)
-    out[0] = forward
-    out[3] = min(max(turn, -yaw_rate), yaw_rate)
+    if window:
+        return window_command(
+            x, y, yaw, forward, turn, target[0], target[1], left, limits, circles, clearance
+        )
+    ahead, turning = drive(
+        target[0] - x,
+        target[1] - y,
+        left,
+        yaw,
+        limits[RATE],
+        limits[SPEED],
+        limits[YAW_RATE],
+        clearance,
+    )
+    free = way_ahead(x, y, yaw, 4.0 * clearance + limits[SPEED], circles)
+    return min(ahead, limits[BRAKING] * free), turning
 
 
 @njit(cache=True)
@@ -150,12 +205,8 @@ def _roll_out(
     start: FloatArray,
     height: float,
     waypoints: FloatArray,
-    rate: float,
-    speed: float,
-    acceleration: float,
-    braking: float,
-    yaw_rate: float,
-    yaw_acceleration: float,
+    limits: FloatArray,
+    window: bool,
     tolerance: float,
     circles: FloatArray,
     vertices: FloatArray,
@@ -169,42 +220,52 @@ def _roll_out(
     costs: FloatArray,
 ) -> None:  # pragma: no cover - compiled
     work = np.zeros((2, 3))
-    command = np.zeros(4)
-    state = np.zeros(5)
+    obstacles = circles.shape[0] > 0
+    rate, speed, yaw_rate = limits[RATE], limits[SPEED], limits[YAW_RATE]
+    acceleration, yaw_acceleration = limits[ACCELERATION], limits[YAW_ACCELERATION]
     for w in range(waypoints.shape[0]):
-        state[:] = start
-        goal = waypoints[w]
+        x, y, yaw, forward, turn = start[0], start[1], start[2], start[3], start[4]
+        gx, gy = waypoints[w, 0], waypoints[w, 1]
         length = limit + 1
         cost = 0.0
         for k in range(limit + 1):
-            positions[w, k, 0] = state[0]
-            positions[w, k, 1] = state[1]
+            positions[w, k, 0] = x
+            positions[w, k, 1] = y
             positions[w, k, 2] = height
-            yaws[w, k] = state[2]
-            if math.hypot(state[0] - goal[0], state[1] - goal[1]) <= tolerance:
+            yaws[w, k] = yaw
+            dx = gx - x
+            dy = gy - y
+            square = dx * dx + dy * dy
+            if square <= tolerance * tolerance:
                 length = k
                 break
-            unicycle_command(
-                state[0],
-                state[1],
-                state[2],
-                goal,
-                rate,
-                speed,
-                braking,
-                yaw_rate,
-                circles,
-                vertices,
-                tables[w],
-                clearance,
-                work,
-                command,
-            )
-            cost += command[0] ** 2 + command[3] ** 2
-            unicycle_step(
-                state,
-                command[0],
-                command[3],
+            if obstacles:
+                ahead, turning = unicycle_command(
+                    x,
+                    y,
+                    yaw,
+                    forward,
+                    turn,
+                    waypoints[w],
+                    limits,
+                    window,
+                    circles,
+                    vertices,
+                    tables[w],
+                    clearance,
+                    work,
+                )
+            else:
+                ahead, turning = drive(dx, dy, math.sqrt(square), yaw, rate, speed, yaw_rate, 0.0)
+            cost += ahead * ahead + turning * turning
+            x, y, yaw, forward, turn = unicycle_step(
+                x,
+                y,
+                yaw,
+                forward,
+                turn,
+                ahead,
+                turning,
                 speed,
                 acceleration,
                 yaw_rate,
@@ -240,10 +301,14 @@ class UnicycleBody(Body):
         """See `Body.step`; sideways and vertical speeds are ignored."""
         command = check_command(velocity_command)
         settings = self.settings
-        unicycle_step(
-            self.state,
-            float(command[0]),
-            float(command[3]),
+        self.state[:] = unicycle_step(
+            self.state[0],
+            self.state[1],
+            self.state[2],
+            self.state[3],
+            self.state[4],
+            command[0],
+            command[3],
             settings.speed,
             settings.acceleration or math.inf,
             settings.yaw_rate,
@@ -286,17 +351,29 @@ class Unicycle(MotionModel):
         radius: float = 0.0,
     ) -> None:
         super().__init__(settings, obstacles, radius)
-        self.rate = settings.approach_rate or K_RHO
-        self.braking = 2.0
+        rate = settings.approach_rate or K_RHO
+        braking = 2.0
         if settings.acceleration is not None:
             slowing = settings.acceleration / settings.speed
-            self.rate = min(self.rate, slowing)
-            self.braking = min(self.braking, 0.5 * slowing)
+            rate = min(rate, slowing)
+            braking = min(braking, 0.5 * slowing)
+        self.limits = np.array(
+            [
+                rate,
+                settings.speed,
+                braking,
+                settings.yaw_rate,
+                settings.acceleration or math.inf,
+                settings.yaw_acceleration or math.inf,
+            ]
+        )
+        self._window = settings.avoidance == 'dynamic_window'
 
     def arrived(self, position: ArrayLike, waypoint: ArrayLike) -> bool:
         """Return whether `position` is within the tolerance of `waypoint`, horizontally."""
-        offset = np.asarray(position, dtype=float) - np.asarray(waypoint, dtype=float)
-        return math.hypot(float(offset[0]), float(offset[1])) <= self.settings.tolerance
+        offset = np.asarray(position, dtype=float)[:2] - np.asarray(waypoint, dtype=float)[:2]
+        tolerance = self.settings.tolerance
+        return float(offset[0] * offset[0] + offset[1] * offset[1]) <= tolerance * tolerance
 
     def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
         """See `MotionModel.predict`."""
@@ -308,18 +385,13 @@ class Unicycle(MotionModel):
         yaws = np.empty((number, limit + 1))
         lengths = np.empty(number, np.int64)
         costs = np.empty(number)
-        settings = self.settings
         _roll_out(
             five_states(state),
             float(state.pose.position[2]),
             goals,
-            self.rate,
-            settings.speed,
-            settings.acceleration or math.inf,
-            self.braking,
-            settings.yaw_rate,
-            settings.yaw_acceleration or math.inf,
-            settings.tolerance,
+            self.limits,
+            self._window,
+            self.settings.tolerance,
             self.keep_out.circles,
             self.keep_out.vertices,
             self._tables(goals),
@@ -336,23 +408,29 @@ class Unicycle(MotionModel):
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`."""
         goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
+        x, y, yaw, forward, turn = (float(value) for value in five_states(state))
         out = np.zeros(4)
-        unicycle_command(
-            float(state.pose.position[0]),
-            float(state.pose.position[1]),
-            state.pose.yaw,
-            goal,
-            self.rate,
-            self.settings.speed,
-            self.braking,
-            self.settings.yaw_rate,
-            self.keep_out.circles,
-            self.keep_out.vertices,
-            self._table(goal),
-            self.keep_out.clearance,
-            np.zeros((2, 3)),
-            out,
-        )
+        if len(self.keep_out):
+            out[0], out[3] = unicycle_command(
+                x,
+                y,
+                yaw,
+                forward,
+                turn,
+                goal,
+                self.limits,
+                self._window,
+                self.keep_out.circles,
+                self.keep_out.vertices,
+                self._table(goal),
+                self.keep_out.clearance,
+                np.zeros((2, 3)),
+            )
+        else:
+            dx, dy = float(goal[0]) - x, float(goal[1]) - y
+            rate, speed, _, yaw_rate, _, _ = (float(value) for value in self.limits)
+            left = math.sqrt(dx * dx + dy * dy)
+            out[0], out[3] = drive(dx, dy, left, yaw, rate, speed, yaw_rate, 0.0)
         return out
 
     def body(self, state: RobotState) -> UnicycleBody:

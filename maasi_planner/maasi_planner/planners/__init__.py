@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+from maasi_planner.planners.active_search import ActiveSearch
 from maasi_planner.planners.base import Planner
 from maasi_planner.planners.intermittent import Intermittent
 from maasi_planner.planners.lawnmower import Lawnmower
+from maasi_planner.planners.mutual_information import MutualInformation
+from maasi_planner.planners.nearest_widest import NearestWidest
 from maasi_planner.settings import PlannerSettings
 
-__all__ = ['Intermittent', 'Lawnmower', 'Planner', 'make_planner']
+__all__ = [
+    'ActiveSearch',
+    'Intermittent',
+    'Lawnmower',
+    'MutualInformation',
+    'NearestWidest',
+    'Planner',
+    'make_planner',
+]
 
 _PLANNERS: dict[str, type[Planner]] = {
     'maasi': Intermittent,
     'asi': Intermittent,
+    'maas': ActiveSearch,
+    'as': ActiveSearch,
+    'mutual_information': MutualInformation,
+    'nearest_widest': NearestWidest,
     'lawnmower': Lawnmower,
 }
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotView, TeamView
 
@@ -197,3 +199,76 @@ def free_of_robots(
             offset = points - place
             free &= (offset * offset).sum(axis=1) >= reach * reach
     return free
+
+
+@dataclass
+class Options:
+    """What one planning robot can choose from.
+
+    Attributes
+    ----------
+    points : (W, 3) array
+        Waypoints, moved out of obstacles, metres.
+    prediction : Trajectories
+        To them.
+    allowed : (W,) array of bool
+        Which can be reached, lead somewhere, and keep away from where others will stand.
+    """
+
+    points: FloatArray
+    prediction: Trajectories
+    allowed: BoolArray
+
+
+def options_of(
+    team: TeamView,
+    name: str,
+    places: list[tuple[FloatArray, float]],
+    extra: FloatArray | None = None,
+) -> Options | str:
+    """Return what a robot can choose from, or why it has to stay.
+
+    Parameters
+    ----------
+    team : TeamView
+        The team.
+    name : str
+        A robot that plans.
+    places : list
+        From `waiting_places`.
+    extra : (n, 3) array, optional
+        Further waypoints.
+    """
+    view = team.robots[name]
+    problem = state_problem(view)
+    if problem is not None:
+        return problem
+    if not len(view.candidates) and (extra is None or not len(extra)):
+        return 'it has no candidates'
+    points, dropped = usable_candidates(team, name, extra)
+    if not len(points):
+        return f'no candidate is usable ({dropped})'
+    prediction = view.motion.predict(view.state, points, team.step_time)
+    free = free_of_robots(points, view.radius, places)
+    allowed = prediction.reached & free & (prediction.lengths > 0)
+    if allowed.any():
+        return Options(points, prediction, allowed)
+    if not free.any():
+        return 'other robots stand at all candidates'
+    if (prediction.lengths == 0).any():
+        return 'it is at its only candidate already'
+    return 'no candidate can be reached'
+
+
+def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float]]) -> bool:
+    """Return whether a waypoint (3,) keeps the radii away from other places."""
+    return bool(free_of_robots(point[None, :], radius, others)[0])
+
+
+def explain(decision: Decision) -> Decision:
+    """Put the robots in the order of their names and join their reasons."""
+    decision.robots = {name: decision.robots[name] for name in sorted(decision.robots)}
+    decision.reason = '; '.join(
+        f'{name}: {robot.reason}' for name, robot in decision.robots.items()
+    )
+    return decision

@@ -10,9 +10,8 @@ from maasi_planner.objective import TeamObjective
 from maasi_planner.planners.base import (
     Planner,
     check_team,
-    free_of_robots,
-    state_problem,
-    usable_candidates,
+    explain,
+    options_of,
     waiting_places,
 )
 from maasi_planner.settings import PlannerSettings
@@ -47,31 +46,14 @@ class Intermittent(Planner):
         allowed: dict[str, BoolArray] = {}
         decision = Decision(step=team.step)
         for name in team.planning():
-            view = team.robots[name]
-            candidates[name] = np.zeros((0, 3))
-            problem = state_problem(view)
-            if problem is None and not len(view.candidates):
-                problem = 'it has no candidates'
-            if problem is None:
-                points, dropped = usable_candidates(team, name, self._centres(team, name))
-                if len(points):
-                    prediction = view.motion.predict(view.state, points, team.step_time)
-                    free = free_of_robots(points, view.radius, places)
-                    fine = prediction.reached & free & (prediction.lengths > 0)
-                    if fine.any():
-                        candidates[name] = points
-                        trajectories[name] = prediction
-                        allowed[name] = fine
-                    elif not free.any():
-                        problem = 'other robots stand at all candidates'
-                    elif (prediction.lengths == 0).any():
-                        problem = 'it is at its only candidate already'
-                    else:
-                        problem = 'no candidate can be reached'
-                else:
-                    problem = f'no candidate is usable ({dropped})'
-            if problem is not None:
-                decision.robots[name] = stay(view, f'stays: {problem}')
+            options = options_of(team, name, places, self._centres(team, name))
+            if isinstance(options, str):
+                candidates[name] = np.zeros((0, 3))
+                decision.robots[name] = stay(team.robots[name], f'stays: {options}')
+            else:
+                candidates[name] = options.points
+                trajectories[name] = options.prediction
+                allowed[name] = options.allowed
         objective = TeamObjective(team, self.settings, candidates, trajectories, allowed)
         chosen, value, exact, work = objective.search()
         decision.objective = value if len(chosen) else 0.0
@@ -81,12 +63,7 @@ class Intermittent(Planner):
             decision.robots[name] = self._robot_decision(
                 team, name, objective, index, chosen, candidates[name], trajectories[name]
             )
-        # In the order of names, whichever way they were decided.
-        decision.robots = {name: decision.robots[name] for name in sorted(decision.robots)}
-        decision.reason = '; '.join(
-            f'{name}: {robot.reason}' for name, robot in decision.robots.items()
-        )
-        return decision
+        return explain(decision)
 
     def _robot_decision(
         self,

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.detection_model import BOX
-from maasi_planner.planners.base import Planner, check_team, state_problem
+from maasi_planner.planners.base import Planner, check_team, explain, state_problem
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, TeamView, stay
+from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
 FloatArray = NDArray[np.float64]
 
@@ -183,10 +183,7 @@ class Lawnmower(Planner):
                 decision.robots[name] = stay(view, f'stays: {problem}')
                 continue
             decision.robots[name] = self._decide_one(team, name)
-        decision.reason = '; '.join(
-            f'{name}: {robot.reason}' for name, robot in decision.robots.items()
-        )
-        return decision
+        return explain(decision)
 
     def _decide_one(self, team: TeamView, name: str) -> RobotDecision:
         view = team.robots[name]
@@ -201,7 +198,7 @@ class Lawnmower(Planner):
             prediction = view.motion.predict(view.state, point[None, :], team.step_time)
             if not prediction.reached[0] or prediction.lengths[0] == 0:
                 continue
-            return single_choice(point[None, :], prediction, 'next point of the lawnmower')
+            return single_choice(point[None, :], prediction, 0, 'next point of the lawnmower')
 
     def finished(self, team: TeamView) -> str | None:
         """See `Planner.finished`; also when every lane is done."""
@@ -212,23 +209,3 @@ class Lawnmower(Planner):
             if standing:
                 return 'all lanes of the lawnmower are done'
         return super().finished(team)
-
-
-def single_choice(points: FloatArray, prediction, reason: str, chosen: int = 0) -> RobotDecision:
-    """Return a decision without terms, for planners that do not compare by J."""
-    length = int(prediction.lengths[chosen])
-    none = np.zeros(len(points))
-    return RobotDecision(
-        chosen=chosen,
-        waypoint=points[chosen].copy(),
-        positions=prediction.positions[chosen, : length + 1].copy(),
-        yaws=prediction.yaws[chosen, : length + 1].copy(),
-        candidates=points,
-        control_cost=prediction.control_cost,
-        target_refinement=none,
-        exploration=none.copy(),
-        objective=none.copy(),
-        lengths=prediction.lengths,
-        measurements=np.zeros(len(points), np.int64),
-        reason=reason,
-    )

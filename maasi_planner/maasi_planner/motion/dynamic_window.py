@@ -1,0 +1,123 @@
+"""Dynamic window: the best of the speeds that a ground robot can reach next (000, section 7.2).
+
+Pairs of forward speed and turn rate within reach of the accelerations are followed as arcs for a
+while; those that could not stop before an obstacle are out, and of the others the one wins that
+brings the robot nearest to the point it is heading for, facing it, with room to obstacles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+# Entries of the array of limits.
+RATE, SPEED, BRAKING, YAW_RATE, ACCELERATION, YAW_ACCELERATION = range(6)
+
+# Seconds until the next command at which the window is taken, and for which arcs are followed.
+WINDOW = 0.2
+LOOK_AHEAD = 1.2
+ARC_STEPS = 8
+FORWARD_SAMPLES = 6
+TURN_SAMPLES = 13
+
+
+@njit(cache=True)
+def window_command(
+    x: float,
+    y: float,
+    yaw: float,
+    forward: float,
+    turn: float,
+    target_x: float,
+    target_y: float,
+    left: float,
+    limits: FloatArray,
+    circles: FloatArray,
+    clearance: float,
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Return forward speed and turn rate.
+
+    Parameters
+    ----------
+    x, y, yaw, forward, turn : float
+        State of the robot.
+    target_x, target_y : float
+        Point to head for, in sight.
+    left : float
+        Length of the way to the waypoint, metres.
+    limits : (6,) array
+        Approach rate, speed, braking rate, yaw rate, acceleration, yaw acceleration.
+    circles : (n, 5) array
+        Obstacles, inflated by the robot's radius.
+    clearance : float
+        Room to obstacles beyond which more is not better, metres.
+    """
+    fastest = min(limits[SPEED], limits[RATE] * left)
+    deceleration = min(limits[ACCELERATION], 2.0 * limits[SPEED])
+    low = max(0.0, forward - limits[ACCELERATION] * WINDOW)
+    high = max(low, min(fastest, forward + limits[ACCELERATION] * WINDOW))
+    low = min(low, high)
+    turn_low = max(-limits[YAW_RATE], turn - limits[YAW_ACCELERATION] * WINDOW)
+    turn_high = min(limits[YAW_RATE], turn + limits[YAW_ACCELERATION] * WINDOW)
+    away = math.hypot(target_x - x, target_y - y)
+    time = min(LOOK_AHEAD, max(0.3, away / max(limits[SPEED], 1e-9)))
+    best = -np.inf
+    best_forward = 0.0
+    best_turn = 0.0
+    for i in range(FORWARD_SAMPLES + 1):
+        # Standing is always among the choices: turning on the spot touches nothing.
+        v = 0.0
+        if i > 0:
+            v = low + (high - low) * (i - 1) / (FORWARD_SAMPLES - 1)
+        stopping = 0.5 * v * v / deceleration + v * WINDOW
+        for j in range(TURN_SAMPLES):
+            w = turn_low + (turn_high - turn_low) * j / (TURN_SAMPLES - 1)
+            px = x
+            py = y
+            heading = yaw
+            room = np.inf
+            free = True
+            dt = time / ARC_STEPS
+            for k in range(ARC_STEPS):
+                heading += 0.5 * w * dt
+                px += v * dt * math.cos(heading)
+                py += v * dt * math.sin(heading)
+                heading += 0.5 * w * dt
+                travelled = v * dt * (k + 1)
+                for c in range(circles.shape[0]):
+                    gap = math.hypot(px - circles[c, 0], py - circles[c, 1]) - circles[c, 3]
+                    room = min(room, gap)
+                    if gap < 0.0 and v > 0.0 and travelled <= stopping + v * dt:
+                        free = False
+                if not free:
+                    break
+                if room < 0.0 and v > 0.0:
+                    break
+            if not free:
+                continue
+            gap = math.hypot(target_x - px, target_y - py)
+            off = math.atan2(target_y - py, target_x - px) - heading
+            off -= 2.0 * math.pi * math.floor((off + math.pi) / (2.0 * math.pi))
+            closer = (away - gap) / (limits[SPEED] * time)
+            score = closer - 0.3 * abs(off) / math.pi * min(1.0, gap / clearance)
+            score += 0.2 * min(max(room, -clearance), clearance) / clearance
+            score -= 0.01 * abs(w) / limits[YAW_RATE]
+            if score > best:
+                best = score
+                best_forward = v
+                best_turn = w
+    # Whatever the arcs say, never faster than the way straight ahead allows.
+    for c in range(circles.shape[0]):
+        ox = circles[c, 0] - x
+        oy = circles[c, 1] - y
+        distance = math.hypot(ox, oy)
+        closing = (ox * math.cos(yaw) + oy * math.sin(yaw)) / max(distance, 1e-9)
+        if closing > 0.0:
+            allowed = limits[BRAKING] * max(distance - circles[c, 3], 0.0) / closing
+            best_forward = min(best_forward, allowed)
+    return best_forward, best_turn

@@ -1,0 +1,353 @@
+"""Full nonlinear quadrotor under backstepping (003, section 4, after Sun and others, 2014).
+
+The stages of the backstepping, each the virtual control of the one before:
+
+    position      v_d = -c1 (p - p_d)                              the velocity command
+    velocity      a_d = c2 (v_d - v),  f = m (a_d + g e3)          force asked for
+    attitude      omega_d = c3 (b3 x f / |f|)                      turns the thrust b3 towards f
+    turn rates    tau = omega x J omega + J c4 (omega_d - omega)   torques
+
+The first stage is the controller's (`command`), the others fly any velocity command. Derivatives
+of the virtual controls are left out, as c1 < c2 < c3 < c4 are far enough apart. The papers do not
+print mass, inertia and gains; those here are of a quadrotor of 1.2 kg.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.pose import Pose
+from maasi_planner.motion.base import (
+    Body,
+    MotionModel,
+    RobotState,
+    Trajectories,
+    check_command,
+    check_step,
+    check_waypoints,
+    sideways_command,
+    trimmed,
+)
+from maasi_planner.motion.mambo import GRAVITY, control_periods
+from maasi_planner.obstacles import Obstacles
+from maasi_planner.settings import MotionSettings
+
+FloatArray = NDArray[np.float64]
+
+MASS = 1.2
+INERTIA = (0.0123, 0.0123, 0.0224)
+C1, C2, C3, C4 = 0.8, 2.5, 10.0, 45.0
+# Entries of the array of limits.
+SPEED, LEVEL, VERTICAL, TILT, YAW_RATE, COUNT_FORCE = range(6)
+
+
+@njit(cache=True)
+def quadrotor_step(
+    state: FloatArray, command: FloatArray, limits: FloatArray, periods: int, h: float
+) -> float:  # pragma: no cover - compiled
+    """Fly `periods` control periods of `h` seconds, in place; return the sum of u'u.
+
+    Parameters
+    ----------
+    state : (13,) array
+        Position, quaternion w x y z, velocity (map), angular velocity (body).
+    command : (4,) array
+        vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+    limits : (6,) array
+        Speed, level and vertical acceleration, tilt, yaw rate, and whether the force counts.
+    """
+    size = math.sqrt(command[0] ** 2 + command[1] ** 2 + command[2] ** 2)
+    scale = 1.0
+    if size > limits[SPEED]:
+        scale = limits[SPEED] / size
+    turn = min(max(command[3], -limits[YAW_RATE]), limits[YAW_RATE])
+    steepest = math.tan(limits[TILT])
+    cost = 0.0
+    for _ in range(periods):
+        w, x, y, z = state[3], state[4], state[5], state[6]
+        # Columns of the rotation matrix: forward, left, up.
+        b1x = 1.0 - 2.0 * (y * y + z * z)
+        b1y = 2.0 * (x * y + w * z)
+        b3x = 2.0 * (x * z + w * y)
+        b3y = 2.0 * (y * z - w * x)
+        b3z = 1.0 - 2.0 * (x * x + y * y)
+        level = math.sqrt(b1x * b1x + b1y * b1y)
+        cos_yaw = b1x / level if level > 1e-9 else 1.0
+        sin_yaw = b1y / level if level > 1e-9 else 0.0
+        vx = scale * (cos_yaw * command[0] - sin_yaw * command[1])
+        vy = scale * (sin_yaw * command[0] + cos_yaw * command[1])
+        vz = scale * command[2]
+        ax = C2 * (vx - state[7])
+        ay = C2 * (vy - state[8])
+        az = C2 * (vz - state[9])
+        az = min(max(az, -limits[VERTICAL]), limits[VERTICAL])
+        most = min(limits[LEVEL], steepest * (GRAVITY + az))
+        asked = math.sqrt(ax * ax + ay * ay)
+        if asked > most:
+            ax *= most / asked
+            ay *= most / asked
+        fz = GRAVITY + az
+        strength = math.sqrt(ax * ax + ay * ay + fz * fz)
+        nx = ax / strength
+        ny = ay / strength
+        nz = fz / strength
+        thrust = MASS * max(0.0, ax * b3x + ay * b3y + fz * b3z)
+        # The way from b3 to the force, b3 x n, in body axes.
+        ex = b3y * nz - b3z * ny
+        ey = b3z * nx - b3x * nz
+        ez = b3x * ny - b3y * nx
+        b2x = 2.0 * (x * y - w * z)
+        b2y = 1.0 - 2.0 * (x * x + z * z)
+        b2z = 2.0 * (y * z + w * x)
+        b1z = 2.0 * (x * z - w * y)
+        wanted_x = C3 * (b1x * ex + b1y * ey + b1z * ez)
+        wanted_y = C3 * (b2x * ex + b2y * ey + b2z * ez)
+        wanted_z = turn
+        p, q, r = state[10], state[11], state[12]
+        tx = INERTIA[0] * C4 * (wanted_x - p) + (INERTIA[2] - INERTIA[1]) * q * r
+        ty = INERTIA[1] * C4 * (wanted_y - q) + (INERTIA[0] - INERTIA[2]) * r * p
+        tz = INERTIA[2] * C4 * (wanted_z - r) + (INERTIA[1] - INERTIA[0]) * p * q
+        cost += tx * tx + ty * ty + tz * tz
+        extra = thrust - MASS * GRAVITY
+        cost += limits[COUNT_FORCE] * extra * extra
+        # Accelerations of the body, then speeds before positions.
+        new_p = p + h * (tx - (INERTIA[2] - INERTIA[1]) * q * r) / INERTIA[0]
+        new_q = q + h * (ty - (INERTIA[0] - INERTIA[2]) * r * p) / INERTIA[1]
+        new_r = r + h * (tz - (INERTIA[1] - INERTIA[0]) * p * q) / INERTIA[2]
+        dvx = h * thrust / MASS * b3x
+        dvy = h * thrust / MASS * b3y
+        dvz = h * (thrust / MASS * b3z - GRAVITY)
+        state[0] += h * (state[7] + 0.5 * dvx)
+        state[1] += h * (state[8] + 0.5 * dvy)
+        state[2] += h * (state[9] + 0.5 * dvz)
+        state[7] += dvx
+        state[8] += dvy
+        state[9] += dvz
+        # Turn by the mean rate over the period.
+        mp = 0.5 * (p + new_p)
+        mq = 0.5 * (q + new_q)
+        mr = 0.5 * (r + new_r)
+        rate = math.sqrt(mp * mp + mq * mq + mr * mr)
+        half = 0.5 * rate * h
+        c = math.cos(half)
+        s = 0.5 * h if half < 1e-9 else math.sin(half) / rate
+        gx = mp * s
+        gy = mq * s
+        gz = mr * s
+        nw = w * c - x * gx - y * gy - z * gz
+        nqx = w * gx + x * c + y * gz - z * gy
+        nqy = w * gy - x * gz + y * c + z * gx
+        nqz = w * gz + x * gy - y * gx + z * c
+        norm = math.sqrt(nw * nw + nqx * nqx + nqy * nqy + nqz * nqz)
+        state[3] = nw / norm
+        state[4] = nqx / norm
+        state[5] = nqy / norm
+        state[6] = nqz / norm
+        state[10] = new_p
+        state[11] = new_q
+        state[12] = new_r
+    return cost
+
+
+@njit(cache=True)
+def heading_of(state: FloatArray) -> float:  # pragma: no cover - compiled
+    """Return the heading of a (13,) state, radians."""
+    w, x, y, z = state[3], state[4], state[5], state[6]
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+@njit(cache=True)
+def _roll_out(
+    start: FloatArray,
+    waypoints: FloatArray,
+    limits: FloatArray,
+    rate: float,
+    barrier: float,
+    face_travel: bool,
+    tolerance: float,
+    circles: FloatArray,
+    vertices: FloatArray,
+    tables: FloatArray,
+    clearance: float,
+    periods: int,
+    h: float,
+    limit: int,
+    positions: FloatArray,
+    yaws: FloatArray,
+    lengths: NDArray[np.int64],
+    costs: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    work = np.zeros((2, 3))
+    command = np.zeros(4)
+    state = np.zeros(13)
+    for w in range(waypoints.shape[0]):
+        state[:] = start
+        length = limit + 1
+        cost = 0.0
+        for k in range(limit + 1):
+            square = 0.0
+            for axis in range(3):
+                positions[w, k, axis] = state[axis]
+                square += (state[axis] - waypoints[w, axis]) ** 2
+            yaw = heading_of(state)
+            yaws[w, k] = yaw
+            if square <= tolerance * tolerance:
+                length = k
+                break
+            sideways_command(
+                state[:3],
+                yaw,
+                waypoints[w],
+                rate,
+                limits[SPEED],
+                barrier,
+                face_travel,
+                limits[YAW_RATE],
+                circles,
+                vertices,
+                tables[w],
+                clearance,
+                work,
+                command,
+            )
+            cost += quadrotor_step(state, command, limits, periods, h)
+        lengths[w] = length
+        costs[w] = cost
+
+
+def thirteen_states(state: RobotState) -> FloatArray:
+    """Return the (13,) state of a robot state."""
+    return np.concatenate(
+        [state.pose.position, state.pose.orientation, state.velocity, state.angular_velocity]
+    )
+
+
+def quadrotor_limits(settings: MotionSettings) -> FloatArray:
+    """Return the array of limits of `quadrotor_step`.
+
+    Level and vertical acceleration share the limit, so that together they stay within it.
+    """
+    out = np.zeros(6)
+    out[SPEED] = settings.speed / 1.08
+    acceleration = settings.acceleration or math.inf
+    out[LEVEL] = min(0.8 * acceleration, 100.0)
+    out[VERTICAL] = min(0.5 * acceleration, 0.5 * GRAVITY)
+    out[TILT] = settings.tilt / 1.03
+    out[YAW_RATE] = settings.yaw_rate
+    out[COUNT_FORCE] = 1.0 if settings.control_inputs == 'all' else 0.0
+    return out
+
+
+class QuadrotorBody(Body):
+    """A rigid body with thrust along its axis and torques, and its inner loops at 200 Hz.
+
+    Parameters
+    ----------
+    settings : MotionSettings
+        Limits.
+    state : RobotState
+        Where it starts.
+
+    Attributes
+    ----------
+    state : (13,) array
+        Position [m, map], quaternion w x y z, velocity [m/s, map], angular velocity [rad/s, body].
+    """
+
+    def __init__(self, settings: MotionSettings, state: RobotState) -> None:
+        self.settings = settings
+        self.limits = quadrotor_limits(settings)
+        self.state = thirteen_states(state)
+
+    def step(self, velocity_command: ArrayLike, dt: float) -> None:
+        """See `Body.step`."""
+        periods, h = control_periods(check_step(dt))
+        quadrotor_step(self.state, check_command(velocity_command), self.limits, periods, h)
+
+    def robot_state(self) -> RobotState:
+        """See `Body.robot_state`."""
+        return RobotState(
+            Pose(self.state[:3].copy(), self.state[3:7].copy()),
+            self.state[7:10].copy(),
+            self.state[10:13].copy(),
+        )
+
+
+class Quadrotor(MotionModel):
+    """Controller and prediction of `QuadrotorBody`."""
+
+    def __init__(
+        self,
+        settings: MotionSettings,
+        obstacles: Obstacles | None = None,
+        radius: float = 0.0,
+    ) -> None:
+        super().__init__(settings, obstacles, radius)
+        self.limits = quadrotor_limits(settings)
+        slowing = min(
+            self.limits[LEVEL], GRAVITY * math.tan(self.limits[TILT]), self.limits[VERTICAL]
+        )
+        self.rate = float(min(settings.approach_rate or C1, slowing / settings.speed))
+        self.barrier = float(min(0.2 * C2, 0.5 * slowing / settings.speed))
+
+    def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
+        """See `MotionModel.predict`."""
+        goals = check_waypoints(waypoints)
+        periods, h = control_periods(check_step(step))
+        limit = self.steps_limit(state, goals, step)
+        number = len(goals)
+        positions = np.empty((number, limit + 1, 3))
+        yaws = np.empty((number, limit + 1))
+        lengths = np.empty(number, np.int64)
+        costs = np.empty(number)
+        _roll_out(
+            thirteen_states(state),
+            goals,
+            self.limits,
+            self.rate,
+            self.barrier,
+            self.settings.heading == 'travel',
+            self.settings.tolerance,
+            self.keep_out.circles,
+            self.keep_out.vertices,
+            self._tables(goals),
+            self.keep_out.clearance,
+            periods,
+            h,
+            limit,
+            positions,
+            yaws,
+            lengths,
+            costs,
+        )
+        return trimmed(positions, yaws, lengths, costs, limit)
+
+    def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
+        """See `MotionModel.command`: the first stage of the backstepping."""
+        goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
+        out = np.zeros(4)
+        sideways_command(
+            np.array(state.pose.position),
+            heading_of(thirteen_states(state)),
+            goal,
+            self.rate,
+            self.limits[SPEED],
+            self.barrier,
+            self.settings.heading == 'travel',
+            self.limits[YAW_RATE],
+            self.keep_out.circles,
+            self.keep_out.vertices,
+            self._table(goal),
+            self.keep_out.clearance,
+            np.zeros((2, 3)),
+            out,
+        )
+        return out
+
+    def body(self, state: RobotState) -> QuadrotorBody:
+        """See `MotionModel.body`."""
+        return QuadrotorBody(self.settings, state)

@@ -1,0 +1,300 @@
+"""Active search with one measurement at each waypoint, AS and MAAS (001, 002, 003).
+
+Single robot, 001, eq. (9) to (13): sequences of `horizon` position changes, scored by
+T + alpha E with E the sum of e at the positions and T either the sum of pi at the cluster centres
+or the mutual information with the empty measurement set. Several robots, 002, section 4: each for
+itself (10), or jointly with the sum of T and the product of e (14) to (16). e and the clusters
+stay as they are at the decision.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.clusters import Cluster
+from maasi_filter.pose import Pose
+from maasi_planner.planners.base import (
+    Options,
+    Planner,
+    apart,
+    check_team,
+    explain,
+    in_bounds,
+    options_of,
+    waiting_places,
+)
+from maasi_planner.planners.mutual_information import (
+    heading_to,
+    intensity,
+    mutual_information,
+)
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+
+FloatArray = NDArray[np.float64]
+
+
+class Sequences:
+    """All sequences of positions of one robot, with their T and e.
+
+    Attributes
+    ----------
+    first : (S,) array
+        Index of the first position among the candidates.
+    refinement : (S,) array
+        T of each sequence.
+    explored : (S, horizon) array
+        e at each position.
+    """
+
+    def __init__(
+        self, team: TeamView, view: RobotView, option: Options, horizon: int, informed: bool
+    ) -> None:
+        clusters = team.clusters if view.clusters is None else view.clusters
+        exploration = team.exploration if view.exploration is None else view.exploration
+        here = np.array(view.state.pose.position)
+        steps = np.asarray(view.candidates, dtype=float) - here
+        kept: list[tuple[int, list[FloatArray]]] = [
+            (int(index), [option.points[index]]) for index in np.flatnonzero(option.allowed)
+        ]
+        for _ in range(horizon - 1):
+            longer = []
+            for index, places in kept:
+                following = places[-1] + steps
+                keep = in_bounds(following, team.bounds)
+                free = [
+                    place
+                    for place, inside in zip(following, keep)
+                    if inside and view.motion.keep_out.is_free(place)
+                ]
+                # A dead end goes on by staying, so that it is not lost.
+                for place in free or [places[-1]]:
+                    longer.append((index, [*places, place]))
+            kept = longer
+        self.first = np.array([index for index, _ in kept], np.int64)
+        positions = np.array([sequence for _, sequence in kept]).reshape(len(kept), horizon, 3)
+        self.places = positions
+        flat = positions.reshape(-1, 3)
+        self.explored = exploration.at(flat).reshape(len(kept), horizon)
+        before = np.concatenate(
+            [np.broadcast_to(here, (len(kept), 1, 3)), positions[:, :-1]], axis=1
+        )
+        self.refinement = self._refinement(team, view, clusters, positions, before, informed)
+
+    def _refinement(
+        self,
+        team: TeamView,
+        view: RobotView,
+        clusters: list[Cluster],
+        places: FloatArray,
+        before: FloatArray,
+        informed: bool,
+    ) -> FloatArray:
+        number, horizon, _ = places.shape
+        if informed:
+            own = team
+            if view.clusters is not None:
+                own = TeamView(
+                    team.step, team.step_time, team.robots, view.clusters, team.exploration
+                )
+            points, weights = intensity(own)
+        else:
+            points = np.array([cluster.position[: team.dimension] for cluster in clusters])
+        out = np.zeros(number)
+        if not len(points):
+            return out
+        known: dict[bytes, FloatArray] = {}
+        for row in range(number):
+            missed = np.ones(len(points))
+            for j in range(horizon):
+                yaw = heading_to(view, before[row, j], places[row, j])
+                key = places[row, j].tobytes() + np.float64(yaw).tobytes()
+                if key not in known:
+                    pose = Pose.from_yaw(places[row, j], yaw)
+                    known[key] = view.sensor.detection.probability(points, pose)
+                if informed:
+                    missed *= 1.0 - known[key]
+                else:
+                    out[row] += float(sum(known[key].tolist()))
+            if informed:
+                out[row] = mutual_information(missed, weights)
+        return out
+
+
+class ActiveSearch(Planner):
+    """Waypoints at a fixed distance, one measurement at each; candidates come from a ring.
+
+    `horizon` sequences are made of the same changes of position as the candidates; only the
+    first waypoint is used, and then all is planned again.
+    """
+
+    def decide(self, team: TeamView) -> Decision:
+        """See `Planner.decide`."""
+        check_team(team)
+        settings = self.settings
+        places = waiting_places(team)
+        decision = Decision(step=team.step)
+        options: dict[str, Options] = {}
+        sequences: dict[str, Sequences] = {}
+        informed = settings.refinement == 'mutual_information'
+        for name in team.planning():
+            found = options_of(team, name, places)
+            if isinstance(found, str):
+                decision.robots[name] = stay(team.robots[name], f'stays: {found}')
+                continue
+            options[name] = found
+            sequences[name] = Sequences(team, team.robots[name], found, settings.horizon, informed)
+        names = list(options)
+        if settings.coordination == 'independent':
+            chosen = self._independent(team, options, sequences)
+        else:
+            chosen, decision.exact, decision.evaluated = self._centralized(team, options, sequences)
+        decision.objective = self._value(sequences, chosen)
+        for name in names:
+            view, option = team.robots[name], options[name]
+            if chosen[name] < 0:
+                decision.robots[name] = stay(view, 'stays: another robot takes its candidates')
+                continue
+            decision.robots[name] = self._report(name, option, sequences, chosen)
+        return explain(decision)
+
+    def _value(self, sequences: dict[str, Sequences], chosen: dict[str, int]) -> float:
+        """Return the joint objective (002, eq. (14)), or the sum of single ones."""
+        going = [name for name in chosen if chosen[name] >= 0]
+        if not going:
+            return 0.0
+        refinement = 0.0
+        single = 0.0
+        product = np.ones(self.settings.horizon)
+        for name in going:
+            refinement += float(sequences[name].refinement[chosen[name]])
+            explored = sequences[name].explored[chosen[name]]
+            product = product * explored
+            single += float(sum(explored.tolist()))
+        if self.settings.coordination == 'centralized':
+            single = float(sum(product.tolist()))
+        return refinement + self.settings.alpha * single
+
+    def _independent(
+        self, team: TeamView, options: dict[str, Options], sequences: dict[str, Sequences]
+    ) -> dict[str, int]:
+        chosen: dict[str, int] = {}
+        taken: list[tuple[FloatArray, float]] = []
+        for name, mine in sequences.items():
+            radius = team.robots[name].radius
+            values = mine.refinement + self.settings.alpha * mine.explored.sum(axis=1)
+            chosen[name] = -1
+            for row in np.argsort(-values, kind='stable').tolist():
+                point = options[name].points[mine.first[row]]
+                if apart(point, radius, taken):
+                    chosen[name] = row
+                    taken.append((point, radius))
+                    break
+        return chosen
+
+    def _fits(
+        self,
+        team: TeamView,
+        options: dict[str, Options],
+        sequences: dict[str, Sequences],
+        chosen: dict[str, int],
+    ) -> bool:
+        taken: list[tuple[FloatArray, float]] = []
+        for name, row in chosen.items():
+            if row < 0:
+                continue
+            point = options[name].points[sequences[name].first[row]]
+            radius = team.robots[name].radius
+            if not apart(point, radius, taken):
+                return False
+            taken.append((point, radius))
+        return True
+
+    def _centralized(
+        self, team: TeamView, options: dict[str, Options], sequences: dict[str, Sequences]
+    ) -> tuple[dict[str, int], bool, int]:
+        names = list(sequences)
+        best: dict[str, int] = dict.fromkeys(names, -1)
+        best_value = -math.inf
+        evaluated = 0
+        if len(names) == 1:
+            mine = sequences[names[0]]
+            values = mine.refinement + self.settings.alpha * mine.explored.sum(axis=1)
+            return {names[0]: int(np.argmax(values))}, True, len(values)
+        number = math.prod(len(sequences[name].first) for name in names)
+        if len(names) == 2 and number <= self.settings.enumeration_limit:
+            # All pairs at once; then the best that fits.
+            one, two = sequences[names[0]], sequences[names[1]]
+            values = one.refinement[:, None] + two.refinement[None, :]
+            for j in range(self.settings.horizon):
+                values = values + self.settings.alpha * (
+                    one.explored[:, j, None] * two.explored[None, :, j]
+                )
+            for flat in np.argsort(-values, axis=None, kind='stable').tolist():
+                rows = np.unravel_index(flat, values.shape)
+                joint = {name: int(row) for name, row in zip(names, rows)}
+                evaluated += 1
+                if self._fits(team, options, sequences, joint):
+                    return joint, True, evaluated
+        elif number <= self.settings.enumeration_limit:
+            ranges = (range(len(sequences[name].first)) for name in names)
+            for rows in itertools.product(*ranges):
+                joint = dict(zip(names, rows))
+                value = self._value(sequences, joint)
+                evaluated += 1
+                if value > best_value and self._fits(team, options, sequences, joint):
+                    best, best_value = joint, value
+            if best_value > -math.inf:
+                return best, True, evaluated
+        for _ in range(1 + self.settings.improvement_rounds):
+            before = dict(best)
+            for name in names:
+                own, own_value = -1, -math.inf
+                for row in range(len(sequences[name].first)):
+                    joint = {**best, name: row}
+                    value = self._value(sequences, joint)
+                    evaluated += 1
+                    if value > own_value and self._fits(team, options, sequences, joint):
+                        own, own_value = row, value
+                best[name] = own
+            if best == before:
+                break
+        return best, not names, evaluated
+
+    def _report(
+        self,
+        name: str,
+        option: Options,
+        sequences: dict[str, Sequences],
+        chosen: dict[str, int],
+    ) -> RobotDecision:
+        """Return the decision of one robot: for each waypoint the best sequence through it."""
+        mine = sequences[name]
+        number = len(option.points)
+        refinement = np.zeros(number)
+        explored = np.zeros(number)
+        value = np.full(number, -np.inf)
+        for row in range(len(mine.first)):
+            joint = {**chosen, name: row}
+            total = self._value(sequences, joint)
+            w = mine.first[row]
+            if total > value[w]:
+                value[w] = total
+                refinement[w] = mine.refinement[row]
+                explored[w] = float(sum(mine.explored[row].tolist()))
+        best = int(mine.first[chosen[name]])
+        result = single_choice(
+            option.points,
+            option.prediction,
+            best,
+            f'T = {refinement[best]:.4g}, E = {explored[best]:.4g} over {self.settings.horizon} '
+            f'waypoints, the best of {len(mine.first)}',
+        )
+        result.target_refinement = refinement
+        result.exploration = explored
+        result.objective = value
+        result.measurements = np.ones(number, np.int64)
+        return result

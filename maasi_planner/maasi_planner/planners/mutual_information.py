@@ -1,0 +1,301 @@
+"""Mutual information with the event of an empty measurement set (Dames and Kumar, 2015).
+
+As 003, section 4, and the baseline of 000, section 5.1, use it. Targets are a Poisson random
+finite set with the filter's intensity D, and Lambda = 0 is the event that nothing is measured.
+With p(X) = prod (1 - pi(x)) the probability of that event given the targets,
+
+    I = h(E p) - E h(p),   h(p) = -p log p - (1 - p) log(1 - p),
+
+and for a Poisson set E p^n = exp(-int (1 - (1 - pi)^n) D) and
+E p log p = E p * int (1 - pi) log(1 - pi) D, while E (1 - p) log(1 - p) is the series
+-sum_n (E p^n - E p^(n + 1)) / n.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_filter.pose import Pose
+from maasi_planner.planners.base import (
+    Options,
+    Planner,
+    apart,
+    check_team,
+    explain,
+    options_of,
+    waiting_places,
+)
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+
+FloatArray = NDArray[np.float64]
+EXACT_TERMS = 48
+DOUBLINGS = 40
+
+
+@njit(cache=True)
+def mutual_information(missed: FloatArray, weights: FloatArray) -> float:  # pragma: no cover
+    """Return the mutual information of targets and the empty measurement set, in nats.
+
+    Parameters
+    ----------
+    missed : (n,) array
+        Probability 1 - pi that a target at each particle is missed; over several measurements
+        the product.
+    weights : (n,) array
+        Expected number of targets at each particle.
+
+    Notes
+    -----
+    The series is summed exactly for its first terms and then in blocks that double, whose error
+    is far below 1e-3 of the result.
+    """
+    number = missed.shape[0]
+    power = np.ones(number)
+    log_term = 0.0
+    seen = 0.0
+    for i in range(number):
+        seen += weights[i] * (1.0 - missed[i])
+        if 0.0 < missed[i] < 1.0:
+            log_term += weights[i] * missed[i] * math.log(missed[i])
+    if seen <= 0.0:
+        return 0.0
+    empty = math.exp(-seen)
+    total = 0.0
+    if empty > 0.0:
+        total += empty * seen
+    rest = -math.expm1(-seen)
+    total -= rest * math.log(rest)
+    # total is h(E p); now subtract E h(p).
+    total += empty * log_term
+    last = empty
+    for i in range(number):
+        power[i] = missed[i]
+    for n in range(1, EXACT_TERMS + 1):
+        exponent = 0.0
+        for i in range(number):
+            power[i] *= missed[i]
+            exponent += weights[i] * (1.0 - power[i])
+        value = math.exp(-exponent)
+        total -= (last - value) / n
+        last = value
+    # power is missed^(N + 1) here; go on in blocks that double.
+    begin = EXACT_TERMS + 1
+    for _ in range(DOUBLINGS):
+        exponent = 0.0
+        for i in range(number):
+            power[i] *= power[i]
+            exponent += weights[i] * (1.0 - power[i])
+        value = math.exp(-exponent)
+        end = 2 * begin
+        # Mean of 1/n over the block.
+        total -= (last - value) * math.log((end - 0.5) / (begin - 0.5)) / (end - begin)
+        if last - value < 1e-15:
+            break
+        last = value
+        begin = end
+    return max(total, 0.0)
+
+
+def intensity(team: TeamView) -> tuple[FloatArray, FloatArray]:
+    """Return the points (n, d) and weights (n,) that stand for the intensity.
+
+    Without particles each cluster is 2 d + 1 points with its mean and covariance.
+    """
+    d = team.dimension
+    if team.particles is not None and team.weights is not None:
+        return (
+            np.ascontiguousarray(team.particles[:, :d], dtype=float),
+            np.ascontiguousarray(team.weights, dtype=float),
+        )
+    points, weights = [np.zeros((0, d))], [np.zeros(0)]
+    for cluster in team.clusters:
+        root = np.zeros((d, d))
+        covariance = np.asarray(cluster.covariance, dtype=float)[:d, :d]
+        for i in range(d):
+            for j in range(i + 1):
+                rest = float(covariance[i, j]) - sum(
+                    float(root[i, k] * root[j, k]) for k in range(j)
+                )
+                if i == j:
+                    root[i, i] = math.sqrt(max(rest, 0.0))
+                elif root[j, j] > 0.0:
+                    root[i, j] = rest / root[j, j]
+        scale = math.sqrt(d + 0.5)
+        offsets = np.vstack([np.zeros((1, d)), scale * root.T, -scale * root.T])
+        points.append(np.asarray(cluster.position, dtype=float)[:d] + offsets)
+        share = 0.5 / (d + 0.5)
+        weights.append(cluster.mass * np.array([share] + [0.5 / (d + 0.5)] * (2 * d)))
+    return np.vstack(points), np.concatenate(weights)
+
+
+def heading_to(view: RobotView, start: FloatArray, end: FloatArray) -> float:
+    """Return the heading of a robot that has gone from `start` to `end`, radians."""
+    settings = view.motion.settings
+    turns = settings.model == 'unicycle' or settings.heading == 'travel'
+    if turns and math.hypot(end[0] - start[0], end[1] - start[1]) > 1e-9:
+        return math.atan2(end[1] - start[1], end[0] - start[0])
+    return view.state.pose.yaw
+
+
+class MutualInformation(Planner):
+    """The joint waypoints with the largest mutual information, and no exploration.
+
+    Each robot measures at its waypoint. Where no waypoint tells anything, robots go straight on.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        super().__init__(settings)
+        self._headings: dict[str, FloatArray] = {}
+
+    def reset(self) -> None:
+        """See `Planner.reset`."""
+        self._headings.clear()
+
+    def decide(self, team: TeamView) -> Decision:
+        """See `Planner.decide`."""
+        check_team(team)
+        places = waiting_places(team)
+        decision = Decision(step=team.step)
+        options: dict[str, Options] = {}
+        for name in team.planning():
+            found = options_of(team, name, places)
+            if isinstance(found, str):
+                decision.robots[name] = stay(team.robots[name], f'stays: {found}')
+            else:
+                options[name] = found
+        points, weights = intensity(team)
+        missed = {
+            name: self._missed(team.robots[name], option.points, points)
+            for name, option in options.items()
+        }
+        chosen, value, exact, evaluated = self._search(team, options, missed, weights)
+        decision.objective = value
+        decision.exact = exact
+        decision.evaluated = evaluated
+        for name, option in options.items():
+            view = team.robots[name]
+            if chosen[name] < 0:
+                decision.robots[name] = stay(view, 'stays: another robot takes its candidates')
+                continue
+            decision.robots[name] = self._report(
+                name, options, missed, weights, chosen, view, option
+            )
+        return explain(decision)
+
+    def _missed(self, view: RobotView, places: FloatArray, points: FloatArray) -> FloatArray:
+        here = np.array(view.state.pose.position)
+        out = np.ones((len(places), len(points)))
+        if len(points):
+            for row, place in zip(out, places):
+                pose = Pose.from_yaw(place, heading_to(view, here, place))
+                row[:] = 1.0 - view.sensor.detection.probability(points, pose)
+        return out
+
+    def _joint(
+        self, missed: dict[str, FloatArray], chosen: dict[str, int], weights: FloatArray
+    ) -> float:
+        product = np.ones(len(weights))
+        for name, index in chosen.items():
+            if index >= 0:
+                product = product * missed[name][index]
+        return float(mutual_information(product, weights))
+
+    def _search(
+        self,
+        team: TeamView,
+        options: dict[str, Options],
+        missed: dict[str, FloatArray],
+        weights: FloatArray,
+    ) -> tuple[dict[str, int], float, bool, int]:
+        names = list(options)
+        indices = {name: np.flatnonzero(options[name].allowed).tolist() for name in names}
+        # Candidates that tell nothing are taken in the order of going straight on.
+        for name in names:
+            order = self._straight_on(team.robots[name], options[name].points, name)
+            indices[name].sort(key=lambda w, order=order: -order[w])
+        number = math.prod(len(indices[name]) for name in names)
+        evaluated = 0
+        best: dict[str, int] = dict.fromkeys(names, -1)
+        best_value = -1.0
+        if number <= self.settings.enumeration_limit:
+            for choice in itertools.product(*(indices[name] for name in names)):
+                joint = dict(zip(names, choice))
+                if not self._fits(team, options, joint):
+                    continue
+                value = self._joint(missed, joint, weights)
+                evaluated += 1
+                if value > best_value + 1e-12:
+                    best, best_value = joint, value
+            if best_value >= 0.0 or not names:
+                return best, max(best_value, 0.0), True, evaluated
+        for _ in range(1 + self.settings.improvement_rounds):
+            before = dict(best)
+            for name in names:
+                own, own_value = best[name], -1.0
+                for w in indices[name]:
+                    joint = {**best, name: w}
+                    if not self._fits(team, options, joint):
+                        continue
+                    value = self._joint(missed, joint, weights)
+                    evaluated += 1
+                    if value > own_value + 1e-12:
+                        own, own_value = w, value
+                best[name] = own
+                best_value = max(own_value, best_value)
+            if best == before:
+                break
+        return best, max(best_value, 0.0), False, evaluated
+
+    def _fits(self, team: TeamView, options: dict[str, Options], joint: dict[str, int]) -> bool:
+        taken: list[tuple[FloatArray, float]] = []
+        for name, index in joint.items():
+            if index < 0:
+                continue
+            point, radius = options[name].points[index], team.robots[name].radius
+            if not apart(point, radius, taken):
+                return False
+            taken.append((point, radius))
+        return True
+
+    def _straight_on(self, view: RobotView, points: FloatArray, name: str) -> FloatArray:
+        """Return how much each waypoint lies straight on, (W,)."""
+        ways = points - view.state.pose.position
+        lengths = np.sqrt((ways * ways).sum(axis=1))
+        last = self._headings.get(name)
+        if last is None:
+            return np.zeros(len(points))
+        return np.asarray((ways * last).sum(axis=1) / np.maximum(lengths, 1e-12))
+
+    def _report(
+        self,
+        name: str,
+        options: dict[str, Options],
+        missed: dict[str, FloatArray],
+        weights: FloatArray,
+        chosen: dict[str, int],
+        view: RobotView,
+        option: Options,
+    ) -> RobotDecision:
+        values = np.array(
+            [self._joint(missed, {**chosen, name: w}, weights) for w in range(len(option.points))]
+        )
+        index = chosen[name]
+        way = option.points[index] - view.state.pose.position
+        length = math.sqrt(float((way * way).sum()))
+        if length > 1e-9:
+            self._headings[name] = way / length
+        if values[index] > 0.0:
+            reason = f'mutual information {values[index]:.4g} nats'
+        else:
+            reason = 'no waypoint tells anything: straight on'
+        result = single_choice(option.points, option.prediction, index, reason)
+        result.target_refinement = values
+        result.objective = np.where(option.allowed, values, -np.inf)
+        result.measurements = np.ones(len(option.points), np.int64)
+        return result

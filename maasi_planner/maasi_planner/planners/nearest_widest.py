@@ -1,0 +1,105 @@
+"""Nearest cluster, widest cluster, in turn: Sung and Tokekar (2022) as 000, section 5.1, adapts it.
+
+Where there is no cluster a robot goes to the candidate with the largest e, the nearest of those.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.clusters import Cluster
+from maasi_planner.planners.base import (
+    Planner,
+    apart,
+    check_team,
+    explain,
+    options_of,
+    waiting_places,
+)
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
+
+FloatArray = NDArray[np.float64]
+
+
+class NearestWidest(Planner):
+    """Each robot by itself, with a turn of its own: nearest, widest, nearest and so on."""
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        super().__init__(settings)
+        self._turns: dict[str, int] = {}
+
+    def reset(self) -> None:
+        """See `Planner.reset`."""
+        self._turns.clear()
+
+    def decide(self, team: TeamView) -> Decision:
+        """See `Planner.decide`."""
+        check_team(team)
+        decision = Decision(step=team.step)
+        taken = waiting_places(team)
+        for name in team.planning():
+            robot = self._decide_one(team, name, taken)
+            decision.robots[name] = robot
+            taken.append((robot.waypoint, team.robots[name].radius))
+        return explain(decision)
+
+    def _decide_one(
+        self, team: TeamView, name: str, taken: list[tuple[FloatArray, float]]
+    ) -> RobotDecision:
+        view = team.robots[name]
+        clusters = [
+            cluster
+            for cluster in (team.clusters if view.clusters is None else view.clusters)
+            if cluster.mass >= self.settings.mass_threshold
+        ]
+        centres = np.zeros((len(clusters), 3))
+        centres[:, 2] = view.candidates[0, 2] if len(view.candidates) else 0.0
+        for row, cluster in zip(centres, clusters):
+            row[: team.dimension] = cluster.position[: team.dimension]
+        found = options_of(team, name, taken, centres)
+        if isinstance(found, str):
+            return stay(view, f'stays: {found}')
+        here = np.array(view.state.pose.position)
+        turn = self._turns.get(name, 0)
+        for kind in (turn, turn + 1) if clusters else ():
+            index = self._cluster_choice(clusters, centres, here, kind % 2)
+            for position in index:
+                point = view.motion.keep_out.moved_out(here, centres[position])
+                if point is None or not apart(point, view.radius, taken):
+                    continue
+                prediction = view.motion.predict(view.state, point[None, :], team.step_time)
+                if not prediction.reached[0] or prediction.lengths[0] == 0:
+                    continue
+                self._turns[name] = (kind + 1) % 2
+                word = ('nearest', 'widest')[kind % 2]
+                return single_choice(point[None, :], prediction, 0, f'{word} cluster')
+        exploration = team.exploration if view.exploration is None else view.exploration
+        explored = exploration.at(found.points)
+        gaps = ((found.points - here) ** 2).sum(axis=1)
+        order = sorted(
+            np.flatnonzero(found.allowed).tolist(),
+            key=lambda w: (-float(explored[w]), float(gaps[w]), w),
+        )
+        best = order[0]
+        result = single_choice(
+            found.points,
+            found.prediction,
+            best,
+            f'no cluster: least explored candidate, e = {explored[best]:.3g}',
+        )
+        result.exploration = explored
+        result.objective = np.where(found.allowed, explored, -np.inf)
+        return result
+
+    @staticmethod
+    def _cluster_choice(
+        clusters: list[Cluster], centres: FloatArray, here: FloatArray, kind: int
+    ) -> list[int]:
+        """Return the clusters in the order of preference."""
+        if kind == 0:
+            keys = [float(((centre - here) ** 2).sum()) for centre in centres]
+        else:
+            keys = [-float(cluster.radius) for cluster in clusters]
+        return sorted(range(len(clusters)), key=lambda i: (keys[i], i))
