@@ -552,8 +552,8 @@ def range_bearing(
     values : ndarray, shape (n, dimension)
         [m, rad(, rad)].
     covariances : ndarray, shape (n, dimension, dimension)
-        To first order, plus the second-order part of the range, which counts near the robot. Right
-        over a target the bearing says nothing: its variance is bounded by that of a uniform angle.
+        To first order. Right over a target the bearing says nothing: its variance is bounded by
+        that of a uniform angle.
 
     """
     if dimension not in (2, 3):
@@ -584,7 +584,6 @@ def _range_bearing(  # type: ignore[no-untyped-def]
         both = cosine * sine * (yy - xx) + (cosine * cosine - sine * sine) * xy
         limit = np.sqrt(_BEARING_VARIANCE_LIMIT / across) if across > 0.0 else np.inf
         per_metre = min(1.0 / horizontal, limit) if horizontal > 0.0 else min(limit, 1e9)
-        along += min(0.75 * (across * per_metre) ** 2, across)
         values[i, 1] = bearing
         result[i, 1, 1] = across * per_metre * per_metre
         if dimension == 2:

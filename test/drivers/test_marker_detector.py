@@ -99,6 +99,18 @@ def test_markers_of_the_wrong_size_are_dropped_and_counted(drone):
     assert len(MarkerDetector(drone(segmentation={'rule': 'paper'})).detect(image, pose)) == 1
 
 
+def test_the_edge_of_something_large_is_no_cut_marker(drone):
+    pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
+    settings = drone(distortion=[])
+    view = MarkerDetector(settings).camera
+    large = RenderSettings.ideal(marker_diameter=0.065)
+    for row in (-0.5, -0.8, -1.2):
+        image = one_image(settings, [view.to_floor([[80.0, row]], pose)[0].tolist()], pose, large)
+        seen = MarkerDetector(settings).detect(image, pose)
+        assert len(seen) == 0
+        assert seen.dropped['size'] == 1
+
+
 def test_the_pose_covariance_of_the_message_wins_over_the_settings(drone):
     pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
     image = one_image(drone(), [[0.1, 0.0]], pose)
