@@ -19,6 +19,10 @@ IntArray = NDArray[np.int64]
 # A detection exists, so the probability of detection of what caused it was not nothing.
 LEAST_PROBABILITY = 0.01
 LEAST_MISS = 0.02
+# Uncertainty over distance beyond which a measurement is not linear, radians.
+LARGEST_ANGLE = 0.25
+# Squared normalised innovation beyond which a detection is of something else.
+LARGEST_INNOVATION = 25.0
 
 
 @dataclass
@@ -204,8 +208,22 @@ def _intensity(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 def _update(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     position, covariance, sensor_position, z, cartesian, centre, root, out, out_covariance
 ):
-    """Update one target with one detection; an iterated extended Kalman filter."""
+    """Update one target with one detection; an iterated extended Kalman filter.
+
+    Return whether it was done: not where the measurement is far from linear over the target's
+    uncertainty, next to the robot or straight above or below it, nor for what is no measurement
+    of it.
+    """
     d = position.shape[0]
+    if not cartesian:
+        level = 0.0
+        trace = 0.0
+        for a in range(2):
+            level += (position[a] - sensor_position[a]) ** 2
+        for a in range(d):
+            trace += covariance[a, a]
+        if trace > LARGEST_ANGLE * LARGEST_ANGLE * level:
+            return False
     error = np.empty(d)
     jacobian = np.empty((d, d))
     noise = np.empty((d, d))
@@ -215,10 +233,17 @@ def _update(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     _noise(root, noise)
     for a in range(d):
         out[a] = position[a]
-    for _ in range(3):
+    for step in range(3):
         _predict(out, sensor_position, z, cartesian, centre, error, jacobian)
         _innovation(jacobian, covariance, noise, innovation)
         _invert(innovation, inverse)
+        if step == 0:
+            q = 0.0
+            for a in range(d):
+                for b in range(d):
+                    q += error[a] * inverse[a, b] * error[b]
+            if q > LARGEST_INNOVATION:
+                return False
         for a in range(d):
             for b in range(d):
                 total = 0.0
@@ -252,6 +277,7 @@ def _update(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                     total += keep[a, i] * covariance[i, j] * keep[b, j]
                     total += gain[a, i] * noise[i, j] * gain[b, j]
             out_covariance[a, b] = total
+    return True
 
 
 def found_intensity(
@@ -329,10 +355,13 @@ def refine(
     index: int,
     pose: Pose,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return position and covariance of a found target after one of its detections."""
+    """Return position and covariance of a found target after one of its detections.
+
+    They are unchanged where the detection cannot be used.
+    """
     new_position = np.empty_like(position)
     new_covariance = np.empty_like(covariance)
-    _update(
+    done = _update(
         position,
         covariance,
         pose.position,
@@ -343,7 +372,7 @@ def refine(
         new_position,
         new_covariance,
     )
-    return new_position, new_covariance
+    return (new_position, new_covariance) if done else (position, covariance)
 
 
 def remove_measurements(

@@ -152,7 +152,8 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     covariances,
     sensor_position,
     pose_error,
-    handle_poles,
+    cartesian_near,
+    cap_angles,
     cartesian,
     centres,
     roots,
@@ -180,7 +181,7 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             covariance[0, 0] += own
             covariance[1, 1] += own / max(level * level, 1e-12)
         deviation = math.sqrt(covariance[0, 0])
-        cartesian[m] = handle_poles and abs(z[0]) < POLE_DEVIATIONS * deviation
+        cartesian[m] = cartesian_near and abs(z[0]) < POLE_DEVIATIONS * deviation
         if cartesian[m]:
             if determinant < 1e-9:
                 spherical_frame(z + 1e-6, frame)
@@ -204,7 +205,7 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             )
             _invert(matrix, information[m])
         else:
-            if handle_poles:
+            if cap_angles:
                 for axis in range(1, d):
                     largest = LARGEST_BEARING_VARIANCE
                     if axis == 2:
@@ -226,7 +227,8 @@ def prepare_measurements(
     covariances: FloatArray,
     pose: Pose,
     pose_error: float = 0.0,
-    handle_poles: bool = True,
+    cartesian_near: bool = False,
+    cap_angles: bool = True,
 ) -> MeasurementSet:
     """Return detections (m, d) with covariances (m, d, d) ready for the kernels.
 
@@ -237,9 +239,12 @@ def prepare_measurements(
     pose_error : float
         Deviation of the error of the sensor's position, per axis, metres; it is added to the
         noise as the measurement sees it.
-    handle_poles : bool
-        Whether a detection within three deviations of range of the robot is taken as Cartesian,
-        and angular variances are capped where an angle is not defined. False is the papers' way.
+    cartesian_near : bool
+        Whether a detection within three deviations of range of the robot is taken as a position
+        with a Cartesian covariance. For covariances that come from one, as a camera's do: next
+        to the robot they say that the bearing is not known, and a ring is no disc.
+    cap_angles : bool
+        Whether angular variances are capped at those of an angle that is not known at all.
     """
     number, d = values.shape
     covariances = np.array(covariances)
@@ -259,7 +264,8 @@ def prepare_measurements(
         covariances,
         pose.position,
         pose_error,
-        handle_poles,
+        cartesian_near,
+        cap_angles,
         out.cartesian,
         out.centres,
         out.roots,

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,6 +110,28 @@ class FilterResult:
     found_changed: bool
     expected_number: float
     dropped: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass
+class _Member:
+    """A checked measurement: every detection has a covariance, and their order is fixed.
+
+    `own` tells whether the covariances are the detections' own.
+    """
+
+    robot: str
+    pose: Pose
+    sensor: Sensor
+    values: FloatArray
+    covariances: FloatArray
+    own: bool
+    index: int
+
+    def only(self, keep: NDArray[np.bool_]) -> _Member:
+        """Return a copy with some of the detections."""
+        if keep.all():
+            return self
+        return replace(self, values=self.values[keep], covariances=self.covariances[keep])
 
 
 class SearchFilter:
@@ -258,7 +280,7 @@ class SearchFilter:
             dropped=dropped,
         )
 
-    def _checked(self, measurement: AgentMeasurement) -> AgentMeasurement:
+    def _checked(self, measurement: AgentMeasurement) -> _Member:
         """Return a measurement whose arrays fit, its detections in a fixed order."""
         name = measurement.robot
         d = self.dimension
@@ -273,8 +295,9 @@ class SearchFilter:
             raise ValueError(f'{name}: values: got shape {values.shape}, allowed is (m, {d})')
         if not np.isfinite(values).all():
             raise ValueError(f'{name}: values: got {values.tolist()}, allowed are finite numbers')
-        covariances = None
+        own = False
         if self._numbers.use_detection_covariances and measurement.covariances is not None:
+            own = True
             covariances = np.array(measurement.covariances, dtype=float)
             if covariances.size == 0:
                 covariances = covariances.reshape(0, d, d)
@@ -293,16 +316,17 @@ class SearchFilter:
             covariances = np.broadcast_to(measurement.sensor.covariance, (len(values), d, d))
         # The order in which a sensor lists its detections means nothing, so it decides nothing.
         order = np.lexsort(values.T[::-1])
-        return AgentMeasurement(
+        return _Member(
             name,
             measurement.pose,
             measurement.sensor,
             np.ascontiguousarray(values[order]),
             np.array(covariances[order]),
+            own,
             measurement.index,
         )
 
-    def _without_found(self, member: AgentMeasurement, dropped: dict[str, int]) -> AgentMeasurement:
+    def _without_found(self, member: _Member, dropped: dict[str, int]) -> _Member:
         """Return a member without the detections that found targets take (000, section 3.3)."""
         numbers = self._numbers
         if numbers.removal not in ('closest', 'every') or not self.found_targets:
@@ -314,17 +338,9 @@ class SearchFilter:
             centres, positions, numbers.removal_distance, numbers.removal == 'every'
         )
         _count(dropped, 'found', int((~keep).sum()))
-        assert member.covariances is not None
-        return AgentMeasurement(
-            member.robot,
-            member.pose,
-            member.sensor,
-            member.values[keep],
-            member.covariances[keep],
-            member.index,
-        )
+        return member.only(keep)
 
-    def _add_births(self, members: Sequence[AgentMeasurement]) -> None:
+    def _add_births(self, members: Sequence[_Member]) -> None:
         """Add births that do not belong to one measurement: anywhere, or 003's Gaussian."""
         numbers = self._numbers
         if not members:
@@ -363,14 +379,14 @@ class SearchFilter:
         self._group = np.concatenate([self._group, group])
         self._groups = groups
 
-    def _prepared(self, member: AgentMeasurement) -> MeasurementSet:
-        assert member.covariances is not None
+    def _prepared(self, member: _Member) -> MeasurementSet:
         return prepare_measurements(
             member.values,
             member.covariances,
             member.pose,
             self._pose_error(member.sensor),
-            handle_poles=self._numbers.births == 'measurement',
+            cartesian_near=member.own,
+            cap_angles=self._numbers.births == 'measurement',
         )
 
     def _threads(self) -> ThreadPoolExecutor | None:
@@ -385,7 +401,7 @@ class SearchFilter:
 
     def _correct(
         self,
-        member: AgentMeasurement,
+        member: _Member,
         predicted: FloatArray | None,
         newly_found: list[FoundTarget],
         dropped: dict[str, int],
@@ -399,17 +415,8 @@ class SearchFilter:
         sensor = member.sensor
         detection = self._detection(sensor)
         reach = member.values[:, 0] <= sensor.maximum_range
-        if not reach.all():
-            _count(dropped, 'range', int((~reach).sum()))
-            assert member.covariances is not None
-            member = AgentMeasurement(
-                member.robot,
-                member.pose,
-                sensor,
-                member.values[reach],
-                member.covariances[reach],
-                member.index,
-            )
+        _count(dropped, 'range', int((~reach).sum()))
+        member = member.only(reach)
         count = len(member.values)
         probability = detection.probability(self.particles, member.pose)
         if count == 0:
@@ -512,7 +519,7 @@ class SearchFilter:
 
     def _found_intensity(
         self,
-        member: AgentMeasurement,
+        member: _Member,
         detection: DetectionModel,
         prepared: MeasurementSet,
         other: FloatArray,
@@ -529,9 +536,7 @@ class SearchFilter:
         )
         return exclusive(kappa, other)
 
-    def _refine(
-        self, member: AgentMeasurement, prepared: MeasurementSet, claims: FloatArray
-    ) -> bool:
+    def _refine(self, member: _Member, prepared: MeasurementSet, claims: FloatArray) -> bool:
         """Update found targets with the detections that most probably are theirs."""
         moved = False
         own = self._pose_error(member.sensor) ** 2 * np.eye(self.dimension)
@@ -559,7 +564,7 @@ class SearchFilter:
 
     def _mark(
         self,
-        member: AgentMeasurement,
+        member: _Member,
         own_mass: FloatArray,
         means: FloatArray,
         covariances: FloatArray,
@@ -629,7 +634,7 @@ class SearchFilter:
                 return True
         return False
 
-    def _resample(self, members: Sequence[AgentMeasurement]) -> None:
+    def _resample(self, members: Sequence[_Member]) -> None:
         numbers = self._numbers
         pool = self._threads()
         expected = total_weight(self.weights)
@@ -691,7 +696,7 @@ class SearchFilter:
                 fill[g] = vectors * np.sqrt(np.maximum(values, 0.0))
         return fill
 
-    def _extract_groups(self, members: Sequence[AgentMeasurement]) -> None:
+    def _extract_groups(self, members: Sequence[_Member]) -> None:
         if self._groups == 0 or len(self.weights) == 0:
             self.clusters = []
             return
@@ -702,7 +707,7 @@ class SearchFilter:
         self.clusters = group_clusters(mass, means, covariances, LEAST_CLUSTER_MASS, least)
 
     def _extract_kmeans(
-        self, members: Sequence[AgentMeasurement], newly_found: list[FoundTarget], time: float
+        self, members: Sequence[_Member], newly_found: list[FoundTarget], time: float
     ) -> None:
         """K-means with k the rounded expected number, and marking (000, section 3.3)."""
         numbers = self._numbers
@@ -759,7 +764,7 @@ def _count(dropped: dict[str, int], reason: str, number: int) -> None:
         dropped[reason] = dropped.get(reason, 0) + number
 
 
-def _cartesian_noise(member: AgentMeasurement, prepared: MeasurementSet, index: int) -> FloatArray:
+def _cartesian_noise(member: _Member, prepared: MeasurementSet, index: int) -> FloatArray:
     """Return the noise of one detection as a covariance in metres."""
     root = prepared.roots[index]
     noise = (root[:, None, :] * root[None, :, :]).sum(axis=-1)
