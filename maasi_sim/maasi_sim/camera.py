@@ -247,20 +247,19 @@ def scene_of(world: World, settings: RenderSettings, seed: int) -> list[Shape]:
     return shapes + [disc(target, radius, settings.marker_colour) for target in world.targets]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _floor_points(rays, turn, centre, floor_x, floor_y):  # type: ignore[no-untyped-def]
     """Where each pixel's ray meets the floor; NaN above the horizon."""
+    above = centre[2] > 0.0
     for row in range(floor_x.shape[0]):
+        us, vs, xs, ys = rays[0, row], rays[1, row], floor_x[row], floor_y[row]
         for column in range(floor_x.shape[1]):
-            u, v = rays[0, row, column], rays[1, row, column]
+            u, v = us[column], vs[column]
             down = turn[2, 0] * u + turn[2, 1] * v + turn[2, 2]
-            scale = -centre[2] / down if down < -1e-6 and centre[2] > 0.0 else np.nan
-            floor_x[row, column] = centre[0] + scale * (
-                turn[0, 0] * u + turn[0, 1] * v + turn[0, 2]
-            )
-            floor_y[row, column] = centre[1] + scale * (
-                turn[1, 0] * u + turn[1, 1] * v + turn[1, 2]
-            )
+            scale = -centre[2] / down
+            scale = scale if down < -1e-6 and above else np.nan
+            xs[column] = centre[0] + scale * (turn[0, 0] * u + turn[0, 1] * v + turn[0, 2])
+            ys[column] = centre[1] + scale * (turn[1, 0] * u + turn[1, 1] * v + turn[1, 2])
 
 
 @njit(cache=True)
@@ -371,6 +370,7 @@ def _paint(albedo, floor_x, floor_y, shapes, boxes, drift, blur):  # type: ignor
         kind = int(shapes[index, 0])
         cx, cy, a, b = shapes[index, 1], shapes[index, 2], shapes[index, 3], shapes[index, 4]
         cosine, sine = shapes[index, 5], shapes[index, 6]
+        move = np.sqrt(drift[index, 0] ** 2 + drift[index, 1] ** 2)
         for row in range(boxes[index, 1], boxes[index, 3]):
             for column in range(boxes[index, 0], boxes[index, 2]):
                 x, y = floor_x[row, column], floor_y[row, column]
@@ -387,24 +387,29 @@ def _paint(albedo, floor_x, floor_y, shapes, boxes, drift, blur):  # type: ignor
                 yr = (floor_y[r1, column] - floor_y[r0, column]) * per_row
                 if np.isnan(xc + yc + xr + yr):
                     continue
-                footprint = np.sqrt(abs(xc * yr - xr * yc))
-                moved = np.sqrt(drift[index, 0] ** 2 + drift[index, 1] ** 2) / footprint
-                count = min(int(np.ceil(2.0 * moved)) + 1, _MAXIMUM_SUBSAMPLES)
-                cover = 0.0
-                for sample in range(count):
-                    t = (sample + 0.5) / count - 0.5
-                    distance, nx, ny = _signed_distance(
-                        kind,
-                        a,
-                        b,
-                        cosine,
-                        sine,
-                        x - cx - t * drift[index, 0],
-                        y - cy - t * drift[index, 1],
-                    )
-                    slope = np.sqrt((nx * xc + ny * yc) ** 2 + (nx * xr + ny * yr) ** 2)
-                    cover += min(max(0.5 - distance / (slope * soft), 0.0), 1.0)
-                cover /= count
+                distance, nx, ny = _signed_distance(kind, a, b, cosine, sine, x - cx, y - cy)
+                # Farther from the edge than it is soft and moves, a pixel is in or out.
+                edge = np.sqrt(xc * xc + yc * yc + xr * xr + yr * yr)
+                if abs(distance) > 0.5 * (move + soft * edge):
+                    cover = 1.0 if distance < 0.0 else 0.0
+                else:
+                    footprint = np.sqrt(abs(xc * yr - xr * yc))
+                    count = min(int(np.ceil(2.0 * move / footprint)) + 1, _MAXIMUM_SUBSAMPLES)
+                    cover = 0.0
+                    for sample in range(count):
+                        t = (sample + 0.5) / count - 0.5
+                        distance, nx, ny = _signed_distance(
+                            kind,
+                            a,
+                            b,
+                            cosine,
+                            sine,
+                            x - cx - t * drift[index, 0],
+                            y - cy - t * drift[index, 1],
+                        )
+                        slope = np.sqrt((nx * xc + ny * yc) ** 2 + (nx * xr + ny * yr) ** 2)
+                        cover += min(max(0.5 - distance / (slope * soft), 0.0), 1.0)
+                    cover /= count
                 if cover > 0.0:
                     for channel in range(3):
                         albedo[channel, row, column] += cover * (
@@ -446,22 +451,32 @@ def _expose(albedo, floor_x, floor_y, lens, light, gains, noise, offsets, read, 
     """
     height, width = floor_x.shape
     brightness = np.empty(width, dtype=np.float32)
+    levels = np.empty((3, width), dtype=np.uint8)
+    amplitude = 4.0 * light[0]
     read2, shot1 = np.float32(read * read), np.float32(shot)
     zero, half, full = np.float32(0.0), np.float32(0.5), np.float32(255.0)
+    # Row by row over contiguous pieces: that is what the compiler makes fast code of.
     for row in range(height):
+        xs, ys, fall_off = floor_x[row], floor_y[row], lens[row]
         for column in range(width):
-            turns = light[1] * floor_x[row, column] + light[2] * floor_y[row, column] + light[3]
+            turns = light[1] * xs[column] + light[2] * ys[column] + light[3]
             t = 2.0 * (turns - np.floor(turns)) - 1.0
-            wave = light[0] * 4.0 * t * (1.0 - abs(t))
+            wave = amplitude * t * (1.0 - abs(t))
             wave = wave if wave == wave else 0.0
-            brightness[column] = np.float32(255.0 * lens[row, column] * (1.0 + wave))
+            brightness[column] = np.float32(255.0 * fall_off[column] * (1.0 + wave))
         for channel in range(3):
             gain = np.float32(gains[channel])
-            start = offsets[row, channel]
+            grain = noise[offsets[row, channel] : offsets[row, channel] + width]
+            line, level = albedo[channel, row], levels[channel]
             for column in range(width):
-                value = brightness[column] * gain * albedo[channel, row, column]
-                value += noise[start + column] * np.sqrt(read2 + shot1 * max(value, zero))
-                image[row, column, channel] = np.uint8(np.int32(min(max(value + half, zero), full)))
+                value = brightness[column] * gain * line[column]
+                value += grain[column] * np.sqrt(read2 + shot1 * value) + half
+                value = value if value > zero else zero
+                value = value if value < full else full
+                level[column] = np.uint8(np.int32(value))
+        for column in range(width):
+            for channel in range(3):
+                image[row, column, channel] = levels[channel, column]
 
 
 def _noise_table() -> NDArray[np.float32]:
