@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.detection_model import DetectionModel
-from maasi_filter.exploration import Exploration, interpolate
+from maasi_filter.exploration import Exploration, interpolate_at
 from maasi_filter.phd import MeasurementSet
 from maasi_filter.pose import Pose
 
@@ -64,7 +64,7 @@ def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 def _weigh(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     particles, jacobian, probability, prior, unexplored, values, lower, step, least
 ):
-    number, births, _ = particles.shape
+    number, births, d = particles.shape
     totals = np.zeros(number)
     for m in range(number):
         for j in range(births):
@@ -72,7 +72,11 @@ def _weigh(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             if jacobian[m, j] > 0.0:
                 weight = prior * probability[m, j] * jacobian[m, j] / births
                 if unexplored:
-                    weight *= max(interpolate(values, lower, step, particles[m, j]), least)
+                    z = particles[m, j, 2] if d == 3 else 0.0
+                    unseen = interpolate_at(
+                        values, lower, step, particles[m, j, 0], particles[m, j, 1], z
+                    )
+                    weight *= max(unseen, least)
             jacobian[m, j] = weight
             totals[m] += weight
     return totals

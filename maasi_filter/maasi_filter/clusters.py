@@ -109,14 +109,11 @@ def group_clusters(
     means = means.copy()
     covariances = covariances.copy()
     order = _merge(mass, means, covariances, least_mass, least_distance)
+    masses = mass.tolist()
+    traces = np.einsum('gii->g', covariances).tolist()
     return [
-        Cluster(
-            position=means[g].copy(),
-            covariance=covariances[g].copy(),
-            radius=math.sqrt(max(float(np.trace(covariances[g])), 0.0)),
-            mass=float(mass[g]),
-        )
-        for g in order
+        Cluster(means[g], covariances[g], math.sqrt(max(traces[g], 0.0)), masses[g])
+        for g in order.tolist()
     ]
 
 

@@ -30,44 +30,39 @@ def interpolate(
     values : (nx, ny, nz) array
         Node values; nz is 1 in 2D.
     lower, step : (3,) arrays
-        Position of node (0, 0, 0) and spacing of the nodes; metres. A step of 0 ignores the axis.
+        Position of node (0, 0, 0) and spacing of the nodes, metres.
     position : (d,) array
         Clamped to the grid, metres.
     """
-    index = np.zeros(3, np.int64)
-    part = np.zeros(3)
-    for axis in range(position.shape[0]):
-        if step[axis] > 0.0:
-            last = values.shape[axis] - 1
-            u = (position[axis] - lower[axis]) / step[axis]
-            u = min(max(u, 0.0), float(last))
-            cell = min(int(u), last - 1)
-            index[axis] = cell
-            part[axis] = u - cell
-    total = 0.0
-    for corner in range(8):
-        weight = 1.0
-        i = index[0]
-        j = index[1]
-        k = index[2]
-        if corner & 1:
-            weight *= part[0]
-            i += 1
-        else:
-            weight *= 1.0 - part[0]
-        if corner & 2:
-            weight *= part[1]
-            j += 1
-        else:
-            weight *= 1.0 - part[1]
-        if corner & 4:
-            weight *= part[2]
-            k += 1
-        else:
-            weight *= 1.0 - part[2]
-        if weight > 0.0:
-            total += weight * values[i, j, k]
-    return total
+    height = position[2] if position.shape[0] == 3 else 0.0
+    return interpolate_at(values, lower, step, position[0], position[1], height)
+
+
+@njit(cache=True)
+def interpolate_at(
+    values: FloatArray, lower: FloatArray, step: FloatArray, x: float, y: float, z: float
+) -> float:  # pragma: no cover - compiled
+    """Return the same as `interpolate` for a position given by its coordinates; z plays no part
+    in 2D.
+    """
+    u = min(max((x - lower[0]) / step[0], 0.0), values.shape[0] - 1.0)
+    i = min(np.int64(u), values.shape[0] - 2)
+    u -= i
+    v = min(max((y - lower[1]) / step[1], 0.0), values.shape[1] - 1.0)
+    j = min(np.int64(v), values.shape[1] - 2)
+    v -= j
+    if values.shape[2] == 1:
+        low = (1.0 - v) * values[i, j, 0] + v * values[i, j + 1, 0]
+        high = (1.0 - v) * values[i + 1, j, 0] + v * values[i + 1, j + 1, 0]
+        return (1.0 - u) * low + u * high
+    w = min(max((z - lower[2]) / step[2], 0.0), values.shape[2] - 1.0)
+    k = min(np.int64(w), values.shape[2] - 2)
+    w -= k
+    a = (1.0 - w) * values[i, j, k] + w * values[i, j, k + 1]
+    b = (1.0 - w) * values[i, j + 1, k] + w * values[i, j + 1, k + 1]
+    c = (1.0 - w) * values[i + 1, j, k] + w * values[i + 1, j, k + 1]
+    e = (1.0 - w) * values[i + 1, j + 1, k] + w * values[i + 1, j + 1, k + 1]
+    return (1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * c + v * e)
 
 
 @njit(cache=True)
@@ -75,8 +70,10 @@ def _interpolate_many(
     values: FloatArray, lower: FloatArray, step: FloatArray, positions: FloatArray
 ) -> FloatArray:  # pragma: no cover - compiled
     out = np.empty(positions.shape[0])
+    solid = positions.shape[1] == 3
     for i in range(positions.shape[0]):
-        out[i] = interpolate(values, lower, step, positions[i])
+        z = positions[i, 2] if solid else 0.0
+        out[i] = interpolate_at(values, lower, step, positions[i, 0], positions[i, 1], z)
     return out
 
 

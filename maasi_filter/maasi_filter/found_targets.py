@@ -146,16 +146,145 @@ def detection_information(
     return out
 
 
+@njit(cache=True)
+def _eigen(matrix, values, vectors):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fill eigenvalues and vectors (columns) of a symmetric matrix, by Jacobi's rotations."""
+    d = matrix.shape[0]
+    a = matrix.copy()
+    for i in range(d):
+        for j in range(d):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(30):
+        off = 0.0
+        diagonal = 0.0
+        for i in range(d):
+            diagonal += a[i, i] * a[i, i]
+            for j in range(i):
+                off += a[i, j] * a[i, j]
+        if off <= 1e-30 * diagonal:
+            break
+        for p in range(d - 1):
+            for q in range(p + 1, d):
+                if a[p, q] == 0.0:
+                    continue
+                theta = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
+                t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                if theta < 0.0:
+                    t = -t
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(d):
+                    x = a[k, p]
+                    y = a[k, q]
+                    a[k, p] = c * x - s * y
+                    a[k, q] = s * x + c * y
+                for k in range(d):
+                    x = a[p, k]
+                    y = a[q, k]
+                    a[p, k] = c * x - s * y
+                    a[q, k] = s * x + c * y
+                for k in range(d):
+                    x = vectors[k, p]
+                    y = vectors[k, q]
+                    vectors[k, p] = c * x - s * y
+                    vectors[k, q] = s * x + c * y
+    for i in range(d):
+        values[i] = a[i, i]
+
+
+@njit(cache=True)
+def _bound(covariance, information, bounded, lack):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the covariance widened to the inverse of the information, and a root of what is added.
+
+    Return whether anything much was added.
+    """
+    d = covariance.shape[0]
+    root = np.empty((d, d))
+    back = np.zeros((d, d))
+    white = np.empty((d, d))
+    values = np.empty(d)
+    vectors = np.empty((d, d))
+    _root(information, root)
+    # back = root^-T, upper triangular.
+    for j in range(d):
+        for i in range(j, -1, -1):
+            total = 1.0 if i == j else 0.0
+            for k in range(i + 1, j + 1):
+                total -= root[k, i] * back[k, j]
+            back[i, j] = total / root[i, i]
+    for i in range(d):
+        for j in range(d):
+            total = 0.0
+            for k in range(d):
+                for m in range(d):
+                    total += root[k, i] * covariance[k, m] * root[m, j]
+            white[i, j] = total
+    for i in range(d):
+        for j in range(i):
+            mean = 0.5 * (white[i, j] + white[j, i])
+            white[i, j] = mean
+            white[j, i] = mean
+    _eigen(white, values, vectors)
+    much = False
+    for j in range(d):
+        missing = max(1.0 - values[j], 0.0)
+        much |= missing > 0.05
+        for i in range(d):
+            total = 0.0
+            for k in range(i, d):
+                total += back[i, k] * vectors[k, j]
+            lack[i, j] = total * math.sqrt(missing)
+    for i in range(d):
+        for j in range(d):
+            total = covariance[i, j]
+            for k in range(d):
+                total += lack[i, k] * lack[j, k]
+            bounded[i, j] = total
+    return much
+
+
+@njit(cache=True)
+def _fill_groups(covariances, information, prior, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
+    groups, d = covariances.shape[0], covariances.shape[1]
+    bounded = np.empty((d, d))
+    any_lack = False
+    for g in range(groups):
+        if _bound(covariances[g], information[g] + prior, bounded, fill[g]):
+            any_lack = True
+        else:
+            fill[g] = 0.0
+    return any_lack
+
+
 def bounded_below(covariance: FloatArray, information: FloatArray) -> FloatArray:
     """Return the covariance widened, where it is narrower, to what the data can tell.
 
     No unbiased estimate is better than the inverse of the information of its data (Cramer-Rao).
+
+    Parameters
+    ----------
+    covariance, information : (d, d) arrays
+        The information has to be positive definite.
     """
-    values, vectors = np.linalg.eigh(information)
-    root = vectors * np.sqrt(np.maximum(values, 1e-12 * max(float(values[-1]), 1e-300)))
-    white, turn = np.linalg.eigh((root.T @ covariance @ root + (root.T @ covariance @ root).T) / 2)
-    back = np.linalg.inv(root.T) @ turn
-    return np.asarray((back * np.maximum(white, 1.0)) @ back.T)
+    bounded = np.empty_like(covariance)
+    _bound(covariance, information, bounded, np.empty_like(covariance))
+    return bounded
+
+
+def missing_spread(
+    covariances: FloatArray, information: FloatArray, prior: FloatArray
+) -> FloatArray | None:
+    """Return roots (g, d, d) of what covariances lack to the bound; None if none lacks much.
+
+    Parameters
+    ----------
+    covariances, information : (g, d, d) arrays
+        Of groups of particles, and of their detections.
+    prior : (d, d) array
+        Information before any detection, positive definite.
+    """
+    fill = np.zeros_like(covariances)
+    return fill if _fill_groups(covariances, information, prior, fill) else None
 
 
 @njit(cache=True)

@@ -9,47 +9,55 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.phd import CHUNK, run_chunks
+from maasi_filter.phd import CHUNK, finish_moments, run_chunks
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)
-def _sum_chunk(weights, start, stop):  # type: ignore[no-untyped-def]  # pragma: no cover
-    total = 0.0
-    for i in range(start, stop):
-        total += weights[i]
-    return total
+def _sum_chunks(first_chunk, last_chunk, weights, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for chunk in range(first_chunk, last_chunk):
+        total = 0.0
+        for i in range(chunk * CHUNK, min(weights.shape[0], (chunk + 1) * CHUNK)):
+            total += weights[i]
+        sums[chunk] = total
 
 
 def total_weight(weights: FloatArray) -> float:
     """Return the sum of the weights, added in chunks of fixed size, in order."""
+    chunks = -(-len(weights) // CHUNK)
+    sums = np.empty(chunks)
+    _sum_chunks(0, chunks, weights, sums)
     total = 0.0
-    for start in range(0, len(weights), CHUNK):
-        total += _sum_chunk(weights, start, min(len(weights), start + CHUNK))
+    for part in sums.tolist():
+        total += part
     return total
 
 
 @njit(cache=True, nogil=True)
-def _select_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    weights, start, stop, base, points, first, last, index
+def _select_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk, last_chunk, weights, bases, points, limits, index
 ):
-    """Fill the ancestors of sorted points [first, last) that fall into one chunk of weights."""
-    cumulative = base
-    point = first
-    holder = start
-    for i in range(start, stop):
-        if weights[i] > 0.0:
-            holder = i
-            cumulative += weights[i]
-            while point < last and points[point] < cumulative:
-                index[point] = i
-                point += 1
-    # Rounding can leave points just behind the last cumulative weight.
-    while point < last:
-        index[point] = holder
-        point += 1
+    """Fill the ancestors of the sorted points that fall into chunks of weights."""
+    for chunk in range(first_chunk, last_chunk):
+        cumulative = bases[chunk]
+        point = limits[chunk]
+        last = limits[chunk + 1]
+        start = chunk * CHUNK
+        stop = min(weights.shape[0], start + CHUNK)
+        holder = start
+        for i in range(start, stop):
+            if weights[i] > 0.0:
+                holder = i
+                cumulative += weights[i]
+                while point < last and points[point] < cumulative:
+                    index[point] = i
+                    point += 1
+        # Rounding can leave points just behind the last cumulative weight.
+        while point < last:
+            index[point] = holder
+            point += 1
 
 
 def resampling_points(
@@ -95,10 +103,7 @@ def resample(
     chunks = max(1, -(-n // CHUNK))
     sums = np.empty(chunks)
 
-    def add(chunk: int, start: int, stop: int) -> None:
-        sums[chunk] = _sum_chunk(weights, start, stop)
-
-    run_chunks(add, n, pool)
+    run_chunks(lambda c, e: _sum_chunks(c, e, weights, sums), n, pool)
     bases = np.zeros(chunks + 1)
     for chunk in range(chunks):
         bases[chunk + 1] = bases[chunk] + sums[chunk]
@@ -112,12 +117,7 @@ def resample(
     limits[int(np.nonzero(sums > 0.0)[0][-1]) + 1 :] = number
     index = np.empty(number, np.int64)
 
-    def select(chunk: int, start: int, stop: int) -> None:
-        _select_chunk(
-            weights, start, stop, bases[chunk], points, limits[chunk], limits[chunk + 1], index
-        )
-
-    run_chunks(select, n, pool)
+    run_chunks(lambda c, e: _select_chunks(c, e, weights, bases, points, limits, index), n, pool)
     return index
 
 
@@ -130,25 +130,110 @@ def _mix(state):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _moments_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    start, stop, particles, weights, group, references, moments
+def _gather_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk, last_chunk, index, particles, group, compact, out, out_group
+):
+    d = particles.shape[1]
+    for i in range(first_chunk * CHUNK, min(index.shape[0], last_chunk * CHUNK)):
+        j = index[i]
+        for a in range(d):
+            out[i, a] = particles[j, a]
+        out_group[i] = compact[group[j]]
+
+
+def gather(
+    index: IntArray,
+    particles: FloatArray,
+    group: IntArray,
+    groups: int,
+    pool: ThreadPoolExecutor | None = None,
+) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
+    """Return the chosen particles, their groups renumbered from 0, and which groups are left."""
+    present = np.zeros(groups, np.bool_)
+    _mark_present(index, group, present)
+    compact = np.cumsum(present) - 1
+    out = np.empty((len(index), particles.shape[1]))
+    out_group = np.empty(len(index), np.int64)
+    run_chunks(
+        lambda c, e: _gather_chunks(c, e, index, particles, group, compact, out, out_group),
+        len(index),
+        pool,
+    )
+    return out, out_group, present
+
+
+@njit(cache=True)
+def _mark_present(index, group, present):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(index.shape[0]):
+        present[group[index[i]]] = True
+
+
+@njit(cache=True)
+def _references(particles, group, references):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the first particle of each group."""
+    for i in range(particles.shape[0] - 1, -1, -1):
+        for a in range(particles.shape[1]):
+            references[group[i], a] = particles[i, a]
+
+
+@njit(cache=True, nogil=True)
+def _moments_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk, last_chunk, particles, weights, group, references, all_moments
 ):
     """Sum weight, and first and second moments about `references`, for each group."""
     d = particles.shape[1]
-    offset = np.empty(d)
-    for i in range(start, stop):
-        weight = weights[i]
-        if weight <= 0.0:
-            continue
-        g = group[i]
-        moments[g, 0] += weight
-        j = 1 + d
-        for a in range(d):
-            offset[a] = particles[i, a] - references[g, a]
-            moments[g, 1 + a] += weight * offset[a]
-            for b in range(a + 1):
-                moments[g, j] += weight * offset[a] * offset[b]
-                j += 1
+    for chunk in range(first_chunk, last_chunk):
+        i = chunk * CHUNK
+        stop = min(particles.shape[0], i + CHUNK)
+        while i < stop:
+            # Particles of a group lie together: each run is summed by itself.
+            g = group[i]
+            c0 = references[g, 0]
+            c1 = references[g, 1]
+            c2 = references[g, 2] if d == 3 else 0.0
+            t0 = 0.0
+            tx = 0.0
+            ty = 0.0
+            tz = 0.0
+            txx = 0.0
+            txy = 0.0
+            tyy = 0.0
+            txz = 0.0
+            tyz = 0.0
+            tzz = 0.0
+            while i < stop and group[i] == g:
+                weight = weights[i]
+                x = particles[i, 0] - c0
+                y = particles[i, 1] - c1
+                t0 += weight
+                tx += weight * x
+                ty += weight * y
+                txx += weight * x * x
+                txy += weight * x * y
+                tyy += weight * y * y
+                if d == 3:
+                    z = particles[i, 2] - c2
+                    tz += weight * z
+                    txz += weight * x * z
+                    tyz += weight * y * z
+                    tzz += weight * z * z
+                i += 1
+            moments = all_moments[chunk, g]
+            moments[0] += t0
+            moments[1] += tx
+            moments[2] += ty
+            if d == 2:
+                moments[3] += txx
+                moments[4] += txy
+                moments[5] += tyy
+            else:
+                moments[3] += tz
+                moments[4] += txx
+                moments[5] += txy
+                moments[6] += tyy
+                moments[7] += txz
+                moments[8] += tyz
+                moments[9] += tzz
 
 
 def group_moments(
@@ -161,31 +246,18 @@ def group_moments(
     """Return mass (g,), mean (g, d) and covariance (g, d, d) of each group of particles."""
     n, d = particles.shape
     chunks = max(1, -(-n // CHUNK))
-    references = np.zeros((groups, d))
     # A particle of the group as origin keeps the digits of narrow groups far from zero.
-    references[group[::-1]] = particles[::-1]
-    size = 1 + d + d * (d + 1) // 2
-    partial = np.zeros((chunks, groups, size))
-
-    def add(chunk: int, start: int, stop: int) -> None:
-        _moments_chunk(start, stop, particles, weights, group, references, partial[chunk])
-
-    run_chunks(add, n, pool)
-    moments = np.zeros((groups, size))
-    for chunk in range(chunks):
-        moments += partial[chunk]
-    mass = moments[:, 0]
-    safe = np.where(mass > 0.0, mass, 1.0)
-    offset = moments[:, 1 : 1 + d] / safe[:, None]
-    covariance = np.zeros((groups, d, d))
-    j = 1 + d
-    for a in range(d):
-        for b in range(a + 1):
-            value = moments[:, j] / safe - offset[:, a] * offset[:, b]
-            covariance[:, a, b] = value
-            covariance[:, b, a] = value
-            j += 1
-    return mass, references + offset, covariance
+    references = np.zeros((groups, d))
+    _references(particles, group, references)
+    partial = np.zeros((chunks, groups, 1 + d + d * (d + 1) // 2))
+    run_chunks(
+        lambda c, e: _moments_chunks(c, e, particles, weights, group, references, partial), n, pool
+    )
+    mass = np.empty(groups)
+    means = np.empty((groups, d))
+    covariances = np.empty((groups, d, d))
+    finish_moments(partial, references, mass, means, covariances)
+    return mass, means, covariances
 
 
 @njit(cache=True)
@@ -205,18 +277,16 @@ def _order(group, groups):  # type: ignore[no-untyped-def]  # pragma: no cover -
 
 
 @njit(cache=True)
-def _count_copies(index, group, groups):  # type: ignore[no-untyped-def]  # pragma: no cover
-    copies = np.zeros(groups)
+def _count_copies(index, group, copies):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(1, index.shape[0]):
         if index[i] == index[i - 1]:
             copies[group[i]] += 1.0
-    return copies
 
 
 @njit(cache=True, nogil=True)
-def _jitter_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    start,
-    stop,
+def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk,
+    last_chunk,
     seed,
     index,
     group,
@@ -236,40 +306,39 @@ def _jitter_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
     # The sum of two uniform numbers on (-1/2, 1/2) has variance 1/6.
     width = deviation * math.sqrt(6.0)
     scale = differential / math.sqrt(2.0)
-    for i in range(start, stop):
+    low_half = np.uint64(0xFFFFFFFF)
+    quarter = np.uint64(0xFFFF)
+    for i in range(first_chunk * CHUNK, min(source.shape[0], last_chunk * CHUNK)):
         g = group[i]
-        first = starts[g]
-        size = np.uint64(starts[g + 1] - first)
-        copied = i > 0 and index[i] == index[i - 1]
-        inside = True
-        if copied:
-            state = seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1)
+        state = seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1)
+        if i > 0 and index[i] == index[i - 1]:
+            first = starts[g]
+            size = np.uint64(starts[g + 1] - first)
             bits = _mix(state)
-            a = order[
-                first + np.int64((np.uint64(bits & np.uint64(0xFFFFFFFF)) * size) >> np.uint64(32))
-            ]
+            a = order[first + np.int64(((bits & low_half) * size) >> np.uint64(32))]
             b = order[first + np.int64(((bits >> np.uint64(32)) * size) >> np.uint64(32))]
             for axis in range(d):
                 moved = source[i, axis] + scale * (source[a, axis] - source[b, axis])
                 if width > 0.0:
                     bits = _mix(bits + np.uint64(axis + 1))
-                    low = np.float64(bits & np.uint64(0xFFFFFFFF)) * 2.0**-32
-                    high = np.float64(bits >> np.uint64(32)) * 2.0**-32
+                    low = np.float64(np.int64(bits & low_half)) * 2.0**-32
+                    high = np.float64(np.int64(bits >> np.uint64(32))) * 2.0**-32
                     moved += width * (low + high - 1.0)
                 target[i, axis] = means[g, axis] + shrink[g] * (moved - means[g, axis])
         else:
             for axis in range(d):
                 target[i, axis] = means[g, axis] + shrink[g] * (source[i, axis] - means[g, axis])
         if filled[g]:
-            bits = _mix(~(seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1)))
+            bits = _mix(~state)
             for axis in range(d):
                 # The sum of four uniform numbers on (-1/2, 1/2) has variance 1/3.
                 bits = _mix(bits + np.uint64(axis + 1))
-                total = (bits & np.uint64(0xFFFF)) + ((bits >> np.uint64(16)) & np.uint64(0xFFFF))
-                total += ((bits >> np.uint64(32)) & np.uint64(0xFFFF)) + (bits >> np.uint64(48))
-                normal = (np.float64(total) * 2.0**-16 - 2.0) * math.sqrt(3.0)
+                total = (bits & quarter) + ((bits >> np.uint64(16)) & quarter)
+                total += ((bits >> np.uint64(32)) & quarter) + (bits >> np.uint64(48))
+                normal = (np.float64(np.int64(total)) * 2.0**-16 - 2.0) * math.sqrt(3.0)
                 for other in range(d):
                     target[i, other] += fill[g, other, axis] * normal
+        inside = True
         for axis in range(d):
             if not bounds[axis, 0] <= target[i, axis] <= bounds[axis, 1]:
                 inside = False
@@ -282,7 +351,7 @@ def jitter(
     particles: FloatArray,
     index: IntArray,
     group: IntArray,
-    groups: int,
+    means: FloatArray,
     differential: float,
     deviation: float,
     bounds: FloatArray,
@@ -296,7 +365,8 @@ def jitter(
     A duplicate gets x += c / sqrt(2) (x_a - x_b) + noise with x_a, x_b drawn from its group. So
     that this does not widen the group, all of it is drawn in towards its mean to the covariance
     it had, as a shrinkage kernel does (Liu and West, 2001). A particle that would leave the
-    bounds stays where it was.
+    bounds stays where it was. Random numbers are hashes of a particle's index and one draw of the
+    generator, so that they do not depend on the order of the work.
 
     Parameters
     ----------
@@ -306,6 +376,8 @@ def jitter(
         Their ancestors, ascending: a duplicate is one that has the ancestor of the one before.
     group : (n,) int array
         Group of each, from 0.
+    means : (g, d) array
+        Of the groups, metres.
     differential : float
         c.
     deviation : float
@@ -315,25 +387,23 @@ def jitter(
     fill : (g, d, d) array, optional
         For each group a root of a covariance: noise of this covariance is added to all of it.
     """
-    n, d = particles.shape
+    groups, d = means.shape
     seed = np.uint64(generator.integers(0, 2**63))
     order, starts = _order(group, groups)
-    copies = _count_copies(index, group, groups)
-    size = np.maximum(starts[1:] - starts[:-1], 1)
     shrink = np.ones(groups)
-    means = np.zeros((groups, d))
     if keep_covariance:
-        _, means, _ = group_moments(particles, np.ones(n), group, groups, pool)
+        copies = np.zeros(groups)
+        _count_copies(index, group, copies)
+        size = np.maximum(starts[1:] - starts[:-1], 1)
         shrink = 1.0 / np.sqrt(1.0 + copies / size * differential**2)
     if fill is None:
         fill = np.zeros((groups, d, d))
-    filled = fill.reshape(groups, -1).any(axis=1)
+    filled = fill.reshape(groups, d * d).any(axis=1)
     out = np.empty_like(particles)
-
-    def move(_: int, start: int, stop: int) -> None:
-        _jitter_chunk(
-            start,
-            stop,
+    run_chunks(
+        lambda c, e: _jitter_chunks(
+            c,
+            e,
             seed,
             index,
             group,
@@ -348,7 +418,8 @@ def jitter(
             filled,
             bounds,
             out,
-        )
-
-    run_chunks(move, n, pool)
+        ),
+        len(particles),
+        pool,
+    )
     return out

@@ -25,8 +25,8 @@ IntArray = NDArray[np.int64]
 
 CHUNK = 8192
 BLOCK = 16
-# Likelihoods exp(-q/2) with q this far above the smallest are below 1e-21 of it.
-RELATIVE_GATE = 100.0
+# Likelihoods exp(-q/2) with q this far above the smallest are below 1e-17 of it.
+RELATIVE_GATE = 80.0
 # Closer than this many deviations of the range, a bearing says nothing and noise is Cartesian.
 POLE_DEVIATIONS = 3.0
 LARGEST_BEARING_VARIANCE = math.pi**2 / 3.0
@@ -277,10 +277,69 @@ def prepare_measurements(
     return out
 
 
+def position_measurements(values: FloatArray, covariances: FloatArray) -> MeasurementSet:
+    """Return measured positions (m, d) [m] with covariances (m, d, d) ready for the kernels.
+
+    A linear measurement, z = x + noise.
+    """
+    number, d = values.shape
+    values = np.ascontiguousarray(values, dtype=float)
+    out = MeasurementSet(
+        values=values,
+        covariances=np.array(covariances),
+        cartesian=np.ones(number, np.bool_),
+        centres=values.copy(),
+        roots=np.empty((number, d, d)),
+        information=np.empty((number, d, d)),
+        log_norm=np.empty(number),
+        volume=np.ones(number),
+        gate=np.trace(covariances, axis1=1, axis2=2),
+    )
+    for m in range(number):
+        log_determinant = _root(out.covariances[m], out.roots[m])
+        _invert(out.covariances[m], out.information[m])
+        out.log_norm[m] = -0.5 * (d * math.log(2.0 * math.pi) + log_determinant)
+    return out
+
+
+@njit(cache=True)
+def arctan2(y: float, x: float) -> float:  # pragma: no cover - compiled
+    """Return the angle of (x, y), to about one unit in the last place; 0 at the origin.
+
+    Cephes' rational approximation: several times faster than the C library's, and the same to
+    the bit on every machine.
+    """
+    ax = abs(x)
+    ay = abs(y)
+    small = min(ax, ay)
+    large = max(ax, ay)
+    if large == 0.0:
+        return 0.0
+    base = 0.0
+    if small > 0.66 * large:
+        base = 0.25 * math.pi
+        t = (small - large) / (small + large)
+    else:
+        t = small / large
+    z = t * t
+    top = -8.750608600031904122785e-1 * z - 1.615753718733365076637e1
+    top = (top * z - 7.500855792314704667340e1) * z - 1.228866684490136173410e2
+    top = top * z - 6.485021904942025371773e1
+    bottom = (z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2
+    bottom = (bottom * z + 4.328810604912902668951e2) * z + 4.853903996359136964868e2
+    bottom = bottom * z + 1.945506571482613964425e2
+    angle = base + (t + t * (z * top / bottom))
+    if ay > ax:
+        angle = 0.5 * math.pi - angle
+    if x < 0.0:
+        angle = math.pi - angle
+    return angle if y >= 0.0 else -angle
+
+
 @njit(cache=True, nogil=True)
-def _associate_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    start,
-    stop,
+def _associate_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk,
+    last_chunk,
     particles,
     denominator_weights,
     probability,
@@ -291,77 +350,144 @@ def _associate_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - comp
     information,
     gate,
     likelihood,
-    smallest,
-    sums,
+    all_smallest,
+    all_sums,
 ):
-    """Fill likelihoods pi exp(-(q - smallest) / 2) of a chunk, and their weighted sums."""
+    """Fill likelihoods (m, n), pi exp(-(q - smallest) / 2), of chunks, and weighted sums."""
     d = particles.shape[1]
     number = values.shape[0]
-    for m in range(number):
-        smallest[m] = np.inf
-        sums[m] = 0.0
-    for i in range(start, stop):
-        for m in range(number):
-            likelihood[i, m] = np.inf
-        if probability[i] <= 0.0 or denominator_weights[i] <= 0.0:
-            continue
-        dx = particles[i, 0] - sensor_position[0]
-        dy = particles[i, 1] - sensor_position[1]
-        dz = 0.0
-        level_square = dx * dx + dy * dy
-        square = level_square
-        if d == 3:
-            dz = particles[i, 2] - sensor_position[2]
-            square += dz * dz
-        distance = math.sqrt(square)
-        bearing = 0.0
-        elevation = 0.0
-        angles_known = False
-        for m in range(number):
-            if cartesian[m]:
-                e0 = particles[i, 0] - centres[m, 0]
-                e1 = particles[i, 1] - centres[m, 1]
-                e2 = 0.0
-                least = e0 * e0 + e1 * e1
-                if d == 3:
-                    e2 = particles[i, 2] - centres[m, 2]
-                    least += e2 * e2
-                if least > gate[m] * (smallest[m] + RELATIVE_GATE):
-                    continue
-            else:
-                e0 = values[m, 0] - distance
-                if e0 * e0 > gate[m] * (smallest[m] + RELATIVE_GATE):
-                    continue
-                if not angles_known:
-                    angles_known = True
-                    bearing = math.atan2(dy, dx)
-                    if d == 3:
-                        elevation = math.atan2(dz, math.sqrt(level_square))
-                e1 = wrap(values[m, 1] - bearing)
-                e2 = 0.0
-                if d == 3:
-                    e2 = values[m, 2] - elevation
-            info = information[m]
-            q = e0 * e0 * info[0, 0] + e1 * e1 * info[1, 1] + 2.0 * e0 * e1 * info[0, 1]
+    distance = np.empty(CHUNK)
+    bearing = np.empty(CHUNK)
+    elevation = np.empty(CHUNK)
+    s0 = sensor_position[0]
+    s1 = sensor_position[1]
+    s2 = sensor_position[2]
+    for chunk in range(first_chunk, last_chunk):
+        start = chunk * CHUNK
+        size = min(particles.shape[0], start + CHUNK) - start
+        # A particle that cannot be seen, or has no weight, is at no distance: gates keep it out.
+        for i in range(size):
+            dx = particles[start + i, 0] - s0
+            dy = particles[start + i, 1] - s1
+            square = dx * dx + dy * dy
             if d == 3:
-                q += e2 * e2 * info[2, 2] + 2.0 * e2 * (e0 * info[0, 2] + e1 * info[1, 2])
-            likelihood[i, m] = q
-            if q < smallest[m]:
-                smallest[m] = q
-    for i in range(start, stop):
+                dz = particles[start + i, 2] - s2
+                square += dz * dz
+            seen = probability[start + i] > 0.0 and denominator_weights[start + i] > 0.0
+            distance[i] = math.sqrt(square) if seen else np.inf
+            bearing[i] = np.inf
         for m in range(number):
-            if likelihood[i, m] < smallest[m] + RELATIVE_GATE:
-                value = probability[i] * math.exp(-0.5 * (likelihood[i, m] - smallest[m]))
-                likelihood[i, m] = value
-                sums[m] += value * denominator_weights[i]
-            else:
-                likelihood[i, m] = 0.0
+            row = likelihood[m]
+            least = np.inf
+            limit = np.inf
+            i00 = information[m, 0, 0]
+            i11 = information[m, 1, 1]
+            i01 = 2.0 * information[m, 0, 1]
+            i22 = 0.0
+            i02 = 0.0
+            i12 = 0.0
+            if d == 3:
+                i22 = information[m, 2, 2]
+                i02 = 2.0 * information[m, 0, 2]
+                i12 = 2.0 * information[m, 1, 2]
+            z0 = values[m, 0]
+            z1 = values[m, 1]
+            z2 = values[m, 2] if d == 3 else 0.0
+            if cartesian[m]:
+                z0 = centres[m, 0]
+                z1 = centres[m, 1]
+                z2 = centres[m, 2] if d == 3 else 0.0
+            variance = gate[m]
+            for i in range(size):
+                j = start + i
+                e2 = 0.0
+                if cartesian[m]:
+                    e0 = particles[j, 0] - z0
+                    e1 = particles[j, 1] - z1
+                    far = e0 * e0 + e1 * e1
+                    if d == 3:
+                        e2 = particles[j, 2] - z2
+                        far += e2 * e2
+                    if not (far <= limit and distance[i] < np.inf):
+                        row[j] = np.inf
+                        continue
+                else:
+                    e0 = z0 - distance[i]
+                    if not e0 * e0 <= limit or distance[i] == np.inf:
+                        row[j] = np.inf
+                        continue
+                    if bearing[i] == np.inf:
+                        dx = particles[j, 0] - s0
+                        dy = particles[j, 1] - s1
+                        bearing[i] = arctan2(dy, dx)
+                        if d == 3:
+                            elevation[i] = arctan2(
+                                particles[j, 2] - s2, math.sqrt(dx * dx + dy * dy)
+                            )
+                    e1 = wrap(z1 - bearing[i])
+                    if d == 3:
+                        e2 = z2 - elevation[i]
+                q = e0 * (e0 * i00 + e1 * i01 + e2 * i02) + e1 * (e1 * i11 + e2 * i12)
+                q += e2 * e2 * i22
+                row[j] = q
+                if q < least:
+                    least = q
+                    limit = variance * (least + RELATIVE_GATE)
+            total = 0.0
+            largest = least + RELATIVE_GATE
+            for j in range(start, start + size):
+                q = row[j]
+                if q < largest:
+                    value = probability[j] * math.exp(-0.5 * (q - least))
+                    row[j] = value
+                    total += value * denominator_weights[j]
+                else:
+                    row[j] = 0.0
+            all_smallest[chunk, m] = least
+            all_sums[chunk, m] = total
+
+
+@njit(cache=True)
+def _normalise(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    smallest, sums, log_norm, other, log_normaliser, own_mass, other_scale, scale
+):
+    """Fill log C(z), the particles' share of it, 1 / C(z), and the factor of each chunk."""
+    chunks, number = smallest.shape
+    for m in range(number):
+        least = np.inf
+        for chunk in range(chunks):
+            least = min(least, smallest[chunk, m])
+        total = 0.0
+        if least < np.inf:
+            for chunk in range(chunks):
+                if smallest[chunk, m] < np.inf:
+                    total += sums[chunk, m] * math.exp(-0.5 * (smallest[chunk, m] - least))
+        log_own = -np.inf
+        if total > 0.0:
+            log_own = math.log(total) + log_norm[m] - 0.5 * least
+        log_other = math.log(other[m]) if other[m] > 0.0 else -np.inf
+        larger = max(log_own, log_other)
+        log_sum = larger
+        own_mass[m] = 0.0
+        other_scale[m] = 0.0
+        for chunk in range(chunks):
+            scale[chunk, m] = 0.0
+        if larger > -np.inf:
+            log_sum = larger + math.log1p(math.exp(min(log_own, log_other) - larger))
+            own_mass[m] = math.exp(log_own - log_sum)
+            # Next to nothing may still be divided by; what is multiplied with it is as small.
+            other_scale[m] = math.exp(min(-log_sum, 700.0))
+            for chunk in range(chunks):
+                if smallest[chunk, m] < np.inf:
+                    exponent = log_norm[m] - log_sum - 0.5 * smallest[chunk, m]
+                    scale[chunk, m] = math.exp(min(exponent, 700.0))
+        log_normaliser[m] = log_sum
 
 
 @njit(cache=True, nogil=True)
-def _apply_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    start,
-    stop,
+def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk,
+    last_chunk,
     particles,
     weights,
     first,
@@ -371,61 +497,163 @@ def _apply_chunk(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     factor,
     share,
     component,
-    moments,
+    all_moments,
     group,
     group_share,
 ):
-    """Turn likelihoods into W_i(z), add them to `factor`, and sum their moments.
+    """Add psi_z / C(z) to `factor`, and sum moments of W_i(z) = psi_z(x_i) w_i / C(z).
 
-    `likelihood` becomes W_i(z) = psi_z(x_i) w_i / C(z); `share` and `component` keep the largest
-    one of each particle. `moments` (m, 1 + d + d (d + 1) / 2) are taken about `centres`.
+    `share` and `component` keep the largest W_i(z) of each particle, and its z. `moments`
+    (m, 1 + d + d (d + 1) / 2) are taken about `centres`.
     """
     d = particles.shape[1]
-    number = likelihood.shape[1]
-    offset = np.empty(d)
-    for m in range(number):
-        for j in range(moments.shape[1]):
-            moments[m, j] = 0.0
-    for i in range(start, stop):
+    number = likelihood.shape[0]
+    for chunk in range(first_chunk, last_chunk):
+        start = chunk * CHUNK
+        stop = min(particles.shape[0], start + CHUNK)
         for m in range(number):
-            value = likelihood[i, m]
-            if value == 0.0:
-                continue
-            ratio = value * scale[m]
-            value = ratio * weights[i]
-            likelihood[i, m] = value
-            factor[i] += ratio
-            if value > share[i]:
-                share[i] = value
-                component[i] = first + m
-            if value > 0.0:
-                group_share[group[i], m] += value
-                moments[m, 0] += value
-                j = 1 + d
-                for a in range(d):
-                    offset[a] = particles[i, a] - centres[m, a]
-                    moments[m, 1 + a] += value * offset[a]
-                    for b in range(a + 1):
-                        moments[m, j] += value * offset[a] * offset[b]
-                        j += 1
+            row = likelihood[m]
+            multiple = scale[chunk, m]
+            c0 = centres[m, 0]
+            c1 = centres[m, 1]
+            c2 = centres[m, 2] if d == 3 else 0.0
+            t0 = 0.0
+            tx = 0.0
+            ty = 0.0
+            tz = 0.0
+            txx = 0.0
+            txy = 0.0
+            tyy = 0.0
+            txz = 0.0
+            tyz = 0.0
+            tzz = 0.0
+            # Particles of a group lie together, so its sum is kept apart until another comes.
+            current = np.int64(0)
+            held = 0.0
+            for i in range(start, stop):
+                value = row[i]
+                if value == 0.0:
+                    continue
+                ratio = value * multiple
+                factor[i] += ratio
+                value = ratio * weights[i]
+                if value <= 0.0:
+                    continue
+                if value > share[i]:
+                    share[i] = value
+                    component[i] = first + m
+                if group[i] != current:
+                    group_share[chunk, current, m] += held
+                    held = 0.0
+                    current = group[i]
+                held += value
+                x = particles[i, 0] - c0
+                y = particles[i, 1] - c1
+                t0 += value
+                tx += value * x
+                ty += value * y
+                txx += value * x * x
+                txy += value * x * y
+                tyy += value * y * y
+                if d == 3:
+                    z = particles[i, 2] - c2
+                    tz += value * z
+                    txz += value * x * z
+                    tyz += value * y * z
+                    tzz += value * z * z
+            if held > 0.0:
+                group_share[chunk, current, m] += held
+            moments = all_moments[chunk, m]
+            moments[0] = t0
+            moments[1] = tx
+            moments[2] = ty
+            if d == 2:
+                moments[3] = txx
+                moments[4] = txy
+                moments[5] = tyy
+            else:
+                moments[3] = tz
+                moments[4] = txx
+                moments[5] = txy
+                moments[6] = tyy
+                moments[7] = txz
+                moments[8] = tyz
+                moments[9] = tzz
+
+
+@njit(cache=True)
+def regroup(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    weights, factor, share, component, group, group_share, updated, regrouped
+):
+    """Fill the updated weights, and the groups of particles after one robot's detections.
+
+    A particle belongs to the detection that explains most of its weight, if one does. What a
+    detection leaves of a group that it mostly took belongs to it too. Groups of detections are
+    numbered behind the ones there are.
+    """
+    groups, number = group_share.shape
+    mass = np.zeros(groups)
+    for i in range(weights.shape[0]):
+        updated[i] = weights[i] * factor[i]
+        mass[group[i]] += updated[i]
+    taken = np.empty(groups, np.int64)
+    for g in range(groups):
+        taken[g] = g
+        best = 0.5 * mass[g]
+        for m in range(number):
+            if group_share[g, m] > best:
+                best = group_share[g, m]
+                taken[g] = groups + m
+    for i in range(weights.shape[0]):
+        if share[i] > 0.5 * updated[i]:
+            regrouped[i] = groups + component[i]
+        else:
+            regrouped[i] = taken[group[i]]
+
+
+@njit(cache=True)
+def finish_moments(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    partial, references, mass, means, covariances
+):
+    """Add moments of chunks in order, and fill mass, mean and covariance of each set.
+
+    Where there is no mass the mean is the reference and the covariance 0.
+    """
+    chunks, sets, size = partial.shape
+    d = references.shape[1]
+    sums = np.empty(size)
+    for g in range(sets):
+        for j in range(size):
+            sums[j] = 0.0
+            for chunk in range(chunks):
+                sums[j] += partial[chunk, g, j]
+        mass[g] = sums[0]
+        j = 1 + d
+        for a in range(d):
+            means[g, a] = references[g, a]
+            if sums[0] > 0.0:
+                means[g, a] += sums[1 + a] / sums[0]
+            for b in range(a + 1):
+                value = 0.0
+                if sums[0] > 0.0:
+                    value = sums[j] / sums[0] - sums[1 + a] * sums[1 + b] / (sums[0] * sums[0])
+                covariances[g, a, b] = value
+                covariances[g, b, a] = value
+                j += 1
 
 
 def run_chunks(
-    function: Callable[[int, int, int], None], number: int, pool: ThreadPoolExecutor | None
+    function: Callable[[int, int], None], number: int, pool: ThreadPoolExecutor | None
 ) -> None:
-    """Call `function(chunk, start, stop)` for chunks of fixed size, in threads if there is a pool.
+    """Call `function(first, last)` for ranges of chunks of fixed size, in threads with a pool.
 
     Every chunk writes to places of its own, so that the result does not depend on the threads.
     """
     count = max(1, -(-number // CHUNK))
     if pool is None or count < 4:
-        for chunk in range(count):
-            function(chunk, chunk * CHUNK, min(number, (chunk + 1) * CHUNK))
+        function(0, count)
         return
-    futures = [
-        pool.submit(function, chunk, chunk * CHUNK, min(number, (chunk + 1) * CHUNK))
-        for chunk in range(count)
-    ]
+    futures = [pool.submit(function, chunk, chunk + 1) for chunk in range(count)]
     for future in futures:
         future.result()
 
@@ -510,123 +738,68 @@ def associate(
     factor = 1.0 - probability
     share = np.zeros(n)
     component = np.full(n, -1, np.int64)
-    log_normaliser = np.full(number, -np.inf)
-    own_mass = np.zeros(number)
-    other_scale = np.zeros(number)
-    means = np.array(measurements.centres)
-    covariances = np.zeros((number, d, d))
+    log_normaliser = np.empty(number)
+    own_mass = np.empty(number)
+    other_scale = np.empty(number)
+    mass = np.empty(number)
+    means = np.empty((number, d))
+    covariances = np.empty((number, d, d))
     group_share = np.zeros((groups, number))
     chunks = max(1, -(-n // CHUNK))
-    upper = [(a, b) for a in range(d) for b in range(a + 1)]
     for first in range(0, number, BLOCK):
         block = slice(first, min(number, first + BLOCK))
         width = block.stop - first
-        likelihood = np.empty((n, width))
+        likelihood = np.empty((width, n))
         smallest = np.empty((chunks, width))
         sums = np.empty((chunks, width))
-        values = measurements.values[block]
-        cartesian = measurements.cartesian[block]
-        centres = measurements.centres[block]
-        information = measurements.information[block]
-        gate = measurements.gate[block]
-
-        def first_pass(
-            chunk: int,
-            start: int,
-            stop: int,
-            values: FloatArray = values,
-            cartesian: NDArray[np.bool_] = cartesian,
-            centres: FloatArray = centres,
-            information: FloatArray = information,
-            gate: FloatArray = gate,
-            likelihood: FloatArray = likelihood,
-            smallest: FloatArray = smallest,
-            sums: FloatArray = sums,
-        ) -> None:
-            _associate_chunk(
-                start,
-                stop,
-                particles,
-                denominator,
-                probability,
-                pose.position,
-                values,
-                cartesian,
-                centres,
-                information,
-                gate,
-                likelihood,
-                smallest[chunk],
-                sums[chunk],
-            )
-
-        run_chunks(first_pass, n, pool)
-        least = smallest.min(axis=0)
-        safe = np.where(np.isfinite(least), least, 0.0)
-        relative = np.exp(-0.5 * np.maximum(smallest - safe, 0.0))
-        relative[~np.isfinite(smallest)] = 0.0
-        total = np.zeros(width)
-        for chunk in range(chunks):
-            total += relative[chunk] * np.where(relative[chunk] > 0.0, sums[chunk], 0.0)
-        log_own = np.full(width, -np.inf)
-        some = total > 0.0
-        log_own[some] = np.log(total[some]) + measurements.log_norm[block][some] - 0.5 * least[some]
-        log_other = np.full(width, -np.inf)
-        there = other[block] > 0.0
-        log_other[there] = np.log(other[block][there])
-        log_sum = np.logaddexp(log_own, log_other)
-        finite = np.isfinite(log_sum)
-        log_normaliser[block] = log_sum
-        own_mass[block][finite] = np.exp(log_own[finite] - log_sum[finite])
-        other_scale[block][finite] = np.exp(-log_sum[finite])
-        scale = np.zeros((chunks, width))
-        exponent = measurements.log_norm[block] - log_sum - 0.5 * smallest
-        usable = np.isfinite(exponent)
-        scale[usable] = np.exp(exponent[usable])
-        moments = np.empty((chunks, width, 1 + d + len(upper)))
+        before = (
+            particles,
+            denominator,
+            probability,
+            pose.position,
+            measurements.values[block],
+            measurements.cartesian[block],
+            measurements.centres[block],
+            measurements.information[block],
+            measurements.gate[block],
+            likelihood,
+            smallest,
+            sums,
+        )
+        run_chunks(lambda c, e, work=before: _associate_chunks(c, e, *work), n, pool)  # type: ignore[misc]
+        scale = np.empty((chunks, width))
+        _normalise(
+            smallest,
+            sums,
+            measurements.log_norm[block],
+            other[block],
+            log_normaliser[block],
+            own_mass[block],
+            other_scale[block],
+            scale,
+        )
+        moments = np.empty((chunks, width, 1 + d + d * (d + 1) // 2))
         shares = np.zeros((chunks, groups, width))
-
-        def second_pass(
-            chunk: int,
-            start: int,
-            stop: int,
-            likelihood: FloatArray = likelihood,
-            scale: FloatArray = scale,
-            centres: FloatArray = centres,
-            moments: FloatArray = moments,
-            shares: FloatArray = shares,
-            first: int = first,
-        ) -> None:
-            _apply_chunk(
-                start,
-                stop,
-                particles,
-                weights,
-                first,
-                likelihood,
-                scale[chunk],
-                centres,
-                factor,
-                share,
-                component,
-                moments[chunk],
-                group,
-                shares[chunk],
-            )
-
-        run_chunks(second_pass, n, pool)
-        summed = np.zeros(moments.shape[1:])
+        after = (
+            particles,
+            weights,
+            first,
+            likelihood,
+            scale,
+            measurements.centres[block],
+            factor,
+            share,
+            component,
+            moments,
+            group,
+            shares,
+        )
+        run_chunks(lambda c, e, work=after: _apply_chunks(c, e, *work), n, pool)  # type: ignore[misc]
+        finish_moments(
+            moments, measurements.centres[block], mass[block], means[block], covariances[block]
+        )
         for chunk in range(chunks):
-            summed += moments[chunk]
             group_share[:, block] += shares[chunk]
-        mass = summed[:, 0]
-        for m in np.nonzero(mass > 0.0)[0]:
-            offset = summed[m, 1 : 1 + d] / mass[m]
-            means[first + m] = centres[m] + offset
-            for j, (a, b) in enumerate(upper):
-                value = summed[m, 1 + d + j] / mass[m] - offset[a] * offset[b]
-                covariances[first + m, a, b] = value
-                covariances[first + m, b, a] = value
     return Association(
         factor,
         log_normaliser,

@@ -26,11 +26,12 @@ from maasi_filter.found_targets import (
     detection_information,
     exclusive,
     found_intensity,
+    missing_spread,
     refine,
     remove_measurements,
 )
-from maasi_filter.particles import group_moments, jitter, resample, total_weight
-from maasi_filter.phd import MeasurementSet, associate, prepare_measurements
+from maasi_filter.particles import gather, group_moments, jitter, resample, total_weight
+from maasi_filter.phd import MeasurementSet, associate, prepare_measurements, regroup
 from maasi_filter.pose import Pose
 from maasi_filter.sensor import Sensor, is_covariance
 from maasi_filter.settings import (
@@ -51,12 +52,15 @@ FOUND_RADIUS_DEVIATIONS = 2.0
 JITTER_DEVIATIONS = 0.03
 # A box's edge is as uncertain as the robot's position; so are its measurements.
 POSE_ERROR_OF_BOX = 0.05
-# Cells along the mean side of the environment.
-EXPLORATION_CELLS = 26
+# Cells along the mean side of the environment, in 2D and 3D.
+EXPLORATION_CELLS = {2: 54, 3: 16}
 LEAST_CLUSTER_MASS = 0.1
 # Two estimates whose difference is below this many deviations, squared, may be one target.
 SAME_TARGET = 12.0
 LARGEST_BIRTHS = 50_000
+UNLIMITED_INFORMATION = 1e12
+# Births that explain less of a detection than this are not worth their particles.
+LEAST_BIRTH_MASS = 1e-3
 
 
 @dataclass
@@ -170,9 +174,11 @@ class SearchFilter:
         self.generator = generator
         size = self.bounds[:, 1] - self.bounds[:, 0]
         self.volume = float(np.prod(size))
+        # Of a uniform density over the environment: enough to be never singular.
+        self._prior_information: FloatArray = np.diag(12.0 / size**2)
         spacing = self._numbers.exploration_spacing
         if spacing is None:
-            spacing = self.volume ** (1.0 / self.dimension) / EXPLORATION_CELLS
+            spacing = self.volume ** (1.0 / self.dimension) / EXPLORATION_CELLS[self.dimension]
         self.exploration = Exploration(self.bounds, spacing)
         self.particles: FloatArray = np.empty((0, self.dimension))
         self.weights: FloatArray = np.empty(0)
@@ -184,12 +190,54 @@ class SearchFilter:
         self._information: FloatArray = np.empty((0, self.dimension, self.dimension))
         self._covariances: list[FloatArray] = []
         self._centres: FloatArray | None = None
+        self._predicted: FloatArray | None = None
+        self._moments: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._pool: ThreadPoolExecutor | None = None
 
     @property
     def expected_number(self) -> float:
         """Expected number of targets in the intensity, the mass of the particles."""
         return total_weight(self.weights)
+
+    def restore_particles(
+        self, particles: ArrayLike, weights: ArrayLike, group: ArrayLike | None = None
+    ) -> None:
+        """Put other particles in place of the present ones.
+
+        Parameters
+        ----------
+        particles : (n, d) array
+            Metres, frame `map`.
+        weights : (n,) array
+            Not negative.
+        group : (n,) int array, optional
+            Which of them belong together, from 0; all in one group if not given.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, or a number is not finite or negative.
+        """
+        positions = np.array(particles, dtype=float).reshape(-1, self.dimension)
+        masses = np.array(weights, dtype=float)
+        if masses.shape != (len(positions),):
+            raise ValueError(f'weights: got shape {masses.shape}, allowed is ({len(positions)},)')
+        if not (np.isfinite(positions).all() and np.isfinite(masses).all()):
+            raise ValueError('particles, weights: got a number that is not finite')
+        if (masses < 0.0).any():
+            raise ValueError(f'weights: got {masses.min()}, allowed are numbers from 0')
+        labels = np.zeros(len(positions), np.int64)
+        if group is not None:
+            labels = np.array(group, dtype=np.int64)
+            if labels.shape != masses.shape or (len(labels) and labels.min() < 0):
+                raise ValueError('group: allowed is a number from 0 for each particle')
+        self.particles = np.ascontiguousarray(positions)
+        self.weights = masses
+        self._group = labels
+        self._groups = int(labels.max()) + 1 if len(labels) else 0
+        # What they are known from is not known, so nothing is held against their spread.
+        self._information = np.zeros((self._groups, self.dimension, self.dimension))
+        self._information[:] = UNLIMITED_INFORMATION * np.eye(self.dimension)
 
     # What the settings leave to the sensor.
 
@@ -245,6 +293,7 @@ class SearchFilter:
             raise ValueError(f'steps: got {steps!r}, allowed are whole numbers from 0')
         if not math.isfinite(time):
             raise ValueError(f'time: got {time}, allowed are finite numbers')
+        self._moments = None
         members = [self._checked(m) for m in sorted(measurements, key=lambda m: m.robot)]
         names = [member.robot for member in members]
         if len(set(names)) != len(names):
@@ -261,11 +310,12 @@ class SearchFilter:
         if numbers.births != 'measurement':
             members = [self._without_found(member, dropped) for member in members]
             self._add_births(members)
-        predicted = self.weights.copy() if numbers.corrector == 'predicted' else None
+        self._predicted = self.weights.copy() if numbers.corrector == 'predicted' else None
         for member in members:
-            used, refined = self._correct(member, predicted, newly_found, dropped, time)
+            used, refined = self._correct(member, newly_found, dropped, time)
             detections += used
             moved |= refined
+        self._predicted = None
         if detections:
             self._resample(members)
         if numbers.extraction == 'kmeans':
@@ -377,7 +427,25 @@ class SearchFilter:
         self.particles = np.concatenate([self.particles, particles])
         self.weights = np.concatenate([self.weights, weights])
         self._group = np.concatenate([self._group, group])
+        if self._predicted is not None:
+            # For the robots after this one, what is born by then is part of the prediction.
+            self._predicted = np.concatenate([self._predicted, weights])
         self._groups = groups
+
+    def _append_born(
+        self, born: birth_models.MeasurementBirths, scale: FloatArray, groups: int
+    ) -> None:
+        """Add births with their posterior weights b / C(z), where they are worth having."""
+        count, each, d = born.particles.shape
+        worth = born.totals * scale > LEAST_BIRTH_MASS
+        if not worth.any():
+            return
+        self._append(
+            born.particles[worth].reshape(-1, d),
+            (born.intensity[worth] * scale[worth, None]).ravel(),
+            np.repeat(groups + np.arange(count)[worth], each),
+            self._groups,
+        )
 
     def _prepared(self, member: _Member) -> MeasurementSet:
         return prepare_measurements(
@@ -402,7 +470,6 @@ class SearchFilter:
     def _correct(
         self,
         member: _Member,
-        predicted: FloatArray | None,
         newly_found: list[FoundTarget],
         dropped: dict[str, int],
         time: float,
@@ -452,7 +519,7 @@ class SearchFilter:
             prepared,
             member.pose,
             other,
-            denominator_weights=predicted,
+            denominator_weights=self._predicted,
             group=self._group,
             groups=self._groups,
             pool=pool,
@@ -460,20 +527,22 @@ class SearchFilter:
         explained = np.isfinite(update.log_normaliser)
         if not explained.all():
             self._count_unexplained(prepared, ~explained, dropped)
-        updated = self.weights * update.factor
-        # A particle belongs to the detection that explains most of its weight, if one does; what
-        # a detection leaves of a group that it mostly took belongs to it too.
         groups = self._groups
-        taken = np.arange(groups)
-        if groups:
-            mass = np.bincount(self._group, weights=updated, minlength=groups)
-            best = update.group_share.argmax(axis=1)
-            most = update.group_share[np.arange(groups), best]
-            taken = np.where(most > 0.5 * mass, groups + best, taken)
-        own = update.share > 0.5 * updated
-        self._group = np.where(own, groups + update.component, taken[self._group])
-        self._groups = groups + count
+        updated = np.empty_like(self.weights)
+        group = np.empty_like(self._group)
+        regroup(
+            self.weights,
+            update.factor,
+            update.share,
+            update.component,
+            self._group,
+            update.group_share,
+            updated,
+            group,
+        )
         self.weights = updated
+        self._group = group
+        self._groups = groups + count
         information = detection_information(update.means, prepared, member.pose)
         if groups:
             source = update.group_share.argmax(axis=0)
@@ -481,13 +550,7 @@ class SearchFilter:
             information[inherits] += self._information[source[inherits]]
         self._information = np.concatenate([self._information, information])
         if born is not None:
-            each = born.intensity.shape[1]
-            self._append(
-                born.particles.reshape(-1, self.dimension),
-                (born.intensity * update.other_scale[:, None]).ravel(),
-                np.repeat(groups + np.arange(count), each),
-                self._groups,
-            )
+            self._append_born(born, update.other_scale, groups)
         moved = False
         claims = kappa * update.other_scale
         if numbers.refine_found and len(claims):
@@ -587,7 +650,9 @@ class SearchFilter:
                 continue
             covariance = covariances[m]
             if numbers.births == 'measurement':
-                covariance = bounded_below(covariance, self._information[groups + m])
+                covariance = bounded_below(
+                    covariance, self._information[groups + m] + self._prior_information
+                )
                 spread = math.sqrt(float(np.trace(covariance)))
                 if spread > radius:
                     continue
@@ -650,13 +715,15 @@ class SearchFilter:
         number = min(max(wanted, 1), numbers.particles)
         assert numbers.resampling is not None
         index = resample(self.weights, number, numbers.resampling, self.generator, pool)
-        particles = self.particles[index]
-        group = self._group[index]
-        present = np.bincount(group, minlength=self._groups) > 0
-        compact = np.cumsum(present) - 1
-        group = compact[group]
+        particles, group, present = gather(index, self.particles, self._group, self._groups, pool)
         self._groups = int(present.sum())
         self._information = self._information[present]
+        weights = np.full(number, expected / number)
+        mass, means, covariances = group_moments(particles, weights, group, self._groups, pool)
+        # Resampling leaves few ancestors where the noise is narrow; their spread is no posterior.
+        fill = None
+        if numbers.births == 'measurement':
+            fill = missing_spread(covariances, self._information, self._prior_information)
         assert numbers.jitter_differential is not None
         deviation = max((self._jitter_deviation(member.sensor) for member in members), default=0.0)
         if numbers.jitter_differential > 0.0 or deviation > 0.0:
@@ -664,45 +731,30 @@ class SearchFilter:
                 particles,
                 index,
                 group,
-                self._groups,
+                means,
                 numbers.jitter_differential,
                 deviation,
                 self.bounds,
                 self.generator,
-                fill=self._fill(particles, group, pool),
+                fill=fill,
                 pool=pool,
             )
         self.particles = particles
-        self.weights = np.full(number, expected / number)
+        self.weights = weights
         self._group = group
-
-    def _fill(
-        self, particles: FloatArray, group: IntArray, pool: ThreadPoolExecutor | None
-    ) -> FloatArray | None:
-        """Return roots of what groups of particles lack to the bound their data sets.
-
-        Resampling leaves few ancestors where the noise is narrow; their spread is no posterior.
-        """
-        if self._numbers.births != 'measurement':
-            return None
-        _, _, covariances = group_moments(
-            particles, np.ones(len(particles)), group, self._groups, pool
-        )
-        fill = np.zeros_like(covariances)
-        for g in range(self._groups):
-            lack = bounded_below(covariances[g], self._information[g]) - covariances[g]
-            values, vectors = np.linalg.eigh(lack)
-            if values[-1] > 0.01 * np.trace(covariances[g]):
-                fill[g] = vectors * np.sqrt(np.maximum(values, 0.0))
-        return fill
+        if fill is not None:
+            covariances = covariances + np.einsum('gij,gkj->gik', fill, fill)
+        self._moments = mass, means, covariances
 
     def _extract_groups(self, members: Sequence[_Member]) -> None:
         if self._groups == 0 or len(self.weights) == 0:
             self.clusters = []
             return
-        mass, means, covariances = group_moments(
-            self.particles, self.weights, self._group, self._groups, self._threads()
-        )
+        if self._moments is None:
+            self._moments = group_moments(
+                self.particles, self.weights, self._group, self._groups, self._threads()
+            )
+        mass, means, covariances = self._moments
         least = min((self._found_radius(member.sensor) for member in members), default=0.0)
         self.clusters = group_clusters(mass, means, covariances, LEAST_CLUSTER_MASS, least)
 

@@ -1,0 +1,216 @@
+"""Speed of the filter, against Stone Soup's SMC-PHD on the same particles and measurements.
+
+Medians of repeated runs in one process. The state before each step is the same; restoring it is
+not timed.
+"""
+
+from __future__ import annotations
+
+import datetime
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter import (
+    AgentMeasurement,
+    FilterSettings,
+    NoiseSettings,
+    Pose,
+    SearchFilter,
+    SensorSettings,
+    warm_up,
+)
+from maasi_filter.phd import associate, position_measurements, prepare_measurements
+
+FloatArray = NDArray[np.float64]
+BOUNDS = np.array([[0.0, 260.0]] * 3)
+TARGETS = 12
+DETECTED = 3
+CLUTTER = 1e-6
+
+
+def sensor() -> Any:
+    """Return the papers' 3D sensor, with angles in radians: the wide clouds it makes cost most."""
+    return SensorSettings(noise=NoiseSettings(range=1.5, bearing=0.175, elevation=0.295)).build(
+        'bench', 3
+    )
+
+
+def cloud(number: int, seed: int = 0) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
+    """Return particles around 12 targets, their groups, and the targets."""
+    generator = np.random.default_rng(seed)
+    targets = 40.0 + 180.0 * generator.random((TARGETS, 3))
+    group = np.sort(np.arange(number) % TARGETS)
+    spread = generator.uniform(1.0, 6.0, (TARGETS, 3))
+    particles = targets[group] + spread[group] * generator.standard_normal((number, 3))
+    return np.clip(particles, 0.0, 260.0), group, targets
+
+
+def state(number: int, threads: int | None) -> tuple[SearchFilter, FloatArray]:
+    """Return a filter in the middle of a search, with `number` particles, and the targets."""
+    settings = FilterSettings(
+        particles=number,
+        particles_per_target=number,
+        particles_minimum=number,
+        threads=threads,
+    )
+    search = SearchFilter(settings, BOUNDS, np.random.default_rng(1))
+    particles, group, targets = cloud(number)
+    search.restore_particles(particles, np.full(number, TARGETS / number), group)
+    return search, targets
+
+
+def batch(targets: FloatArray, robots: int, seed: int = 2) -> list[AgentMeasurement]:
+    """Return what `robots` robots measure at one step, three detections each."""
+    generator = np.random.default_rng(seed)
+    device = sensor()
+    members = []
+    for robot in range(robots):
+        seen = targets[(DETECTED * robot + np.arange(DETECTED)) % TARGETS]
+        pose = Pose(seen.mean(axis=0) + generator.normal(0.0, 20.0, 3))
+        values = device.measurement.measure(seen, pose)
+        values += generator.standard_normal(values.shape) * [1.5, 0.05, 0.05]
+        members.append(AgentMeasurement(f'robot_{robot:02d}', pose, device, values))
+    return members
+
+
+def median(function: Callable[[], Any], prepare: Callable[[], Any], repeats: int) -> float:
+    """Return the median of the wall times of `function` in seconds, after one unmeasured call."""
+    prepare()
+    function()
+    times = []
+    for _ in range(repeats):
+        prepare()
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def step_time(number: int, robots: int, repeats: int, threads: int | None) -> float:
+    """Return the median time of one whole step, seconds."""
+    search, targets = state(number, threads)
+    members = batch(targets, robots)
+    particles, weights, group = (
+        search.particles,
+        search.weights,
+        np.sort(np.arange(number) % TARGETS),
+    )
+    values = search.exploration.values.copy()
+
+    def prepare() -> None:
+        search.restore_particles(particles, weights, group)
+        search.exploration.values[...] = values
+        search.found_targets.clear()
+
+    return median(lambda: search.step(members, 1, 0.0), prepare, repeats)
+
+
+def _stone_soup(linear: bool, particles: FloatArray, values: FloatArray, pose: Pose) -> Any:
+    """Return a call of Stone Soup's update of the same particles by the same measurements."""
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
+    from stonesoup.types.array import CovarianceMatrix, StateVector, StateVectors
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.multihypothesis import MultipleHypothesis
+    from stonesoup.types.numeric import Probability
+    from stonesoup.types.prediction import ParticleStatePrediction
+    from stonesoup.updater.particle import SMCPHDUpdater
+
+    now = datetime.datetime(2024, 1, 1)
+    prediction = ParticleStatePrediction(
+        state_vector=StateVectors(particles.T),
+        weight=np.full(len(particles), TARGETS / len(particles)),
+        timestamp=now,
+    )
+    if linear:
+        model = LinearGaussian(3, (0, 1, 2), CovarianceMatrix(np.eye(3)))
+        vectors = [StateVector(value) for value in values]
+    else:
+        model = CartesianToElevationBearingRange(
+            3,
+            np.array([0, 1, 2]),
+            CovarianceMatrix(np.diag(np.array([0.295, 0.175, 1.5]) ** 2)),
+            translation_offset=StateVector(pose.position),
+        )
+        from stonesoup.types.angle import Bearing, Elevation
+
+        vectors = [StateVector([Elevation(v[2]), Bearing(v[1]), v[0]]) for v in values]
+    hypotheses = MultipleHypothesis(
+        [
+            SingleHypothesis(prediction, Detection(vector, timestamp=now, measurement_model=model))
+            for vector in vectors
+        ]
+    )
+    updater = SMCPHDUpdater(
+        measurement_model=model,
+        prob_detect=Probability(0.9),
+        clutter_intensity=CLUTTER,
+        num_samples=len(particles),
+        resampler=None,
+    )
+    return lambda: updater.update(hypotheses)
+
+
+def update_times(linear: bool, number: int = 10_000, repeats: int = 3) -> tuple[float, float]:
+    """Return our median time of the weights' update and Stone Soup's, seconds."""
+    particles, _, targets = cloud(number)
+    member = batch(targets, 1)[0]
+    values = member.values
+    if linear:
+        values = targets[:DETECTED] + 0.5
+    theirs = median(
+        _stone_soup(linear, particles, values, member.pose), lambda: None, 20 if linear else repeats
+    )
+    weights = np.full(number, TARGETS / number)
+    probability = np.full(number, 0.9)
+    other = np.full(len(values), CLUTTER)
+    noise = np.broadcast_to(np.eye(3) if linear else member.sensor.covariance, (len(values), 3, 3))
+
+    def ours() -> FloatArray:
+        if linear:
+            prepared = position_measurements(values, noise)
+        else:
+            prepared = prepare_measurements(values, noise, member.pose)
+        update = associate(particles, weights, probability, prepared, member.pose, other)
+        return weights * update.factor
+
+    return median(ours, lambda: None, 200), theirs
+
+
+def _entry(
+    name: str, seconds: float, baseline: str | None = None, ratio: float | None = None
+) -> dict[str, Any]:
+    return {
+        'name': name,
+        'value': 1e3 * seconds,
+        'unit': 'ms',
+        'baseline': baseline,
+        'ratio': ratio,
+    }
+
+
+def run() -> list[dict[str, Any]]:
+    """Return all figures as entries {name, value, unit, baseline, ratio}."""
+    start = time.perf_counter()
+    warm_up()
+    entries = [_entry('filter_warm_up', time.perf_counter() - start)]
+    entries.append(_entry('filter_step_10k', step_time(10_000, 1, 200, 1)))
+    entries.append(_entry('filter_step_100k', step_time(100_000, 1, 30, None)))
+    entries.append(_entry('filter_step_1m', step_time(1_000_000, 1, 9, None)))
+    entries.append(_entry('filter_step_ten_robots', step_time(10_000, 10, 100, 1)))
+    for name, linear in (('stone_soup_update', False), ('stone_soup_update_linear', True)):
+        ours, theirs = update_times(linear)
+        text = f'Stone Soup SMCPHDUpdater, {1e3 * theirs:.3g} ms'
+        entries.append(_entry(name, ours, text, theirs / ours))
+    return entries
+
+
+if __name__ == '__main__':
+    for entry in run():
+        print(entry)
