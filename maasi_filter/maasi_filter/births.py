@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 LEAST_UNEXPLORED = 1e-6
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     values, cartesian, centres, roots, volume, sensor_position, bounds, noise, particles, jacobian
 ):
@@ -60,7 +60,7 @@ def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             jacobian[m, j] = size
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _weigh(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     particles, jacobian, probability, prior, unexplored, values, lower, step, least
 ):

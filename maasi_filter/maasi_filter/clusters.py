@@ -37,7 +37,7 @@ class Cluster:
     mass: float
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _merge(mass, means, covariances, least_mass, least_distance):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Merge groups that are at one place, in place; return the order and number of what is left."""
     groups, d = means.shape
@@ -117,7 +117,7 @@ def group_clusters(
     ]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _assign(particles, centres, label):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Fill the nearest centre of each particle; return how many changed."""
     changed = 0
@@ -138,7 +138,7 @@ def _assign(particles, centres, label):  # type: ignore[no-untyped-def]  # pragm
     return changed
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _centre(particles, weights, label, centres):  # type: ignore[no-untyped-def]  # pragma: no cover
     d = particles.shape[1]
     mass = np.zeros(centres.shape[0])
@@ -155,7 +155,7 @@ def _centre(particles, weights, label, centres):  # type: ignore[no-untyped-def]
     return mass
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _squares(particles, centre, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in range(particles.shape[0]):
         square = 0.0
@@ -165,7 +165,7 @@ def _squares(particles, centre, least):  # type: ignore[no-untyped-def]  # pragm
             least[i] = square
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _farthest(particles, weights, label, means, squares):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(particles.shape[0]):
         if weights[i] > 0.0:

@@ -25,7 +25,7 @@ BOX = 2
 PARAMETERS = 9
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def detection_probability(
     kind: int,
     parameters: FloatArray,
@@ -45,7 +45,7 @@ def detection_probability(
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def detection_probability_at(
     kind: int,
     parameters: FloatArray,
@@ -83,7 +83,7 @@ def detection_probability_at(
     return parameters[0] * math.exp(-0.5 * math.sqrt(square))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _probabilities(
     kind: int,
     parameters: FloatArray,

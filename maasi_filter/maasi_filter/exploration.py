@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 MAXIMUM_NODES = 20_000_000
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def interpolate(
     values: FloatArray, lower: FloatArray, step: FloatArray, position: FloatArray
 ) -> float:  # pragma: no cover - compiled
@@ -38,7 +38,7 @@ def interpolate(
     return interpolate_at(values, lower, step, position[0], position[1], height)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def interpolate_at(
     values: FloatArray, lower: FloatArray, step: FloatArray, x: float, y: float, z: float
 ) -> float:  # pragma: no cover - compiled
@@ -65,7 +65,7 @@ def interpolate_at(
     return (1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * c + v * e)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _interpolate_many(
     values: FloatArray, lower: FloatArray, step: FloatArray, positions: FloatArray
 ) -> FloatArray:  # pragma: no cover - compiled
@@ -77,7 +77,7 @@ def _interpolate_many(
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _decrease(
     values: FloatArray,
     lower: FloatArray,
@@ -104,7 +104,7 @@ def _decrease(
                 values[i, j, k] *= 1.0 - probability
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _expected_unseen_seen(
     values: FloatArray,
     cell: FloatArray,

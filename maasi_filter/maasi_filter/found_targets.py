@@ -53,7 +53,7 @@ class FoundTarget:
     time: float
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _predict(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     position, sensor_position, z, cartesian, centre, error, jacobian
 ):
@@ -86,7 +86,7 @@ def _predict(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
         jacobian[2, 2] = level / square
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _innovation(jacobian, covariance, noise, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     d = jacobian.shape[0]
     for a in range(d):
@@ -98,7 +98,7 @@ def _innovation(jacobian, covariance, noise, out):  # type: ignore[no-untyped-de
             out[a, b] = total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _noise(roots, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     d = roots.shape[0]
     for a in range(d):
@@ -109,7 +109,7 @@ def _noise(roots, out):  # type: ignore[no-untyped-def]  # pragma: no cover - co
             out[a, b] = total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _information(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     positions, sensor_position, values, cartesian, centres, information, out
 ):
@@ -146,7 +146,7 @@ def detection_information(
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _eigen(matrix, values, vectors):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Fill eigenvalues and vectors (columns) of a symmetric matrix, by Jacobi's rotations."""
     d = matrix.shape[0]
@@ -192,7 +192,7 @@ def _eigen(matrix, values, vectors):  # type: ignore[no-untyped-def]  # pragma: 
         values[i] = a[i, i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _bound(covariance, information, bounded, lack):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill the covariance widened to the inverse of the information, and a root of what is added.
 
@@ -243,7 +243,7 @@ def _bound(covariance, information, bounded, lack):  # type: ignore[no-untyped-d
     return much
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _fill_groups(covariances, information, prior, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
     groups, d = covariances.shape[0], covariances.shape[1]
     bounded = np.empty((d, d))
@@ -287,7 +287,7 @@ def missing_spread(
     return fill if _fill_groups(covariances, information, prior, fill) else None
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _intensity(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     positions,
     covariances,
@@ -333,7 +333,7 @@ def _intensity(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             kappa[f, m] = detected * density
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _update(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     position, covariance, sensor_position, z, cartesian, centre, root, out, out_covariance
 ):

@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 TWO_PI = 2.0 * math.pi
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def wrap(angle: float) -> float:  # pragma: no cover - compiled
     """Return `angle` in [-pi, pi)."""
     if -math.pi <= angle < math.pi:

@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _sum_chunks(first_chunk, last_chunk, weights, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
     for chunk in range(first_chunk, last_chunk):
         total = 0.0
@@ -35,7 +35,7 @@ def total_weight(weights: FloatArray) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _select_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk, last_chunk, weights, bases, points, limits, index
 ):
@@ -121,7 +121,7 @@ def resample(
     return index
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _mix(state):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Return 64 well mixed bits of a counter (splitmix64)."""
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -129,7 +129,7 @@ def _mix(state):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     return state ^ (state >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _gather_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk, last_chunk, index, particles, group, compact, out, out_group
 ):
@@ -162,13 +162,13 @@ def gather(
     return out, out_group, present
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _mark_present(index, group, present):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(index.shape[0]):
         present[group[index[i]]] = True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _references(particles, group, references):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill the first particle of each group."""
     for i in range(particles.shape[0] - 1, -1, -1):
@@ -176,7 +176,7 @@ def _references(particles, group, references):  # type: ignore[no-untyped-def]  
             references[group[i], a] = particles[i, a]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _moments_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk, last_chunk, particles, weights, group, references, all_moments
 ):
@@ -260,7 +260,7 @@ def group_moments(
     return mass, means, covariances
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _order(group, groups):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Return particle indices sorted by group (stable), and where each group starts."""
     starts = np.zeros(groups + 1, np.int64)
@@ -276,14 +276,14 @@ def _order(group, groups):  # type: ignore[no-untyped-def]  # pragma: no cover -
     return order, starts
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _count_copies(index, group, copies):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(1, index.shape[0]):
         if index[i] == index[i - 1]:
             copies[group[i]] += 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk,
     last_chunk,

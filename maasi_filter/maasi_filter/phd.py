@@ -74,7 +74,7 @@ class MeasurementSet:
         return len(self.values)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _invert(matrix, inverse):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Fill the inverse of a covariance, in place."""
     if matrix.shape[0] == 2:
@@ -100,7 +100,7 @@ def _invert(matrix, inverse):  # type: ignore[no-untyped-def]  # pragma: no cove
     inverse[2, 2] = (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]) / determinant
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _root(matrix, root):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Fill the lower Cholesky factor of a covariance, in place; return log of its determinant."""
     d = matrix.shape[0]
@@ -120,7 +120,7 @@ def _root(matrix, root):  # type: ignore[no-untyped-def]  # pragma: no cover - c
     return log_determinant
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def spherical_frame(values, frame):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Fill dx/dz at a measurement (d, d), in place; return the magnitude of its determinant."""
     r = values[0]
@@ -146,7 +146,7 @@ def spherical_frame(values, frame):  # type: ignore[no-untyped-def]  # pragma: n
     return abs(r * r * cos_elevation)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     values,
     covariances,
@@ -302,7 +302,7 @@ def position_measurements(values: FloatArray, covariances: FloatArray) -> Measur
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def arctan2(y: float, x: float) -> float:  # pragma: no cover - compiled
     """Return the angle of (x, y), to about one unit in the last place; 0 at the origin.
 
@@ -336,7 +336,7 @@ def arctan2(y: float, x: float) -> float:  # pragma: no cover - compiled
     return angle if y >= 0.0 else -angle
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _associate_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk,
     last_chunk,
@@ -447,7 +447,7 @@ def _associate_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - com
             all_sums[chunk, m] = total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _normalise(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     smallest, sums, log_norm, other, log_normaliser, own_mass, other_scale, scale
 ):
@@ -484,7 +484,7 @@ def _normalise(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
         log_normaliser[m] = log_sum
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk,
     last_chunk,
@@ -581,7 +581,7 @@ def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
                 moments[9] = tzz
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def regroup(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     weights, factor, share, component, group, group_share, updated, regrouped
 ):
@@ -611,7 +611,7 @@ def regroup(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             regrouped[i] = taken[group[i]]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def finish_moments(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     partial, references, mass, means, covariances
 ):
@@ -632,11 +632,12 @@ def finish_moments(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
         for a in range(d):
             means[g, a] = references[g, a]
             if sums[0] > 0.0:
-                means[g, a] += sums[1 + a] / sums[0]
+                sums[1 + a] /= sums[0]
+                means[g, a] += sums[1 + a]
             for b in range(a + 1):
                 value = 0.0
                 if sums[0] > 0.0:
-                    value = sums[j] / sums[0] - sums[1 + a] * sums[1 + b] / (sums[0] * sums[0])
+                    value = sums[j] / sums[0] - sums[1 + a] * sums[1 + b]
                 covariances[g, a, b] = value
                 covariances[g, b, a] = value
                 j += 1
