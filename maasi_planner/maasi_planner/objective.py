@@ -32,6 +32,13 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+CACHE_ROWS = 8000
+# Above this many pairs of a candidate and another robot, values of candidates that were not
+# chosen are reported as without the other planning robots.
+REPORT_LIMIT = 600
+# Moves of two robots at once are tried in teams up to this size.
+PAIRS_LIMIT = 5
+
 
 class Weights(NamedTuple):
     """Settings of the objective with nothing left open."""
@@ -226,6 +233,11 @@ class Joint(NamedTuple):
     entry_value: FloatArray
     entry_node: FloatArray
     entry_time: IntArray
+    # What one candidate's measurements leave of another one's entries: slot (G, G) is a row of
+    # cache (S, longest), filled when first asked for; used (1,) counts the rows in use.
+    slot: NDArray[np.int32]
+    cache: FloatArray
+    used: IntArray
     # Information about clusters.
     mass: FloatArray
     covariance: FloatArray
@@ -570,34 +582,80 @@ def _new_targets(joint: Joint, g: int, chosen: IntArray) -> float:  # pragma: no
 
 
 @njit(cache=True)
+def _fill_left(
+    nodes: FloatArray,
+    until: IntArray,
+    times: IntArray,
+    places: FloatArray,
+    turns: FloatArray,
+    dimension: int,
+    kind: int,
+    parameters: FloatArray,
+    out: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Write what a row of measurements leaves at each entry, up to the entry's own time."""
+    for i in range(nodes.shape[0]):
+        left = 1.0
+        for e in range(times.shape[0]):
+            if times[e] > until[i] or left <= 0.0:
+                break
+            left *= 1.0 - detection_probability_at(
+                kind,
+                parameters,
+                nodes[i, 0] - places[e, 0],
+                nodes[i, 1] - places[e, 1],
+                (nodes[i, 2] - places[e, 2]) if dimension == 3 else 0.0,
+                turns[e, 0],
+                turns[e, 1],
+            )
+        out[i] = left
+
+
+@njit(cache=True)
+def _left(joint: Joint, g: int, other: int) -> FloatArray:  # pragma: no cover - compiled
+    """Return what the measurements of candidate `other` leave at the entries of g."""
+    begin = joint.entry_start[g]
+    end = joint.entry_start[g + 1]
+    slot = joint.slot[g, other]
+    if slot >= 0:
+        return joint.cache[slot, : end - begin]
+    if joint.used[0] < joint.cache.shape[0]:
+        slot = joint.used[0]
+        joint.used[0] += 1
+        joint.slot[g, other] = slot
+        out = joint.cache[slot, : end - begin]
+    else:
+        out = np.empty(end - begin)
+    first = joint.event_start[other]
+    last = joint.event_start[other + 1]
+    robot = joint.robot[other]
+    _fill_left(
+        joint.entry_node[begin:end],
+        joint.entry_time[begin:end],
+        joint.event_time[first:last],
+        joint.event_place[first:last],
+        joint.event_turn[first:last],
+        joint.dimension,
+        joint.kind[robot],
+        joint.parameters[robot],
+        out,
+    )
+    return out
+
+
+@njit(cache=True)
 def _explored(joint: Joint, g: int, chosen: IntArray) -> float:  # pragma: no cover - compiled
     """Return E of `paper` for candidate g, given the others (31), (32)."""
     robot = joint.robot[g]
+    values = joint.entry_value[joint.entry_start[g] : joint.entry_start[g + 1]].copy()
+    for r in range(chosen.shape[0]):
+        if r != robot and chosen[r] >= 0:
+            left = _left(joint, g, chosen[r])
+            for i in range(values.shape[0]):
+                values[i] *= left[i]
     total = 0.0
-    for i in range(joint.entry_start[g], joint.entry_start[g + 1]):
-        value = joint.entry_value[i]
-        x = joint.entry_node[i, 0]
-        y = joint.entry_node[i, 1]
-        z = joint.entry_node[i, 2]
-        until = joint.entry_time[i]
-        for r in range(chosen.shape[0]):
-            if r == robot or chosen[r] < 0:
-                continue
-            kind = joint.kind[r]
-            for e in range(joint.event_start[chosen[r]], joint.event_start[chosen[r] + 1]):
-                if joint.event_time[e] > until:
-                    break
-                dz = z - joint.event_place[e, 2] if joint.dimension == 3 else 0.0
-                value *= 1.0 - detection_probability_at(
-                    kind,
-                    joint.parameters[r],
-                    x - joint.event_place[e, 0],
-                    y - joint.event_place[e, 1],
-                    dz,
-                    joint.event_turn[e, 0],
-                    joint.event_turn[e, 1],
-                )
-        total += value
+    for i in range(values.shape[0]):
+        total += values[i]
     return total
 
 
@@ -813,6 +871,53 @@ def search_in_turn(
     return total, evaluated
 
 
+@njit(cache=True)
+def improve_in_pairs(
+    joint: Joint,
+    alone: FloatArray,
+    order: IntArray,
+    total: float,
+    budget: int,
+    chosen: IntArray,
+) -> tuple[float, int]:  # pragma: no cover - compiled
+    """Improve a choice by moves of two robots at once, while the budget of evaluations lasts.
+
+    One robot takes another candidate, the best alone first, and a second one its best reply.
+    """
+    robots = joint.radii.shape[0]
+    work = np.zeros((3, 3, 3))
+    trial = np.zeros(robots, np.int64)
+    evaluated = 0
+    improved = True
+    while improved and evaluated < budget:
+        improved = False
+        for r in range(robots):
+            if chosen[r] < 0:
+                continue
+            for i in range(joint.start[r], joint.start[r + 1]):
+                g = order[i]
+                if alone[g] == -np.inf or evaluated >= budget:
+                    break
+                if g == chosen[r]:
+                    continue
+                for s in range(robots):
+                    if s == r or chosen[s] < 0 or evaluated >= budget:
+                        continue
+                    trial[:] = chosen
+                    trial[s] = -1
+                    if collides(joint, g, trial):
+                        continue
+                    trial[r] = g
+                    reply, value, count = _best_reply(joint, s, alone, order, trial, work)
+                    evaluated += count + 1
+                    if reply >= 0 and value > total + 1e-12 * abs(total):
+                        chosen[r] = g
+                        chosen[s] = reply
+                        total = value
+                        improved = True
+    return total, evaluated
+
+
 def kernel_of(view: RobotView) -> tuple[int, FloatArray] | None:
     """Return kind and parameters of a robot's detection model, if it has a kernel."""
     return view.sensor.detection.kernel()
@@ -894,6 +999,7 @@ class TeamObjective:
         self.start = np.concatenate(
             [[0], np.cumsum([len(candidates[name]) for name in self.names])]
         ).astype(np.int64)
+        self._alone: FloatArray | None = None
         self._build(candidates, trajectories, allowed)
 
     def _build(
@@ -985,6 +1091,8 @@ class TeamObjective:
                 entries = self._entries(kernels, planned, settled, first)
                 if len(names) > 1:
                     rows = _rows(planned, number)
+        pairs = number if len(entries[1]) and len(names) > 1 else 0
+        longest = int(np.diff(entries[0]).max(initial=0)) if pairs else 0
         parameters = np.zeros((len(names), PARAMETERS))
         for index, kernel in enumerate(kernels):
             parameters[index] = kernel[1]
@@ -1014,6 +1122,9 @@ class TeamObjective:
             entry_value=entries[1],
             entry_node=entries[2],
             entry_time=entries[3],
+            slot=np.full((pairs, pairs), -1, np.int32),
+            cache=np.empty((min(CACHE_ROWS, pairs * pairs), longest)),
+            used=np.zeros(1, np.int64),
             mass=mass,
             covariance=covariance,
             base=base,
@@ -1199,7 +1310,20 @@ class TeamObjective:
         return out
 
     def given(self, robot: int, chosen: IntArray) -> FloatArray:
-        """Return T, E and J of each candidate of one robot, given the others' choices, (W, 3)."""
+        """Return T, E and J of each candidate of one robot, given the others' choices, (W, 3).
+
+        In teams too large for that, all but the chosen one as without the others.
+        """
+        if int(self.start[-1]) * (len(self.names) - 1) > REPORT_LIMIT:
+            if self._alone is None:
+                self._alone = self.alone()
+            rows = self._alone[self.start[robot] : self.start[robot + 1]].copy()
+            g = int(chosen[robot])
+            if g >= 0:
+                rows[g - self.start[robot]] = candidate_value(
+                    self.joint, g, chosen, np.zeros((3, 3, 3))
+                )
+            return rows
         out = np.zeros((int(self.start[robot + 1] - self.start[robot]), 3))
         given_values(self.joint, robot, chosen, out)
         return out
@@ -1213,7 +1337,8 @@ class TeamObjective:
 
         The choice (R,) has indices into all candidates, -1 for a robot with none admissible.
         """
-        alone = self.alone()[:, 2]
+        self._alone = self.alone()
+        alone = self._alone[:, 2]
         order = np.zeros(len(alone), np.int64)
         for r in range(len(self.names)):
             rows = slice(int(self.start[r]), int(self.start[r + 1]))
@@ -1224,9 +1349,10 @@ class TeamObjective:
             return chosen, 0.0, True, 0
         best = np.full(robots, -1, np.int64)
         rounds = self.settings.improvement_rounds
-        best_value, work = search_in_turn(self.joint, alone, order, rounds, False, best)
+        alone_best, work = search_in_turn(self.joint, alone, order, rounds, False, best)
         if robots == 1:
-            return best, best_value, True, work
+            return best, alone_best, True, work
+        best_value = alone_best
         joint_number = 1.0
         for r in range(robots):
             rows = slice(int(self.start[r]), int(self.start[r + 1]))
@@ -1238,11 +1364,18 @@ class TeamObjective:
             return found, value, True, work + count
         other = np.full(robots, -1, np.int64)
         value, count = search_in_turn(self.joint, alone, order, rounds, True, other)
-        if (other >= 0).sum() > (best >= 0).sum() or (
-            (other >= 0).sum() == (best >= 0).sum() and value > best_value
-        ):
-            best, best_value = other, value
-        return best, best_value, False, work + count
+        work += count
+        tries = [(best, best_value), (other, value)]
+        if robots <= PAIRS_LIMIT:
+            for index, (trial, value) in enumerate(tries):
+                value, count = improve_in_pairs(
+                    self.joint, alone, order, value, self.settings.pair_budget, trial
+                )
+                tries[index] = (trial, value)
+                work += count
+        # More robots on their way come first, then the larger value.
+        best, best_value = max(tries, key=lambda item: (int((item[0] >= 0).sum()), item[1]))
+        return best, best_value, False, work
 
 
 def _required_kernel(name: str, view: RobotView) -> tuple[int, FloatArray]:

@@ -209,28 +209,42 @@ def next_point(
     if not is_clear(px, py, pz, goal[0], goal[1], goal[2], circles, 0.0, True):
         best = np.inf
         index = -1
-        # A vertex that is as good as reached is passed over if another one is in sight.
-        for attempt in range(2):
-            for i in range(vertices.shape[0]):
-                vx = vertices[i, 0]
-                vy = vertices[i, 1]
-                near = math.hypot(vx - px, vy - py)
-                if attempt == 0 and near < 0.5 * clearance:
+        # Beyond a vertex that is as good as reached, if what comes next is in sight already.
+        beyond = np.inf
+        beyond_index = -1
+        for i in range(vertices.shape[0]):
+            vx = vertices[i, 0]
+            vy = vertices[i, 1]
+            near = math.sqrt((vx - px) * (vx - px) + (vy - py) * (vy - py))
+            total = near + to_goal[i]
+            if total < best or (near >= 0.5 * clearance and total < beyond):
+                if not is_clear(px, py, 0.0, vx, vy, 0.0, circles, 0.0, True):
                     continue
-                total = near + to_goal[i]
-                if total < best and is_clear(px, py, 0.0, vx, vy, 0.0, circles, 0.0, True):
+                if total < best:
                     best = total
                     index = i
-            if index >= 0:
-                break
+                if near >= 0.5 * clearance and total < beyond:
+                    beyond = total
+                    beyond_index = i
         if index >= 0:
+            slow = False
+            if beyond_index != index:
+                if beyond <= best + 0.5 * clearance:
+                    best = beyond
+                    index = beyond_index
+                else:
+                    slow = True
             vx = vertices[index, 0]
             vy = vertices[index, 1]
-            share = math.hypot(vx - px, vy - py) / best if best > 0.0 else 1.0
+            near = math.sqrt((vx - px) * (vx - px) + (vy - py) * (vy - py))
+            share = near / best if best > 0.0 else 1.0
             out[0] = vx
             out[1] = vy
             out[2] = pz + share * dz
             left = math.sqrt(best * best + dz * dz)
+            if slow:
+                # It has to be met closely, or what comes next stays hidden.
+                left = min(left, 2.0 * near)
     # Around the first sphere in the way, on the side where the line passes its centre.
     first = -1
     nearest = np.inf
@@ -297,7 +311,9 @@ def hold_back(
     Towards a circle at distance d at most `rate` * d is left, and inside of one at least that
     much outwards.
     """
-    for _ in range(2):
+    shrink = 1.0
+    for attempt in range(9):
+        changed = False
         for i in range(circles.shape[0]):
             nx = position[0] - circles[i, 0]
             ny = position[1] - circles[i, 1]
@@ -305,15 +321,24 @@ def hold_back(
             size = math.sqrt(nx * nx + ny * ny + nz * nz)
             if size < 1e-9:
                 continue
-            nx /= size
-            ny /= size
-            nz /= size
-            outwards = velocity[0] * nx + velocity[1] * ny + velocity[2] * nz
+            outwards = (velocity[0] * nx + velocity[1] * ny + velocity[2] * nz) / size
             least = -rate * (size - circles[i, 3])
-            if outwards < least:
-                velocity[0] += (least - outwards) * nx
-                velocity[1] += (least - outwards) * ny
-                velocity[2] += (least - outwards) * nz
+            if outwards >= least:
+                continue
+            changed = True
+            if attempt < 8:
+                change = (least - outwards) / size
+                velocity[0] += change * nx
+                velocity[1] += change * ny
+                velocity[2] += change * nz
+            elif least <= 0.0:
+                # What one limit gives another one takes: standing still satisfies both.
+                shrink = min(shrink, least / outwards)
+        if not changed:
+            break
+    velocity[0] *= shrink
+    velocity[1] *= shrink
+    velocity[2] *= shrink
 
 
 class KeepOut:
@@ -331,7 +356,8 @@ class KeepOut:
     Attributes
     ----------
     circles : (n, 5) array
-        x, y, z, inflated radius, and 1 for a sphere.
+        x, y, z, inflated radius with a tenth of the clearance, and 1 for a sphere. Robots stop
+        short of these, so that rounding does not put them into an obstacle.
     """
 
     def __init__(self, obstacles: Obstacles, radius: float, clearance: float) -> None:
@@ -343,13 +369,13 @@ class KeepOut:
         number = len(obstacles)
         self.circles = np.zeros((number, 5))
         self.circles[:, :3] = obstacles.centres
-        self.circles[:, 3] = obstacles.radii + radius
+        self.circles[:, 3] = obstacles.radii + radius + 0.1 * clearance
         self.circles[:, 4] = obstacles.spheres
         corners = []
         for circle in self.circles:
             if circle[4] > 0.5:
                 continue
-            reach = (circle[3] + clearance) / math.cos(math.pi / CORNERS)
+            reach = (circle[3] + 0.9 * clearance) / math.cos(math.pi / CORNERS)
             for corner in range(CORNERS):
                 angle = 2.0 * math.pi * corner / CORNERS
                 point = (
@@ -388,7 +414,7 @@ class KeepOut:
         point = np.array(waypoint, dtype=float)
         line = point - start
         part = 1.0
-        least = self.circles[:, 3] + self.clearance
+        least = self.circles[:, 3] + 0.9 * self.clearance
         for _ in range(len(self.circles) + 1):
             here = start + part * line
             changed = False

@@ -185,7 +185,7 @@ class PlannerSettings(Settings):
         default=12.0, gt=0.0, description='N0, targets expected before the search [1]'
     )
     exploration_nodes: int = Field(
-        default=4096, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
+        default=1000, ge=8, le=1_000_000, description='Most nodes for expected new targets [1]'
     )
     enumeration_limit: int = Field(
         default=50_000,
@@ -197,6 +197,11 @@ class PlannerSettings(Settings):
         ge=0,
         le=100,
         description='Most rounds of improvement when robots choose in turn [1]',
+    )
+    pair_budget: int = Field(
+        default=1000,
+        ge=0,
+        description='Most evaluations of moves of two robots when up to 5 choose in turn [1]',
     )
     measurement: Literal['periodic', 'event'] = Field(
         default='periodic', description='Measure at every period, or only when worth it (24), (33)'

@@ -139,6 +139,7 @@ class RobotDecision:
         Waypoints that were compared, after moving them out of obstacles.
     control_cost, target_refinement, exploration, objective : (W,) arrays
         C, T, E and J of each, given what the other robots do; J is -inf for what is not allowed.
+        In very large teams T, E and J of those not chosen are without the other planning robots.
     lengths, measurements : (W,) integer arrays
         Steps K and measurements M of each predicted trajectory.
     reason : str

@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.pose import Pose
-from maasi_planner.obstacles import KeepOut, Obstacles, hold_back, next_point
+from maasi_planner.obstacles import KeepOut, Obstacles, hold_back, next_point, segment_distance
 from maasi_planner.settings import MotionSettings
 
 FloatArray = NDArray[np.float64]
@@ -310,6 +310,7 @@ def sideways_command(
     rate: float,
     speed: float,
     barrier: float,
+    deceleration: float,
     face_travel: bool,
     yaw_rate: float,
     circles: FloatArray,
@@ -321,7 +322,8 @@ def sideways_command(
 ) -> None:  # pragma: no cover - compiled
     """Write the command of a robot that can move in any direction into `out` (4,), body axes.
 
-    The velocity is `rate` times the way left, at most `speed`; `work` (2, 3) is scratch.
+    The velocity is `rate` times the way left, at most `speed`, and next to obstacles what
+    `deceleration` can stop; `work` (2, 3) is scratch.
     """
     if circles.shape[0] == 0:
         out[0], out[1], out[2], out[3] = straight_command(
@@ -342,6 +344,23 @@ def sideways_command(
     dy = target[1] - position[1]
     dz = target[2] - position[2]
     size = math.sqrt(dx * dx + dy * dy + dz * dz)
+    if deceleration < np.inf:
+        room = np.inf
+        for i in range(circles.shape[0]):
+            room = min(
+                room,
+                segment_distance(
+                    position[0],
+                    position[1],
+                    position[2],
+                    position[0],
+                    position[1],
+                    position[2],
+                    circles[i],
+                )
+                - circles[i, 3],
+            )
+        speed = min(speed, math.sqrt(deceleration * max(room, 0.0)) + 0.05 * speed)
     scale = 0.0
     if size > 0.0:
         scale = min(rate * left, speed) / size

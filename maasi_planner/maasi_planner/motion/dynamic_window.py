@@ -27,6 +27,25 @@ TURN_SAMPLES = 13
 
 
 @njit(cache=True)
+def way_ahead(
+    x: float, y: float, yaw: float, reach: float, circles: FloatArray
+) -> float:  # pragma: no cover - compiled
+    """Return how far straight ahead is free of circles, at most `reach` metres."""
+    cos_yaw = math.cos(yaw)
+    sin_yaw = math.sin(yaw)
+    free = reach
+    for i in range(circles.shape[0]):
+        ox = circles[i, 0] - x
+        oy = circles[i, 1] - y
+        along = ox * cos_yaw + oy * sin_yaw
+        across = ox * sin_yaw - oy * cos_yaw
+        radius = circles[i, 3]
+        if along > 0.0 and abs(across) < radius:
+            free = min(free, max(along - math.sqrt(radius * radius - across * across), 0.0))
+    return free
+
+
+@njit(cache=True)
 def window_command(
     x: float,
     y: float,
@@ -112,12 +131,5 @@ def window_command(
                 best_forward = v
                 best_turn = w
     # Whatever the arcs say, never faster than the way straight ahead allows.
-    for c in range(circles.shape[0]):
-        ox = circles[c, 0] - x
-        oy = circles[c, 1] - y
-        distance = math.hypot(ox, oy)
-        closing = (ox * math.cos(yaw) + oy * math.sin(yaw)) / max(distance, 1e-9)
-        if closing > 0.0:
-            allowed = limits[BRAKING] * max(distance - circles[c, 3], 0.0) / closing
-            best_forward = min(best_forward, allowed)
-    return best_forward, best_turn
+    ahead = way_ahead(x, y, yaw, 4.0 * clearance + limits[SPEED], circles)
+    return min(best_forward, limits[BRAKING] * ahead), best_turn

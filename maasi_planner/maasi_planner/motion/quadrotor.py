@@ -205,6 +205,7 @@ def _roll_out(
                 rate,
                 limits[SPEED],
                 barrier,
+                np.inf,
                 face_travel,
                 limits[YAW_RATE],
                 circles,
@@ -292,7 +293,7 @@ class Quadrotor(MotionModel):
             self.limits[LEVEL], GRAVITY * math.tan(self.limits[TILT]), self.limits[VERTICAL]
         )
         self.rate = float(min(settings.approach_rate or C1, slowing / settings.speed))
-        self.barrier = float(min(0.2 * C2, 0.5 * slowing / settings.speed))
+        self.barrier = float(min(0.15 * C2, 0.5 * slowing / settings.speed))
 
     def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
         """See `MotionModel.predict`."""
@@ -337,6 +338,7 @@ class Quadrotor(MotionModel):
             self.rate,
             self.limits[SPEED],
             self.barrier,
+            math.inf,
             self.settings.heading == 'travel',
             self.limits[YAW_RATE],
             self.keep_out.circles,

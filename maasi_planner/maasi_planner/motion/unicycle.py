@@ -35,6 +35,7 @@ from maasi_planner.motion.dynamic_window import (
     SPEED,
     YAW_ACCELERATION,
     YAW_RATE,
+    way_ahead,
     window_command,
 )
 from maasi_planner.obstacles import Obstacles, next_point
@@ -86,29 +87,6 @@ def unicycle_step(
         wanted,
         wanted_turn,
     )
-
-
-@njit(cache=True)
-def way_ahead(
-    x: float, y: float, yaw: float, reach: float, circles: FloatArray
-) -> float:  # pragma: no cover - compiled
-    """Return how far straight ahead is free of circles, at most `reach` metres."""
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    free = reach
-    for i in range(circles.shape[0]):
-        if circles[i, 4] > 0.5 and abs(circles[i, 2]) > circles[i, 3]:
-            continue
-        ox = circles[i, 0] - x
-        oy = circles[i, 1] - y
-        along = ox * cos_yaw + oy * sin_yaw
-        across = ox * sin_yaw - oy * cos_yaw
-        radius = circles[i, 3]
-        if along > 0.0 and abs(across) < radius:
-            inside = ox * ox + oy * oy < radius * radius
-            entry = along - math.sqrt(radius * radius - across * across)
-            free = min(free, 0.0 if inside else max(entry, 0.0))
-    return free
 
 
 @njit(cache=True)
