@@ -291,8 +291,9 @@ class BagWriter:
             return None
         rows = image.data[: image.height * image.step].reshape(image.height, image.step)
         pixels = rows[:, : image.width * channels].reshape(image.height, image.width, channels)
+        pixels = np.ascontiguousarray(pixels)
         if image.encoding == 'rgb8':
-            pixels = pixels[:, :, ::-1]
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
         options = [cv2.IMWRITE_PNG_COMPRESSION, 1]
         if self._images == 'jpeg':
             options = [cv2.IMWRITE_JPEG_QUALITY, 95]
@@ -300,7 +301,7 @@ class BagWriter:
                 cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
                 cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
             ]
-        done, encoded = cv2.imencode(f'.{self._images}', np.ascontiguousarray(pixels), options)
+        done, encoded = cv2.imencode(f'.{self._images}', pixels, options)
         if not done:
             return None
         stored = 'bgr8' if channels == 3 else ''

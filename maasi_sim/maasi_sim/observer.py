@@ -16,6 +16,7 @@ from maasi_sim.scoring import Scores, matching_radius, score
 FloatArray = NDArray[np.float64]
 
 UPDATE, FOUND, DECISIONS = '/filter_update', '/found_targets', '/decisions'
+BATCH = '/measurement_batch'
 STEP = '/lockstep/step'
 UNAVAILABLE = 5
 
@@ -158,17 +159,29 @@ class RunObserver:
         }
         self._found: dict[int, Found] = {}
         self._updates: list[Any] = []
+        self._arrays: list[Any] = []
         self._team: list[str] | None = None
         self.progress: list[Progress] = []
         self.measurements = dict.fromkeys(scenario.names(), 0)
         self.events: list[dict[str, Any]] = []
         self.completed: Progress | None = None
+        self.settled: str | None = None
+        self._settled_step: int | None = None
+        self._explored = 0.0
+        self.news = False
         self.expected_number = 0.0
 
     @property
     def topics(self) -> list[str]:
         """Topics that it wants."""
         return [UPDATE, FOUND, STEP, *self._kept]
+
+    @property
+    def end_step(self) -> int | None:
+        """Step at which the run came to its end by itself, if it has."""
+        if self.completed is not None:
+            return self.completed.step
+        return self._settled_step
 
     @property
     def found(self) -> int:
@@ -180,23 +193,23 @@ class RunObserver:
         """Number of measurements so far, of all robots."""
         return sum(self.measurements.values())
 
+    @property
     def explored(self) -> float:
-        """Return the share of the environment explored, as of the last decision."""
-        if not self._kept[DECISIONS]:
-            return 0.0
-        return float(self._decode(self._kept[DECISIONS][-1], 'PlanDecision').explored)
+        """Share of the environment explored, as of the last decision."""
+        return self._explored
 
     def add(self, topic: str, data: bytes) -> None:
         """Take a serialised message; what is not in `topics` is left alone."""
         if topic in self._kept:
             self._kept[topic].append(data)
+            if topic == DECISIONS:
+                self._note_decision(self._decode(data, 'PlanDecision'))
         elif self.completed is not None:
             return
         elif topic == UPDATE:
             self._updates.append(self._decode(data, 'FilterUpdate'))
         elif topic == FOUND:
-            targets = self._decode(data, 'FoundTargetArray').targets
-            self._found = {int(item.id): self._target(item) for item in targets}
+            self._arrays.append(self._decode(data, 'FoundTargetArray'))
         elif topic == STEP:
             self._note_team(self._decode(data, 'LockstepStep'))
 
@@ -211,6 +224,7 @@ class RunObserver:
                 self._take(update)
 
     def _take(self, update: Any) -> None:
+        self._apply_arrays(int(update.batch_id))
         for item in update.newly_found:
             self._found.setdefault(int(item.id), self._target(item))
         for member in update.members:
@@ -225,9 +239,16 @@ class RunObserver:
             len(self._found),
             scores.match.true_found,
         )
+        self.news = self.news or not self.progress or self.progress[-1].found != now.found
         self.progress.append(now)
         if len(self.truth) and scores.complete and self.scenario.stop == 'all_found':
             self.completed = now
+
+    def _apply_arrays(self, batch: int) -> None:
+        """Take the found targets as they stood after a batch."""
+        while self._arrays and self._arrays[0].batch_id <= batch:
+            targets = self._arrays.pop(0).targets
+            self._found = {int(item.id): self._target(item) for item in targets}
 
     def _scores(self) -> Scores:
         positions = [self._found[key].position for key in sorted(self._found)]
@@ -243,6 +264,13 @@ class RunObserver:
             int(item.measurement),
             seconds(item.stamp),
         )
+
+    def _note_decision(self, decision: Any) -> None:
+        """Note when the planner says that nothing is left to gain: nobody goes anywhere."""
+        self._explored = float(decision.explored)
+        if decision.reason and all(robot.chosen < 0 for robot in decision.robots):
+            self.settled = self.settled or decision.reason
+            self._settled_step = int(decision.step)
 
     def _note_team(self, step: Any) -> None:
         team = list(step.robots)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,6 +33,7 @@ from maasi_sim.yaml_files import (
     ScenarioError,
     dotted,
     merge,
+    override,
     place,
     read_layer,
     unknown,
@@ -228,11 +229,20 @@ def find_scenario(name: str | Path) -> Path:
     return folder / f'{path.name}.yaml'
 
 
-def load_scenario(path: str | Path) -> Scenario:
+def load_scenario(
+    path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> Scenario:
     """Read a scenario file with its layers: all robots, then the type, then the robot itself.
 
     Types are looked for in `robots/` beside the scenario file and beside its folder, then in
     `config/robots`.
+
+    Parameters
+    ----------
+    path : str or Path
+        Scenario file, or the name of one in `config/scenarios`.
+    overrides : mapping, optional
+        Values that win over the file's: where each comes from (for messages), key and value.
 
     Raises
     ------
@@ -247,6 +257,24 @@ def load_scenario(path: str | Path) -> Scenario:
             if isinstance(robots[name], dict):
                 key: Key = ('robots', name)
                 place(layer, key, _robot_layer(path, layer.part(key), key))
+    for origin, (key, value) in (overrides or {}).items():
+        override(layer, key, value, origin)
+    return check_scenario(layer)
+
+
+def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
+    """Return the scenario of values with all layers merged, as from `Scenario.content`.
+
+    Raises
+    ------
+    ScenarioError
+        As `load_scenario`.
+    """
+    return check_scenario(Layer(content, {(): origin}))
+
+
+def check_scenario(layer: Layer) -> Scenario:
+    """Return the scenario of a tree of values with all layers merged."""
     scenario = validate(Scenario, layer)
     problems = list(_problems(scenario))
     if problems:

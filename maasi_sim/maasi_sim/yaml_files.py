@@ -165,6 +165,17 @@ def place(target: Layer, key: Key, part: Layer) -> None:
             target.origins[key + path] = origin
 
 
+def override(layer: Layer, key: Key, value: Any, origin: str) -> None:
+    """Put a value under a key, making the mappings above it; `origin` stands for its place."""
+    data = layer.data
+    for step in key[:-1]:
+        if not isinstance(data.get(step), dict):
+            data[step] = {}
+        data = data[step]
+    data[key[-1]] = value
+    layer.origins[key] = origin
+
+
 def validate(model: type[Model], layer: Layer) -> Model:
     """Return the settings of a tree, strictly by type.
 

@@ -1,0 +1,217 @@
+"""Which nodes a scenario needs, with their parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from maasi_sim.observer import BATCH, DECISIONS, FOUND, STEP, UPDATE
+from maasi_sim.scenario import RobotSettings, Scenario
+
+CLOCK = '/clock'
+
+
+@dataclass(frozen=True)
+class NodePlan:
+    """A node to start.
+
+    Attributes
+    ----------
+    package, executable : str
+        As for `ros2 run`.
+    name, namespace : str
+        Of the node; the namespace without slashes, empty for none.
+    parameters : dict
+        Flat, with dots.
+    topics : tuple of str
+        That it publishes, and that the run cannot do without.
+    says_ready : bool
+        Whether it says so on `lockstep/ready`, and is waited for.
+    says_done : bool
+        Whether it takes part in lockstep.
+    is_clock : bool
+        Whether the time is its.
+    """
+
+    package: str
+    executable: str
+    name: str
+    namespace: str = ''
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    topics: tuple[str, ...] = ()
+    says_ready: bool = True
+    says_done: bool = True
+    is_clock: bool = False
+
+    @property
+    def full_name(self) -> str:
+        """Name with namespace, from the root."""
+        return f'/{self.namespace}/{self.name}' if self.namespace else f'/{self.name}'
+
+    @property
+    def file_name(self) -> str:
+        """What its log and parameter file are called, without ending."""
+        return self.full_name.strip('/').replace('/', '_')
+
+    def parameter_text(self) -> str:
+        """Return its parameter file."""
+        content = {'/**': {'ros__parameters': dict(self.parameters)}}
+        return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
+
+    def command(self, executable: Path, parameter_file: Path) -> list[str]:
+        """Return the command line of its process; what it says goes to its standard output."""
+        return [
+            str(executable),
+            '--ros-args',
+            '--disable-external-lib-logs',
+            '--remap',
+            f'__node:={self.name}',
+            '--remap',
+            f'__ns:=/{self.namespace}',
+            '--params-file',
+            str(parameter_file),
+        ]
+
+
+def plan_nodes(
+    scenario: Scenario,
+    *,
+    seed: int,
+    lockstep: bool,
+    rate: float | None,
+    recorder: bool,
+    file: Path,
+) -> list[NodePlan]:
+    """Return the nodes that a scenario needs: sim, drivers and guards, filter, planner.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With all layers.
+    seed : int
+        Of the run.
+    lockstep : bool
+        Step by step, or free running.
+    rate : float, optional
+        Simulated over wall time; None: as fast as it goes in lockstep, else 1.
+    recorder : bool
+        Whether the sim waits for a recorder.
+    file : Path
+        Scenario file with all layers, for the sim.
+    """
+    from maasi_filter.node_settings import FilterNodeSettings
+    from maasi_filter.parameters import flatten
+    from maasi_planner.node_settings import PlannerNodeSettings
+
+    common = {'step': scenario.step, 'seed': seed, 'lockstep': lockstep}
+    environment = scenario.environment.model_dump()
+    filter_settings = FilterNodeSettings.model_validate(
+        {
+            **common,
+            'environment': environment,
+            'filter': scenario.filter.model_dump(),
+            'robots': {
+                name: {'sensor': robot.sensor.model_dump()}
+                for name, robot in scenario.robots.items()
+            },
+        }
+    )
+    planner_settings = PlannerNodeSettings.model_validate(
+        {
+            **common,
+            'environment': environment,
+            'planner': scenario.planner.model_dump(),
+            'robots': {
+                name: {
+                    'candidates': robot.candidates.model_dump(),
+                    'motion': robot.motion.model_dump(),
+                    'sensor': robot.sensor.model_dump(),
+                    'radius': robot.radius,
+                    'start': robot.start,
+                }
+                for name, robot in scenario.robots.items()
+            },
+        }
+    )
+    simulation: dict[str, Any] = {
+        'scenario': str(file),
+        'seed': seed,
+        'lockstep': lockstep,
+        'rate': rate if rate is not None else 0.0 if lockstep else 1.0,
+        'recorder': recorder,
+    }
+    plans = [
+        NodePlan(
+            'maasi_sim',
+            'sim_node',
+            'sim_node',
+            parameters=simulation,
+            topics=(CLOCK, STEP) if lockstep else (CLOCK,),
+            says_ready=False,
+            says_done=False,
+            is_clock=True,
+        )
+    ]
+    for name in scenario.names():
+        plans += _robot_plans(name, scenario.robots[name], scenario, common)
+    plans.append(
+        NodePlan(
+            'maasi_filter',
+            'filter_node',
+            'filter_node',
+            parameters=flatten(filter_settings),
+            topics=(UPDATE, FOUND),
+        )
+    )
+    plans.append(
+        NodePlan(
+            'maasi_planner',
+            'planner_node',
+            'planner_node',
+            parameters=flatten(planner_settings),
+            topics=(DECISIONS, BATCH),
+        )
+    )
+    return plans
+
+
+def _robot_plans(
+    name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
+) -> list[NodePlan]:
+    """Return a robot's driver, and its guard if it has one."""
+    from maasi_drivers.driver_settings import DriverSettings
+    from maasi_filter.parameters import flatten
+
+    settings = DriverSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment.model_dump(),
+            'start': robot.start,
+            'yaw': robot.yaw,
+            'radius': robot.radius,
+            'motion': robot.motion.model_dump(),
+            'sensor': robot.sensor.model_dump(),
+            'camera': None if robot.camera is None else robot.camera.model_dump(),
+        }
+    )
+    plans = [
+        NodePlan(
+            'maasi_drivers',
+            robot.driver,
+            'driver',
+            name,
+            flatten(settings),
+            topics=tuple(f'/{name}/{topic}' for topic in ('state', 'detections', 'cmd_vel')),
+        )
+    ]
+    if robot.guard:
+        plans.append(
+            NodePlan(
+                'maasi_drivers', 'guard_node', 'guard', name, says_ready=False, says_done=False
+            )
+        )
+    return plans

@@ -1,0 +1,92 @@
+"""Progress of a run on the terminal: one line that changes, or plain lines where there is none."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from rich.live import Live
+
+
+@dataclass(frozen=True)
+class Status:
+    """What is shown: simulated time [s], counts, share explored, real-time factor."""
+
+    time: float
+    measurements: int
+    found: int
+    targets: int
+    explored: float
+    factor: float
+
+    def text(self) -> str:
+        """Return it as one line."""
+        targets = f' of {self.targets}' if self.targets else ''
+        return (
+            f'{self.time:7.1f} s   {self.measurements:4d} measurements   '
+            f'{self.found} found{targets}   {100.0 * self.explored:3.0f} % explored   '
+            f'{self.factor:.1f} x real time'
+        )
+
+
+class ProgressDisplay:
+    """
+    Show how a run goes on.
+
+    Parameters
+    ----------
+    stream : TextIO
+        Where to; a terminal gets a line that changes, anything else a line now and then.
+    period : float
+        Seconds between lines that say nothing new, where it is no terminal.
+    """
+
+    def __init__(self, stream: TextIO | None = None, period: float = 5.0) -> None:
+        self._stream = stream or sys.stderr
+        self._terminal = self._stream.isatty()
+        self._period = 0.1 if self._terminal else period
+        self._last = -1e9
+        self._found = -1
+        self._live: Live | None = None
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to show something."""
+        return time.monotonic() - self._last >= self._period
+
+    def say(self, text: str) -> None:
+        """Write a line that stays."""
+        if self._live is not None:
+            self._live.console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=self._stream, flush=True)
+
+    def show(self, status: Status) -> None:
+        """Show a status, if it is time or it has a new target."""
+        if not self.due and (self._terminal or status.found == self._found):
+            return
+        self._last = time.monotonic()
+        self._found = status.found
+        if not self._terminal:
+            self.say(status.text())
+            return
+        if self._live is None:
+            self._live = _live(self._stream)
+            self._live.start()
+        self._live.update(status.text(), refresh=True)
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+
+def _live(stream: TextIO) -> Live:
+    from rich.console import Console
+    from rich.live import Live
+
+    return Live(console=Console(file=stream), auto_refresh=False, transient=False)

@@ -1,0 +1,318 @@
+"""The recorder: sees all topics of a run, writes them down, and takes part in lockstep."""
+
+from __future__ import annotations
+
+import importlib
+import struct
+import time
+from collections import deque
+from collections.abc import Collection
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.context import Context
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+
+from maasi_msgs.msg import (
+    AgentState,
+    ClusterArray,
+    DetectionArray,
+    FilterUpdate,
+    FoundTargetArray,
+    LockstepDone,
+    LockstepStep,
+    MeasurementBatch,
+    PlanDecision,
+)
+from maasi_sim.bag import BagError, BagWriter, TopicQos
+from maasi_sim.observer import STEP, UPDATE, RunObserver
+
+NAME = '/recorder'
+CLOCK, READY, DONE = '/clock', '/lockstep/ready', '/lockstep/done'
+# What is left out: of no use to who reads the recording.
+_SKIPPED = ('/parameter_events', READY)
+# What is recorded while the nodes are ended.
+_AT_THE_END = ('cmd_vel', 'odom', 'rosout', 'diagnostics', 'transition_event')
+_WITH_STEP = (
+    AgentState,
+    DetectionArray,
+    FilterUpdate,
+    LockstepDone,
+    LockstepStep,
+    MeasurementBatch,
+    PlanDecision,
+)
+_WITH_BATCH = (ClusterArray, FoundTargetArray)
+_READY_QOS = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+_RELIABLE = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
+)
+
+
+class Recorder:
+    """
+    A node that takes serialised messages from all topics that it discovers.
+
+    It is not spun: `wait` and `drain` take the messages without callbacks, which costs a fifth.
+
+    Subscribes
+    ----------
+    every topic with a publisher, with the quality of service of that publisher;
+    `lockstep/ready` (maasi_msgs/LockstepDone)
+
+    Publishes
+    ---------
+    `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone);
+    `<robot>/cmd_vel` (geometry_msgs/TwistStamped): zeros, when `stop_robot` is called
+
+    Parameters
+    ----------
+    domain : int
+        ROS domain.
+    observer : RunObserver
+        Is fed with what the report needs.
+    bag : BagWriter, optional
+        Recording; None: nothing is recorded, and only what the observer needs is taken.
+    """
+
+    def __init__(self, domain: int, observer: RunObserver, bag: BagWriter | None) -> None:
+        self.context = Context()
+        rclpy.init(
+            context=self.context,
+            domain_id=domain,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self.node = Node(
+            NAME.strip('/'),
+            context=self.context,
+            start_parameter_services=False,
+            enable_rosout=False,
+            use_global_arguments=False,
+        )
+        self.observer = observer
+        self.bag = bag
+        self.time = 0
+        self.step: int | None = None
+        self.last_seen: dict[str, float] = {}
+        self._last_done: deque[bytes] = deque(maxlen=100)
+        self.ready: set[str] = set()
+        self._finished = False
+        self.complaints: list[str] = []
+        self._wanted = {*observer.topics, CLOCK, DONE}
+        self._subscriptions: dict[str, Subscription] = {}
+        self._refused: set[str] = set()
+        self._ready_subscription = self._subscribe(
+            READY,
+            LockstepDone,
+            QoSProfile(
+                depth=100,
+                reliability=ReliabilityPolicy.RELIABLE,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL,
+            ),
+        )
+        self._ready_publisher = self.node.create_publisher(LockstepDone, READY, _READY_QOS)
+        self._done_publisher = self.node.create_publisher(LockstepDone, DONE, _RELIABLE)
+        self._wait_set = rclpy_implementation.WaitSet(2, 0, 0, 0, 0, 0, self.context.handle)
+
+    def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> Subscription:
+        return self.node.create_subscription(kind, topic, _never, qos, raw=True)
+
+    def discover(self) -> None:
+        """Subscribe to the topics that have come up since the last time."""
+        for topic, types in self.node.get_topic_names_and_types():
+            if topic in self._subscriptions or topic in _SKIPPED or topic in self._refused:
+                continue
+            if not self._wants(topic):
+                continue
+            infos = self.node.get_publishers_info_by_topic(topic)
+            if not infos:
+                continue
+            profiles = [info.qos_profile for info in infos]
+            reliable = all(
+                profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles
+            )
+            latched = all(
+                profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles
+            )
+            try:
+                kind = _message_class(types[0])
+                if self.bag is not None:
+                    self.bag.add_topic(topic, types[0], TopicQos(reliable, latched))
+            except (ImportError, AttributeError, BagError) as error:
+                self._refused.add(topic)
+                self.complaints.append(f'topic {topic} is not recorded: {error}')
+                continue
+            qos = QoSProfile(
+                history=HistoryPolicy.KEEP_ALL if reliable else HistoryPolicy.KEEP_LAST,
+                depth=1000,
+                reliability=(
+                    ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+                ),
+                durability=(
+                    DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+                ),
+            )
+            self._subscriptions[topic] = self._subscribe(topic, kind, qos)
+
+    def missing(self, topics: Collection[str]) -> list[str]:
+        """Return those topics, of use to the recorder, whose publisher is not connected yet."""
+        return [
+            topic
+            for topic in topics
+            if self._wants(topic)
+            and (
+                topic not in self._subscriptions
+                or self._subscriptions[topic].handle.get_publisher_count() == 0
+            )
+        ]
+
+    def _wants(self, topic: str) -> bool:
+        return self.bag is not None or topic in self._wanted
+
+    def take_ready(self) -> set[str]:
+        """Return the names of the nodes that have said that they are ready."""
+        for data in _take(self._ready_subscription):
+            self.ready.add(deserialize_message(data, LockstepDone).node)
+        return self.ready
+
+    def publish_ready(self) -> None:
+        """Say that the recorder is ready."""
+        self._ready_publisher.publish(LockstepDone(node=NAME, step=0))
+
+    def publish_done(self, step: int) -> None:
+        """Say that the recorder is done with a step."""
+        self._done_publisher.publish(LockstepDone(node=NAME, step=step))
+
+    def wait(self, timeout: float) -> None:
+        """Return when there is a new step (free running: after the time) [s]."""
+        waiting = [self._ready_subscription]
+        if STEP in self._subscriptions:
+            waiting.append(self._subscriptions[STEP])
+        self._wait_set.clear_entities()
+        for subscription in waiting:
+            self._wait_set.add_subscription(subscription.handle)
+        self._wait_set.wait(round(timeout * 1e9))
+
+    def drain(self, limit: int | None = None) -> None:
+        """
+        Take all messages that have come: to the observer, and into the recording.
+
+        What ends a run ends it at a step: of what nodes have sent since, nothing is kept that
+        would make one recording differ from another.
+
+        Parameters
+        ----------
+        limit : int, optional
+            Simulated time at which the run ends [ns].
+        """
+        # What belongs to an update was published before it: take updates first, read them last.
+        updates = self._take_from(UPDATE)
+        steps = self._take_from(STEP)
+        for data in steps:
+            self.step = struct.unpack_from('<Q', data, 4)[0]
+            self._set_time(data, 12)
+        taken = [(CLOCK, data) for data in self._take_from(CLOCK)]
+        for _, data in taken:
+            self._set_time(data, 4)
+        for topic, subscription in self._subscriptions.items():
+            if topic not in (UPDATE, STEP, CLOCK):
+                taken += [(topic, data) for data in _take(subscription)]
+        taken += [(UPDATE, data) for data in updates]
+        taken += [(STEP, data) for data in steps]
+        if self._finished:
+            taken = [item for item in taken if item[0].rpartition('/')[2] in _AT_THE_END]
+        elif limit is not None and self.step is not None and self.time >= limit:
+            taken = self._until(taken, self.step - 1)
+        now = time.monotonic()
+        for topic, data in taken:
+            self.last_seen[topic] = now
+            if topic == DONE:
+                self._last_done.append(data)
+            if not self._finished:
+                self.observer.add(topic, data)
+        self.observer.settle()
+        if self.observer.end_step is not None and not self._finished:
+            taken = self._until(taken, self.observer.end_step)
+        if self.bag is not None:
+            for topic, data in taken:
+                self.bag.write(topic, self.time, data)
+
+    def finish(self) -> None:
+        """Keep from now on only what tells how robots and nodes are stopped."""
+        self._finished = True
+
+    def _until(self, taken: list[tuple[str, bytes]], step: int) -> list[tuple[str, bytes]]:
+        """Return the messages up to a step, as far as they say to which they belong."""
+        progress = self.observer.progress
+        batch = progress[-1].batch if progress else 0
+        kept = []
+        for topic, data in taken:
+            kind = self._subscriptions[topic].msg_type
+            if kind in _WITH_STEP and deserialize_message(data, kind).step > step:
+                continue
+            if kind in _WITH_BATCH and deserialize_message(data, kind).batch_id > batch:
+                continue
+            kept.append((topic, data))
+        return kept
+
+    def _take_from(self, topic: str) -> list[bytes]:
+        subscription = self._subscriptions.get(topic)
+        return [] if subscription is None else _take(subscription)
+
+    def _set_time(self, data: bytes, offset: int) -> None:
+        seconds, nanoseconds = struct.unpack_from('<iI', data, offset)
+        self.time = max(self.time, seconds * 10**9 + nanoseconds)
+
+    def done_steps(self) -> dict[str, int]:
+        """Return the last step that each node has said it is done with, of late."""
+        steps: dict[str, int] = {}
+        for data in self._last_done:
+            message = deserialize_message(data, LockstepDone)
+            steps[message.node] = max(message.step, steps.get(message.node, 0))
+        return steps
+
+    def stop_robot(self, name: str) -> None:
+        """Publish zeros on a robot's `cmd_vel`."""
+        topic = f'/{name}/cmd_vel'
+        types = dict(self.node.get_topic_names_and_types()).get(topic, [])
+        kind = Twist if types == ['geometry_msgs/msg/Twist'] else TwistStamped
+        publisher = self.node.create_publisher(kind, topic, _RELIABLE)
+        message: Any = kind()
+        if isinstance(message, TwistStamped):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.time, 10**9)
+        publisher.publish(message)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        if self.context.ok():
+            self.node.destroy_node()
+            rclpy.shutdown(context=self.context)
+
+
+def _take(subscription: Subscription) -> list[bytes]:
+    """Return all serialised messages that wait in a subscription."""
+    taken: list[bytes] = []
+    handle = subscription.handle
+    while True:
+        item = handle.take_message(subscription.msg_type, True)
+        if item is None:
+            return taken
+        taken.append(item[0])
+
+
+def _message_class(name: str) -> type:
+    """Return the class of `package/msg/Type`."""
+    package, _, kind = name.split('/')
+    return getattr(importlib.import_module(f'{package}.msg'), kind)
+
+
+def _never(_: bytes) -> None:
+    """Stand in for a callback: messages are taken by hand."""

@@ -1,0 +1,249 @@
+"""Feed a recording's measurements to the filter node again, and compare what it finds."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from maasi_sim.bag import Bag, BagError
+from maasi_sim.node_plan import NodePlan
+from maasi_sim.observer import FOUND, UPDATE
+from maasi_sim.processes import Domain, NodeProcess, find_executable, stop
+
+FILTER = '/filter_node'
+EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
+# Wall time that one update may take, and the start of the node [s].
+_PATIENCE = 60.0
+
+
+@dataclass
+class Batch:
+    """One recorded update: what went in, in which order, and what came out.
+
+    Attributes
+    ----------
+    id, step : int
+        Of the batch.
+    stamp : (int, int)
+        Seconds and nanoseconds.
+    members : list of (robot, decision, measurement)
+        That were processed, in their order.
+    detections : list of bytes
+        Serialised DetectionArray of each member.
+    update : dict
+        What the filter published.
+    """
+
+    id: int
+    step: int
+    stamp: tuple[int, int]
+    members: list[tuple[str, int, int]]
+    detections: list[bytes]
+    update: Any
+
+
+@dataclass
+class Recording:
+    """What a replay takes from a recording.
+
+    Attributes
+    ----------
+    facts : dict
+        Scenario, seed and parameters of each node.
+    batches : list of Batch
+        In order.
+    found : list of dict
+        Found targets at the end.
+    """
+
+    facts: dict[str, Any]
+    batches: list[Batch] = field(default_factory=list)
+    found: list[dict[str, Any]] = field(default_factory=list)
+
+
+def read_recording(path: Path) -> Recording:
+    """Return what a replay needs of a recording.
+
+    Raises
+    ------
+    BagError
+        If it is none, or measurements that the filter processed are not in it.
+    """
+    with Bag(path) as bag:
+        recording = Recording(bag.scenario())
+        if FILTER not in recording.facts.get('nodes', {}):
+            raise BagError(f'{path}: holds no parameters of {FILTER}')
+        robots = recording.facts['scenario']['robots']
+        topics = {f'/{name}/detections': name for name in robots}
+        detections: dict[tuple[str, int], bytes] = {}
+        for topic, kind, _, data in bag.raw(topics):
+            message = bag.decode(data, kind)
+            # An index comes again only where a driver was started again: the first was used.
+            detections.setdefault((topics[topic], int(message.measurement)), data)
+        for item in bag.messages([UPDATE]):
+            recording.batches.append(_batch(item.message, detections, path))
+        for item in bag.messages([FOUND]):
+            recording.found = [plain(target) for target in item.message.targets]
+    return recording
+
+
+def _batch(update: Any, detections: dict[tuple[str, int], bytes], path: Path) -> Batch:
+    members = [
+        (member.robot, int(member.decision), int(member.measurement)) for member in update.members
+    ]
+    missing = [
+        key for key in ((name, index) for name, _, index in members) if key not in detections
+    ]
+    if missing:
+        name, index = missing[0]
+        raise BagError(f'{path}: measurement {index} of {name} is not in the recording')
+    stamp = update.header.stamp
+    return Batch(
+        int(update.batch_id),
+        int(update.step),
+        (int(stamp.sec), int(stamp.nanosec)),
+        members,
+        [detections[name, index] for name, _, index in members],
+        plain(update),
+    )
+
+
+def plain(message: Any) -> Any:
+    """Return a message, of `rosbags` or of ROS, as plain values that can be compared."""
+    fields = getattr(message, '__dataclass_fields__', None)
+    names = [name for name in fields if name != '__msgtype__'] if fields else None
+    if names is None and hasattr(message, 'get_fields_and_field_types'):
+        names = list(message.get_fields_and_field_types())
+    if names is not None:
+        return {name: plain(getattr(message, name)) for name in names}
+    if isinstance(message, str):
+        return message
+    if hasattr(message, 'tolist'):
+        return message.tolist()
+    if isinstance(message, (list, tuple)):
+        return [plain(item) for item in message]
+    return message
+
+
+def differences(recorded: list[dict[str, Any]], found: list[dict[str, Any]]) -> list[str]:
+    """Return in words how two lists of found targets differ; empty if they are equal to the bit."""
+    lines = []
+    if len(recorded) != len(found):
+        lines.append(f'{len(recorded)} found targets were recorded, {len(found)} found now')
+    for before, now in zip(recorded, found):
+        for key, value in before.items():
+            if now.get(key) != value:
+                lines.append(f'target {before["id"]}: {key} was {value}, is {now.get(key)}')
+    return lines
+
+
+def replay(
+    path: Path,
+    out: Path | None,
+    domain_id: int | None,
+    interrupted: Callable[[], bool],
+) -> int:
+    """Replay a recording, say whether the filter finds the same, and return the exit code.
+
+    Parameters
+    ----------
+    path : Path
+        Recording, or folder of the run that holds it.
+    out : Path, optional
+        Folder for the node's log and parameters.
+    domain_id : int, optional
+        ROS domain; one of its own if not given.
+    interrupted : callable
+        Becomes true when the user wants it to end.
+
+    Raises
+    ------
+    BagError
+        If the recording cannot be replayed.
+    """
+    from maasi_sim.run_scenario import make_folder
+
+    recording = read_recording(path)
+    folder = make_folder(out, '_replay')
+    facts = recording.facts['nodes'][FILTER]
+    plan = NodePlan(
+        facts['package'],
+        facts['executable'],
+        FILTER.strip('/'),
+        # Without lockstep the filter would give up waiting for what is slow to come.
+        parameters={**facts['parameters'], 'lockstep': True},
+    )
+    parameters = folder / f'{plan.file_name}.yaml'
+    parameters.write_text(plan.parameter_text(), encoding='utf-8')
+    executable = find_executable(plan.package, plan.executable)
+    log = folder / f'{plan.file_name}.log'
+    with Domain(domain_id) as domain:
+        os.environ.update(domain.environment())
+        process = NodeProcess(plan.full_name, plan.command(executable, parameters), log)
+        process.start()
+        try:
+            from maasi_sim.replay_node import ReplayNode
+
+            node = ReplayNode(domain.number, sorted(recording.facts['scenario']['robots']))
+            try:
+                return _feed(node, recording, process, interrupted)
+            finally:
+                node.close()
+        finally:
+            stop([process])
+
+
+def _feed(
+    node: Any, recording: Recording, process: NodeProcess, interrupted: Callable[[], bool]
+) -> int:
+    first_difference = None
+
+    def wait_for(condition: Callable[[], bool], what: str) -> int | None:
+        deadline = time.monotonic() + _PATIENCE
+        while not condition():
+            if interrupted():
+                return INTERRUPTED
+            if not process.running:
+                return _failed(f'{process.name} {process.how_it_ended()}', process)
+            if time.monotonic() > deadline:
+                return _failed(f'{process.name}: {what} for {_PATIENCE:g} s', process)
+            node.spin()
+        return None
+
+    code = wait_for(lambda: node.ready, 'was not ready')
+    if code is not None:
+        return code
+    for index, batch in enumerate(recording.batches):
+        node.publish(batch)
+        code = wait_for(
+            lambda number=index + 1: len(node.updates) >= number,  # type: ignore[misc]
+            f'did not answer batch {batch.id}',
+        )
+        if code is not None:
+            return code
+        if first_difference is None and plain(node.updates[-1]) != batch.update:
+            first_difference = batch
+    code = wait_for(lambda: node.found_batch >= node.changed_batch, 'published no found targets')
+    if code is not None:
+        return code
+    lines = differences(recording.found, [plain(target) for target in node.found])
+    for line in lines:
+        print(line)
+    if first_difference is not None:
+        print(f'the first update that differs is that of batch {first_difference.id}')
+    number = len(recording.found)
+    if lines:
+        print(f'{len(recording.batches)} batches replayed: the found targets are NOT equal')
+        return DIFFERENT
+    print(f'{len(recording.batches)} batches replayed: {number} found targets, equal to the bit')
+    return EQUAL
+
+
+def _failed(text: str, process: NodeProcess) -> int:
+    print(f'error: {text}\n--- {process.log}\n{process.last_words()}', file=sys.stderr)
+    return FAILED

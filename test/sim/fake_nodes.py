@@ -1,0 +1,314 @@
+"""Nodes that play a run by a script: what they find, when they die. Started as processes by tests.
+
+Usage: fake_nodes.py ROLE --ros-args ... with parameters `robots`, `lockstep`, `step`, `trouble`
+(none, die, hang, raise, deaf, silent), `trouble_step`, `targets` (flat), `finished_step`, `marker`.
+"""
+
+import os
+import signal
+import sys
+import threading
+
+import rclpy
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+
+from maasi_msgs.msg import (
+    AgentState,
+    BatchMember,
+    DetectionArray,
+    FilterUpdate,
+    FoundTarget,
+    FoundTargetArray,
+    LockstepDone,
+    LockstepStep,
+    MeasurementBatch,
+    PlanDecision,
+    RobotDecision,
+)
+
+ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+class Fake(Node):
+    """What all have in common."""
+
+    def __init__(self, role):
+        super().__init__(role)
+        self.robots = list(self.value('robots', ['mambo']))
+        self.lockstep = self.value('lockstep', True)
+        self.length = self.value('step', 0.05)
+        self.trouble = self.value('trouble', 'none')
+        self.trouble_step = self.value('trouble_step', 0)
+        self.full_name = self.get_fully_qualified_name()
+        self.ready = self.create_publisher(LockstepDone, '/lockstep/ready', LATCHED)
+        self.done = self.create_publisher(LockstepDone, '/lockstep/done', ALL)
+        if role != 'sim_node':
+            self.create_subscription(LockstepStep, '/lockstep/step', self.on_step, ALL)
+
+    def value(self, name, default):
+        return self.declare_parameter(name, default).value
+
+    def say_ready(self, *peers):
+        """Say so once each publisher has as many subscriptions as named, the recorder's apart."""
+        self.peers = peers
+        if self.trouble != 'silent':
+            self.ready_timer = self.create_timer(0.01, self.look_for_peers)
+
+    def look_for_peers(self):
+        if all(publisher.get_subscription_count() >= number for publisher, number in self.peers):
+            self.ready_timer.cancel()
+            self.ready.publish(LockstepDone(node=self.full_name, step=0))
+
+    def finish(self, step):
+        self.done.publish(LockstepDone(node=self.full_name, step=step))
+
+    def misbehave(self, step):
+        """Do what the script says at this step; a restarted process behaves."""
+        marker = (
+            self.value('marker', '')
+            if not self.has_parameter('marker')
+            else (self.get_parameter('marker').value)
+        )
+        if self.trouble == 'none' or step != self.trouble_step:
+            return False
+        if marker and os.path.exists(marker):
+            return False
+        if marker:
+            with open(marker, 'w'):
+                pass
+        if self.trouble == 'die':
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.trouble == 'raise':
+            raise RuntimeError('a scripted trouble')
+        return self.trouble == 'hang'
+
+    def stamp(self, message, step):
+        nanoseconds = round(step * self.length * 1e9)
+        message.sec, message.nanosec = divmod(nanoseconds, 10**9)
+
+
+class Sim(Fake):
+    """The clock and the robots' odometry."""
+
+    def __init__(self):
+        super().__init__('sim_node')
+        self.steps = self.create_publisher(LockstepStep, '/lockstep/step', ALL)
+        self.clock = self.create_publisher(Clock, '/clock', 10)
+        self.odometry = {
+            name: self.create_publisher(Odometry, f'/{name}/odom', ALL) for name in self.robots
+        }
+        expected = ['/filter_node', '/planner_node', *(f'/{name}/driver' for name in self.robots)]
+        self.missing = {*expected, '/recorder'}
+        self.taking_part = set(self.missing)
+        self.step = -1
+        self.waiting = set()
+        self.create_subscription(LockstepDone, '/lockstep/ready', self.on_ready, LATCHED)
+        self.create_subscription(LockstepDone, '/lockstep/done', self.on_done, ALL)
+        if not self.lockstep:
+            self.timer = self.create_timer(0.02, self.tick)
+
+    def on_ready(self, message):
+        if self.missing:
+            self.missing.discard(message.node)
+            if not self.missing and self.lockstep:
+                self.advance()
+        elif self.lockstep and message.node in self.waiting:
+            # Somebody who was started again: the step is for it as well.
+            self.publish_step()
+
+    def tick(self):
+        if not self.missing:
+            self.advance()
+
+    def advance(self):
+        self.step += 1
+        if self.misbehave(self.step):
+            return
+        self.waiting = set(self.taking_part)
+        self.publish_step()
+
+    def publish_step(self):
+        clock = Clock()
+        self.stamp(clock.clock, self.step)
+        for name in self.robots:
+            odometry = Odometry()
+            self.stamp(odometry.header.stamp, self.step)
+            self.odometry[name].publish(odometry)
+        self.clock.publish(clock)
+        if self.lockstep or self.step >= 0:
+            message = LockstepStep(step=self.step, robots=self.robots)
+            self.stamp(message.stamp, self.step)
+            self.steps.publish(message)
+
+    def on_done(self, message):
+        if message.step == self.step and self.lockstep:
+            self.waiting.discard(message.node)
+            if not self.waiting:
+                self.advance()
+
+
+class Driver(Fake):
+    """A robot that moves along x."""
+
+    def __init__(self):
+        super().__init__('driver')
+        self.name = self.get_namespace().strip('/')
+        self.state = self.create_publisher(AgentState, 'state', ALL)
+        self.command = self.create_publisher(TwistStamped, 'cmd_vel', ALL)
+        self.detections = self.create_publisher(DetectionArray, 'detections', ALL)
+        self.create_subscription(MeasurementBatch, '/measurement_batch', self.on_batch, ALL)
+        self.say_ready((self.detections, 1), (self.done, 1))
+
+    def on_step(self, message):
+        if self.misbehave(message.step):
+            return
+        state = AgentState(step=message.step, robot=self.name, goal_status=AgentState.MOVING)
+        state.header.stamp = message.stamp
+        state.pose.pose.position.x = 0.01 * message.step
+        self.state.publish(state)
+        command = TwistStamped()
+        command.header.stamp = message.stamp
+        command.twist.linear.x = 0.2
+        self.command.publish(command)
+        self.finish(message.step)
+
+    def on_batch(self, batch):
+        for member in batch.members:
+            if member.robot == self.name:
+                answer = DetectionArray(
+                    batch_id=batch.id,
+                    step=batch.step,
+                    robot=self.name,
+                    measurement=member.measurement,
+                )
+                answer.header.stamp = batch.stamp
+                self.detections.publish(answer)
+
+    def stop(self):
+        self.command.publish(TwistStamped())
+
+
+class Filter(Fake):
+    """Finds the next target of the list with each batch."""
+
+    def __init__(self):
+        super().__init__('filter_node')
+        self.targets = list(self.value('targets', [0.0]))
+        self.update = self.create_publisher(FilterUpdate, '/filter_update', ALL)
+        self.found_targets = self.create_publisher(FoundTargetArray, '/found_targets', LATCHED)
+        self.found = []
+        self.pending = {}
+        self.create_subscription(MeasurementBatch, '/measurement_batch', self.on_batch, ALL)
+        for name in self.robots:
+            self.create_subscription(DetectionArray, f'/{name}/detections', self.on_detections, ALL)
+        self.say_ready((self.update, 1), (self.done, 1))
+
+    def on_step(self, message):
+        if not self.misbehave(message.step):
+            self.finish(message.step)
+
+    def on_batch(self, batch):
+        self.pending.setdefault(batch.id, [None, set()])[0] = batch
+        self.process(batch.id)
+
+    def on_detections(self, detections):
+        self.pending.setdefault(detections.batch_id, [None, set()])[1].add(detections.robot)
+        self.process(detections.batch_id)
+
+    def process(self, number):
+        batch, robots = self.pending[number]
+        if batch is None or robots != {member.robot for member in batch.members}:
+            return
+        new = []
+        index = len(self.found)
+        if 2 * index < len(self.targets) - 1:
+            target = FoundTarget(id=index + 1, robot=self.robots[0], batch_id=number)
+            target.position.x, target.position.y = self.targets[2 * index : 2 * index + 2]
+            target.stamp = batch.stamp
+            new = [target]
+            self.found += new
+        array = FoundTargetArray(batch_id=number, targets=self.found)
+        array.header.stamp = batch.stamp
+        self.found_targets.publish(array)
+        update = FilterUpdate(
+            batch_id=number,
+            step=batch.step,
+            members=batch.members,
+            found=len(self.found),
+            newly_found=new,
+        )
+        update.header.stamp = batch.stamp
+        self.update.publish(update)
+
+
+class Planner(Fake):
+    """Decides and measures every tenth step."""
+
+    def __init__(self):
+        super().__init__('planner_node')
+        self.finished_step = self.value('finished_step', -1)
+        self.decisions = self.create_publisher(PlanDecision, '/decisions', ALL)
+        self.batch = self.create_publisher(MeasurementBatch, '/measurement_batch', ALL)
+        self.create_subscription(FilterUpdate, '/filter_update', self.on_update, ALL)
+        self.number = 0
+        self.say_ready((self.batch, 1 + len(self.robots)), (self.done, 1))
+
+    def on_step(self, message):
+        if self.misbehave(message.step):
+            return
+        if message.step % 10:
+            self.finish(message.step)
+            return
+        finished = 0 <= self.finished_step <= message.step
+        decision = PlanDecision(step=message.step, planner='maasi', explored=0.5)
+        decision.header.stamp = message.stamp
+        decision.reason = 'nothing is left to gain' if finished else ''
+        decision.robots = [
+            RobotDecision(robot=name, decision=self.number, chosen=-1 if finished else 0)
+            for name in self.robots
+        ]
+        self.decisions.publish(decision)
+        self.number += 1
+        batch = MeasurementBatch(id=self.number, step=message.step, stamp=message.stamp)
+        batch.members = [
+            BatchMember(robot=name, decision=self.number, measurement=self.number)
+            for name in self.robots
+        ]
+        self.batch.publish(batch)
+
+    def on_update(self, update):
+        self.finish(update.step)
+
+
+def main():
+    role = sys.argv[1]
+    rclpy.init()
+    node = {'sim': Sim, 'driver': Driver, 'filter': Filter, 'planner': Planner}[role]()
+    if node.trouble == 'deaf':
+        # Ends by nothing but SIGKILL.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        threading.Thread(target=threading.Event().wait, daemon=False).start()
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        if role == 'driver' and rclpy.ok():
+            node.stop()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main()

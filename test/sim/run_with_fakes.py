@@ -1,0 +1,56 @@
+"""`run_scenario` with nodes that play by a script; the first argument is JSON of parameters."""
+
+import json
+import sys
+from pathlib import Path
+
+from maasi_sim import node_plan, processes, run_scenario
+
+FAKES = Path(__file__).with_name('fake_nodes.py')
+
+
+class FakePlan(node_plan.NodePlan):
+    """Starts a fake in place of the executable."""
+
+    def command(self, executable, parameter_file):
+        rest = super().command(executable, parameter_file)[1:]
+        return [sys.executable, str(FAKES), self.executable, *rest]
+
+
+def plan_fakes(scenario, *, seed, lockstep, rate, recorder, file):
+    """Return the plans of a clock, drivers, a filter and a planner."""
+    script = json.loads(sys.argv[1])
+    names = scenario.names()
+    common = {'robots': names, 'lockstep': lockstep, 'step': scenario.step}
+    targets = [float(value) for row in scenario.world(seed).targets for value in row]
+
+    def plan(role, name, namespace='', **more):
+        parameters = {**common, **script.get(f'{namespace}/{name}'.strip('/'), {})}
+        parameters.update(more.pop('parameters', {}))
+        return FakePlan('maasi_fakes', role, name, namespace, parameters, **more)
+
+    found = script.get('found', len(targets) // 2)
+    return [
+        plan('sim', 'sim_node', is_clock=True, says_ready=False, says_done=False, topics=('/clock', '/lockstep/step')),
+        *(
+            plan('driver', 'driver', name, topics=(f'/{name}/state', f'/{name}/cmd_vel'))
+            for name in names
+        ),
+        plan(
+            'filter',
+            'filter_node',
+            parameters={'targets': targets[: 2 * found] or [0.0]},
+            topics=('/filter_update',),
+        ),
+        plan('planner', 'planner_node', topics=('/decisions', '/measurement_batch')),
+    ]
+
+
+def main():
+    node_plan.plan_nodes = plan_fakes
+    processes.find_executable = lambda package, executable: Path(executable)
+    return run_scenario.main(sys.argv[2:])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

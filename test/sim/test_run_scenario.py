@@ -1,0 +1,333 @@
+"""Runs with nodes that play by a script: how they end, what they leave, who is blamed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from maasi_sim.bag import Bag
+
+WITH_FAKES = Path(__file__).with_name('run_with_fakes.py')
+LIMIT = 60.0
+
+TARGETS = [[0.5, 0.5], [1.5, 0.5], [1.0, 1.5]]
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    def write(**changes):
+        content = {
+            'version': 1,
+            'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+            'step': 0.05,
+            'targets': {'positions': TARGETS},
+            'robots': {
+                name: {
+                    'type': 'mambo',
+                    'start': [0.5, 0.5, 1.0],
+                    'candidates': {'grid': [6, 6], 'spacing': 0.34},
+                }
+                for name in ('mambo', 'second')
+            },
+            'limits': {'time': 20.0, 'start': 30.0, 'silence': 5.0},
+        }
+        content.update(changes)
+        path = tmp_path / 'scripted.yaml'
+        path.write_text(yaml.safe_dump(content))
+        return path
+
+    return write
+
+
+class Run:
+    """A run as a process."""
+
+    def __init__(self, folder, scenario, *options, script=None):
+        self.folder = folder
+        self.process = subprocess.Popen(
+            [
+                sys.executable,
+                str(WITH_FAKES),
+                json.dumps(script or {}),
+                str(scenario),
+                '--out',
+                str(folder),
+                *options,
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+
+    def wait(self):
+        """Return exit code and output."""
+        output, _ = self.process.communicate(timeout=LIMIT)
+        return self.process.returncode, output
+
+    def wait_for(self, text):
+        """Read the output up to a line with a text."""
+        for line in self.process.stdout:
+            if text in line:
+                return
+        raise AssertionError(f'never said {text}')
+
+    @property
+    def report(self):
+        return json.loads((self.folder / 'report.json').read_text())
+
+    def nodes(self):
+        """Return the numbers of its nodes' processes that are alive."""
+        alive = []
+        for folder in Path('/proc').glob('[0-9]*'):
+            try:
+                command = (folder / 'cmdline').read_bytes()
+                state = (folder / 'stat').read_text().rpartition(')')[2].split()[0]
+            except OSError:
+                continue
+            if str(self.folder).encode() in command and b'fake_nodes' in command and state != 'Z':
+                alive.append(int(folder.name))
+        return alive
+
+
+def test_a_run_that_finds_all(tmp_path, scenario):
+    run = Run(tmp_path / 'run', scenario(), '--lockstep', '--seed', '5')
+    code, output = run.wait()
+    assert code == 0, output
+    assert '3 of 3 targets found' in output
+    report = run.report
+    assert report['end_reason'] == 'all_found'
+    assert report['seed'] == 5
+    assert report['true_found'] == 3 and report['false_found'] == 0
+    assert report['measurements'] == {'mambo': 3, 'second': 3}
+    assert report['measurements_to_find_all'] == 6
+    assert report['time_to_find_all'] == 1.0
+    assert report['decisions'] == 6
+    assert report['distance']['mambo'] == pytest.approx(0.2)
+    assert report['real_time_factor'] > 0.0
+    assert (run.folder / 'report.png').exists()
+    logs = {path.name for path in run.folder.glob('*.log')}
+    assert logs == {
+        'sim_node.log',
+        'mambo_driver.log',
+        'second_driver.log',
+        'filter_node.log',
+        'planner_node.log',
+    }
+    assert (run.folder / 'parameters' / 'filter_node.yaml').exists()
+    assert run.nodes() == []
+
+
+def test_the_recording_holds_the_run_and_how_to_repeat_it(tmp_path, scenario):
+    run = Run(tmp_path / 'run', scenario(), '--lockstep')
+    code, output = run.wait()
+    assert code == 0, output
+    with Bag(run.folder) as bag:
+        counts = bag.counts
+        steps = [item.message.step for item in bag.messages(['/lockstep/step'])]
+        updates = [item.message.step for item in bag.messages(['/filter_update'])]
+        states = [item.message.step for item in bag.messages(['/mambo/state'])]
+        facts = bag.scenario()
+    assert steps == list(range(21))
+    assert updates == [0, 10, 20]
+    assert states == list(range(21))
+    assert counts['/decisions'] == counts['/measurement_batch'] == 3
+    assert counts['/mambo/odom'] >= 21
+    assert facts['seed'] == 1 and facts['lockstep'] is True
+    assert facts['scenario']['targets']['positions'] == TARGETS
+    assert facts['nodes']['/mambo/driver']['parameters']['step'] == 0.05
+
+
+def test_two_runs_at_once_do_not_hear_each_other(tmp_path, scenario):
+    path = scenario()
+    runs = [Run(tmp_path / f'run{i}', path, '--lockstep') for i in range(2)]
+    for run in runs:
+        code, output = run.wait()
+        assert code == 0, output
+        assert run.report['measurements'] == {'mambo': 3, 'second': 3}
+
+
+def test_free_running(tmp_path, scenario):
+    run = Run(tmp_path / 'run', scenario(), '--no-record')
+    code, output = run.wait()
+    assert code == 0, output
+    assert run.report['true_found'] == 3
+    assert not (run.folder / 'bag').exists()
+
+
+def test_the_time_limit_ends_a_run_at_the_same_step_each_time(tmp_path, scenario):
+    run = Run(
+        tmp_path / 'run', scenario(), '--lockstep', '--time-limit', '1.0', script={'found': 2}
+    )
+    code, output = run.wait()
+    assert code == 1, output
+    assert run.report['end_reason'] == 'time_limit'
+    assert run.report['true_found'] == 2 and run.report['missed'] == 1
+    assert run.report['measurements_to_find_all'] is None
+    with Bag(run.folder) as bag:
+        assert [item.message.step for item in bag.messages(['/mambo/state'])] == list(range(20))
+        assert [item.message.step for item in bag.messages(['/filter_update'])] == [0, 10]
+
+
+@pytest.mark.parametrize('stop, code', [('planner_done', 0), ('all_found', 1)])
+def test_the_planner_may_end_a_run(tmp_path, scenario, stop, code):
+    script = {'found': 1, 'planner_node': {'finished_step': 30}}
+    run = Run(tmp_path / 'run', scenario(stop=stop), '--lockstep', script=script)
+    ended, output = run.wait()
+    assert ended == code, output
+    assert 'nothing is left to gain' in output
+    assert run.report['end_reason'] == 'planner_done'
+
+
+@pytest.mark.parametrize('node', ['filter_node', 'planner_node', 'mambo/driver', 'sim_node'])
+def test_a_node_that_dies_ends_the_run_and_is_named(tmp_path, scenario, node):
+    script = {node: {'trouble': 'die', 'trouble_step': 15}}
+    run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
+    code, output = run.wait()
+    assert code == 3, output
+    assert f'/{node} was killed by SIGKILL' in output
+    assert run.report['end_reason'] == 'node_died'
+    (event,) = run.report['events']
+    assert event['node'] == f'/{node}' and event['event'] == 'died'
+    assert run.nodes() == []
+    with Bag(run.folder) as bag:
+        assert bag.counts['/lockstep/step'] >= 15
+
+
+def test_the_robot_of_a_dead_driver_is_told_to_stop(tmp_path, scenario):
+    script = {'mambo/driver': {'trouble': 'die', 'trouble_step': 15}}
+    run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
+    assert run.wait()[0] == 3
+    with Bag(run.folder) as bag:
+        *_, last = bag.messages(['/mambo/cmd_vel'])
+    assert last.message.twist.linear.x == 0.0
+
+
+def test_an_error_is_shown_with_the_end_of_the_log(tmp_path, scenario):
+    script = {'filter_node': {'trouble': 'raise', 'trouble_step': 5}}
+    run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
+    code, output = run.wait()
+    assert code == 3, output
+    assert '/filter_node exited with 1' in output
+    assert 'RuntimeError: a scripted trouble' in output
+
+
+def test_a_node_that_dies_is_started_again_where_the_scenario_says_so(tmp_path, scenario):
+    marker = tmp_path / 'died'
+    script = {
+        'second/driver': {'trouble': 'die', 'trouble_step': 5, 'marker': str(marker)},
+    }
+    run = Run(tmp_path / 'run', scenario(on_exit='respawn'), '--lockstep', script=script)
+    code, output = run.wait()
+    assert code == 0, output
+    assert 'it is started again' in output
+    (event,) = [event for event in run.report['events'] if 'node' in event]
+    assert event['event'] == 'restarted' and event['node'] == '/second/driver'
+
+
+def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, scenario):
+    limits = {'time': 20.0, 'start': 30.0, 'silence': 20.0, 'restarts': 1}
+    script = {'second/driver': {'trouble': 'die', 'trouble_step': 5}}
+    path = scenario(on_exit='respawn', limits=limits)
+    run = Run(tmp_path / 'run', path, '--lockstep', script=script)
+    code, output = run.wait()
+    assert code == 3, output
+    assert 'after 1 restarts' in output
+
+
+@pytest.mark.parametrize('node', ['filter_node', 'second/driver'])
+def test_a_node_that_hangs_ends_the_run_and_is_named(tmp_path, scenario, node):
+    script = {node: {'trouble': 'hang', 'trouble_step': 7}}
+    run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
+    code, output = run.wait()
+    assert code == 3, output
+    assert f'step 7: nothing from /{node}' in output
+    assert run.report['end_reason'] == 'node_hung'
+
+
+def test_a_node_that_never_gets_ready_is_named(tmp_path, scenario):
+    limits = {'time': 20.0, 'start': 5.0, 'silence': 5.0}
+    script = {'filter_node': {'trouble': 'silent'}}
+    run = Run(tmp_path / 'run', scenario(limits=limits), script=script)
+    code, output = run.wait()
+    assert code == 3, output
+    assert '/filter_node is not ready' in output
+    assert run.report['end_reason'] == 'not_ready'
+
+
+def test_a_deaf_node_is_killed(tmp_path, scenario):
+    run = Run(
+        tmp_path / 'run', scenario(), '--lockstep', script={'filter_node': {'trouble': 'deaf'}}
+    )
+    code, output = run.wait()
+    assert code == 0, output
+    assert 'had to be killed: /filter_node' in output
+    assert run.nodes() == []
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('said', ['nodes in ROS domain', 'measurements'])
+def test_an_interrupt_leaves_no_process_and_a_readable_recording(tmp_path, scenario, number, said):
+    script = {'found': 0}
+    run = Run(tmp_path / 'run', scenario(), '--rate', '1.0', script=script)
+    run.wait_for(said)
+    run.process.send_signal(number)
+    code, output = run.wait()
+    assert code == 130, output
+    assert 'Traceback' not in output
+    assert run.nodes() == []
+    assert run.report['end_reason'] == 'interrupted'
+    with Bag(run.folder) as bag:
+        assert bag.scenario()['name'] == 'scripted'
+
+
+def test_no_node_outlives_a_run_that_is_killed(tmp_path, scenario):
+    run = Run(tmp_path / 'run', scenario(), script={'found': 0})
+    run.wait_for('measurements')
+    assert len(run.nodes()) == 5
+    run.process.kill()
+    run.wait()
+    deadline = time.monotonic() + LIMIT
+    while run.nodes():
+        assert time.monotonic() < deadline
+        os.sched_yield()
+
+
+def test_wrong_input_is_told_before_anything_starts(tmp_path, scenario):
+    run = Run(tmp_path / 'run', scenario(stopp=1), '--lockstep')
+    code, output = run.wait()
+    assert code == 2
+    assert 'scripted.yaml' in output and "did you mean 'stop'" in output
+    assert not (tmp_path / 'run').exists()
+
+
+@pytest.mark.parametrize(
+    'options, words',
+    [
+        (['--planner', 'masi'], "--planner: planner.name: unknown value 'masi'"),
+        (['--domain-id', '300'], 'domain id: read 300'),
+        (['--seed', '-1'], '--seed'),
+        (['--rate', '0'], '--rate'),
+        (['--time-limit', 'nan'], '--time-limit'),
+        (['--replay', 'x'], 'either a scenario or --replay'),
+    ],
+)
+def test_wrong_options_are_named(tmp_path, scenario, options, words):
+    run = Run(tmp_path / 'run', scenario(), *options)
+    code, output = run.wait()
+    assert code == 2, output
+    assert words in output
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path, scenario):
+    (tmp_path / 'run').mkdir()
+    (tmp_path / 'run' / 'report.json').write_text('{}')
+    code, output = Run(tmp_path / 'run', scenario()).wait()
+    assert code == 2
+    assert 'holds a run already' in output
