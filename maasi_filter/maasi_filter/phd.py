@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.measurement_model import wrap
+from maasi_filter.measurement_model import TWO_PI, wrap
 from maasi_filter.pose import Pose
 
 FloatArray = NDArray[np.float64]
@@ -56,8 +56,6 @@ class MeasurementSet:
         Logarithm of the density at its peak, per unit of measurement space.
     volume : (m,) array
         |dx/dz| at the detection: 1 / (unit of measurement space) times m^d.
-    gate : (m,) array
-        Variance that bounds q from below: of the range, or of the distance to the centre.
     """
 
     values: FloatArray
@@ -68,7 +66,6 @@ class MeasurementSet:
     information: FloatArray
     log_norm: FloatArray
     volume: FloatArray
-    gate: FloatArray
 
     def __len__(self) -> int:
         return len(self.values)
@@ -160,7 +157,6 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     information,
     log_norm,
     volume,
-    gate,
 ):
     number, d = values.shape
     frame = np.zeros((d, d))
@@ -194,10 +190,6 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                         for n in range(d):
                             total += frame[i, k] * covariance[k, n] * frame[j, n]
                     matrix[i, j] = total
-            trace = 0.0
-            for i in range(d):
-                trace += matrix[i, i]
-            gate[m] = trace
             volume[m] = max(determinant, 1e-9)
             log_determinant = _root(matrix, roots[m])
             log_norm[m] = (
@@ -215,7 +207,6 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                         for j in range(d):
                             covariance[axis, j] *= scale
                             covariance[j, axis] *= scale
-            gate[m] = covariance[0, 0]
             volume[m] = determinant
             log_determinant = _root(covariance, roots[m])
             log_norm[m] = -0.5 * d * math.log(2.0 * math.pi) - 0.5 * log_determinant
@@ -257,7 +248,6 @@ def prepare_measurements(
         information=np.empty((number, d, d)),
         log_norm=np.empty(number),
         volume=np.empty(number),
-        gate=np.empty(number),
     )
     _prepare(
         values,
@@ -272,7 +262,6 @@ def prepare_measurements(
         out.information,
         out.log_norm,
         out.volume,
-        out.gate,
     )
     return out
 
@@ -293,7 +282,6 @@ def position_measurements(values: FloatArray, covariances: FloatArray) -> Measur
         information=np.empty((number, d, d)),
         log_norm=np.empty(number),
         volume=np.ones(number),
-        gate=np.trace(covariances, axis1=1, axis2=2),
     )
     for m in range(number):
         log_determinant = _root(out.covariances[m], out.roots[m])
@@ -313,14 +301,11 @@ def arctan2(y: float, x: float) -> float:  # pragma: no cover - compiled
     ay = abs(y)
     small = min(ax, ay)
     large = max(ax, ay)
-    if large == 0.0:
-        return 0.0
-    base = 0.0
-    if small > 0.66 * large:
-        base = 0.25 * math.pi
-        t = (small - large) / (small + large)
-    else:
-        t = small / large
+    # Choices instead of branches, so that loops over arrays become vector instructions.
+    upper = small > 0.66 * large
+    top = small - large if upper else small
+    bottom = small + large if upper else large
+    t = top / (bottom if bottom > 0.0 else 1.0)
     z = t * t
     top = -8.750608600031904122785e-1 * z - 1.615753718733365076637e1
     top = (top * z - 7.500855792314704667340e1) * z - 1.228866684490136173410e2
@@ -328,11 +313,9 @@ def arctan2(y: float, x: float) -> float:  # pragma: no cover - compiled
     bottom = (z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2
     bottom = (bottom * z + 4.328810604912902668951e2) * z + 4.853903996359136964868e2
     bottom = bottom * z + 1.945506571482613964425e2
-    angle = base + (t + t * (z * top / bottom))
-    if ay > ax:
-        angle = 0.5 * math.pi - angle
-    if x < 0.0:
-        angle = math.pi - angle
+    angle = (0.25 * math.pi if upper else 0.0) + (t + t * (z * top / bottom))
+    angle = 0.5 * math.pi - angle if ay > ax else angle
+    angle = math.pi - angle if x < 0.0 else angle
     return angle if y >= 0.0 else -angle
 
 
@@ -348,7 +331,6 @@ def _associate_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - com
     cartesian,
     centres,
     information,
-    gate,
     likelihood,
     all_smallest,
     all_sums,
@@ -356,93 +338,87 @@ def _associate_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - com
     """Fill likelihoods (m, n), pi exp(-(q - smallest) / 2), of chunks, and weighted sums."""
     d = particles.shape[1]
     number = values.shape[0]
+    polar = not cartesian.all()
+    # Coordinates apart, and loops without branches: they become vector instructions.
+    x = np.empty(CHUNK)
+    y = np.empty(CHUNK)
+    height = np.zeros(CHUNK)
     distance = np.empty(CHUNK)
     bearing = np.empty(CHUNK)
-    elevation = np.empty(CHUNK)
-    s0 = sensor_position[0]
-    s1 = sensor_position[1]
-    s2 = sensor_position[2]
+    elevation = np.zeros(CHUNK)
     for chunk in range(first_chunk, last_chunk):
         start = chunk * CHUNK
         size = min(particles.shape[0], start + CHUNK) - start
-        # A particle that cannot be seen, or has no weight, is at no distance: gates keep it out.
         for i in range(size):
-            dx = particles[start + i, 0] - s0
-            dy = particles[start + i, 1] - s1
-            square = dx * dx + dy * dy
+            x[i] = particles[start + i, 0] - sensor_position[0]
+            y[i] = particles[start + i, 1] - sensor_position[1]
+        if d == 3:
+            for i in range(size):
+                height[i] = particles[start + i, 2] - sensor_position[2]
+        if polar:
+            for i in range(size):
+                bearing[i] = arctan2(y[i], x[i])
+                distance[i] = math.sqrt(x[i] * x[i] + y[i] * y[i])
             if d == 3:
-                dz = particles[start + i, 2] - s2
-                square += dz * dz
-            seen = probability[start + i] > 0.0 and denominator_weights[start + i] > 0.0
-            distance[i] = math.sqrt(square) if seen else np.inf
-            bearing[i] = np.inf
+                for i in range(size):
+                    elevation[i] = arctan2(height[i], distance[i])
+                    distance[i] = math.sqrt(distance[i] * distance[i] + height[i] * height[i])
         for m in range(number):
-            row = likelihood[m]
-            least = np.inf
-            limit = np.inf
+            row = likelihood[m, start : start + size]
             i00 = information[m, 0, 0]
             i11 = information[m, 1, 1]
             i01 = 2.0 * information[m, 0, 1]
             i22 = 0.0
             i02 = 0.0
             i12 = 0.0
+            z2 = 0.0
             if d == 3:
                 i22 = information[m, 2, 2]
                 i02 = 2.0 * information[m, 0, 2]
                 i12 = 2.0 * information[m, 1, 2]
-            z0 = values[m, 0]
-            z1 = values[m, 1]
-            z2 = values[m, 2] if d == 3 else 0.0
             if cartesian[m]:
-                z0 = centres[m, 0]
-                z1 = centres[m, 1]
-                z2 = centres[m, 2] if d == 3 else 0.0
-            variance = gate[m]
-            for i in range(size):
-                j = start + i
-                e2 = 0.0
-                if cartesian[m]:
-                    e0 = particles[j, 0] - z0
-                    e1 = particles[j, 1] - z1
-                    far = e0 * e0 + e1 * e1
-                    if d == 3:
-                        e2 = particles[j, 2] - z2
-                        far += e2 * e2
-                    if not (far <= limit and distance[i] < np.inf):
-                        row[j] = np.inf
-                        continue
-                else:
+                z0 = centres[m, 0] - sensor_position[0]
+                z1 = centres[m, 1] - sensor_position[1]
+                if d == 3:
+                    z2 = centres[m, 2] - sensor_position[2]
+                for i in range(size):
+                    e0 = z0 - x[i]
+                    e1 = z1 - y[i]
+                    e2 = z2 - height[i]
+                    row[i] = (
+                        e0 * (e0 * i00 + e1 * i01 + e2 * i02)
+                        + e1 * (e1 * i11 + e2 * i12)
+                        + e2 * e2 * i22
+                    )
+            else:
+                z0 = values[m, 0]
+                z1 = wrap(values[m, 1])
+                if d == 3:
+                    z2 = values[m, 2]
+                for i in range(size):
                     e0 = z0 - distance[i]
-                    if not e0 * e0 <= limit or distance[i] == np.inf:
-                        row[j] = np.inf
-                        continue
-                    if bearing[i] == np.inf:
-                        dx = particles[j, 0] - s0
-                        dy = particles[j, 1] - s1
-                        bearing[i] = arctan2(dy, dx)
-                        if d == 3:
-                            elevation[i] = arctan2(
-                                particles[j, 2] - s2, math.sqrt(dx * dx + dy * dy)
-                            )
-                    e1 = wrap(z1 - bearing[i])
-                    if d == 3:
-                        e2 = z2 - elevation[i]
-                q = e0 * (e0 * i00 + e1 * i01 + e2 * i02) + e1 * (e1 * i11 + e2 * i12)
-                q += e2 * e2 * i22
-                row[j] = q
-                if q < least:
-                    least = q
-                    limit = variance * (least + RELATIVE_GATE)
+                    e1 = z1 - bearing[i]
+                    e1 = e1 - TWO_PI if e1 >= math.pi else e1
+                    e1 = e1 + TWO_PI if e1 < -math.pi else e1
+                    e2 = z2 - elevation[i]
+                    row[i] = (
+                        e0 * (e0 * i00 + e1 * i01 + e2 * i02)
+                        + e1 * (e1 * i11 + e2 * i12)
+                        + e2 * e2 * i22
+                    )
+            least = np.inf
+            for i in range(size):
+                if row[i] < least and probability[start + i] * denominator_weights[start + i] > 0.0:
+                    least = row[i]
             total = 0.0
             largest = least + RELATIVE_GATE
-            for j in range(start, start + size):
-                q = row[j]
-                if q < largest:
-                    value = probability[j] * math.exp(-0.5 * (q - least))
-                    row[j] = value
-                    total += value * denominator_weights[j]
+            for i in range(size):
+                if row[i] < largest and probability[start + i] * denominator_weights[start + i] > 0:
+                    value = probability[start + i] * math.exp(-0.5 * (row[i] - least))
+                    row[i] = value
+                    total += value * denominator_weights[start + i]
                 else:
-                    row[j] = 0.0
+                    row[i] = 0.0
             all_smallest[chunk, m] = least
             all_sums[chunk, m] = total
 
@@ -762,7 +738,6 @@ def associate(
             measurements.cartesian[block],
             measurements.centres[block],
             measurements.information[block],
-            measurements.gate[block],
             likelihood,
             smallest,
             sums,
