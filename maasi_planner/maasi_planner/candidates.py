@@ -7,11 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from maasi_filter.detection_model import detection_probability_at
 from maasi_filter.exploration import Exploration, check_bounds
 from maasi_filter.pose import Pose
 from maasi_filter.sensor import Sensor
+from maasi_planner.objective import reach_of
 from maasi_planner.settings import CandidateSettings
 
 FloatArray = NDArray[np.float64]
@@ -213,50 +216,137 @@ def unseen_parts(
     size = float((box[:, 1] - box[:, 0]).max())
     grid = Exploration(box, size / (cells if len(box) == 2 else min(cells, 40)))
     nodes = grid.nodes()
-    seen = np.zeros(len(nodes), dtype=bool)
+    seen = np.zeros(len(nodes), dtype=np.bool_)
     members = list(viewers.values()) if isinstance(viewers, Mapping) else list(viewers)
     for viewer in members:
-        for pose in _poses(viewer, size):
-            rest = np.flatnonzero(~seen)
-            if not len(rest):
-                break
-            found = viewer.sensor.detection.probability(nodes[rest], pose) >= probability
-            seen[rest[found]] = True
+        places, yaws = _poses(viewer, size)
+        kernel = viewer.sensor.detection.kernel()
+        if kernel is None:
+            for place, yaw in zip(places, yaws):
+                rest = np.flatnonzero(~seen)
+                pose = Pose.from_yaw(place, yaw)
+                found = viewer.sensor.detection.probability(nodes[rest], pose) >= probability
+                seen[rest[found]] = True
+        else:
+            _, lower, step = grid.kernel()
+            shape = np.ones(3, np.int64)
+            shape[: grid.dimension] = grid.values.shape
+            _mark_seen(
+                seen,
+                shape,
+                lower,
+                step,
+                places,
+                yaws,
+                grid.dimension,
+                kernel[0],
+                kernel[1],
+                reach_of(*kernel),
+                probability,
+            )
     return _parts(grid, seen, nodes)
 
 
-def _poses(viewer: Viewer, size: float) -> list[Pose]:
-    """Return the poses on all ways between candidates, thinned to about 1/100 of `size`."""
+@njit(cache=True)
+def _mark_seen(
+    seen: NDArray[np.bool_],
+    shape: NDArray[np.int64],
+    lower: FloatArray,
+    step: FloatArray,
+    places: FloatArray,
+    yaws: FloatArray,
+    dimension: int,
+    kind: int,
+    parameters: FloatArray,
+    reach: float,
+    probability: float,
+) -> None:  # pragma: no cover - compiled
+    """Mark the nodes that some pose sees; `seen` is flat, in the order of the grid's nodes."""
+    low = np.zeros(3, np.int64)
+    high = np.ones(3, np.int64)
+    left = 0
+    for n in range(seen.shape[0]):
+        if not seen[n]:
+            left += 1
+    for m in range(places.shape[0]):
+        if left == 0:
+            break
+        cosine = math.cos(yaws[m])
+        sine = math.sin(yaws[m])
+        for axis in range(dimension):
+            low[axis] = 0
+            high[axis] = shape[axis]
+            if reach < np.inf:
+                centre = (places[m, axis] - lower[axis]) / step[axis]
+                width = reach / step[axis]
+                low[axis] = min(max(math.floor(centre - width), 0), shape[axis])
+                high[axis] = max(min(math.ceil(centre + width) + 1, shape[axis]), 0)
+        for i in range(low[0], high[0]):
+            for j in range(low[1], high[1]):
+                for k in range(low[2], high[2]):
+                    node = (i * shape[1] + j) * shape[2] + k
+                    if seen[node]:
+                        continue
+                    dz = lower[2] + k * step[2] - places[m, 2] if dimension == 3 else 0.0
+                    found = detection_probability_at(
+                        kind,
+                        parameters,
+                        lower[0] + i * step[0] - places[m, 0],
+                        lower[1] + j * step[1] - places[m, 1],
+                        dz,
+                        cosine,
+                        sine,
+                    )
+                    if found >= probability:
+                        seen[node] = True
+                        left -= 1
+
+
+def _poses(viewer: Viewer, size: float) -> tuple[FloatArray, FloatArray]:
+    """Return places (n, 3) and headings (n,) on all ways between candidates.
+
+    They are thinned to about 1/100 of `size` and 16 headings, or to one heading where the view
+    does not depend on it.
+    """
     points = np.vstack([viewer.start[None, :], viewer.candidates])
-    turns = viewer.yaw is None
-    # A sensor whose view does not depend on the heading needs each place only once.
+    ways = viewer.candidates[None, :, :] - points[:, None, :]
+    lengths = np.sqrt((ways * ways).sum(axis=2))
+    number = max(1, math.ceil(float(lengths.max(initial=0.0)) / viewer.spacing))
+    # From the way's end towards its start: what is seen on arrival counts in any case.
+    along = np.arange(number + 1) * viewer.spacing
+    share = np.maximum(0.0, 1.0 - along / np.maximum(lengths, 1e-12)[..., None])
+    places = points[:, None, None, :] + share[..., None] * ways[:, :, None, :]
+    if viewer.yaw is None:
+        yaws = np.arctan2(ways[..., 1], ways[..., 0])
+    else:
+        yaws = np.full(lengths.shape, viewer.yaw)
+    headings = np.broadcast_to(yaws[..., None], places.shape[:3]).ravel()
+    flat = places.reshape(-1, 3)
+    sectors = np.zeros(len(flat), np.int64)
+    if viewer.yaw is None and _turns(viewer, size):
+        sectors = np.round(headings / (math.pi / 8.0)).astype(np.int64) % 16
+    cells = np.round(flat / (size / 100.0)).astype(np.int64)
+    cells -= cells.min(axis=0)
+    spans = cells.max(axis=0) + 1
+    keys = ((cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]) * 16 + sectors
+    _, first = np.unique(keys, return_index=True)
+    return np.ascontiguousarray(flat[first]), np.ascontiguousarray(headings[first])
+
+
+def _turns(viewer: Viewer, size: float) -> bool:
+    """Return whether what the sensor sees depends on the heading."""
     probe = np.array([[0.1, 0.03, 0.0], [-0.07, 0.11, 0.0], [0.02, -0.1, 0.0]])
     probe = probe[:, : viewer.sensor.dimension]
-    scales = size * np.array([1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0])
-    if turns:
-        turns = any(
-            not np.allclose(
-                viewer.sensor.detection.probability(probe * scale, Pose.from_yaw(np.zeros(3), 0.0)),
-                viewer.sensor.detection.probability(probe * scale, Pose.from_yaw(np.zeros(3), yaw)),
-            )
-            for scale in scales
-            for yaw in (0.7, 2.0, -1.5)
+    detection = viewer.sensor.detection
+    ahead = Pose.from_yaw(np.zeros(3), 0.0)
+    return any(
+        not np.allclose(
+            detection.probability(probe * scale, ahead),
+            detection.probability(probe * scale, Pose.from_yaw(np.zeros(3), yaw)),
         )
-    fine = size / 100.0
-    keep: dict[tuple[int, ...], Pose] = {}
-    for start in points:
-        ways = viewer.candidates - start
-        lengths = np.sqrt((ways * ways).sum(axis=1))
-        for way, length in zip(ways, lengths):
-            yaw = viewer.yaw if viewer.yaw is not None else math.atan2(way[1], way[0])
-            number = max(1, math.ceil(length / viewer.spacing)) if length > 0.0 else 1
-            along = np.minimum(np.arange(number + 1) * viewer.spacing / max(length, 1e-12), 1.0)
-            places = start + along[:, None] * way
-            rounded = np.round(places / fine).astype(int)
-            sector = round(yaw / (math.pi / 8.0)) % 16 if turns else 0
-            for place, key in zip(places, rounded):
-                keep.setdefault((*key.tolist(), sector), Pose.from_yaw(place, yaw))
-    return list(keep.values())
+        for scale in size * np.array([1e-2, 0.1, 0.3, 1.0, 3.0, 10.0])
+        for yaw in (0.7, 2.0, -1.5)
+    )
 
 
 def _parts(grid: Exploration, seen: NDArray[np.bool_], nodes: FloatArray) -> Unseen:

@@ -7,8 +7,9 @@ import pytest
 from plain_objective import all_choices, plain_information_terms, plain_terms
 from planner_helpers import random_team
 
+from maasi_filter.detection_model import BoxDetection
 from maasi_filter.exploration import Exploration
-from maasi_planner import PlannerSettings, make_planner
+from maasi_planner import PlannerSettings, RobotState, make_planner
 from maasi_planner.objective import TeamObjective
 from maasi_planner.planners.base import free_of_robots, waiting_places
 
@@ -157,6 +158,7 @@ def test_own_measurement_with_certain_view():
     rng = np.random.default_rng(8)
     team = random_team(rng, dimension=2, planning=1, waiting=0, candidates=5, kinds=('box',))
     name = team.planning()[0]
+    team.robots[name].sensor.detection = BoxDetection([-0.3, -0.3], [0.3, 0.3])
     literal = make_planner('maasi', PlannerSettings(objective='paper')).decide(team)
     assert (literal.robots[name].exploration == 0.0).all()
     before = make_planner(
@@ -216,6 +218,7 @@ def test_unexplored_corner_draws_the_robot():
     team.exploration.values[...] = 0.0
     team.exploration.values[-3:, -3:] = 1.0
     view = team.robots[name]
+    view.state = RobotState.at_rest([1.0, 1.0, 0.0])
     view.candidates = np.array([[0.1, 0.1, 0.0], [1.9, 1.9, 0.0]])
     decision = make_planner('maasi').decide(team)
     assert decision.robots[name].chosen == 1

@@ -585,7 +585,8 @@ def _mambo_parameters(settings: MotionSettings) -> FloatArray:
     tilt = min(settings.tilt, acceleration / GRAVITY / math.sqrt(2.0))
     out[TILT] = tilt / max(pitch_tilt, roll_tilt)
     out[LIFT] = MASS * min(acceleration, GRAVITY)
-    out[SPEED] = settings.speed / overshoot
+    # A little less, as the axes differ and may turn under a command.
+    out[SPEED] = settings.speed / (1.015 * overshoot)
     out[YAW_RATE] = settings.yaw_rate
     out[COUNT_FORCE] = 1.0 if settings.control_inputs == 'all' else 0.0
     return out

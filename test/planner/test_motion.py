@@ -1,0 +1,249 @@
+"""Motion models: one closed loop for prediction, driver and simulator, and its limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from maasi_planner import MotionSettings, Obstacles, RobotState, make_motion
+from maasi_planner.motion.mambo import (
+    GRAVITY,
+    INERTIA,
+    MASS,
+    PERIOD,
+    lqr_gains,
+    mambo_parameters,
+)
+
+FLYING = ('constant_speed', 'mambo', 'quadrotor')
+MODELS = {
+    'constant_speed': MotionSettings(model='constant_speed', speed=0.5, acceleration=0.8),
+    'constant_speed_free': MotionSettings(model='constant_speed', speed=0.5),
+    'mambo': MotionSettings(model='mambo', speed=0.4, approach_rate=1.2),
+    'mambo_travel': MotionSettings(model='mambo', speed=0.4, heading='travel'),
+    'unicycle': MotionSettings(
+        model='unicycle',
+        speed=0.22,
+        yaw_rate=2.84,
+        acceleration=2.5,
+        yaw_acceleration=6.0,
+        tolerance=0.04,
+    ),
+    'quadrotor': MotionSettings(model='quadrotor', speed=0.5),
+}
+
+
+def test_lqr_is_that_of_the_whole_model():
+    """The gains by chain are those of the 12-state discrete LQR."""
+    settings = MotionSettings(
+        model='mambo',
+        state_weights=[2, 3, 4, 1, 5, 1, 1, 2, 1, 1, 1, 3],
+        input_weights=[900, 1000, 700, 100],
+    )
+    a = np.zeros((12, 12))
+    b = np.zeros((12, 4))
+    a[0, 6] = a[1, 7] = a[2, 8] = 1.0
+    a[3, 9] = a[4, 10] = a[5, 11] = 1.0
+    a[6, 4], a[7, 3] = GRAVITY, -GRAVITY
+    b[9, 0], b[10, 1], b[11, 2] = (1.0 / value for value in INERTIA)
+    b[8, 3] = 1.0 / MASS
+    both = scipy.linalg.expm(np.block([[a, b], [np.zeros((4, 16))]]) * PERIOD)
+    discrete_a, discrete_b = both[:12, :12], both[:12, 12:]
+    q = np.diag(settings.state_weights)
+    r = np.diag(settings.input_weights)
+    p = scipy.linalg.solve_discrete_are(discrete_a, discrete_b, q, r)
+    gain = np.linalg.solve(r + discrete_b.T @ p @ discrete_b, discrete_b.T @ p @ discrete_a)
+    own = lqr_gains(settings)
+    assert own['roll'] == pytest.approx(gain[0, [1, 7, 3, 9]], rel=1e-6)
+    assert own['pitch'] == pytest.approx(gain[1, [0, 6, 4, 10]], rel=1e-6)
+    assert own['yaw'] == pytest.approx(gain[2, [5, 11]], rel=1e-6)
+    assert own['height'] == pytest.approx(gain[3, [2, 8]], rel=1e-6)
+
+
+def test_command_is_the_leading_set_point():
+    """Near the waypoint the velocity command is the LQR's own set-point there."""
+    settings = MotionSettings(model='mambo', speed=4.0)
+    motion = make_motion(settings)
+    gains = lqr_gains(settings)
+    waypoint = np.array([0.5, 0.0, 0.0])
+    command = motion.command(RobotState.at_rest([0.0, 0.0, 0.0]), waypoint)
+    torque = mambo_parameters(settings)[0] * command[0]
+    assert torque == pytest.approx(gains['pitch'][0] * 0.5, rel=0.05)
+
+
+@pytest.mark.parametrize('name', MODELS)
+def test_simulated_is_predicted(name):
+    """Stepping the body under the controller's commands follows the prediction."""
+    motion = make_motion(MODELS[name])
+    rng = np.random.default_rng(3)
+    state = RobotState.at_rest([1.0, 0.5, 1.0], 0.4)
+    goals = rng.uniform(-0.3, 2.4, size=(4, 3))
+    if name == 'unicycle':
+        goals[:, 2] = 1.0
+    prediction = motion.predict(state, goals, 0.05)
+    assert prediction.reached.all()
+    for w, goal in enumerate(goals):
+        body = motion.body(state)
+        length = int(prediction.lengths[w])
+        for k in range(length):
+            now = body.robot_state()
+            assert now.pose.position == pytest.approx(prediction.positions[w, k], abs=1e-9)
+            assert not motion.arrived(now.pose.position, goal)
+            body.step(motion.command(now, goal), 0.05)
+        end = body.robot_state()
+        assert end.pose.position == pytest.approx(prediction.positions[w, length], abs=1e-9)
+        assert math.remainder(end.pose.yaw - prediction.yaws[w, length], 2 * math.pi) == (
+            pytest.approx(0.0, abs=1e-9)
+        )
+        assert motion.arrived(end.pose.position, goal)
+        # Afterwards the trajectory stays where it is.
+        assert (prediction.positions[w, length:] == prediction.positions[w, length]).all()
+
+
+@pytest.mark.parametrize('name', MODELS)
+def test_every_waypoint_is_reached(name):
+    """From any place and heading, everywhere in the environment."""
+    settings = MODELS[name]
+    motion = make_motion(settings)
+    axis = np.linspace(-0.3, 2.4, 8)
+    height = 0.0 if settings.model == 'unicycle' else 1.0
+    goals = np.array([[x, y, height] for x in axis for y in axis])
+    rng = np.random.default_rng(7)
+    for _ in range(6):
+        start = np.append(rng.uniform(-0.3, 2.4, 2), height)
+        prediction = motion.predict(
+            RobotState.at_rest(start, float(rng.uniform(-math.pi, math.pi))), goals, 0.05
+        )
+        assert prediction.reached.all()
+        rows = np.arange(len(goals))
+        ends = prediction.positions[rows, prediction.lengths]
+        gaps = np.sqrt(((ends - goals) ** 2).sum(axis=1))
+        assert gaps.max() <= settings.tolerance + 1e-12
+
+
+def test_waypoint_straight_behind():
+    motion = make_motion(MODELS['unicycle'])
+    prediction = motion.predict(RobotState.at_rest([0.0, 0.0, 0.0]), [[-1.0, 0.0, 0.0]], 0.05)
+    assert prediction.reached[0]
+
+
+@pytest.mark.parametrize('name', MODELS)
+def test_limits_hold_under_any_command(name):
+    """Speed, acceleration, tilt and turn rate stay within the settings whatever is asked for."""
+    settings = MODELS[name]
+    body = make_motion(settings).body(RobotState.at_rest([0.0, 0.0, 1.0]))
+    rng = np.random.default_rng(11)
+    before = body.robot_state()
+    for k in range(4000):
+        if k % 12 == 0:
+            command = rng.normal(size=4) * [1.5, 1.5, 1.0, 6.0]
+        body.step(command, 0.05)
+        now = body.robot_state()
+        speed = math.sqrt(float((now.velocity**2).sum()))
+        assert speed <= settings.speed * (1.0 + 1e-9)
+        assert abs(now.angular_velocity[2]) <= settings.yaw_rate * (1.0 + 1e-6)
+        tilt = math.acos(min(1.0, now.pose.rotation()[2, 2]))
+        assert tilt <= math.sqrt(2.0) * settings.tilt
+        if settings.acceleration is not None and settings.model == 'constant_speed':
+            change = math.sqrt(float(((now.velocity - before.velocity) ** 2).sum()))
+            assert change <= settings.acceleration * 0.05 * (1.0 + 1e-9)
+        before = now
+
+
+@pytest.mark.parametrize('model', ['mambo', 'quadrotor'])
+@pytest.mark.parametrize('tilt', [0.1, 0.4])
+def test_tilt_and_acceleration_of_fast_flight(model, tilt):
+    settings = MotionSettings(model=model, speed=4.0, tilt=tilt, acceleration=3.0)
+    body = make_motion(settings).body(RobotState.at_rest([0.0, 0.0, 1.0]))
+    rng = np.random.default_rng(2)
+    for k in range(3000):
+        if k % 40 == 0:
+            command = np.append(rng.choice([-4.0, 4.0], size=2), [rng.normal(), 0.0])
+        before = body.robot_state().velocity
+        body.step(command, 0.05)
+        now = body.robot_state()
+        assert np.abs(now.velocity - before).max() / 0.05 <= 3.0 * 1.001
+        assert math.sqrt(float((now.velocity**2).sum())) <= 4.0 * 1.001
+        angles = now.pose.rotation()[2]
+        assert np.abs(np.arcsin(angles[:2])).max() <= tilt * 1.02
+
+
+def test_drone_keeps_its_height_and_heading():
+    motion = make_motion(MotionSettings(model='mambo', speed=0.4))
+    state = RobotState.at_rest([0.0, 0.0, 1.0], 0.7)
+    prediction = motion.predict(state, [[2.0, 1.0, 1.0]], 0.05)
+    assert np.abs(prediction.positions[0, :, 2] - 1.0).max() < 1e-12
+    assert np.abs(prediction.yaws - 0.7).max() < 1e-9
+
+
+def test_drone_faces_its_travel_if_wanted():
+    motion = make_motion(MotionSettings(model='mambo', speed=0.4, heading='travel'))
+    prediction = motion.predict(RobotState.at_rest([0.0, 0.0, 1.0], -2.0), [[2.0, 2.0, 1.0]], 0.05)
+    end = prediction.yaws[0, prediction.lengths[0]]
+    assert end == pytest.approx(math.pi / 4, abs=0.05)
+
+
+def test_length_zero_at_the_waypoint():
+    for settings in MODELS.values():
+        prediction = make_motion(settings).predict(
+            RobotState.at_rest([1.0, 1.0, 0.0]), [[1.0, 1.0, 0.0]], 0.05
+        )
+        assert prediction.lengths[0] == 0
+        assert prediction.reached[0]
+        assert prediction.control_cost[0] == 0.0
+
+
+def test_control_cost_counts_what_it_says():
+    """A climb costs force, level flight torques; `torques` leaves the force out."""
+    state = RobotState.at_rest([0.0, 0.0, 1.0])
+    up, along = [[0.0, 0.0, 2.0]], [[1.0, 0.0, 1.0]]
+    every = make_motion(MotionSettings(model='mambo'))
+    torques = make_motion(MotionSettings(model='mambo', control_inputs='torques'))
+    assert every.predict(state, up, 0.05).control_cost[0] > 0.0
+    assert torques.predict(state, up, 0.05).control_cost[0] < 1e-20
+    assert every.predict(state, along, 0.05).control_cost[0] == pytest.approx(
+        torques.predict(state, along, 0.05).control_cost[0], rel=1e-6
+    )
+
+
+@pytest.mark.parametrize('kind', ['printed', 'away'])
+def test_obstacle_term_of_the_paper(kind):
+    """(14), (15): nothing beyond d_l; within it k_obs off the inputs, or along the way out."""
+    obstacles = Obstacles(np.array([[1.0, 0.0, 0.0]]), np.array([0.2]), np.array([False]))
+    common = {'model': 'mambo', 'obstacle_distance': 0.12, 'obstacle_gain': 0.002}
+    term = make_motion(MotionSettings(**common, obstacle_term=kind, clearance=1e-6), obstacles)
+    plain = make_motion(MotionSettings(**common))
+    gains = mambo_parameters(term.settings)
+    goal = [0.0, 3.0, 1.0]
+    far, near = RobotState.at_rest([0.6, 0.0, 1.0]), RobotState.at_rest([0.75, 0.0, 1.0])
+    assert (term.command(far, goal) == plain.command(far, goal)).all()
+    change = term.command(near, goal) - plain.command(near, goal)
+    if kind == 'printed':
+        assert change[0] * gains[0] == pytest.approx(-0.002)
+        assert change[1] * gains[3] == pytest.approx(-0.002)
+        assert change[2] * gains[6] == pytest.approx(-0.002)
+        assert change[3] * gains[7] == pytest.approx(-0.002)
+    else:
+        assert change[0] * gains[0] == pytest.approx(-0.002)
+        assert np.abs(change[1:]).max() < 1e-12
+
+
+def test_bad_states_and_commands_are_refused():
+    motion = make_motion(MODELS['mambo'])
+    with pytest.raises(ValueError, match='velocity'):
+        RobotState(RobotState.at_rest([0, 0, 0]).pose, np.array([0.0, np.nan, 0.0]))
+    with pytest.raises(ValueError, match='waypoints'):
+        motion.predict(RobotState.at_rest([0, 0, 0]), [[0.0, np.inf, 0.0]], 0.05)
+    with pytest.raises(ValueError, match='waypoints'):
+        motion.predict(RobotState.at_rest([0, 0, 0]), [[0.0, 1.0]], 0.05)
+    with pytest.raises(ValueError, match='command'):
+        motion.body(RobotState.at_rest([0, 0, 0])).step([0.0, 0.0, np.nan, 0.0], 0.05)
+    with pytest.raises(ValueError, match='step'):
+        motion.body(RobotState.at_rest([0, 0, 0])).step([0.0, 0.0, 0.0, 0.0], 0.0)
+    with pytest.raises(ValueError, match='speed'):
+        MotionSettings(speed=-1.0)
+    with pytest.raises(ValueError, match='finite'):
+        MotionSettings(speed=math.inf)
