@@ -15,6 +15,7 @@ from maasi_filter.phd import MeasurementSet
 from maasi_filter.pose import Pose
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 # A place never counts as seen beyond doubt: the model of the sensor is not that good.
 LEAST_UNEXPLORED = 1e-6
 
@@ -155,6 +156,76 @@ def measurement_births(
         LEAST_UNEXPLORED,
     )
     return MeasurementBirths(particles, jacobian, totals, inside)
+
+
+@njit(cache=True, error_model='numpy')
+def _thin(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    particles, intensity, mass, number, offset, first_group, out, weights, group
+):
+    """Fill systematically chosen births of each measurement, of equal weights."""
+    births, d = particles.shape[1], particles.shape[2]
+    filled = 0
+    for m in range(particles.shape[0]):
+        wanted = number[m]
+        if wanted == 0:
+            continue
+        total = 0.0
+        for j in range(births):
+            total += intensity[m, j]
+        step = total / wanted
+        point = offset[m] * step
+        cumulative = 0.0
+        placed = 0
+        for j in range(births):
+            cumulative += intensity[m, j]
+            while placed < wanted and (point < cumulative or j == births - 1):
+                for a in range(d):
+                    out[filled, a] = particles[m, j, a]
+                weights[filled] = mass[m] / wanted
+                group[filled] = first_group + m
+                filled += 1
+                placed += 1
+                point += step
+
+
+def thin_births(
+    births: MeasurementBirths,
+    mass: FloatArray,
+    number: IntArray,
+    first_group: int,
+    generator: np.random.Generator,
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return the births worth keeping: particles (n, d), weights (n,) and groups (n,).
+
+    What a detection leaves to its births decides how many particles they get; they are chosen by
+    systematic resampling.
+
+    Parameters
+    ----------
+    mass : (m,) array
+        Posterior mass of each measurement's births.
+    number : (m,) int array
+        Particles for each.
+    first_group : int
+        Group of the first measurement's births; the next ones have the next numbers.
+    """
+    total = int(number.sum())
+    out = np.empty((total, births.particles.shape[2]))
+    weights = np.empty(total)
+    group = np.empty(total, np.int64)
+    offset = generator.random(len(number))
+    _thin(
+        births.particles,
+        births.intensity,
+        mass,
+        number,
+        offset,
+        first_group,
+        out,
+        weights,
+        group,
+    )
+    return out, weights, group
 
 
 def uniform_births(

@@ -57,7 +57,8 @@ EXPLORATION_CELLS = {2: 54, 3: 16}
 LEAST_CLUSTER_MASS = 0.1
 # Two estimates whose difference is below this many deviations, squared, may be one target.
 SAME_TARGET = 12.0
-LARGEST_BIRTHS = 50_000
+# Particles of a birth when there are more detections than there are particles for.
+LEAST_BIRTHS = 20
 UNLIMITED_INFORMATION = 1e12
 # Births that explain less of a detection than this are not worth their particles.
 LEAST_BIRTH_MASS = 1e-3
@@ -191,6 +192,7 @@ class SearchFilter:
         self._covariances: list[FloatArray] = []
         self._centres: FloatArray | None = None
         self._predicted: FloatArray | None = None
+        self._birth_budget = 0
         self._moments: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._pool: ThreadPoolExecutor | None = None
 
@@ -311,6 +313,8 @@ class SearchFilter:
             members = [self._without_found(member, dropped) for member in members]
             self._add_births(members)
         self._predicted = self.weights.copy() if numbers.corrector == 'predicted' else None
+        total = sum(len(member.values) for member in members)
+        self._birth_budget = numbers.particles // (2 * max(total, 1))
         for member in members:
             used, refined = self._correct(member, newly_found, dropped, time)
             detections += used
@@ -436,14 +440,15 @@ class SearchFilter:
         self, born: birth_models.MeasurementBirths, scale: FloatArray, groups: int
     ) -> None:
         """Add births with their posterior weights b / C(z), where they are worth having."""
-        count, each, d = born.particles.shape
-        worth = born.totals * scale > LEAST_BIRTH_MASS
-        if not worth.any():
+        mass = born.totals * scale
+        per_target = self._numbers.particles_per_target
+        assert per_target is not None
+        number = np.minimum(np.ceil(per_target * mass), born.intensity.shape[1])
+        number[mass <= LEAST_BIRTH_MASS] = 0.0
+        if not number.any():
             return
         self._append(
-            born.particles[worth].reshape(-1, d),
-            (born.intensity[worth] * scale[worth, None]).ravel(),
-            np.repeat(groups + np.arange(count)[worth], each),
+            *birth_models.thin_births(born, mass, number.astype(np.int64), groups, self.generator),
             self._groups,
         )
 
@@ -497,7 +502,7 @@ class SearchFilter:
         kappa = np.zeros((0, count))
         if numbers.births == 'measurement':
             assert numbers.birth_particles is not None and numbers.expected_targets is not None
-            each = max(20, min(numbers.birth_particles, LARGEST_BIRTHS // count))
+            each = max(LEAST_BIRTHS, min(numbers.birth_particles, self._birth_budget))
             born = birth_models.measurement_births(
                 prepared,
                 member.pose,
