@@ -1,0 +1,576 @@
+"""Every planner: against brute force on small cases, and in whole searches."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from planner_helpers import CUBE, FLOOR, SmallSearch, drone, floor_members, random_team
+
+from maasi_filter.clusters import Cluster
+from maasi_filter.exploration import Exploration
+from maasi_filter.pose import Pose
+from maasi_planner import (
+    CandidateSet,
+    CandidateSettings,
+    Obstacles,
+    PlannerSettings,
+    RobotState,
+    make_motion,
+    make_planner,
+)
+from maasi_planner.planners.lawnmower import lanes
+from maasi_planner.planners.mutual_information import mutual_information
+
+NAMES = ('maasi', 'asi', 'maas', 'as', 'mutual_information', 'nearest_widest', 'lawnmower')
+
+
+def test_unknown_planner_is_refused():
+    with pytest.raises(ValueError, match='allowed are'):
+        make_planner('best')
+
+
+def test_aliases_are_the_same_planner():
+    for one, other in (('maasi', 'asi'), ('maas', 'as')):
+        assert type(make_planner(one)) is type(make_planner(other))
+
+
+# Coverage
+
+
+@pytest.mark.parametrize('names', [('mambo', 'turtlebot'), ('mambo',), ('turtlebot',)])
+def test_no_target_covers_the_floor(names):
+    """With certain views and no target the whole floor is seen and the search ends by itself."""
+    search = SmallSearch(make_planner('maasi'), floor_members(names), FLOOR, 0.05, 0.05)
+    reason = search.run(9000)
+    assert reason is not None
+    assert search.exploration.explored_fraction() >= 0.95
+    axis = np.arange(-0.2, 2.3001, 0.02)
+    places = np.array([[x, y] for x in axis for y in axis])
+    seen = np.zeros(len(places), dtype=bool)
+    for _, name, pose in search.measured:
+        seen |= search.members[name].sensor.detection.probability(places, pose) > 0.0
+    # Targets are at least 0.1 m from the edge: next to everywhere they may be was seen.
+    assert seen.mean() >= 0.998
+
+
+def test_no_target_covers_the_cube():
+    members = {'one': drone([1.0, 1.0, 1.0], 12.0), 'two': drone([250.0, 250.0, 250.0], 12.0)}
+    for member in members.values():
+        member.period = 10
+    settings = PlannerSettings(explored_threshold=0.95)
+    search = SmallSearch(make_planner('maasi', settings), members, CUBE, 10.0, 0.1)
+    reason = search.run(6000)
+    assert reason is not None
+    assert 'explored' in reason
+    assert search.exploration.explored_fraction() >= 0.95
+
+
+def test_paper_objective_covers_the_cube():
+    members = {'one': drone([1.0, 1.0, 1.0], 12.0)}
+    members['one'].period = 10
+    settings = PlannerSettings(objective='paper', control_weight=1e-4, explored_threshold=0.95)
+    search = SmallSearch(make_planner('maasi', settings), members, CUBE, 10.0, 0.1)
+    assert search.run(9000) is not None
+    assert search.exploration.explored_fraction() >= 0.95
+
+
+def test_obstacles_are_kept_clear_in_a_whole_search():
+    obstacles = Obstacles(
+        np.array([[0.5, 0.6, 0.0], [1.5, 0.4, 0.0], [0.8, 1.7, 0.0], [1.7, 1.5, 0.0]]),
+        np.array([0.1, 0.15, 0.12, 0.08]),
+        np.zeros(4, dtype=bool),
+    )
+    members = floor_members(obstacles=obstacles)
+    search = SmallSearch(make_planner('maasi'), members, FLOOR, 0.1, 0.05, obstacles)
+    search.run(4000)
+    assert search.exploration.explored_fraction() >= 0.9
+    for member, radius in ((members['mambo'], 0.07), (members['turtlebot'], 0.1)):
+        for position in member.path:
+            assert obstacles.distances(position).min() >= radius
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_same_search_twice(name):
+    """A search is the same to the bit when it is repeated."""
+    runs = []
+    for _ in range(2):
+        settings = PlannerSettings(objective='paper' if name == 'asi' else 'information')
+        search = SmallSearch(make_planner(name, settings), floor_members(), FLOOR, 0.2, 0.05)
+        search.clusters = [Cluster(np.array([1.5, 0.5]), 0.01 * np.eye(2), 0.1, 0.7)]
+        search.run(400)
+        runs.append(
+            [(d.step, n, tuple(r.waypoint)) for d in search.decisions for n, r in d.robots.items()]
+        )
+    assert runs[0] == runs[1]
+    assert len(runs[0]) >= 2
+
+
+# Finishing
+
+
+def test_finished_says_why():
+    rng = np.random.default_rng(1)
+    team = random_team(rng, dimension=2, planning=1, waiting=0, candidates=3)
+    planner = make_planner('maasi')
+    team.exploration.values[...] = 0.0
+    team.clusters = []
+    assert '100.0 %' in planner.finished(team)
+    team.clusters = [Cluster(np.array([1.0, 1.0]), np.eye(2), 0.5, 0.5)]
+    assert planner.finished(team) is None
+    team.clusters = [Cluster(np.array([1.0, 1.0]), np.eye(2), 0.5, 0.01)]
+    assert planner.finished(team) is not None
+    team.exploration.values[...] = 0.5
+    assert planner.finished(team) is None
+
+
+def test_finished_when_no_candidate_can_show_more():
+    rng = np.random.default_rng(2)
+    team = random_team(rng, dimension=2, planning=1, waiting=0, candidates=3, kinds=('box',))
+    name = team.planning()[0]
+    team.clusters = []
+    team.exploration.values[...] = 0.0
+    # A corner that is out of reach of every candidate.
+    team.exploration = Exploration(team.bounds, 0.1)
+    team.exploration.values[...] = 0.0
+    team.exploration.values[-4:, -4:] = 1.0
+    view = team.robots[name]
+    view.state = RobotState.at_rest([0.3, 0.3, 0.0])
+    view.candidates = np.array([[0.1, 0.1, 0.0], [0.5, 0.2, 0.0]])
+    planner = make_planner('maasi')
+    planner.decide(team)
+    assert 'no candidate of any robot' in planner.finished(team)
+
+
+# Active search
+
+
+def brute_active_search(team, settings):
+    """Return the best joint value over all first waypoints and sequences (001, 002)."""
+    names = team.planning()
+    centres = [cluster.position for cluster in team.clusters]
+
+    def sequences(name):
+        view = team.robots[name]
+        here = view.state.pose.position
+        steps = view.candidates - here
+        found = [[here + step] for step in steps]
+        for _ in range(settings.horizon - 1):
+            found = [[*past, past[-1] + step] for past in found for step in steps]
+        bounds = team.bounds
+        return [
+            past
+            for past in found
+            if all(
+                (place[:2] >= bounds[:, 0] - 1e-9).all()
+                and (place[:2] <= bounds[:, 1] + 1e-9).all()
+                for place in past
+            )
+        ]
+
+    def refinement(name, past):
+        detection = team.robots[name].sensor.detection
+        return sum(
+            float(detection.probability(np.array(centres), Pose.from_yaw(place, 0.0)).sum())
+            for place in past
+        )
+
+    best = -math.inf
+    for joint in itertools.product(*(sequences(name) for name in names)):
+        total = sum(refinement(name, past) for name, past in zip(names, joint))
+        for j in range(settings.horizon):
+            product = 1.0
+            for past in joint:
+                product *= float(team.exploration.at(past[j])[0])
+            total += settings.alpha * product
+        best = max(best, total)
+    return best
+
+
+def ring_team(rng, planning):
+    team = random_team(
+        rng, dimension=2, planning=planning, waiting=0, candidates=1, kinds=('exponential',)
+    )
+    for view in team.robots.values():
+        place = np.append(rng.uniform(0.6, 1.4, 2), 0.0)
+        view.state = RobotState.at_rest(place)
+        settings = view.motion.settings.model_copy(
+            update={'model': 'constant_speed', 'heading': 'keep'}
+        )
+        view.motion = make_motion(settings)
+        ring = CandidateSet(CandidateSettings(ring=4, distance=0.25), team.bounds)
+        view.candidates = ring.at(place)
+    return team
+
+
+@pytest.mark.parametrize(('planning', 'horizon'), [(1, 1), (1, 2), (1, 3), (2, 1), (2, 2), (3, 1)])
+def test_active_search_is_brute_force(planning, horizon):
+    settings = PlannerSettings(name='maas', alpha=0.8, horizon=horizon)
+    for seed in range(4):
+        team = ring_team(np.random.default_rng(seed), planning)
+        decision = make_planner('maas', settings).decide(team)
+        assert decision.objective == pytest.approx(brute_active_search(team, settings), rel=1e-9)
+        assert decision.exact
+        for robot in decision.robots.values():
+            assert robot.objective[robot.chosen] == pytest.approx(decision.objective, rel=1e-9)
+
+
+def test_independent_robots_do_not_see_each_other():
+    """Each robot's choice is the one it would make alone, with a filter of its own too."""
+    settings = PlannerSettings(name='maas', alpha=0.8, coordination='independent')
+    team = ring_team(np.random.default_rng(5), 2)
+    names = team.planning()
+    own = team.exploration.copy()
+    own.values[...] = np.random.default_rng(6).uniform(size=own.values.shape)
+    team.robots[names[1]].exploration = own
+    team.robots[names[1]].clusters = [Cluster(np.array([0.2, 0.2]), np.eye(2) * 0.01, 0.1, 1.0)]
+    both = make_planner('maas', settings).decide(team)
+    for name in names:
+        view = team.robots[name]
+        alone = ring_team(np.random.default_rng(5), 2)
+        alone.robots = {name: view}
+        if view.exploration is not None:
+            alone.exploration = view.exploration
+            alone.clusters = view.clusters
+        decision = make_planner('maas', settings).decide(alone)
+        assert decision.robots[name].chosen == both.robots[name].chosen
+
+
+def test_active_search_with_mutual_information():
+    settings = PlannerSettings(name='as', alpha=0.0, refinement='mutual_information')
+    team = ring_team(np.random.default_rng(9), 1)
+    decision = make_planner('as', settings).decide(team)
+    other = make_planner('mutual_information').decide(team)
+    name = team.planning()[0]
+    assert decision.robots[name].chosen == other.robots[name].chosen
+    assert decision.robots[name].target_refinement == pytest.approx(
+        other.robots[name].target_refinement
+    )
+
+
+# Mutual information
+
+
+def entropy(p):
+    return 0.0 if p <= 0.0 or p >= 1.0 else -p * math.log(p) - (1 - p) * math.log(1 - p)
+
+
+def test_mutual_information_of_few_places():
+    """Against the sum over all numbers of targets at each place."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        weights = rng.uniform(0.05, 0.8, 3)
+        missed = rng.uniform(0.02, 0.99, 3)
+        mean, conditional = 0.0, 0.0
+        for counts in itertools.product(range(18), repeat=3):
+            chance, left = 1.0, 1.0
+            for count, weight, miss in zip(counts, weights, missed):
+                chance *= math.exp(-weight) * weight**count / math.factorial(count)
+                left *= miss**count
+            mean += chance * left
+            conditional += chance * entropy(left)
+        expected = entropy(mean) - conditional
+        assert mutual_information(missed, weights) == pytest.approx(expected, abs=2e-5, rel=1e-3)
+
+
+def test_mutual_information_extremes():
+    assert mutual_information(np.ones(3), np.full(3, 0.5)) == 0.0
+    assert mutual_information(np.zeros(0), np.zeros(0)) == 0.0
+    # A certain view of one place with mass m: the event says all about "is there any".
+    value = mutual_information(np.zeros(1), np.full(1, 0.7))
+    assert value == pytest.approx(entropy(math.exp(-0.7)), rel=1e-9)
+
+
+def test_mutual_information_chooses_the_most_informative_pair():
+    rng = np.random.default_rng(4)
+    team = random_team(rng, dimension=2, planning=2, waiting=0, candidates=4)
+    team.particles = rng.uniform(0.0, 2.0, (200, 2))
+    team.weights = rng.uniform(0.0, 0.03, 200)
+    decision = make_planner('mutual_information').decide(team)
+    names = team.planning()
+    missed = {}
+    for name in names:
+        view = team.robots[name]
+        here = view.state.pose.position
+        turns = view.motion.settings.model == 'unicycle' or (
+            view.motion.settings.heading == 'travel'
+        )
+        rows = []
+        for place in view.candidates:
+            yaw = view.state.pose.yaw
+            if turns:
+                yaw = math.atan2(place[1] - here[1], place[0] - here[0])
+            pose = Pose.from_yaw(place, yaw)
+            rows.append(1.0 - view.sensor.detection.probability(team.particles, pose))
+        missed[name] = rows
+    best = max(
+        mutual_information(one * two, team.weights)
+        for one in missed[names[0]]
+        for two in missed[names[1]]
+    )
+    assert decision.objective == pytest.approx(best, rel=1e-9)
+
+
+def test_without_information_robots_go_straight_on():
+    team = ring_team(np.random.default_rng(3), 1)
+    team.clusters = []
+    name = team.planning()[0]
+    planner = make_planner('mutual_information')
+    first = planner.decide(team).robots[name]
+    way = first.waypoint - team.robots[name].state.pose.position
+    team.robots[name].state = RobotState.at_rest(first.waypoint)
+    team.robots[name].candidates = team.robots[name].candidates + way
+    second = planner.decide(team).robots[name]
+    assert second.waypoint - first.waypoint == pytest.approx(way, abs=1e-9)
+    assert 'straight on' in second.reason
+
+
+# Nearest, widest
+
+
+def test_nearest_then_widest():
+    team = ring_team(np.random.default_rng(3), 1)
+    name = team.planning()[0]
+    team.robots[name].state = RobotState.at_rest([0.2, 0.2, 0.0])
+    near, wide = np.array([0.5, 0.4]), np.array([1.7, 1.6])
+    team.clusters = [
+        Cluster(wide, 0.1 * np.eye(2), 0.4, 0.9),
+        Cluster(near, 0.01 * np.eye(2), 0.1, 0.9),
+    ]
+    planner = make_planner('nearest_widest')
+    waypoints = [planner.decide(team).robots[name].waypoint[:2] for _ in range(4)]
+    assert np.allclose(waypoints, [near, wide, near, wide])
+
+
+def test_nearest_widest_explores_without_clusters():
+    team = ring_team(np.random.default_rng(3), 1)
+    name = team.planning()[0]
+    team.clusters = []
+    decision = make_planner('nearest_widest').decide(team).robots[name]
+    explored = team.exploration.at(team.robots[name].candidates)
+    assert decision.chosen == int(np.argmax(explored))
+    assert 'no cluster' in decision.reason
+
+
+# Lawnmower
+
+
+@pytest.mark.parametrize('bounds', [FLOOR, CUBE])
+def test_lanes_cover_everything_within_half_a_spacing(bounds):
+    spacing = float((bounds[:, 1] - bounds[:, 0]).max()) / 6.5
+    found = lanes(bounds, spacing, spacing, 0.5 * spacing)
+    rng = np.random.default_rng(0)
+    d = len(bounds)
+    for _ in range(200):
+        place = rng.uniform(bounds[:, 0], bounds[:, 1])
+        gaps = []
+        for start, end in found:
+            across = np.abs(place[1:] - start[1:d])
+            along = max(0.0, min(start[0], end[0]) - place[0], place[0] - max(start[0], end[0]))
+            gaps.append(max(along, across.max()))
+        assert min(gaps) <= 0.5 * spacing + 1e-9
+    for (_, before), (after, _) in itertools.pairwise(found):
+        assert (np.abs(after - before) > 1e-9).sum() == 1
+
+
+@pytest.mark.parametrize('names', [('mambo',), ('mambo', 'turtlebot')])
+def test_lawnmower_covers_and_ends(names):
+    search = SmallSearch(
+        make_planner('lawnmower', PlannerSettings(lane_spacing=0.25)),
+        floor_members(names),
+        FLOOR,
+        0.1,
+        0.05,
+    )
+    reason = search.run(12000)
+    assert reason is not None
+    assert search.exploration.explored_fraction() >= 0.9
+    # With two robots each has done a share, and they did not do it twice.
+    lengths = {name: len(member.path) for name, member in search.members.items()}
+    assert min(lengths.values()) > 0
+
+
+def test_lawnmowers_meet_in_the_middle():
+    search = SmallSearch(
+        make_planner('lawnmower', PlannerSettings(lane_spacing=0.25)),
+        floor_members(),
+        FLOOR,
+        0.1,
+        0.05,
+    )
+    search.run(12000)
+    rows = {
+        name: [
+            r.waypoint[1]
+            for d in search.decisions
+            for n, r in d.robots.items()
+            if n == name and not r.stays
+        ]
+        for name in ('mambo', 'turtlebot')
+    }
+    assert rows['mambo'][0] > 1.8
+    assert rows['turtlebot'][0] < 0.3
+    assert min(rows['mambo']) > max(rows['turtlebot']) - 1e-6
+
+
+# Waypoints of several robots
+
+
+@pytest.mark.parametrize('name', ['maasi', 'maas', 'mutual_information', 'nearest_widest'])
+def test_robots_are_not_sent_to_one_place(name):
+    rng = np.random.default_rng(0)
+    team = random_team(rng, dimension=2, planning=2, waiting=0, candidates=3, radius=0.1)
+    shared = np.array([[0.5, 0.5, 0.0], [1.0, 0.5, 0.0], [0.5, 1.4, 0.0]])
+    team.clusters = [Cluster(np.array([1.0, 0.5]), 0.01 * np.eye(2), 0.1, 0.9)]
+    for view in team.robots.values():
+        view.candidates = shared.copy()
+    decision = make_planner(name).decide(team)
+    one, two = (robot.waypoint for robot in decision.robots.values())
+    assert np.linalg.norm(one - two) >= 0.4 - 1e-9
+
+
+@pytest.mark.parametrize('name', ['maasi', 'maas', 'mutual_information', 'nearest_widest'])
+def test_idle_robots_and_goals_of_others_count(name):
+    rng = np.random.default_rng(0)
+    team = random_team(rng, dimension=2, planning=1, waiting=2, candidates=3, radius=0.1)
+    planning = team.planning()[0]
+    first, second = (n for n in team.names() if n != planning)
+    team.robots[first].tail = None
+    team.robots[first].tail_yaws = None
+    team.robots[first].state = RobotState.at_rest([0.5, 0.5, 0.0])
+    team.robots[second].tail = np.array([[1.9, 1.9, 0.0], [1.5, 1.5, 0.0]])
+    team.robots[second].tail_yaws = None
+    team.clusters = []
+    team.robots[planning].state = RobotState.at_rest([0.1, 1.9, 0.0])
+    team.robots[planning].candidates = np.array(
+        [[0.55, 0.5, 0.0], [1.5, 1.45, 0.0], [0.4, 1.5, 0.0]]
+    )
+    decision = make_planner(name).decide(team)
+    assert decision.robots[planning].waypoint == pytest.approx([0.4, 1.5, 0.0])
+
+
+# Bad input
+
+
+def one_robot(seed=0):
+    team = random_team(
+        np.random.default_rng(seed), dimension=2, planning=1, waiting=0, candidates=3
+    )
+    return team, team.planning()[0]
+
+
+@pytest.mark.parametrize('name', NAMES[:-1])
+def test_no_candidates_means_stay(name):
+    team, robot = one_robot()
+    team.clusters = []
+    team.robots[robot].candidates = np.zeros((0, 3))
+    decision = make_planner(name).decide(team).robots[robot]
+    assert decision.stays
+    assert 'no candidates' in decision.reason
+    assert decision.waypoint == pytest.approx(team.robots[robot].state.pose.position)
+
+
+@pytest.mark.parametrize('name', NAMES[:-1])
+def test_all_candidates_in_obstacles_means_stay(name):
+    team, robot = one_robot()
+    team.clusters = []
+    view = team.robots[robot]
+    centre = np.array([[1.0, 1.0, 0.0]])
+    obstacles = Obstacles(centre, np.array([0.5]), np.array([False]))
+    view.motion = make_motion(view.motion.settings, obstacles, 0.1)
+    # At the edge already: there is no way further towards the candidates.
+    view.state = RobotState.at_rest([0.397, 1.0, 0.0])
+    view.candidates = np.array([[1.0, 1.0, 0.0], [1.1, 1.0, 0.0]])
+    decision = make_planner(name).decide(team).robots[robot]
+    assert decision.stays
+    assert 'obstacles' in decision.reason
+
+
+@pytest.mark.parametrize('name', NAMES[:-1])
+def test_waypoints_outside_are_never_chosen(name):
+    team, robot = one_robot()
+    team.clusters = []
+    team.robots[robot].candidates = np.array([[3.0, 1.0, 0.0], [np.nan, 0.0, 0.0], [1.0, 1.2, 0.0]])
+    decision = make_planner(name).decide(team).robots[robot]
+    assert decision.waypoint == pytest.approx([1.0, 1.2, 0.0])
+    team.robots[robot].candidates = np.array([[3.0, 1.0, 0.0]])
+    decision = make_planner(name).decide(team).robots[robot]
+    assert decision.stays
+    assert 'outside the bounds' in decision.reason
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_state_that_is_not_finite_means_stay(name):
+    team, robot = one_robot()
+    team.robots[robot].state.velocity = np.array([0.0, np.nan, 0.0])
+    decision = make_planner(name).decide(team).robots[robot]
+    assert decision.stays
+    assert 'not finite' in decision.reason
+
+
+def test_only_candidate_is_where_the_robot_is():
+    team, robot = one_robot()
+    team.clusters = []
+    team.robots[robot].candidates = np.array([team.robots[robot].state.pose.position])
+    decision = make_planner('maasi').decide(team).robots[robot]
+    assert decision.stays
+    assert 'already' in decision.reason
+
+
+def test_candidate_at_the_present_place_is_not_chosen():
+    team, robot = one_robot()
+    here = np.array(team.robots[robot].state.pose.position)
+    team.robots[robot].candidates = np.vstack([here, team.robots[robot].candidates])
+    for kind in ('paper', 'information'):
+        settings = PlannerSettings(objective=kind, cluster_candidates=False)
+        decision = make_planner('maasi', settings).decide(team).robots[robot]
+        assert decision.chosen != 0
+        assert decision.lengths[0] == 0
+        assert decision.objective[0] == -np.inf
+
+
+@pytest.mark.parametrize(
+    'bad',
+    [
+        {'alpha': -0.1},
+        {'beta': float('nan')},
+        {'control_weight': -1.0},
+        {'alpha': float('inf')},
+        {'horizon': 4},
+        {'objective': 'best'},
+        {'weight': 1.0},
+    ],
+)
+def test_bad_weights_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        PlannerSettings(**bad)
+
+
+def test_wrong_team_is_refused():
+    for change, word in (
+        ({'period_steps': 0}, 'period_steps'),
+        ({'radius': math.nan}, 'radius'),
+        ({'tail': np.array([[np.nan, 0.0, 0.0]])}, 'tail'),
+        ({'candidates': np.zeros((3, 2))}, 'candidates'),
+    ):
+        team, robot = one_robot()
+        for field, value in change.items():
+            setattr(team.robots[robot], field, value)
+        with pytest.raises(ValueError, match=word):
+            make_planner('maasi').decide(team)
+    team, robot = one_robot()
+    team.step_time = 0.0
+    with pytest.raises(ValueError, match='step_time'):
+        make_planner('maasi').decide(team)
+    team, robot = one_robot()
+    team.clusters[0].mass = math.nan
+    with pytest.raises(ValueError, match='clusters'):
+        make_planner('maasi').decide(team)
+
+
+def test_nobody_plans():
+    team = random_team(np.random.default_rng(0), planning=0, waiting=2)
+    for name in NAMES:
+        assert make_planner(name).decide(team).robots == {}
