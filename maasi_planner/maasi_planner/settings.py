@@ -216,7 +216,7 @@ class PlannerSettings(Settings):
         default=4.0, ge=0.0, description='T_delta, threshold of the trigger [1]'
     )
     explored_threshold: float = Field(
-        default=0.995, gt=0.0, le=1.0, description='Explored share at which the search may end [1]'
+        default=0.999, gt=0.0, le=1.0, description='Explored share at which the search may end [1]'
     )
     mass_threshold: float = Field(
         default=0.1, gt=0.0, description='Mass of a cluster that is still worth a visit [1]'

@@ -10,6 +10,7 @@ from maasi_filter.clusters import Cluster
 from maasi_filter.detection_model import BoxDetection, ExponentialDetection
 from maasi_filter.exploration import Exploration
 from maasi_filter.sensor import Sensor
+from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import make_planner
@@ -19,12 +20,33 @@ from maasi_planner.team import RobotView, TeamView
 Model = Literal['constant_speed', 'mambo', 'unicycle', 'quadrotor']
 
 
+def _decide(team: TeamView) -> None:
+    """Let every planner decide for all robots together, and for the first one alone."""
+    for settings in (
+        PlannerSettings(objective='paper'),
+        PlannerSettings(objective='information'),
+        PlannerSettings(objective='information', enumeration_limit=1),
+    ):
+        make_planner('maasi', settings).decide(team)
+    make_planner('mutual_information').decide(team)
+    last = team.robots[team.names()[-1]]
+    last.planning = False
+    start = np.array(last.state.pose.position)
+    last.tail = np.stack([start, start + 0.1])
+    for settings in (PlannerSettings(objective='paper'), PlannerSettings()):
+        make_planner('maasi', settings).decide(team)
+    name = team.names()[0]
+    view = team.robots[name]
+    trigger = MeasurementTrigger(PlannerSettings(measurement='event'))
+    trigger.measures(name, 1, view.sensor, view.state.pose, team.clusters, team.exploration)
+
+
 def warm_up() -> None:
     """Run small decisions of every kind, so that the first real one is not the slow one."""
     obstacles = Obstacles(np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.array([False]))
     pairs: tuple[tuple[int, tuple[Model, Model]], ...] = (
         (2, ('mambo', 'unicycle')),
-        (3, ('constant_speed', 'mambo')),
+        (3, ('constant_speed', 'quadrotor')),
     )
     for dimension, models in pairs:
         exploration = Exploration(np.array([[0.0, 2.0]] * dimension), 0.25)
@@ -46,8 +68,4 @@ def warm_up() -> None:
                     period_steps=5,
                 )
             team = TeamView(0, 0.05, robots, clusters, exploration)
-            for planner_settings in (
-                PlannerSettings(objective='paper'),
-                PlannerSettings(objective='information'),
-            ):
-                make_planner('maasi', planner_settings).decide(team)
+            _decide(team)
