@@ -1,0 +1,310 @@
+"""Between messages and the library's records, in pairs."""
+
+from __future__ import annotations
+
+import array
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Quaternion
+from geometry_msgs.msg import Pose as PoseMessage
+from numpy.typing import NDArray
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from maasi_filter.clusters import Cluster
+from maasi_filter.found_targets import FoundTarget
+from maasi_filter.pose import Pose
+from maasi_filter.search_filter import AgentMeasurement
+from maasi_filter.sensor import Sensor
+from maasi_msgs.msg import Cluster as ClusterMessage
+from maasi_msgs.msg import Detection, DetectionArray
+from maasi_msgs.msg import FoundTarget as FoundTargetMessage
+
+FloatArray = NDArray[np.float64]
+
+# Relative, for what is called symmetric and positive.
+_ROUNDING = 1e-9
+
+
+def stamp_to_ros(nanoseconds: int) -> Time:
+    """Return a stamp."""
+    seconds, rest = divmod(int(nanoseconds), 1_000_000_000)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def stamp_from_ros(stamp: Time) -> int:
+    """Return a stamp in nanoseconds."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def stamp_of_step(step: int, duration: float) -> int:
+    """Return the time of a step of `duration` seconds in nanoseconds."""
+    return round(step * duration * 1e9)
+
+
+def point_to_ros(position: Sequence[float] | FloatArray) -> Point:
+    """Return a position of two or three coordinates [m]."""
+    z = float(position[2]) if len(position) == 3 else 0.0
+    return Point(x=float(position[0]), y=float(position[1]), z=z)
+
+
+def point_from_ros(point: Point) -> FloatArray:
+    """Return a position, (3,) [m]."""
+    return np.array([point.x, point.y, point.z])
+
+
+def pose_to_ros(pose: Pose) -> PoseMessage:
+    """Return a pose."""
+    w, x, y, z = (float(value) for value in pose.orientation)
+    return PoseMessage(
+        position=point_to_ros(pose.position), orientation=Quaternion(x=x, y=y, z=z, w=w)
+    )
+
+
+def pose_from_ros(message: PoseMessage) -> Pose:
+    """Return a pose.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or the quaternion is zero.
+    """
+    turn = message.orientation
+    return Pose(point_from_ros(message.position), np.array([turn.w, turn.x, turn.y, turn.z]))
+
+
+def covariance_to_ros(covariance: FloatArray) -> list[float]:
+    """Return a covariance of two or three coordinates as nine numbers, row-major."""
+    full = np.zeros((3, 3))
+    d = len(covariance)
+    full[:d, :d] = covariance
+    return [float(value) for value in full.ravel()]
+
+
+def covariance_from_ros(values: Sequence[float], dimension: int) -> FloatArray:
+    """Return the first `dimension` rows and columns of nine numbers."""
+    return np.array(values, dtype=float).reshape(3, 3)[:dimension, :dimension]
+
+
+def cluster_to_ros(cluster: Cluster) -> ClusterMessage:
+    """Return a cluster."""
+    return ClusterMessage(
+        position=point_to_ros(cluster.position),
+        covariance=covariance_to_ros(cluster.covariance),
+        radius=float(cluster.radius),
+        mass=float(cluster.mass),
+    )
+
+
+def cluster_from_ros(message: ClusterMessage, dimension: int) -> Cluster:
+    """Return a cluster."""
+    return Cluster(
+        position=point_from_ros(message.position)[:dimension],
+        covariance=covariance_from_ros(message.covariance, dimension),
+        radius=message.radius,
+        mass=message.mass,
+    )
+
+
+def found_target_to_ros(target: FoundTarget, batch: int) -> FoundTargetMessage:
+    """Return a found target and the batch that settled it."""
+    return FoundTargetMessage(
+        id=target.id,
+        position=point_to_ros(target.position),
+        covariance=covariance_to_ros(target.covariance),
+        robot=target.robot,
+        measurement=target.measurement,
+        batch_id=batch,
+        stamp=stamp_to_ros(round(target.time * 1e9)),
+    )
+
+
+def detections_to_ros(values: FloatArray, covariances: FloatArray | None) -> list[Detection]:
+    """Return detections.
+
+    Parameters
+    ----------
+    values : (m, d) array
+        Range, bearing and, in 3D, elevation [m, rad].
+    covariances : (m, d, d) array, optional
+        Of the values.
+    """
+    messages = []
+    for index, value in enumerate(values):
+        messages.append(
+            Detection(
+                range=float(value[0]),
+                bearing=float(value[1]),
+                elevation=float(value[2]) if len(value) == 3 else 0.0,
+                covariance=[]
+                if covariances is None
+                else [float(item) for item in covariances[index].ravel()],
+            )
+        )
+    return messages
+
+
+def detection_problem(detection: Detection, dimension: int) -> str | None:
+    """Return what is wrong with a detection: field, what was read, what is allowed."""
+    if not (math.isfinite(detection.range) and detection.range >= 0.0):
+        return f'range: read {detection.range}, allowed are finite numbers from 0 [m]'
+    for name, limit in (('bearing', math.pi), ('elevation', 0.5 * math.pi)):
+        value = getattr(detection, name)
+        if not (math.isfinite(value) and abs(value) <= limit + 1e-6):
+            return f'{name}: read {value}, allowed is {-limit:.4f} to {limit:.4f} [rad]'
+    size = len(detection.covariance)
+    if not size:
+        return None
+    if size != dimension * dimension:
+        return f'covariance: read {size} numbers, allowed are {dimension * dimension}, or none'
+    matrix = np.array(detection.covariance).reshape(dimension, dimension)
+    if not np.isfinite(matrix).all():
+        return f'covariance: read {list(detection.covariance)}, allowed are finite numbers'
+    size_of = max(float(np.abs(matrix).max()), 1e-300)
+    if np.abs(matrix - matrix.T).max() > _ROUNDING * size_of:
+        return f'covariance: read {list(detection.covariance)}, allowed is a symmetric matrix'
+    if np.linalg.eigvalsh(matrix).min() <= 0.0:
+        return f'covariance: read {list(detection.covariance)}, allowed is a positive matrix'
+    return None
+
+
+def measurement_from_ros(
+    message: DetectionArray, sensor: Sensor, dimension: int
+) -> tuple[AgentMeasurement, list[str]]:
+    """Return what a robot measured, and what is wrong with the detections left out.
+
+    Raises
+    ------
+    ValueError
+        If the pose is not finite.
+    """
+    pose = pose_from_ros(message.pose.pose)
+    problems = []
+    kept: list[Detection] = []
+    for index, detection in enumerate(message.detections):
+        problem = detection_problem(detection, dimension)
+        if problem is None:
+            kept.append(detection)
+        else:
+            problems.append(f'detections[{index}].{problem}')
+    values = np.array(
+        [[item.range, item.bearing, item.elevation][:dimension] for item in kept], dtype=float
+    ).reshape(-1, dimension)
+    covariances = None
+    if any(len(item.covariance) for item in kept):
+        covariances = np.array(
+            [
+                np.array(item.covariance).reshape(dimension, dimension)
+                if len(item.covariance)
+                else sensor.covariance
+                for item in kept
+            ]
+        )
+    return (
+        AgentMeasurement(
+            robot=message.robot,
+            pose=pose,
+            sensor=sensor,
+            values=values,
+            covariances=covariances,
+            index=int(message.measurement),
+        ),
+        problems,
+    )
+
+
+def particles_to_ros(positions: FloatArray, weights: FloatArray, header: Header) -> PointCloud2:
+    """Return particles as a cloud of x, y, z [m] and weight, each float32."""
+    number, dimension = positions.shape
+    data = np.zeros((number, 4), dtype='<f4')
+    data[:, :dimension] = positions
+    data[:, 3] = weights
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=number,
+        fields=[
+            PointField(name=name, offset=4 * index, datatype=PointField.FLOAT32, count=1)
+            for index, name in enumerate(('x', 'y', 'z', 'weight'))
+        ],
+        is_bigendian=False,
+        point_step=16,
+        row_step=16 * number,
+        data=array.array('B', data.tobytes()),
+        is_dense=True,
+    )
+
+
+def colour(red: float, green: float, blue: float, alpha: float = 1.0) -> ColorRGBA:
+    """Return a colour."""
+    return ColorRGBA(r=red, g=green, b=blue, a=alpha)
+
+
+def sphere_marker(
+    header: Header,
+    namespace: str,
+    number: int,
+    position: FloatArray,
+    diameter: float,
+    tint: ColorRGBA,
+) -> Marker:
+    """Return a sphere; namespace and number stay the same for the same thing."""
+    marker = Marker(header=header, ns=namespace, id=number, type=Marker.SPHERE, action=Marker.ADD)
+    marker.pose.position = point_to_ros(position)
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = marker.scale.y = marker.scale.z = diameter
+    marker.color = tint
+    return marker
+
+
+def filter_markers(
+    header: Header,
+    clusters: Iterable[Cluster],
+    found: Iterable[FoundTarget],
+    size: float,
+    shown_clusters: int,
+) -> tuple[MarkerArray, int]:
+    """Return markers of clusters (orange, as large as they are wide) and found targets (red).
+
+    Parameters
+    ----------
+    header : Header
+        Stamp and frame.
+    clusters, found : iterables
+        What to show.
+    size : float
+        Diameter of a found target [m].
+    shown_clusters : int
+        How many were shown last, so that those too many are taken away.
+
+    Returns
+    -------
+    MarkerArray, int
+        The markers, and how many clusters are shown now.
+    """
+    markers = []
+    number = 0
+    for number, cluster in enumerate(clusters, start=1):
+        markers.append(
+            sphere_marker(
+                header,
+                'clusters',
+                number,
+                cluster.position,
+                max(2.0 * cluster.radius, 0.5 * size),
+                colour(1.0, 0.6, 0.0, 0.2 + 0.6 * min(cluster.mass, 1.0)),
+            )
+        )
+    for index in range(number + 1, shown_clusters + 1):
+        markers.append(Marker(header=header, ns='clusters', id=index, action=Marker.DELETE))
+    for target in found:
+        markers.append(
+            sphere_marker(
+                header, 'found', target.id, target.position, size, colour(0.8, 0.0, 0.1)
+            )
+        )
+    return MarkerArray(markers=markers), number

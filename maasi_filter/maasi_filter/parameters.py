@@ -1,0 +1,226 @@
+"""Settings as flat ROS parameters, and back. No ROS in here.
+
+Nested settings become names with dots, `None` is left out, and lists of lists (or of small
+settings) become lists of strings of numbers: `bounds: ['-0.3 2.4', '-0.3 2.4']`. Settings by name,
+`robots`, become the list `robots` and `robot.<name>.<key>`.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+ParameterValue = bool | int | float | str | list[Any]
+
+
+@dataclass(frozen=True)
+class ParameterField:
+    """One parameter of a node.
+
+    Attributes
+    ----------
+    name : str
+        With dots.
+    default : bool, int, float, str, list or None
+        None: it has none.
+    description : str
+        Meaning and unit.
+    constraints : str
+        What is allowed, in words.
+    """
+
+    name: str
+    default: ParameterValue | None
+    description: str
+    constraints: str
+
+
+def flatten(settings: BaseModel, prefix: str = '') -> dict[str, ParameterValue]:
+    """Return settings as flat parameters.
+
+    Parameters
+    ----------
+    settings : BaseModel
+        Any settings of the suite.
+    prefix : str
+        Of all names.
+    """
+    flat: dict[str, ParameterValue] = {}
+    for name, info in type(settings).model_fields.items():
+        value = getattr(settings, name)
+        key = prefix + (info.alias or name)
+        if value is None:
+            continue
+        if isinstance(value, BaseModel):
+            flat.update(flatten(value, f'{key}.'))
+        elif _model_by_name(info.annotation) is not None:
+            flat[key] = sorted(value)
+            for item in sorted(value):
+                flat.update(flatten(value[item], f'{prefix}{_singular(name)}.{item}.'))
+        elif not isinstance(value, (list, tuple)):
+            flat[key] = value
+        elif len(value):
+            flat[key] = [_as_text(item) for item in value]
+    return flat
+
+
+def unflatten(model: type[BaseModel], flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Return flat parameters as nested values for `model.model_validate`.
+
+    Raises
+    ------
+    ValueError
+        If a list of numbers is not one; the message names the parameter.
+    """
+    return _nest(model, flat, '')
+
+
+def parameter_fields(
+    model: type[BaseModel], given: Mapping[str, Any], prefix: str = ''
+) -> Iterator[ParameterField]:
+    """Yield the parameters of settings.
+
+    Parameters
+    ----------
+    model : type
+        The settings.
+    given : mapping
+        Flat parameters that are set; they say which robots there are, and which of the optional
+        parts.
+    prefix : str
+        Of all names.
+    """
+    for name, info in model.model_fields.items():
+        key = prefix + (info.alias or name)
+        by_name = _model_by_name(info.annotation)
+        nested = _nested(info.annotation)
+        if by_name is not None:
+            yield ParameterField(key, [], info.description or '', '')
+            for item in given.get(key) or []:
+                yield from parameter_fields(by_name, given, f'{prefix}{_singular(name)}.{item}.')
+        elif nested is not None:
+            optional = type(None) in get_args(info.annotation)
+            if not optional or any(item.startswith(f'{key}.') for item in given):
+                yield from parameter_fields(nested, given, f'{key}.')
+        else:
+            yield ParameterField(key, _default(info), info.description or '', _constraints(info))
+
+
+def _default(info: FieldInfo) -> ParameterValue | None:
+    if info.is_required():
+        return None
+    value = info.get_default(call_default_factory=True)
+    if isinstance(value, (list, tuple)):
+        return [_as_text(item) for item in value] or None
+    return value
+
+
+def _constraints(info: FieldInfo) -> str:
+    words = {'gt': 'above', 'ge': 'at least', 'lt': 'below', 'le': 'at most'}
+    parts = [
+        f'{words[key]} {getattr(item, key)}'
+        for item in info.metadata
+        for key in words
+        if getattr(item, key, None) is not None
+    ]
+    for part in (info.annotation, *get_args(info.annotation)):
+        if get_origin(part) is Literal:
+            parts.append('one of ' + ', '.join(str(item) for item in get_args(part)))
+    return ' and '.join(parts)
+
+
+def _nest(model: type[BaseModel], flat: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    nested: dict[str, Any] = {}
+    for name, info in model.model_fields.items():
+        key = prefix + (info.alias or name)
+        target = info.alias or name
+        by_name = _model_by_name(info.annotation)
+        inner = _nested(info.annotation)
+        if by_name is not None:
+            nested[target] = {
+                item: _nest(by_name, flat, f'{prefix}{_singular(name)}.{item}.')
+                for item in flat.get(key) or []
+            }
+        elif inner is not None:
+            part = _nest(inner, flat, f'{key}.')
+            if part or type(None) not in get_args(info.annotation):
+                nested[target] = part
+        elif flat.get(key) is not None:
+            value = flat[key]
+            if isinstance(value, (list, tuple)):
+                value = [_from_text(key, item, info.annotation) for item in value]
+            nested[target] = value
+    return nested
+
+
+def _as_text(item: Any) -> Any:
+    """Return an item of a list; one that is a list or settings as its numbers in a string."""
+    if isinstance(item, BaseModel):
+        numbers: list[float] = []
+        for name in type(item).model_fields:
+            value = getattr(item, name)
+            numbers += value if isinstance(value, list) else [value]
+        return ' '.join(repr(float(number)) for number in numbers)
+    if isinstance(item, (list, tuple)):
+        return ' '.join(repr(float(number)) for number in item)
+    return item
+
+
+def _from_text(key: str, item: Any, annotation: Any) -> Any:
+    element = _element(annotation)
+    if not isinstance(item, str) or element is str or element is None:
+        return item
+    if get_origin(element) is Literal:
+        return item
+    try:
+        numbers = [float(word) for word in item.split()]
+    except ValueError as error:
+        raise ValueError(f'{key}: got {item!r}, allowed are numbers with spaces between') from error
+    if isinstance(element, type) and issubclass(element, BaseModel):
+        # All but the last number belong to the list, as the centre of an obstacle.
+        names = list(element.model_fields)
+        return {names[0]: numbers[:-1], names[1]: numbers[-1] if numbers else None}
+    return numbers
+
+
+def _bare(annotation: Any) -> Any:
+    while get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
+    return annotation
+
+
+def _choices(annotation: Any) -> list[Any]:
+    annotation = _bare(annotation)
+    if get_origin(annotation) in (Union, types.UnionType):
+        return [_bare(item) for item in get_args(annotation)]
+    return [annotation]
+
+
+def _element(annotation: Any) -> Any:
+    for choice in _choices(annotation):
+        if get_origin(choice) is list:
+            return _bare(get_args(choice)[0])
+    return None
+
+
+def _nested(annotation: Any) -> type[BaseModel] | None:
+    for choice in _choices(annotation):
+        if isinstance(choice, type) and issubclass(choice, BaseModel):
+            return choice
+    return None
+
+
+def _model_by_name(annotation: Any) -> type[BaseModel] | None:
+    for choice in _choices(annotation):
+        if get_origin(choice) is dict:
+            return _nested(get_args(choice)[1])
+    return None
+
+
+def _singular(name: str) -> str:
+    return name.removesuffix('s')
