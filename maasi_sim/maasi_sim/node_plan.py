@@ -13,6 +13,8 @@ from maasi_sim.observer import BATCH, DECISIONS, FOUND, STEP, UPDATE
 from maasi_sim.scenario import RobotSettings, Scenario
 
 CLOCK = '/clock'
+# The time is that of the sim.
+_SIMULATED = {'use_sim_time': True}
 
 
 @dataclass(frozen=True)
@@ -108,28 +110,24 @@ def plan_nodes(
     from maasi_planner.node_settings import PlannerNodeSettings
 
     common = {'step': scenario.step, 'seed': seed, 'lockstep': lockstep}
-    environment = scenario.environment.model_dump()
     filter_settings = FilterNodeSettings.model_validate(
         {
             **common,
-            'environment': environment,
-            'filter': scenario.filter.model_dump(),
-            'robots': {
-                name: {'sensor': robot.sensor.model_dump()}
-                for name, robot in scenario.robots.items()
-            },
+            'environment': scenario.environment,
+            'filter': scenario.filter,
+            'robots': {name: {'sensor': robot.sensor} for name, robot in scenario.robots.items()},
         }
     )
     planner_settings = PlannerNodeSettings.model_validate(
         {
             **common,
-            'environment': environment,
-            'planner': scenario.planner.model_dump(),
+            'environment': scenario.environment,
+            'planner': scenario.planner,
             'robots': {
                 name: {
-                    'candidates': robot.candidates.model_dump(),
-                    'motion': robot.motion.model_dump(),
-                    'sensor': robot.sensor.model_dump(),
+                    'candidates': robot.candidates,
+                    'motion': robot.motion,
+                    'sensor': robot.sensor,
                     'radius': robot.radius,
                     'start': robot.start,
                 }
@@ -163,7 +161,7 @@ def plan_nodes(
             'maasi_filter',
             'filter_node',
             'filter_node',
-            parameters=flatten(filter_settings),
+            parameters={**flatten(filter_settings), **_SIMULATED},
             topics=(UPDATE, FOUND),
         )
     )
@@ -172,7 +170,7 @@ def plan_nodes(
             'maasi_planner',
             'planner_node',
             'planner_node',
-            parameters=flatten(planner_settings),
+            parameters={**flatten(planner_settings), **_SIMULATED},
             topics=(DECISIONS, BATCH),
         )
     )
@@ -189,13 +187,13 @@ def _robot_plans(
     settings = DriverSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment.model_dump(),
+            'environment': scenario.environment,
             'start': robot.start,
             'yaw': robot.yaw,
             'radius': robot.radius,
-            'motion': robot.motion.model_dump(),
-            'sensor': robot.sensor.model_dump(),
-            'camera': None if robot.camera is None else robot.camera.model_dump(),
+            'motion': robot.motion,
+            'sensor': robot.sensor,
+            'camera': robot.camera,
         }
     )
     plans = [
@@ -204,7 +202,7 @@ def _robot_plans(
             robot.driver,
             'driver',
             name,
-            flatten(settings),
+            {**flatten(settings), **_SIMULATED},
             topics=tuple(f'/{name}/{topic}' for topic in ('state', 'detections', 'cmd_vel')),
         )
     ]

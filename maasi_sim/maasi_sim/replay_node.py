@@ -88,6 +88,12 @@ class ReplayNode:
 
     def publish(self, batch: Batch) -> None:
         """Publish a batch with the measurements that the filter processed then."""
+        if not batch.late:
+            self._publish_batch(batch)
+        for (robot, _, _), data in zip(batch.members, batch.detections):
+            self._detections[robot].publish(deserialize_message(data, DetectionArray))
+
+    def _publish_batch(self, batch: Batch) -> None:
         message = MeasurementBatch(id=batch.id, step=batch.step)
         message.stamp.sec, message.stamp.nanosec = batch.stamp
         message.members = [
@@ -95,11 +101,6 @@ class ReplayNode:
             for robot, decision, measurement in batch.members
         ]
         self._batch.publish(message)
-        for (robot, _, _), data in zip(batch.members, batch.detections):
-            detections = deserialize_message(data, DetectionArray)
-            # What came late then was a batch of its own.
-            detections.batch_id = batch.id
-            self._detections[robot].publish(detections)
 
     def _on_update(self, message: FilterUpdate) -> None:
         self.updates.append(message)
