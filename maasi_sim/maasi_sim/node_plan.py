@@ -123,6 +123,7 @@ def plan_nodes(
             **common,
             'environment': scenario.environment,
             'planner': scenario.planner,
+            'exploration_spacing': scenario.filter.exploration_spacing,
             'robots': {
                 name: {
                     'candidates': robot.candidates,

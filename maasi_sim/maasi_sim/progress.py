@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
     from rich.live import Live
+    from rich.text import Text
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,20 @@ class ProgressDisplay:
         if self._live is None:
             self._live = _live(self._stream)
             self._live.start()
-        self._live.update(status.text(), refresh=True)
+        # Not as markup, and without colours for numbers.
+        self._live.update(_plain_text(status.text()), refresh=True)
 
     def close(self) -> None:
         """Leave the terminal as it was."""
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+
+def _plain_text(text: str) -> Text:
+    from rich.text import Text
+
+    return Text(text)
 
 
 def _live(stream: TextIO) -> Live:

@@ -31,7 +31,14 @@ def plan_fakes(scenario, *, seed, lockstep, rate, recorder, file):
 
     found = script.get('found', len(targets) // 2)
     return [
-        plan('sim', 'sim_node', is_clock=True, says_ready=False, says_done=False, topics=('/clock', '/lockstep/step')),
+        plan(
+            'sim',
+            'sim_node',
+            is_clock=True,
+            says_ready=False,
+            says_done=False,
+            topics=('/clock', '/lockstep/step'),
+        ),
         *(
             plan('driver', 'driver', name, topics=(f'/{name}/state', f'/{name}/cmd_vel'))
             for name in names
