@@ -36,6 +36,7 @@ from maasi_filter.settings import (
     NoiseSettings,
     SensorSettings,
 )
+from maasi_filter.state_file import StateFileError
 
 __all__ = [
     'AgentMeasurement',
@@ -62,6 +63,7 @@ __all__ = [
     'SearchFilter',
     'Sensor',
     'SensorSettings',
+    'StateFileError',
     'compose',
     'detection_probability',
     'gospa',

@@ -110,7 +110,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         settings = self.settings
         warm_up()
         if settings.save_file and Path(settings.save_file).exists():
-            self.filter.load(Path(settings.save_file))
+            self.filter = SearchFilter.load(settings.save_file)
             self.get_logger().info(
                 f'state loaded from {settings.save_file}: '
                 f'{len(self.filter.found_targets)} found targets'
@@ -142,7 +142,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
 
     def _save(self) -> None:
         if self.settings.save_file:
-            self.filter.save(Path(self.settings.save_file))
+            self.filter.save(self.settings.save_file)
 
     def reset(self) -> None:
         """Begin a new search."""

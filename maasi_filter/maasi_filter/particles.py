@@ -295,7 +295,7 @@ def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     source,
     means,
     shrink,
-    differential,
+    scale,
     deviation,
     fill,
     filled,
@@ -305,7 +305,6 @@ def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     d = source.shape[1]
     # The sum of two uniform numbers on (-1/2, 1/2) has variance 1/6.
     width = deviation * math.sqrt(6.0)
-    scale = differential / math.sqrt(2.0)
     low_half = np.uint64(0xFFFFFFFF)
     quarter = np.uint64(0xFFFF)
     for i in range(first_chunk * CHUNK, min(source.shape[0], last_chunk * CHUNK)):
@@ -318,7 +317,7 @@ def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
             a = order[first + np.int64(((bits & low_half) * size) >> np.uint64(32))]
             b = order[first + np.int64(((bits >> np.uint64(32)) * size) >> np.uint64(32))]
             for axis in range(d):
-                moved = source[i, axis] + scale * (source[a, axis] - source[b, axis])
+                moved = source[i, axis] + scale[g] * (source[a, axis] - source[b, axis])
                 if width > 0.0:
                     bits = _mix(bits + np.uint64(axis + 1))
                     low = np.float64(np.int64(bits & low_half)) * 2.0**-32
@@ -352,7 +351,7 @@ def jitter(
     index: IntArray,
     group: IntArray,
     means: FloatArray,
-    differential: float,
+    differential: FloatArray,
     deviation: float,
     bounds: FloatArray,
     generator: np.random.Generator,
@@ -378,8 +377,8 @@ def jitter(
         Group of each, from 0.
     means : (g, d) array
         Of the groups, metres.
-    differential : float
-        c.
+    differential : (g,) array
+        c, for each group.
     deviation : float
         Of the noise on each axis, metres; its density is triangular.
     keep_covariance : bool
@@ -390,6 +389,7 @@ def jitter(
     groups, d = means.shape
     seed = np.uint64(generator.integers(0, 2**63))
     order, starts = _order(group, groups)
+    scale = differential / math.sqrt(2.0)
     shrink = np.ones(groups)
     if keep_covariance:
         copies = np.zeros(groups)
@@ -412,7 +412,7 @@ def jitter(
             particles,
             means,
             shrink,
-            differential,
+            scale,
             deviation,
             fill,
             filled,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Sequence
@@ -40,6 +41,15 @@ from maasi_filter.settings import (
     NoiseSettings,
     Preset,
     SensorSettings,
+)
+from maasi_filter.state_file import (
+    StateFileError,
+    generator_state,
+    read_state,
+    restored_generator,
+    text,
+    untext,
+    write_state,
 )
 
 FloatArray = NDArray[np.float64]
@@ -241,6 +251,92 @@ class SearchFilter:
         self._information = np.zeros((self._groups, self.dimension, self.dimension))
         self._information[:] = UNLIMITED_INFORMATION * np.eye(self.dimension)
 
+    # The state in a file.
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the whole state, random generator included, to one file.
+
+        The file is replaced in one piece: a crash leaves the old one or the new one.
+        """
+        targets = self.found_targets
+        d = self.dimension
+        state = {
+            'settings': text(self.settings.model_dump_json(exclude_unset=True)),
+            'generator': text(generator_state(self.generator)),
+            'bounds': self.bounds,
+            'spacing': np.array(self.exploration.spacing),
+            'exploration': self.exploration.values,
+            'particles': self.particles,
+            'weights': self.weights,
+            'group': self._group,
+            'groups': np.array(self._groups),
+            'information': self._information,
+            'centres': np.empty((0, d)) if self._centres is None else self._centres,
+            'robots': text(json.dumps([target.robot for target in targets])),
+            'found_ids': np.array([target.id for target in targets], np.int64),
+            'found_measurements': np.array([target.measurement for target in targets], np.int64),
+            'found_times': np.array([target.time for target in targets], float),
+            'found_positions': np.array([t.position for t in targets]).reshape(-1, d),
+            'found_covariances': np.array([t.covariance for t in targets]).reshape(-1, d, d),
+            'own_covariances': np.array(self._covariances).reshape(-1, d, d),
+            'cluster_positions': np.array([c.position for c in self.clusters]).reshape(-1, d),
+            'cluster_covariances': np.array([c.covariance for c in self.clusters]).reshape(
+                -1, d, d
+            ),
+            'cluster_radii': np.array([c.radius for c in self.clusters], float),
+            'cluster_masses': np.array([c.mass for c in self.clusters], float),
+        }
+        write_state(path, state)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SearchFilter:
+        """Return the filter that was saved; it continues to the bit as the saved one would have.
+
+        Raises
+        ------
+        StateFileError
+            If the file is missing, of another format or version, or damaged; it says which.
+        """
+        state = read_state(path)
+        try:
+            search = cls(
+                FilterSettings.model_validate_json(untext(state['settings'])),
+                state['bounds'],
+                restored_generator(untext(state['generator'])),
+            )
+            search.exploration = Exploration(search.bounds, float(state['spacing']))
+            search.exploration.values[...] = state['exploration']
+            search.particles = state['particles']
+            search.weights = state['weights']
+            search._group = state['group']
+            search._groups = int(state['groups'])
+            search._information = state['information']
+            search._centres = state['centres'] if len(state['centres']) else None
+            search._covariances = list(state['own_covariances'])
+            search.found_targets = [
+                FoundTarget(int(number), position, covariance, robot, int(index), float(time))
+                for number, position, covariance, robot, index, time in zip(
+                    state['found_ids'],
+                    state['found_positions'],
+                    state['found_covariances'],
+                    json.loads(untext(state['robots'])),
+                    state['found_measurements'],
+                    state['found_times'],
+                )
+            ]
+            search.clusters = [
+                Cluster(position, covariance, float(radius), float(mass))
+                for position, covariance, radius, mass in zip(
+                    state['cluster_positions'],
+                    state['cluster_covariances'],
+                    state['cluster_radii'],
+                    state['cluster_masses'],
+                )
+            ]
+        except (KeyError, ValueError, TypeError) as error:
+            raise StateFileError(f'{path}: does not hold a usable state: {error}') from None
+        return search
+
     # What the settings leave to the sensor.
 
     def _pose_error(self, sensor: Sensor) -> float:
@@ -309,8 +405,9 @@ class SearchFilter:
         newly_found: list[FoundTarget] = []
         moved = False
         detections = 0
-        if numbers.births != 'measurement':
+        if numbers.removal in ('closest', 'every'):
             members = [self._without_found(member, dropped) for member in members]
+        if numbers.births != 'measurement':
             self._add_births(members)
         self._predicted = self.weights.copy() if numbers.corrector == 'predicted' else None
         total = sum(len(member.values) for member in members)
@@ -383,7 +480,7 @@ class SearchFilter:
     def _without_found(self, member: _Member, dropped: dict[str, int]) -> _Member:
         """Return a member without the detections that found targets take (000, section 3.3)."""
         numbers = self._numbers
-        if numbers.removal not in ('closest', 'every') or not self.found_targets:
+        if not self.found_targets:
             return member
         centres = member.sensor.measurement.inverse(member.values, member.pose)
         positions = np.array([target.position for target in self.found_targets])
@@ -654,13 +751,12 @@ class SearchFilter:
             if spread > radius:
                 continue
             covariance = covariances[m]
-            if numbers.births == 'measurement':
-                covariance = bounded_below(
-                    covariance, self._information[groups + m] + self._prior_information
-                )
-                spread = math.sqrt(float(np.trace(covariance)))
-                if spread > radius:
-                    continue
+            covariance = bounded_below(
+                covariance, self._information[groups + m] + self._prior_information
+            )
+            spread = math.sqrt(float(np.trace(covariance)))
+            if spread > radius:
+                continue
             if self._is_known(means[m], covariance, claims, known, m):
                 continue
             target = FoundTarget(
@@ -727,9 +823,11 @@ class SearchFilter:
         mass, means, covariances = group_moments(particles, weights, group, self._groups, pool)
         # Resampling leaves few ancestors where the noise is narrow; their spread is no posterior.
         fill = None
-        if numbers.births == 'measurement':
+        if numbers.extraction == 'measurement':
             fill = missing_spread(covariances, self._information, self._prior_information)
         assert numbers.jitter_differential is not None
+        # Births that no detection has drawn together have nothing in common.
+        known = self._information[:, 0, 0] > 0.0
         deviation = max((self._jitter_deviation(member.sensor) for member in members), default=0.0)
         if numbers.jitter_differential > 0.0 or deviation > 0.0:
             particles = jitter(
@@ -737,7 +835,7 @@ class SearchFilter:
                 index,
                 group,
                 means,
-                numbers.jitter_differential,
+                np.where(known, numbers.jitter_differential, 0.0),
                 deviation,
                 self.bounds,
                 self.generator,

@@ -202,12 +202,14 @@ class EnvironmentSettings(Settings):
 Preset = Literal['recommended', 'paper_000', 'paper_001', 'paper_002', 'paper_003']
 
 
+# What the papers leave open is the same for all four.
 _PAPER: dict[str, Any] = {
+    'particles': 10000,
     'particles_minimum': 500,
     'particles_per_target': 1000,
     'survival_probability': 1.0,
-    'births': 'uniform',
-    'birth_particles': 2000,
+    'births': 'measurement',
+    'birth_particles': 500,
     'birth_prior': 'constant',
     'expected_targets': 12.0,
     'birth_targets': 1.0,
@@ -230,6 +232,7 @@ _PAPER: dict[str, Any] = {
 # What each preset fills in; `docs/filter_presets.md` says where the numbers are from.
 PRESETS: dict[str, dict[str, Any]] = {
     'recommended': {
+        'particles': 10000,
         'particles_minimum': 1000,
         'particles_per_target': 2000,
         'survival_probability': 1.0,
@@ -250,9 +253,16 @@ PRESETS: dict[str, dict[str, Any]] = {
         'kmeans_iterations': 20,
     },
     'paper_000': _PAPER,
-    'paper_001': _PAPER,
-    'paper_002': {**_PAPER, 'corrector': 'predicted'},
-    'paper_003': {**_PAPER, 'births': 'gaussian', 'removal': 'every'},
+    'paper_001': {**_PAPER, 'particles': 5000, 'particles_per_target': 500},
+    'paper_002': {**_PAPER, 'corrector': 'predicted', 'found_radius': 1.2},
+    'paper_003': {
+        **_PAPER,
+        'births': 'gaussian',
+        'birth_particles': 2000,
+        'removal': 'every',
+        'removal_distance': 4.0,
+        'found_radius': 0.5,
+    },
 }
 
 
@@ -374,6 +384,6 @@ class FilterSettings(Settings):
         values = {
             name: value
             for name, value in PRESETS[self.preset].items()
-            if getattr(self, name) is None
+            if getattr(self, name) is None or name not in self.model_fields_set
         }
         return self.model_copy(update=values)
