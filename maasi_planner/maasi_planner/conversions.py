@@ -1,0 +1,183 @@
+"""Between messages and the planner's records."""
+
+from __future__ import annotations
+
+import array
+import math
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import OccupancyGrid, Path
+from numpy.typing import NDArray
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from maasi_filter.conversions import colour, point_to_ros, pose_from_ros
+from maasi_filter.exploration import Exploration
+from maasi_msgs.msg import AgentState, Candidate, PlanDecision
+from maasi_msgs.msg import RobotDecision as RobotDecisionMessage
+from maasi_planner.motion import RobotState
+from maasi_planner.team import Decision, RobotDecision
+
+FloatArray = NDArray[np.float64]
+
+# J of a candidate that is not allowed; a message holds finite numbers only.
+NOT_ALLOWED = -1e30
+
+
+def robot_state_from_ros(message: AgentState) -> RobotState:
+    """Return a robot's state.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite; the message names the field.
+    """
+    angular = message.twist.angular
+    return RobotState(
+        pose_from_ros(message.pose.pose),
+        np.array([message.twist.linear.x, message.twist.linear.y, message.twist.linear.z]),
+        np.array([angular.x, angular.y, angular.z]),
+    )
+
+
+def robot_decision_to_ros(name: str, index: int, decision: RobotDecision) -> RobotDecisionMessage:
+    """Return a robot's decision with all its candidates."""
+    objective = decision.objective.tolist()
+    rows = zip(
+        decision.candidates.tolist(),
+        decision.control_cost.tolist(),
+        decision.target_refinement.tolist(),
+        decision.exploration.tolist(),
+        objective,
+        decision.lengths.tolist(),
+        decision.measurements.tolist(),
+    )
+    return RobotDecisionMessage(
+        robot=name,
+        decision=index,
+        chosen=decision.chosen,
+        waypoint=point_to_ros(decision.waypoint),
+        candidates=[
+            Candidate(
+                position=point_to_ros(position),
+                control_cost=cost,
+                target_refinement=refinement,
+                exploration=exploration,
+                objective=value if math.isfinite(value) else NOT_ALLOWED,
+                length=length,
+                measurements=measurements,
+            )
+            for position, cost, refinement, exploration, value, length, measurements in rows
+        ],
+    )
+
+
+def decision_to_ros(
+    decision: Decision,
+    indices: dict[str, int],
+    planner: str,
+    batch: int,
+    explored: float,
+    header: Header,
+) -> PlanDecision:
+    """Return a joint decision.
+
+    Parameters
+    ----------
+    decision : Decision
+        What was decided.
+    indices : dict
+        Decision index of each robot.
+    planner : str
+        Name.
+    batch : int
+        The last batch whose clusters were used.
+    explored : float
+        Share of the environment, 0 to 1.
+    header : Header
+        Stamp and frame.
+    """
+    reasons = [
+        f'{name}: {robot.reason}' for name, robot in sorted(decision.robots.items()) if robot.stays
+    ]
+    return PlanDecision(
+        header=header,
+        step=decision.step,
+        planner=planner,
+        batch_id=batch,
+        objective=decision.objective if math.isfinite(decision.objective) else NOT_ALLOWED,
+        explored=explored,
+        reason='; '.join(reasons) if decision.robots else decision.reason,
+        robots=[
+            robot_decision_to_ros(name, indices[name], robot)
+            for name, robot in sorted(decision.robots.items())
+        ],
+    )
+
+
+def path_to_ros(positions: FloatArray, header: Header, most: int = 50) -> Path:
+    """Return a trajectory, thinned to at most so many poses."""
+    count = len(positions)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+    poses = []
+    for index in chosen.tolist() if count else []:
+        pose = PoseStamped(header=header)
+        pose.pose.position = point_to_ros(positions[index])
+        pose.pose.orientation.w = 1.0
+        poses.append(pose)
+    return Path(header=header, poses=poses)
+
+
+def exploration_to_ros(exploration: Exploration, header: Header) -> OccupancyGrid:
+    """Return e in 2D as a grid: 100 is unseen, 0 explored; cells are centred on the nodes."""
+    values = np.asarray(exploration.values)
+    step = [float(axis[1] - axis[0]) for axis in exploration.axes()]
+    grid = OccupancyGrid(header=header)
+    grid.info.map_load_time = header.stamp
+    grid.info.resolution = step[0]
+    grid.info.width, grid.info.height = values.shape[:2]
+    corner = exploration.bounds[:, 0] - 0.5 * np.array(step)
+    grid.info.origin.position = point_to_ros(corner)
+    grid.info.origin.orientation.w = 1.0
+    cells = np.rint(100.0 * values.reshape(values.shape[:2]).T).astype(np.int8)
+    grid.data = array.array('b', cells.tobytes())
+    return grid
+
+
+def planner_markers(
+    robots: dict[str, tuple[FloatArray, FloatArray, FloatArray]], header: Header, size: float
+) -> MarkerArray:
+    """Return markers of robots (blue), waypoints (pink) and planned ways (green).
+
+    Parameters
+    ----------
+    robots : dict
+        Name to position (3,), waypoint (3,) and path (n, 3).
+    header : Header
+        Stamp and frame.
+    size : float
+        Diameter of a robot [m].
+    """
+    markers = []
+    for number, name in enumerate(sorted(robots)):
+        position, waypoint, path = robots[name]
+        for namespace, place, tint, shape in (
+            ('robots', position, colour(0.1, 0.3, 0.9), Marker.SPHERE),
+            ('waypoints', waypoint, colour(0.95, 0.3, 0.7), Marker.CUBE),
+        ):
+            marker = Marker(header=header, ns=namespace, id=number, type=shape)
+            marker.pose.position = point_to_ros(place)
+            marker.pose.orientation.w = 1.0
+            marker.scale.x = marker.scale.y = marker.scale.z = size
+            marker.color = tint
+            markers.append(marker)
+        line = Marker(header=header, ns='ways', id=number, type=Marker.LINE_STRIP)
+        line.pose.orientation.w = 1.0
+        line.scale.x = 0.2 * size
+        line.color = colour(0.1, 0.7, 0.2)
+        thinned = path[:: max(1, len(path) // 50)]
+        line.points = [point_to_ros(point) for point in thinned]
+        line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE
+        markers.append(line)
+    return MarkerArray(markers=markers)

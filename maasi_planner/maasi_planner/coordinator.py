@@ -1,0 +1,297 @@
+"""The team's planning from step to step: who plans, who measures, what is explored.
+
+The planner node and the in-process search both run on this (000, algorithms 1 and 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.clusters import Cluster
+from maasi_filter.exploration import Exploration
+from maasi_filter.pose import Pose
+from maasi_filter.search_filter import EXPLORATION_CELLS
+from maasi_filter.sensor import Sensor
+from maasi_planner.candidates import CandidateSet
+from maasi_planner.measurement_trigger import MeasurementTrigger
+from maasi_planner.motion import MotionModel, RobotState, make_motion
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.obstacles import Obstacles
+from maasi_planner.planners import make_planner
+from maasi_planner.team import Decision, RobotView, TeamView
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class PresentRobot:
+    """A robot that takes part in a step.
+
+    Attributes
+    ----------
+    state : RobotState
+        Where it is.
+    free : bool
+        Whether it has no goal, or its goal has ended.
+    """
+
+    state: RobotState
+    free: bool
+
+
+@dataclass(frozen=True)
+class Member:
+    """A robot that measures at a step: its name, decision index d and measurement index m."""
+
+    robot: str
+    decision: int
+    measurement: int
+
+
+@dataclass
+class _Plan:
+    """A robot with its present plan."""
+
+    motion: MotionModel
+    sensor: Sensor
+    candidates: CandidateSet
+    period: int
+    radius: float
+    decision: int = -1
+    decided_at: int | None = None
+    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    yaws: FloatArray = field(default_factory=lambda: np.zeros(0))
+    staying: bool = True
+    measurements: int = 0
+    due: bool = False
+
+
+class Coordinator:
+    """Plans for a team of robots step by step.
+
+    Parameters
+    ----------
+    settings : PlannerNodeSettings
+        Robots, planner and environment.
+
+    Attributes
+    ----------
+    exploration : Exploration
+        e after the last measurements.
+    clusters : list of Cluster
+        Potential targets after the last measurements.
+    finished : str or None
+        Why nothing is left to gain, once that is so.
+    """
+
+    def __init__(self, settings: PlannerNodeSettings) -> None:
+        self.settings = settings
+        environment = settings.environment
+        self.dimension = environment.dimension
+        bounds = environment.array()
+        spacing = settings.exploration_spacing
+        if spacing is None:
+            size = float(np.prod(bounds[:, 1] - bounds[:, 0]))
+            spacing = size ** (1.0 / self.dimension) / EXPLORATION_CELLS[self.dimension]
+        self.exploration = Exploration(bounds, spacing)
+        self.obstacles = Obstacles.from_settings(environment.obstacles)
+        self.clusters: list[Cluster] = []
+        self.finished: str | None = None
+        self.planner = make_planner(settings.planner.name, settings.planner)
+        self.trigger = MeasurementTrigger(settings.planner)
+        self._plans: dict[str, _Plan] = {}
+        for name in sorted(settings.robots):
+            robot = settings.robots[name]
+            self._plans[name] = _Plan(
+                motion=make_motion(robot.motion, self.obstacles, robot.radius),
+                sensor=robot.sensor.build(name, self.dimension),
+                candidates=CandidateSet(robot.candidates, bounds, height=robot.start[2]),
+                period=max(1, round(robot.sensor.period / settings.step)),
+                radius=robot.radius,
+            )
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all robots, in order."""
+        return list(self._plans)
+
+    def sensor(self, name: str) -> Sensor:
+        """Return a robot's sensor."""
+        return self._plans[name].sensor
+
+    def decision_index(self, name: str) -> int:
+        """Return the index of a robot's last decision, -1 before the first."""
+        return self._plans[name].decision
+
+    def path(self, name: str) -> FloatArray:
+        """Return a robot's predicted trajectory, (K + 1, 3) [m]."""
+        return self._plans[name].positions
+
+    def is_idle(self, name: str) -> bool:
+        """Return whether a robot has no goal of its plan: it never had one, or was told to stay."""
+        return self._plans[name].staying
+
+    def refuse(self, name: str) -> None:
+        """Take note that a robot refused its goal; it plans anew at its next measurement."""
+        self._plans[name].staying = True
+
+    def skip_measurements(self, name: str, index: int) -> None:
+        """Let a robot's measurement indices go on from `index`, as after a restart."""
+        plan = self._plans[name]
+        plan.measurements = max(plan.measurements, index)
+
+    def leave(self, name: str) -> None:
+        """Take note that a robot does not take part: it has no plan any more."""
+        plan = self._plans[name]
+        plan.decided_at = None
+        plan.positions = np.zeros((0, 3))
+        plan.yaws = np.zeros(0)
+        plan.staying = True
+        plan.due = False
+
+    def planning(self, step: int, robots: Mapping[str, PresentRobot]) -> list[str]:
+        """Return P_k, the robots that plan at a step, in order of their names.
+
+        A robot plans when it has arrived; one that was told to stay, again at its next possible
+        measurement.
+        """
+        if self.finished is not None:
+            return []
+        chosen = []
+        for name in sorted(robots):
+            plan = self._plans[name]
+            if not robots[name].free:
+                continue
+            waited = plan.decided_at is None or step - plan.decided_at >= plan.period
+            if not plan.staying or waited:
+                chosen.append(name)
+        return chosen
+
+    def plan(self, step: int, robots: Mapping[str, PresentRobot]) -> Decision | None:
+        """Return the joint decision of the robots that plan at a step, None where nobody does.
+
+        Parameters
+        ----------
+        step : int
+            k.
+        robots : mapping
+            The robots that take part, by name.
+        """
+        planning = self.planning(step, robots)
+        if not planning:
+            return None
+        team = self._team(step, robots, planning)
+        self.finished = self.planner.finished(team)
+        if self.finished is not None:
+            for name in planning:
+                plan = self._plans[name]
+                plan.decision += 1
+                plan.decided_at, plan.staying = step, True
+            return Decision(step=step, reason=self.finished)
+        decision = self.planner.decide(team)
+        for name in planning:
+            plan, chosen = self._plans[name], decision.robots[name]
+            plan.decision += 1
+            plan.decided_at = step
+            plan.positions, plan.yaws = chosen.positions, chosen.yaws
+            plan.staying = chosen.stays
+            self.trigger.begin(
+                name,
+                plan.sensor,
+                chosen.positions,
+                chosen.yaws,
+                plan.period,
+                self.clusters,
+                self.exploration,
+            )
+        return decision
+
+    def _team(
+        self, step: int, robots: Mapping[str, PresentRobot], planning: Sequence[str]
+    ) -> TeamView:
+        views = {}
+        for name in sorted(robots):
+            plan = self._plans[name]
+            state = robots[name].state
+            view = RobotView(
+                state=state,
+                candidates=plan.candidates.at(state.pose.position),
+                motion=plan.motion,
+                sensor=plan.sensor,
+                period_steps=plan.period,
+                planning=name in planning,
+                radius=plan.radius,
+            )
+            if not view.planning and plan.decided_at is not None:
+                gone = step - plan.decided_at
+                view.phase = -gone % plan.period
+                if len(plan.positions):
+                    first = min(gone, len(plan.positions) - 1)
+                    view.tail = plan.positions[first:]
+                    view.tail_yaws = plan.yaws[first:]
+            views[name] = view
+        return TeamView(
+            step=step,
+            step_time=self.settings.step,
+            robots=views,
+            clusters=self.clusters,
+            exploration=self.exploration,
+            obstacles=self.obstacles,
+        )
+
+    def measuring(
+        self,
+        step: int,
+        robots: Mapping[str, PresentRobot],
+        able: Collection[str] | None = None,
+    ) -> list[Member]:
+        """Return M_k, the robots that measure at a step, in order of their names.
+
+        Parameters
+        ----------
+        step : int
+            k.
+        robots : mapping
+            The robots that take part, by name.
+        able : collection of str, optional
+            Robots whose sensor has data now; another one's measurement waits until it has. None:
+            all.
+        """
+        members = []
+        for name in sorted(robots):
+            plan = self._plans[name]
+            if plan.decided_at is None:
+                continue
+            gone = step - plan.decided_at
+            if gone % plan.period == 0:
+                plan.due = plan.due or self.trigger.measures(
+                    name,
+                    gone // plan.period,
+                    plan.sensor,
+                    robots[name].state.pose,
+                    self.clusters,
+                    self.exploration,
+                )
+            if plan.due and (able is None or name in able):
+                plan.due = False
+                members.append(Member(name, plan.decision, plan.measurements))
+                plan.measurements += 1
+        return members
+
+    def absorb(self, poses: Mapping[str, Pose], clusters: list[Cluster]) -> None:
+        """Take in a batch after the filter has processed it.
+
+        Parameters
+        ----------
+        poses : mapping
+            Where the members measured, by name (000, eq. (20), (30)).
+        clusters : list of Cluster
+            After the batch.
+        """
+        for name in sorted(poses):
+            self.exploration.update(self._plans[name].sensor.detection, poses[name])
+        self.clusters = clusters
