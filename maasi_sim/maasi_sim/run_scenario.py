@@ -146,7 +146,8 @@ def main(arguments: list[str] | None = None) -> int:
         if options.replay is not None:
             from maasi_sim.replay import replay
 
-            return replay(options.replay, options.out, options.domain_id, interruption)
+            stop_asked = interruption.__bool__
+            return replay(options.replay, options.out, options.domain_id, stop_asked)
         chosen = Options(
             scenario=options.scenario,
             out=options.out,
