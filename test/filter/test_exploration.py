@@ -1,0 +1,97 @@
+"""The exploration function: grid, update, interpolation and what is expected unseen."""
+
+import numpy as np
+import pytest
+from maasi_filter import BoxDetection, Exploration, ExponentialDetection, FunctionDetection, Pose
+from scipy.interpolate import RegularGridInterpolator
+
+BOUNDS = np.array([[0.0, 100.0], [-20.0, 50.0], [0.0, 30.0]])
+MODEL = ExponentialDetection(0.98, [25.0, 25.0, 25.0])
+
+
+def test_nodes_stand_on_both_bounds():
+    exploration = Exploration(BOUNDS, 12.0)
+    for axis, bounds in zip(exploration.axes(), BOUNDS):
+        assert axis[0] == bounds[0]
+        assert axis[-1] == pytest.approx(bounds[1])
+        assert np.diff(axis).max() <= 12.0 + 1e-9
+    assert exploration.values.shape == (10, 7, 4)
+    assert (exploration.values == 1.0).all()
+
+
+def test_update_is_equation_20_at_every_node():
+    exploration = Exploration(BOUNDS, 12.0)
+    poses = [Pose([10.0, 10.0, 10.0]), Pose([90.0, 0.0, 5.0])]
+    expected = np.ones(len(exploration.nodes()))
+    for pose in poses:
+        exploration.update(MODEL, pose)
+        expected *= 1.0 - MODEL.probability(exploration.nodes(), pose)
+    np.testing.assert_allclose(exploration.values.ravel(), expected, rtol=1e-12)
+
+
+def test_a_function_of_the_user_updates_alike():
+    compiled = Exploration(BOUNDS, 12.0)
+    interpreted = Exploration(BOUNDS, 12.0)
+    pose = Pose([10.0, 10.0, 10.0])
+    compiled.update(MODEL, pose)
+    interpreted.update(FunctionDetection(MODEL.probability), pose)
+    np.testing.assert_allclose(compiled.values, interpreted.values, rtol=1e-12)
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_interpolation_is_multilinear_and_clamped(dimension):
+    generator = np.random.default_rng(0)
+    exploration = Exploration(BOUNDS[:dimension], 9.0)
+    exploration.values[...] = generator.random(exploration.values.shape)
+    reference = RegularGridInterpolator(exploration.axes(), exploration.values)
+    positions = generator.uniform(-50.0, 150.0, (300, dimension))
+    inside = np.clip(positions, BOUNDS[:dimension, 0], BOUNDS[:dimension, 1])
+    np.testing.assert_allclose(exploration.at(positions), reference(inside), atol=1e-12)
+
+
+def test_expected_unseen_goes_down_from_all_targets():
+    exploration = Exploration(BOUNDS, 5.0)
+    assert exploration.expected_unseen(12.0) == pytest.approx(12.0)
+    assert exploration.explored_fraction() == pytest.approx(0.0)
+    pose = Pose([50.0, 10.0, 15.0])
+    new = exploration.expected_new(MODEL, [pose.position], [0.0], 12.0)
+    exploration.update(MODEL, pose)
+    assert exploration.expected_unseen(12.0) == pytest.approx(12.0 - new)
+    assert exploration.explored_fraction() == pytest.approx(new / 12.0)
+
+
+def test_expected_new_of_several_measurements_counts_each_place_once():
+    exploration = Exploration(BOUNDS[:2], 5.0)
+    box = BoxDetection([-20.0, -20.0], [20.0, 20.0])
+    once = exploration.expected_new(box, [[50.0, 15.0, 1.0]], [0.0], 12.0)
+    twice = exploration.expected_new(box, [[50.0, 15.0, 1.0]] * 2, [0.0, 0.0], 12.0)
+    assert twice == pytest.approx(once)
+    own = FunctionDetection(box.probability)
+    assert exploration.expected_new(own, [[50.0, 15.0, 1.0]], [0.0], 12.0) == pytest.approx(once)
+
+
+def test_a_copy_is_independent():
+    exploration = Exploration(BOUNDS, 12.0)
+    other = exploration.copy()
+    exploration.update(MODEL, Pose([10.0, 10.0, 10.0]))
+    assert (other.values == 1.0).all()
+
+
+@pytest.mark.parametrize(
+    ('bounds', 'spacing', 'word'),
+    [
+        ([[0.0, 1.0]], 0.1, 'bounds'),
+        ([[1.0, 0.0], [0.0, 1.0]], 0.1, 'bounds'),
+        ([[0.0, np.nan], [0.0, 1.0]], 0.1, 'bounds'),
+        ([[0.0, 1.0], [0.0, 1.0]], 0.0, 'spacing'),
+        ([[0.0, 1e6], [0.0, 1e6]], 0.1, 'nodes'),
+    ],
+)
+def test_bad_grids_are_refused(bounds, spacing, word):
+    with pytest.raises(ValueError, match=word):
+        Exploration(bounds, spacing)
+
+
+def test_positions_that_are_not_finite_are_refused():
+    with pytest.raises(ValueError, match='finite'):
+        Exploration(BOUNDS, 12.0).at([[0.0, np.nan, 0.0]])
