@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -120,14 +121,12 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         self._found_publisher = self.create_publisher(FoundTargetArray, 'found_targets', LATCHED)
         self._particles_publisher = self.create_publisher(PointCloud2, 'particles', 2)
         self._markers_publisher = self.create_publisher(MarkerArray, 'markers', 10)
-        self.create_subscription(
-            MeasurementBatch, 'measurement_batch', self._on_batch, RELIABLE
-        )
+        self.create_subscription(MeasurementBatch, 'measurement_batch', self._on_batch, RELIABLE)
         for name in self._sensors:
             self.create_subscription(
                 DetectionArray,
                 f'{name}/detections',
-                lambda message, name=name: self._on_detections(name, message),
+                partial(self._on_detections, name),
                 RELIABLE,
             )
         if not settings.lockstep:

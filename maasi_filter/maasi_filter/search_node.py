@@ -37,6 +37,9 @@ _WARNING_PERIOD = 2.0
 _SIGNAL_PERIOD = 0.1
 
 
+_STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+
 class SettingsError(Exception):
     """Parameters that are not allowed; the text says which and why."""
 
@@ -82,7 +85,6 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         self.active = False
         self.step = -1
         self._warned: dict[str, float] = {}
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._peers: list[Callable[[], bool]] = []
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
@@ -103,9 +105,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         return '/' + '/'.join([*parts, name])
 
     def _read_settings(self, model: type[SettingsT]) -> SettingsT:
-        given = {
-            name: parameter.value for name, parameter in self._parameter_overrides.items()
-        }
+        given = {name: parameter.value for name, parameter in self._parameter_overrides.items()}
         values: dict[str, Any] = {}
         for item in parameter_fields(model, given):
             descriptor = ParameterDescriptor(
@@ -158,7 +158,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
             )
             self.expect_subscribers(self._done_publisher)
             self._step_subscription = self.create_subscription(
-                LockstepStep, self.team_topic('lockstep/step'), self._take_step, RELIABLE
+                LockstepStep, self.team_topic('lockstep/step'), self._hear_step, RELIABLE
             )
         self.set_up()
         return TransitionCallbackReturn.SUCCESS
@@ -167,7 +167,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         """Begin to work."""
         self.active = True
         self.start()
-        self._peer_timer = self.create_timer(_PEERS_PERIOD, self._look_for_peers, clock=self._steady)
+        self._peer_timer = self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -225,7 +225,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
     def on_ready(self) -> None:
         """Note that all peers are there."""
 
-    def _take_step(self, message: LockstepStep) -> None:
+    def _hear_step(self, message: LockstepStep) -> None:
         if not self.active:
             return
         if message.step < self.step:
@@ -254,7 +254,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
 
     def create_wall_timer(self, period: float, callback: Callable[[], None]) -> Any:
         """Return a timer on the steady clock; `period` in seconds."""
-        return self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        return self.create_timer(period, callback, clock=_STEADY)
 
     def _on_jump(self, jump: Any) -> None:
         if jump.delta.nanoseconds < 0 and self.active:

@@ -6,6 +6,7 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -133,22 +134,22 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         kind = OccupancyGrid if self._dimension == 2 else PointCloud2
         self._exploration_publisher = self.create_publisher(kind, 'exploration', 2)
         self._path_publishers = {}
-        self._clients: dict[str, ActionClient] = {}
+        self._go_to: dict[str, ActionClient] = {}
         for name in names:
             self._path_publishers[name] = self.create_publisher(Path, f'{name}/plan', 10)
             client = ActionClient(self, GoToWaypoint, f'{name}/go_to')
-            self._clients[name] = client
+            self._go_to[name] = client
             self.expect(client.server_is_ready)
             self.create_subscription(
                 AgentState,
                 f'{name}/state',
-                lambda message, name=name: self._on_state(name, message),
+                partial(self._on_state, name),
                 RELIABLE,
             )
             self.create_subscription(
                 DetectionArray,
                 f'{name}/detections',
-                lambda message, name=name: self._on_detections(name, message),
+                partial(self._on_detections, name),
                 RELIABLE,
             )
         self.create_subscription(FilterUpdate, 'filter_update', self._on_update, UPDATES)
@@ -340,7 +341,7 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                 self._leave(name, 'it left')
         for name in names:
             self._join_or_leave(name, self._heard[name].status, self._heard[name].reason)
-        self._take_step(step, stamp_from_ros(expected.stamp), set(expected.imaging))
+        self._plan_step(step, stamp_from_ros(expected.stamp), set(expected.imaging))
         self._try_done()
 
     def _try_free_step(self) -> None:
@@ -350,9 +351,9 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             return
         step = min(self._heard[name].step for name in present)
         if step > self._taken_step:
-            self._take_step(step, stamp_of_step(step, self.settings.step), None)
+            self._plan_step(step, stamp_of_step(step, self.settings.step), None)
 
-    def _take_step(self, step: int, stamp: int, imaging: set[str] | None) -> None:
+    def _plan_step(self, step: int, stamp: int, imaging: set[str] | None) -> None:
         self._taken_step = step
         self.step = step
         if not self.searching:
@@ -419,8 +420,8 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             goal.waypoint.pose.orientation.w = 1.0
             key = (name, indices[name] + 1)
             self._waiting_goals.add(key)
-            future = self._clients[name].send_goal_async(goal)
-            future.add_done_callback(lambda future, key=key: self._on_goal_answer(key, future))
+            future = self._go_to[name].send_goal_async(goal)
+            future.add_done_callback(partial(self._on_goal_answer, key))
             self._path_publishers[name].publish(path_to_ros(robot.positions, header))
 
     def _on_goal_answer(self, key: tuple[str, int], future: Any) -> None:
