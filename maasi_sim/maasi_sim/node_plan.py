@@ -182,7 +182,7 @@ def _robot_plans(
     name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
 ) -> list[NodePlan]:
     """Return a robot's driver, and its guard if it has one."""
-    from maasi_drivers.driver_settings import DriverSettings
+    from maasi_drivers.driver_settings import DriverSettings, GuardSettings
     from maasi_filter.parameters import flatten
 
     settings = DriverSettings.model_validate(
@@ -210,7 +210,13 @@ def _robot_plans(
     if robot.guard:
         plans.append(
             NodePlan(
-                'maasi_drivers', 'guard_node', 'guard', name, says_ready=False, says_done=False
+                'maasi_drivers',
+                'guard_node',
+                'guard',
+                name,
+                {**flatten(GuardSettings.model_validate(common)), **_SIMULATED},
+                says_ready=False,
+                says_done=False,
             )
         )
     return plans

@@ -11,7 +11,7 @@ from rosbags.typesys.store import Typestore
 
 from maasi_sim.bag import Bag
 from maasi_sim.scenario import Scenario
-from maasi_sim.scoring import Scores, matching_radius, score
+from maasi_sim.scoring import Scores, score, scoring_radius
 
 FloatArray = NDArray[np.float64]
 
@@ -117,13 +117,6 @@ class RunRecord:
         """Return the scores at the end."""
         positions = [target.position for target in self.found]
         return score(positions, self.truth, self.radius, self.scenario.scoring.order)
-
-
-def scoring_radius(scenario: Scenario, truth: FloatArray) -> float:
-    """Return the scenario's matching radius, or the one that follows from T_z and the targets."""
-    if scenario.scoring.radius is not None:
-        return scenario.scoring.radius
-    return matching_radius(scenario.removal_distance(), truth)
 
 
 class RunObserver:
@@ -266,10 +259,10 @@ class RunObserver:
         )
 
     def _note_decision(self, decision: Any) -> None:
-        """Note when the planner says that nothing is left to gain: nobody goes anywhere."""
+        """Note when the planner says that nothing is left to gain: a reason, and no robots."""
         self._explored = float(decision.explored)
-        if decision.reason and all(robot.chosen < 0 for robot in decision.robots):
-            self.settled = self.settled or decision.reason
+        if decision.reason and not decision.robots and self.settled is None:
+            self.settled = decision.reason
             self._settled_step = int(decision.step)
 
     def _note_team(self, step: Any) -> None:

@@ -68,7 +68,7 @@ class RobotSettings(Settings):
         description='Position at the start, x y z [m, map]'
     )
     yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
-    radius: float = Field(default=0.1, ge=0.0, description='Of a circle around the robot [m]')
+    radius: float = Field(default=0.1, gt=0.0, description='Of a circle around the robot [m]')
     candidates: CandidateSettings = Field(description='Waypoints to choose from')
     motion: MotionSettings = Field(description='How it moves')
     sensor: SensorSettings = Field(description='What it sees, as the filter believes')

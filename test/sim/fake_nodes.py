@@ -274,8 +274,8 @@ class Planner(Fake):
         decision.header.stamp = message.stamp
         decision.reason = 'nothing is left to gain' if finished else ''
         decision.robots = [
-            RobotDecision(robot=name, decision=self.number, chosen=-1 if finished else 0)
-            for name in self.robots
+            RobotDecision(robot=name, decision=self.number, chosen=0)
+            for name in ([] if finished else self.robots)
         ]
         self.decisions.publish(decision)
         self.number += 1
