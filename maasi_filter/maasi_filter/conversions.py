@@ -303,8 +303,6 @@ def filter_markers(
         markers.append(Marker(header=header, ns='clusters', id=index, action=Marker.DELETE))
     for target in found:
         markers.append(
-            sphere_marker(
-                header, 'found', target.id, target.position, size, colour(0.8, 0.0, 0.1)
-            )
+            sphere_marker(header, 'found', target.id, target.position, size, colour(0.8, 0.0, 0.1))
         )
     return MarkerArray(markers=markers), number

@@ -438,25 +438,26 @@ def _normalise(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             for chunk in range(chunks):
                 if smallest[chunk, m] < np.inf:
                     total += sums[chunk, m] * math.exp(-0.5 * (smallest[chunk, m] - least))
-        log_own = -np.inf
-        if total > 0.0:
-            log_own = math.log(total) + log_norm[m] - 0.5 * least
         log_other = math.log(other[m]) if other[m] > 0.0 else -np.inf
-        larger = max(log_own, log_other)
-        log_sum = larger
+        # Everything in units of the largest likelihood: exact however small that is.
+        log_peak = log_norm[m] - 0.5 * least if total > 0.0 else -np.inf
         own_mass[m] = 0.0
         other_scale[m] = 0.0
         for chunk in range(chunks):
             scale[chunk, m] = 0.0
-        if larger > -np.inf:
-            log_sum = larger + math.log1p(math.exp(min(log_own, log_other) - larger))
-            own_mass[m] = math.exp(log_own - log_sum)
-            # Next to nothing may still be divided by; what is multiplied with it is as small.
-            other_scale[m] = math.exp(min(-log_sum, 700.0))
+        log_sum = log_other
+        if total > 0.0:
+            # Beyond this the particles explain nothing that a number could hold.
+            relative = math.exp(min(log_other - log_peak, 700.0))
+            own_mass[m] = total / (total + relative)
+            log_sum = log_peak + math.log(total + relative)
             for chunk in range(chunks):
                 if smallest[chunk, m] < np.inf:
-                    exponent = log_norm[m] - log_sum - 0.5 * smallest[chunk, m]
-                    scale[chunk, m] = math.exp(min(exponent, 700.0))
+                    part = math.exp(-0.5 * (smallest[chunk, m] - least))
+                    scale[chunk, m] = part / (total + relative)
+        if log_sum > -np.inf:
+            # Next to nothing may still be divided by; what is multiplied with it is as small.
+            other_scale[m] = math.exp(min(-log_sum, 700.0))
         log_normaliser[m] = log_sum
 
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from maasi_filter import BoxDetection, Exploration, ExponentialDetection, FunctionDetection, Pose
 from scipy.interpolate import RegularGridInterpolator
+
+from maasi_filter import BoxDetection, Exploration, ExponentialDetection, FunctionDetection, Pose
 
 BOUNDS = np.array([[0.0, 100.0], [-20.0, 50.0], [0.0, 30.0]])
 MODEL = ExponentialDetection(0.98, [25.0, 25.0, 25.0])

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from maasi_filter import NoiseSettings, Pose, RangeBearing, RangeBearingElevation, wrap_angle
 from scipy.stats import multivariate_normal
+
+from maasi_filter import NoiseSettings, Pose, RangeBearing, RangeBearingElevation, wrap_angle
 
 MODELS = [RangeBearing(), RangeBearingElevation()]
 coordinate = st.floats(-100.0, 100.0)

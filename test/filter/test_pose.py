@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from maasi_filter import Pose, compose, inverse
 
 angles = st.floats(-10.0, 10.0)

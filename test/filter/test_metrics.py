@@ -1,0 +1,112 @@
+"""Metrics: by hand, by brute force, and their properties."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from maasi_filter import gospa, match_targets, ospa, restricted_mean
+from maasi_filter.metrics import cardinality_error, normalised_error
+
+points = st.lists(
+    st.tuples(st.floats(-10.0, 10.0), st.floats(-10.0, 10.0)), min_size=0, max_size=4
+).map(lambda values: np.array(values, float).reshape(-1, 2))
+
+
+def brute_gospa(estimates, truth, cutoff, power):
+    """The smallest cost over every way to leave out, and to pair, points."""
+    best = np.inf
+    small, large = sorted((len(estimates), len(truth)))
+    for size in range(small + 1):
+        for ours in itertools.combinations(range(len(estimates)), size):
+            for theirs in itertools.permutations(range(len(truth)), size):
+                cost = sum(
+                    np.linalg.norm(estimates[i] - truth[j]) ** power for i, j in zip(ours, theirs)
+                )
+                cost += cutoff**power / 2 * (small + large - 2 * size)
+                best = min(best, cost)
+    return best ** (1 / power)
+
+
+@settings(max_examples=60, deadline=None)
+@given(points, points, st.floats(0.5, 20.0), st.sampled_from([1.0, 2.0]))
+def test_gospa_is_the_best_assignment(estimates, truth, cutoff, power):
+    value = gospa(estimates, truth, cutoff, power)
+    assert value.total == pytest.approx(brute_gospa(estimates, truth, cutoff, power), abs=1e-9)
+    parts = value.localisation + value.missed + value.false
+    assert value.total == pytest.approx(parts ** (1 / power))
+
+
+def test_gospa_parts_by_hand():
+    value = gospa([[0.0, 3.0], [50.0, 0.0]], [[0.0, 0.0], [0.0, 40.0], [9.0, 9.0]], 10.0, 2.0)
+    assert (value.localisation, value.missed, value.false) == (9.0, 100.0, 50.0)
+    assert value.matched == 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(points, points, points)
+def test_ospa_is_a_metric(first, second, third):
+    def apart(a, b):
+        return ospa(a, b, 5.0, 2.0)
+
+    assert apart(first, first) == 0.0
+    assert apart(first, second) == pytest.approx(apart(second, first))
+    assert apart(first, third) <= apart(first, second) + apart(second, third) + 1e-9
+    assert apart(first, second) <= 5.0 + 1e-12
+
+
+def test_ospa_by_hand():
+    assert ospa([[0.0, 1.0]], [[0.0, 0.0], [3.0, 3.0]], 2.0, 1.0) == pytest.approx(1.5)
+    assert ospa([], [[0.0, 0.0]], 2.0) == 2.0
+    assert ospa([], [], 2.0) == 0.0
+
+
+def test_matching_is_one_to_one_and_takes_as_many_pairs_as_it_can():
+    match = match_targets([[1.0, 0.0], [0.1, 0.0], [9.0, 9.0]], [[0.0, 0.0], [-1.0, 0.0]], 1.2)
+    assert sorted(match.pairs) == [(0, 0), (1, 1)]
+    assert (match.true_found, match.missed, match.false_found) == (2, 0, 1)
+    assert match.rmse == pytest.approx(np.sqrt((1.0 + 1.21) / 2))
+    assert np.isnan(match_targets([], [[0.0, 0.0]], 1.0).rmse)
+
+
+def test_cardinality_and_normalised_error():
+    assert cardinality_error(1.4, 3, 5) == pytest.approx(-0.6)
+    assert normalised_error([2.0, 0.0], np.diag([4.0, 1.0])) == pytest.approx(1.0)
+
+
+def test_restricted_mean_of_finished_runs_is_their_mean():
+    value = restricted_mean([10.0, 20.0, 30.0], 100.0)
+    assert value.mean == pytest.approx(20.0)
+    assert value.standard_error == pytest.approx(np.std([10, 20, 30], ddof=1) / np.sqrt(3))
+    assert (value.finished, value.runs) == (3, 3)
+
+
+def test_runs_that_reach_the_cap_count_as_the_cap():
+    value = restricted_mean([10.0, None, 30.0, 250.0], 100.0)
+    assert value.mean == pytest.approx((10.0 + 100.0 + 30.0 + 100.0) / 4)
+    assert value.finished == 2
+
+
+def test_runs_cut_short_count_as_kaplan_and_meier_have_it():
+    value = restricted_mean([10.0, None, 30.0], 40.0, ended=[10.0, 20.0, 30.0])
+    assert value.mean == pytest.approx(10.0 + 20.0 * 2 / 3)
+
+
+@pytest.mark.parametrize(
+    'call',
+    [
+        lambda: gospa([[np.nan, 0.0]], [[0.0, 0.0]], 1.0),
+        lambda: gospa([[0.0, 0.0]], [[0.0, 0.0, 0.0]], 1.0),
+        lambda: gospa([[0.0, 0.0]], [[0.0, 0.0]], 0.0),
+        lambda: ospa([[0.0, 0.0]], [[0.0, 0.0]], 1.0, 0.5),
+        lambda: match_targets([[0.0, 0.0]], [[0.0, 0.0]], -1.0),
+        lambda: restricted_mean([], 10.0),
+        lambda: restricted_mean([np.nan], 10.0),
+        lambda: restricted_mean([None], 10.0, ended=[1.0, 2.0]),
+    ],
+)
+def test_bad_input_is_refused(call):
+    with pytest.raises(ValueError, match='got'):
+        call()
