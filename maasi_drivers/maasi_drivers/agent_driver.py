@@ -1,0 +1,644 @@
+"""What every driver shares: odometry, goals, commands, and the answers to measurement batches."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
+from rclpy.duration import Duration
+from rclpy.qos import HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import BatteryState
+
+from maasi_drivers.driver_settings import LIVELINESS_LEASE, DriverSettings
+from maasi_drivers.measurement_queue import Frame, MeasurementQueue, MeasurementRequest
+from maasi_drivers.odometry import MapOdometry, PoseHistory, StampedPose
+from maasi_drivers.waypoint_follower import Goal, GoalStatus, WaypointFollower
+from maasi_filter.conversions import (
+    detections_to_ros,
+    pose_from_ros,
+    pose_to_ros,
+    stamp_from_ros,
+    stamp_to_ros,
+)
+from maasi_filter.pose import Pose
+from maasi_filter.qos import RELIABLE, sensor_reader
+from maasi_filter.search_node import SearchNode
+from maasi_msgs.action import GoToWaypoint
+from maasi_msgs.msg import AgentState, DetectionArray, LockstepStep, MeasurementBatch
+from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.obstacles import Obstacles
+
+FloatArray = NDArray[np.float64]
+DataT = TypeVar('DataT')
+
+# What tells the guard that the driver lives.
+LIVELY = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    liveliness=LivelinessPolicy.AUTOMATIC,
+    liveliness_lease_duration=Duration(seconds=LIVELINESS_LEASE),
+)
+
+_WATCH_PERIOD = 0.1
+# Of those, from one state of a robot that has no odometry to the next.
+_WATCHES_PER_STATE = 2
+_PATIENCE = 3.0
+# Stamps that go back farther belong to another time [ns].
+_JUMP = 1_000_000_000
+_FEEDBACK_PERIOD = 500_000_000
+# Longest wait for the last command and the last results to arrive [s].
+_FAREWELL = 0.3
+_STOP_COMMANDS = 3
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """
+    What a sensor saw at one instant.
+
+    Attributes
+    ----------
+    values : ndarray, shape (m, d)
+        Range [m], bearing and, in 3D, elevation [rad].
+    covariances : ndarray, shape (m, d, d), or None
+        Of the values; none: the sensor's preset.
+    positions : ndarray, shape (m, d)
+        Where the targets are by that [m, map].
+    dropped : dict
+        What was left out: reason to count.
+
+    """
+
+    values: FloatArray
+    covariances: FloatArray | None
+    positions: FloatArray
+    dropped: dict[str, int]
+
+
+class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
+    """
+    The driver of a robot, in the robot's namespace.
+
+    Subscribes
+    ----------
+    `odom` (nav_msgs/Odometry), `battery` (sensor_msgs/BatteryState);
+    `measurement_batch` of the team (maasi_msgs/MeasurementBatch)
+
+    Publishes
+    ---------
+    `state` (maasi_msgs/AgentState), with each odometry;
+    `cmd_vel` (geometry_msgs/TwistStamped or Twist), with each odometry, and zeros at the end;
+    `detections` (maasi_msgs/DetectionArray), for each batch that this robot is in
+
+    Actions
+    -------
+    `go_to` (maasi_msgs/GoToWaypoint): the newest goal replaces the one before
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('driver', DriverSettings, in_robot=True, **options)
+        settings = self.settings
+        self.robot = self.get_namespace().rstrip('/').rpartition('/')[2]
+        self.dimension = settings.environment.dimension
+        self.sensor = settings.sensor.build(self.robot, self.dimension)
+        self.offset = 0
+        self._bounds = settings.environment.array()
+        self._motion = make_motion(
+            settings.motion,
+            Obstacles.from_settings(settings.environment.obstacles),
+            settings.radius,
+        )
+        self._start = Pose.from_yaw(settings.start, settings.yaw)
+        self._history = PoseHistory()
+        self._odometry: MapOdometry | None = None
+        self._follower = WaypointFollower(self._motion)
+        self._ended: dict[bytes, Goal] = {}
+        self._queue: MeasurementQueue[DataT] = MeasurementQueue(self._history)
+        self._unseen: Counter[str] = Counter()
+        self._battery = -1.0
+        # Why the robot cannot go on; empty where it can.
+        self._trouble = ''
+        self._no_odometry = False
+        self._odometry_at = time.monotonic()
+        self._watches = 0
+        self._feedback_at = 0
+        self._awaited: int | None = None
+        self._answered: int | None = None
+        self._unusable: int | None = None
+        self._away = False
+        self._entities: list[Any] = []
+        self._command_publisher: Any = None
+        self._server: ActionServer | None = None
+        self._state = AgentState(robot=self.robot, battery=-1.0)
+        self._state.header.frame_id = settings.frame
+        self._state.pose.pose = pose_to_ros(self._start)
+        self._command = TwistStamped()
+        self._command.header.frame_id = f'{self.robot}/base_link'
+
+    # ---- what a robot's own driver adds ------------------------------------------------------
+
+    @abstractmethod
+    def set_up_sensor(self) -> None:
+        """Compile what the sensor needs, and subscribe to it."""
+
+    @abstractmethod
+    def look(self, data: DataT, pose: StampedPose) -> Sighting:
+        """
+        Return what an image or sweep shows.
+
+        Raises
+        ------
+        ValueError
+            If it cannot be used: the next one takes its place.
+
+        """
+
+    # ---- life cycle --------------------------------------------------------------------------
+
+    def set_up(self) -> None:
+        """Compile and connect."""
+        settings = self.settings
+        ahead = self._start.position + np.array([0.1, 0.1, 0.0])
+        self._motion.command(RobotState(self._start), ahead)
+        nowhere = np.zeros((1, self.dimension))
+        self.sensor.detection.probability(nowhere, self._start)
+        self._queue.offset = self.offset
+        self._state_publisher = self.create_publisher(AgentState, 'state', LIVELY)
+        self._detections_publisher = self.create_publisher(DetectionArray, 'detections', RELIABLE)
+        self._command_publisher = self.create_publisher(
+            TwistStamped if settings.command_type == 'stamped' else Twist, 'cmd_vel', RELIABLE
+        )
+        quality = sensor_reader(settings.lockstep)
+        self._entities = [
+            self._state_publisher,
+            self._detections_publisher,
+            self._command_publisher,
+            self.create_subscription(Odometry, 'odom', self._on_odometry, quality),
+            self.create_subscription(BatteryState, 'battery', self._on_battery, quality),
+            self.create_subscription(
+                MeasurementBatch, self.team_topic('measurement_batch'), self._on_batch, RELIABLE
+            ),
+        ]
+        self._server = ActionServer(
+            self,
+            GoToWaypoint,
+            'go_to',
+            self._conclude,
+            goal_callback=self._judge_goal,
+            handle_accepted_callback=self._take_goal,
+            cancel_callback=self._cancel_goal,
+        )
+        known = len(list(self.subscriptions))
+        self.set_up_sensor()
+        self._entities += list(self.subscriptions)[known:]
+        if not settings.lockstep:
+            self._entities.append(self.create_wall_timer(_WATCH_PERIOD, self._watch))
+        self.expect_subscribers(self._command_publisher)
+        self.expect(lambda: self._heard(self._state_publisher, {'planner_node'}))
+        self.expect(
+            lambda: self._heard(self._detections_publisher, {'filter_node', 'planner_node'})
+        )
+
+    def _heard(self, publisher: Any, names: set[str]) -> bool:
+        """Return whether these nodes, and all others that are known, are matched."""
+        known = self.get_subscriptions_info_by_topic(publisher.topic_name)
+        return names <= {item.node_name for item in known} and (
+            publisher.get_subscription_count() >= len(known)
+        )
+
+    def start(self) -> None:
+        """Begin to work."""
+        self._odometry_at = time.monotonic()
+
+    def halt(self) -> None:
+        """Publish zeros, and give the goal up."""
+        if self._command_publisher is None:
+            return
+        self._end_goal(GoalStatus.ABORTED, 'the driver stops')
+        for _ in range(_STOP_COMMANDS):
+            self._publish_command([0.0, 0.0, 0.0, 0.0])
+        self._command_publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
+
+    def tear_down(self) -> None:
+        """Disconnect."""
+        if self._server is not None:
+            self._server.destroy()
+            self._server = None
+        self._command_publisher = None
+        for entity in self._entities:
+            for destroy in (self.destroy_publisher, self.destroy_subscription, self.destroy_timer):
+                if destroy(entity):
+                    break
+        self._entities = []
+        self._begin_anew()
+
+    def destroy_node(self) -> None:
+        """Let those who wait for a goal know how it ended, and leave."""
+        self.active = False
+        deadline = time.monotonic() + _FAREWELL
+        while self._ended and self.executor is not None and time.monotonic() < deadline:
+            self.executor.spin_once(timeout_sec=0.01)
+        if self._server is not None:
+            self._server.destroy()
+            self._server = None
+        super().destroy_node()
+
+    def reset(self) -> None:
+        """Forget where the robot was."""
+        self._end_goal(GoalStatus.ABORTED, 'the time jumped back')
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self._history.clear()
+        self._queue.clear()
+        self._follower = WaypointFollower(self._motion)
+        self._awaited = self._answered = self._unusable = None
+        if self.settings.odometry_origin == 'first':
+            self._odometry = None
+
+    def status(self) -> dict[str, Any]:
+        """Return what the robot does."""
+        return {
+            'goal': f'{self._state.goal_id}: {self._follower.status.name}',
+            'trouble': self._trouble,
+            'battery': f'{self._battery:.2f}',
+            'open batches': len(self._queue),
+            **{f'detections left out: {key}': number for key, number in self._unseen.items()},
+        }
+
+    # ---- odometry and the control step -------------------------------------------------------
+
+    def _on_odometry(self, message: Odometry) -> None:
+        if not self.active:
+            return
+        stamp = stamp_from_ros(message.header.stamp)
+        latest = self._history.latest
+        if latest is not None and stamp <= latest.stamp:
+            if latest.stamp - stamp <= _JUMP:
+                if stamp < latest.stamp or not self.settings.lockstep:
+                    self.drop(
+                        'odometry stamp',
+                        f'odom.header.stamp: read {stamp} ns, allowed are stamps after '
+                        f'{latest.stamp} ns',
+                    )
+                return
+            self.get_logger().warning(
+                f'odom.header.stamp jumped back by {1e-9 * (latest.stamp - stamp):.3f} s: '
+                'starting anew'
+            )
+            self.reset()
+        try:
+            placed = self._place(stamp, message)
+        except ValueError as error:
+            self.drop('odometry', f'odom: {error}')
+            self._unusable = stamp
+            self._answer_step()
+            return
+        self._history.add(placed)
+        self._odometry_at = time.monotonic()
+        if self._no_odometry:
+            self._no_odometry = False
+            self._trouble = ''
+            self.get_logger().info('odometry is back')
+        if not self.settings.lockstep:
+            self._control(placed)
+            self._serve()
+        else:
+            self._answer_step()
+
+    def _place(self, stamp: int, message: Odometry) -> StampedPose:
+        pose = pose_from_ros(message.pose.pose)
+        covariance = np.asarray(message.pose.covariance)
+        if self._odometry is None:
+            origin = pose if self.settings.odometry_origin == 'first' else None
+            self._odometry = MapOdometry(self._start, origin)
+        linear, angular = message.twist.twist.linear, message.twist.twist.angular
+        # A negative variance in the first place stands for an unknown covariance.
+        known = covariance.any() and covariance[0] >= 0.0
+        return self._odometry.apply(
+            stamp,
+            pose,
+            covariance.reshape(6, 6) if known else None,
+            (linear.x, linear.y, linear.z),
+            (angular.x, angular.y, angular.z),
+        )
+
+    def _step_of(self, stamp: int) -> int:
+        return round(stamp * 1e-9 / self.settings.step)
+
+    def _control(self, placed: StampedPose) -> None:
+        """Judge the goal, and publish state and command."""
+        follower = self._follower
+        step = self._step_of(placed.stamp)
+        robot = RobotState(placed.pose, placed.velocity, placed.angular_velocity)
+        command, reached = follower.update(robot, step if self.settings.lockstep else None)
+        if reached is not None:
+            self._finish(reached)
+        self._fill_state(placed, step)
+        self._state_publisher.publish(self._state)
+        self._publish_command(command.tolist())
+        if (
+            follower.status == GoalStatus.MOVING
+            and placed.stamp - self._feedback_at >= _FEEDBACK_PERIOD
+            and follower.goal is not None
+        ):
+            self._feedback_at = placed.stamp
+            distance = follower.distance(placed.pose.position)
+            follower.goal.handle.publish_feedback(GoToWaypoint.Feedback(distance=distance))
+
+    def _fill_state(self, placed: StampedPose, step: int) -> None:
+        state = self._state
+        state.header.stamp = self._command.header.stamp = stamp_to_ros(placed.stamp)
+        state.step = step
+        position, orientation = state.pose.pose.position, state.pose.pose.orientation
+        position.x, position.y, position.z = placed.pose.position.tolist()
+        orientation.w, orientation.x, orientation.y, orientation.z = (
+            placed.pose.orientation.tolist()
+        )
+        state.pose.covariance = placed.covariance.ravel()
+        linear, angular = state.twist.linear, state.twist.angular
+        linear.x, linear.y, linear.z = placed.velocity.tolist()
+        angular.x, angular.y, angular.z = placed.angular_velocity.tolist()
+        self._fill_status()
+
+    def _fill_status(self) -> None:
+        state, goal = self._state, self._follower.goal
+        state.battery = self._battery
+        state.goal_id = 0 if goal is None else goal.id
+        state.goal_status = int(self._follower.status)
+        state.reason = '' if goal is None else goal.reason
+        if self._trouble:
+            state.goal_status = AgentState.UNAVAILABLE
+            state.reason = self._trouble
+
+    def _publish_command(self, command: list[float]) -> None:
+        twist = self._command.twist
+        twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z = command
+        stamped = self.settings.command_type == 'stamped'
+        self._command_publisher.publish(self._command if stamped else twist)
+
+    # ---- lockstep ----------------------------------------------------------------------------
+
+    def on_step(self, message: LockstepStep) -> None:
+        """Do the control step of step k once its odometry is there."""
+        self._away = self.robot not in message.robots
+        if self._away:
+            # The sim does not wait for a robot that is gone.
+            self._end_goal(GoalStatus.ABORTED, 'left')
+            self._follower.let_go()
+            return
+        self._awaited = stamp_from_ros(message.stamp)
+        self._answer_step()
+
+    def _answer_step(self) -> None:
+        stamp = self._awaited
+        if stamp is None:
+            return
+        latest = self._history.latest
+        if stamp == self._answered:
+            # Said again for somebody who was started again.
+            self._state_publisher.publish(self._state)
+            self._command_publisher.publish(self._command)
+        elif latest is not None and latest.stamp == stamp:
+            self._control(latest)
+        elif stamp == self._unusable:
+            self._state.header.stamp = self._command.header.stamp = stamp_to_ros(stamp)
+            self._state.step = self.step
+            self._fill_status()
+            self._state_publisher.publish(self._state)
+            self._publish_command([0.0, 0.0, 0.0, 0.0])
+        else:
+            return
+        self._awaited, self._answered = None, stamp
+        self.done(self.step)
+        self._serve()
+
+    # ---- goals -------------------------------------------------------------------------------
+
+    def _judge_goal(self, request: GoToWaypoint.Goal) -> GoalResponse:
+        problem = self._problem(request)
+        if problem is None:
+            return GoalResponse.ACCEPT
+        self.drop('goal', f'go_to: {problem}')
+        return GoalResponse.REJECT
+
+    def _problem(self, request: GoToWaypoint.Goal) -> str | None:
+        """Return what is wrong with a goal: field, what was read, what is allowed."""
+        if not self.active:
+            return 'the driver is not active'
+        if self._away:
+            return 'the robot has left'
+        if self._trouble:
+            return f'the robot cannot go on: {self._trouble}'
+        if request.waypoint.header.frame_id != self.settings.frame:
+            return (
+                f'waypoint.header.frame_id: read {request.waypoint.header.frame_id!r}, '
+                f'allowed is {self.settings.frame!r}'
+            )
+        point = request.waypoint.pose.position
+        position = np.array([point.x, point.y, point.z])
+        if not np.isfinite(position).all():
+            return (
+                f'waypoint.pose.position: read {position.tolist()}, allowed are finite numbers [m]'
+            )
+        margin = self.settings.radius
+        for axis, (low, high) in enumerate(self._bounds.tolist()):
+            if not low - margin <= position[axis] <= high + margin:
+                return (
+                    f'waypoint.pose.position.{"xyz"[axis]}: read {position[axis]}, '
+                    f'allowed is {low - margin:g} to {high + margin:g} [m]'
+                )
+        if not (np.isfinite(request.tolerance) and request.tolerance >= 0.0):
+            return f'tolerance: read {request.tolerance}, allowed are finite numbers from 0 [m]'
+        return None
+
+    def _take_goal(self, handle: ServerGoalHandle) -> None:
+        request = handle.request
+        point = request.waypoint.pose.position
+        replaced = self._follower.take(
+            Goal(
+                id=int(request.goal_id),
+                step=int(request.step),
+                waypoint=np.array([point.x, point.y, point.z]),
+                tolerance=float(request.tolerance),
+                handle=handle,
+            )
+        )
+        if replaced is not None:
+            self._finish(replaced)
+
+    def _cancel_goal(self, handle: ServerGoalHandle) -> CancelResponse:
+        goal = self._follower.current
+        if goal is None or goal.handle is not handle:
+            # It has ended, or been replaced: there is nothing to cancel.
+            return CancelResponse.REJECT
+        self._end_goal(GoalStatus.CANCELED, 'cancelled')
+        if not self.settings.lockstep:
+            self._publish_command([0.0, 0.0, 0.0, 0.0])
+        return CancelResponse.ACCEPT
+
+    def _end_goal(self, status: GoalStatus, reason: str) -> None:
+        goal = self._follower.end(status, reason)
+        if goal is not None:
+            self._finish(goal)
+
+    def _finish(self, goal: Goal) -> None:
+        """Have the goal's result sent; the executor calls `_conclude` for it."""
+        self._ended[bytes(goal.handle.goal_id.uuid)] = goal
+        goal.handle.execute()
+
+    def _conclude(self, handle: ServerGoalHandle) -> GoToWaypoint.Result:
+        goal = self._ended.pop(bytes(handle.goal_id.uuid))
+        if goal.status == GoalStatus.REACHED:
+            handle.succeed()
+        elif goal.status == GoalStatus.CANCELED and handle.is_cancel_requested:
+            handle.canceled()
+        else:
+            handle.abort()
+        result = GoToWaypoint.Result(reached=goal.status == GoalStatus.REACHED, reason=goal.reason)
+        latest = self._history.latest
+        result.pose = pose_to_ros(self._start if latest is None else latest.pose)
+        return result
+
+    # ---- when it cannot go on ----------------------------------------------------------------
+
+    def _watch(self) -> None:
+        """Stop a robot without odometry; on wall time, as a clock may stand still with it."""
+        if not self.active:
+            return
+        self._watches += 1
+        age = time.monotonic() - self._odometry_at
+        if self._history.latest is None:
+            if age > _PATIENCE:
+                self.warn_throttled('no odometry', f'odom: nothing yet, for {age:.0f} s')
+            return
+        if self._command_publisher.get_subscription_count() == 0:
+            self._say_nobody_listens()
+        if age <= self.settings.odometry_timeout:
+            return
+        self._trouble = f'no odometry for {age:.1f} s'
+        if not self._no_odometry:
+            self._no_odometry = True
+            self.get_logger().warning(f'odom: {self._trouble}: the robot is stopped')
+            self._end_goal(GoalStatus.ABORTED, self._trouble)
+            self._follower.let_go()
+            self._watches = 0
+        self._publish_command([0.0, 0.0, 0.0, 0.0])
+        if self._watches % _WATCHES_PER_STATE == 0:
+            self._fill_status()
+            self._state_publisher.publish(self._state)
+
+    def _say_nobody_listens(self) -> None:
+        types = {
+            item.topic_type
+            for item in self.get_subscriptions_info_by_topic(self._command_publisher.topic_name)
+        }
+        listens = (
+            f'the robot wants {", ".join(sorted(types))}: see the parameter command_type'
+            if types
+            else 'is the robot there?'
+        )
+        self.warn_throttled('cmd_vel', f'cmd_vel: nobody listens; {listens}')
+
+    def _on_battery(self, message: BatteryState) -> None:
+        charge = message.percentage
+        # Some robots say per cent.
+        if 1.0 < charge <= 100.0:
+            charge *= 0.01
+        self._battery = charge if 0.0 <= charge <= 1.0 else -1.0
+        minimum = self.settings.battery_minimum
+        if self._no_odometry or not minimum:
+            return
+        low = 0.0 <= self._battery < minimum
+        if low and not self._trouble:
+            self._trouble = f'battery at {self._battery:.2f}, below {minimum:.2f}'
+            self.get_logger().warning(f'{self._trouble}: the robot goes nowhere any more')
+            self._end_goal(GoalStatus.ABORTED, self._trouble)
+        elif not low:
+            self._trouble = ''
+
+    # ---- measurements ------------------------------------------------------------------------
+
+    def _on_batch(self, message: MeasurementBatch) -> None:
+        if not self.active:
+            return
+        for member in message.members:
+            if member.robot == self.robot:
+                request = MeasurementRequest(
+                    int(message.id), stamp_from_ros(message.stamp), int(member.measurement)
+                )
+                for old in self._queue.add_request(request):
+                    self.drop('batch', f'batch {old.batch}: no image for it, too many newer ones')
+                self._serve()
+                return
+
+    def take_frame(self, topic: str, stamp: int, data: DataT) -> None:
+        """Take an image or sweep stamped in nanoseconds."""
+        if not self.active:
+            return
+        latest = self._queue.latest
+        if latest is not None and stamp <= latest:
+            if latest - stamp <= _JUMP:
+                self.drop(
+                    'image stamp',
+                    f'{topic}.header.stamp: read {stamp} ns, allowed are stamps after {latest} ns',
+                )
+                return
+            self.get_logger().warning(
+                f'{topic}.header.stamp jumped back by {1e-9 * (latest - stamp):.3f} s'
+            )
+            self._queue.clear()
+        self._queue.add_frame(Frame(stamp, data))
+        self._serve()
+
+    def _serve(self) -> None:
+        """Answer the batches for which image and pose are there."""
+        while (found := self._queue.next()) is not None:
+            request, frame, pose = found
+            try:
+                seen = self.look(frame.data, pose)
+            except ValueError as error:
+                # Not seeing is information: the next image answers instead of an empty answer.
+                self.drop('image', str(error))
+                continue
+            self._queue.answered()
+            self._publish_sighting(request, frame.stamp, pose, seen)
+
+    def _publish_sighting(
+        self, request: MeasurementRequest, stamp: int, pose: StampedPose, seen: Sighting
+    ) -> None:
+        values, covariances = seen.values, seen.covariances
+        dropped = sum(seen.dropped.values())
+        self._unseen.update(seen.dropped)
+        if len(values):
+            inside = self.sensor.detection.probability(seen.positions, pose.pose) > 0.0
+            inside &= values[:, 0] <= self.sensor.maximum_range
+            outside = int(np.count_nonzero(~inside))
+            if outside:
+                values = values[inside]
+                covariances = None if covariances is None else covariances[inside]
+                dropped += outside
+                self._unseen['outside the field of view'] += outside
+        answer = DetectionArray(
+            batch_id=request.batch,
+            step=self._step_of(stamp),
+            robot=self.robot,
+            measurement=request.measurement,
+            sensor=self.sensor.name,
+            detections=detections_to_ros(values, covariances),
+            dropped=dropped,
+        )
+        answer.header.stamp = stamp_to_ros(stamp)
+        answer.header.frame_id = self.settings.frame
+        answer.pose.pose = pose_to_ros(pose.pose)
+        answer.pose.covariance = pose.covariance.ravel()
+        self._detections_publisher.publish(answer)

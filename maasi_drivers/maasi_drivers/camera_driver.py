@@ -1,0 +1,146 @@
+"""What the drivers of robots with a camera share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from maasi_drivers.agent_driver import AgentDriver, Sighting
+from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.image_encoding import image_to_array
+from maasi_drivers.marker_detector import MarkerDetector
+from maasi_drivers.odometry import StampedPose
+from maasi_drivers.projection import box_view_margin
+from maasi_drivers.warm_up import warm_up
+from maasi_filter.conversions import stamp_from_ros
+from maasi_filter.detection_model import BoxDetection
+from maasi_filter.pose import Pose
+from maasi_filter.qos import sensor_reader
+from maasi_filter.search_node import SettingsError
+
+ImageArray = NDArray[np.uint8]
+# An image that may still have to be decoded.
+Picture = Callable[[], ImageArray]
+
+
+class CameraDriver(AgentDriver[Picture]):
+    """
+    A robot with a camera that sees markers on the floor.
+
+    Subscribes
+    ----------
+    `camera/image_raw` (sensor_msgs/Image) or `camera/image_raw/compressed`;
+    `camera/camera_info` (sensor_msgs/CameraInfo), whose calibration replaces the parameters'
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        if self.settings.camera is None:
+            raise SettingsError(
+                'parameter camera: got nothing, allowed are the settings of a camera '
+                '(camera.width, ...)'
+            )
+        self._calibration: tuple[object, ...] | None = None
+        self._use(self.settings.camera)
+        self.offset = round(self.settings.camera.stamp_offset * 1e9)
+
+    def _use(self, camera: CameraSettings) -> None:
+        self.camera = camera
+        self.detector = MarkerDetector(camera, self.dimension)
+        box = self.sensor.detection
+        if isinstance(box, BoxDetection):
+            margin = box_view_margin(
+                self.detector.camera,
+                self.settings.sensor.detection.lower or [],
+                self.settings.sensor.detection.upper or [],
+                max(self.settings.start[2], 0.0),
+            )
+            if margin < 0.0:
+                self.get_logger().warning(
+                    'sensor.detection: the box is not all inside what the camera sees from '
+                    f'{self.settings.start[2]} m, by {-margin:.1f} px'
+                )
+
+    def set_up_sensor(self) -> None:
+        """Compile and connect."""
+        warm_up()
+        grey = np.full((self.camera.height, self.camera.width, 3), 120, np.uint8)
+        # Images are read-only views of messages.
+        view = np.frombuffer(grey.tobytes(), np.uint8).reshape(grey.shape)
+        height = max(self.settings.start[2], 0.1)
+        self.detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0), np.zeros((6, 6)))
+        quality = sensor_reader(self.settings.lockstep)
+        self.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
+        if self.settings.image_transport == 'raw':
+            self.create_subscription(Image, 'camera/image_raw', self._on_image, quality)
+        else:
+            self.create_subscription(
+                CompressedImage, 'camera/image_raw/compressed', self._on_compressed, quality
+            )
+
+    def _on_calibration(self, message: CameraInfo) -> None:
+        calibration = (
+            message.width,
+            message.height,
+            message.k.tolist(),
+            list(message.d),
+            message.distortion_model,
+        )
+        # Without a focal length the camera has not been calibrated.
+        if calibration == self._calibration or message.k[0] == 0.0:
+            return
+        self._calibration = calibration
+        try:
+            camera = self.camera.with_calibration(*calibration)
+        except ValueError as error:
+            self.drop('calibration', f'camera/camera_info: {error}')
+            return
+        self._use(camera)
+
+    def _on_image(self, message: Image) -> None:
+        try:
+            image = image_to_array(
+                message.height, message.width, message.encoding, message.step, message.data
+            )
+            self._check_size(image)
+        except ValueError as error:
+            self.drop('image', f'camera/image_raw: {error}')
+            return
+        self.take_frame('camera/image_raw', stamp_from_ros(message.header.stamp), lambda: image)
+
+    def _on_compressed(self, message: CompressedImage) -> None:
+        def decode() -> ImageArray:
+            data = np.frombuffer(message.data, np.uint8)
+            image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+            if image is None:
+                raise ValueError(
+                    f'camera/image_raw/compressed: got {data.size} bytes of '
+                    f"'{message.format}', allowed is what OpenCV decodes"
+                )
+            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+        topic = 'camera/image_raw/compressed'
+        self.take_frame(topic, stamp_from_ros(message.header.stamp), decode)
+
+    def _check_size(self, image: ImageArray) -> None:
+        camera = self.camera
+        if image.shape[:2] != (camera.height, camera.width):
+            raise ValueError(
+                f'image: got {image.shape[1]} x {image.shape[0]} px, allowed is the size of the '
+                f'calibration, {camera.width} x {camera.height} px'
+            )
+
+    def look(self, data: Picture, pose: StampedPose) -> Sighting:
+        """Find the markers in an image."""
+        # Odometry that says nothing of its errors carries zeros.
+        covariance = pose.covariance if pose.covariance.any() else None
+        seen = self.detector.detect(data(), pose.pose, covariance)
+        positions = seen.positions
+        if self.dimension == 3:
+            positions = np.pad(positions, ((0, 0), (0, 1)))
+        return Sighting(seen.values, seen.covariances, positions, seen.dropped)

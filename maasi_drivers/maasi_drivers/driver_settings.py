@@ -1,0 +1,81 @@
+"""Settings of a robot's driver and of its guard."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from maasi_drivers.camera_settings import CameraSettings
+from maasi_filter.node_settings import NodeSettings
+from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings
+from maasi_planner.settings import MotionSettings
+
+CommandType = Literal['stamped', 'twist']
+# A driver that is silent for so long is dead to its guard [s].
+LIVELINESS_LEASE = 0.5
+
+
+class DriverSettings(NodeSettings):
+    """What the driver of a robot needs to know."""
+
+    environment: EnvironmentSettings = Field(description='Where the robot may go')
+    start: list[Finite] = Field(
+        default_factory=lambda: [0.0, 0.0, 0.0],
+        min_length=3,
+        max_length=3,
+        description='Position in the map where its odometry is zero [m]',
+    )
+    yaw: Finite = Field(default=0.0, description='Heading there, from the x axis of the map [rad]')
+    radius: float = Field(default=0.1, gt=0.0, description='Of the robot [m]')
+    motion: MotionSettings = Field(
+        default_factory=MotionSettings, description='Motion model and controller'
+    )
+    sensor: SensorSettings = Field(
+        default_factory=SensorSettings, description='What it measures targets with'
+    )
+    camera: CameraSettings | None = Field(default=None, description='Its camera; none: it has none')
+    image_transport: Literal['raw', 'compressed'] = Field(
+        default='raw',
+        description='Images as camera/image_raw, or as camera/image_raw/compressed',
+    )
+    odometry_origin: Literal['zero', 'first'] = Field(
+        default='zero',
+        description='What the odometry shows at the start: zero, or what its first message says',
+    )
+    odometry_timeout: float = Field(
+        default=0.5,
+        ge=0.1,
+        description='Wall time without odometry after which the robot is stopped; not in lockstep '
+        '[s]',
+    )
+    command_type: CommandType = Field(
+        default='stamped', description='Type of cmd_vel: TwistStamped or Twist'
+    )
+    battery_minimum: float = Field(
+        default=0.0,
+        ge=0.0,
+        lt=1.0,
+        description='Charge below which the robot goes nowhere any more; 0: not looked at [1]',
+    )
+
+    @model_validator(mode='after')
+    def _consistent(self) -> DriverSettings:
+        if self.lockstep and self.command_type != 'stamped':
+            raise ValueError(
+                f'command_type: got {self.command_type!r}, allowed is stamped in lockstep'
+            )
+        if self.lockstep and self.camera is not None and self.camera.stamp_offset > 0.0:
+            raise ValueError(
+                f'camera.stamp_offset: got {self.camera.stamp_offset}, allowed is at most 0 in '
+                'lockstep: the pose after an image is not awaited there'
+            )
+        return self
+
+
+class GuardSettings(NodeSettings):
+    """What the guard of a robot needs to know."""
+
+    command_type: CommandType = Field(
+        default='stamped', description='Type of cmd_vel: TwistStamped or Twist'
+    )

@@ -1,0 +1,115 @@
+"""The guard of a robot: a small process that stops the robot when its driver is gone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+
+from maasi_drivers.driver_settings import LIVELINESS_LEASE, GuardSettings
+from maasi_filter.qos import RELIABLE
+from maasi_filter.search_node import SearchNode, run
+from maasi_msgs.msg import AgentState
+
+_STOP_PERIOD = 0.1
+
+
+class GuardNode(SearchNode[GuardSettings]):
+    """
+    Publishes zeros while no driver is alive, and nothing while one is.
+
+    Ground robots need it: the last command goes on when nothing follows.
+
+    Subscribes
+    ----------
+    `state` (maasi_msgs/AgentState), for the driver's liveliness
+
+    Publishes
+    ---------
+    `cmd_vel` (geometry_msgs/TwistStamped or Twist), 10 times a second from the driver's death until
+    it is back
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('guard', GuardSettings, in_robot=True, lockstep_member=False, **options)
+        self._last = b''
+        self._stop_timer: Any = None
+
+    def set_up(self) -> None:
+        """Connect."""
+        stamped = self.settings.command_type == 'stamped'
+        self._publisher = self.create_publisher(
+            TwistStamped if stamped else Twist, 'cmd_vel', RELIABLE
+        )
+        quality = QoSProfile(
+            depth=1,
+            reliability=ReliabilityPolicy.BEST_EFFORT,
+            liveliness=LivelinessPolicy.AUTOMATIC,
+            liveliness_lease_duration=Duration(seconds=LIVELINESS_LEASE),
+        )
+        # Of the messages only the last one matters, and that only when no other comes.
+        self._subscription = self.create_subscription(
+            AgentState,
+            'state',
+            self._on_state,
+            quality,
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(liveliness=self._on_liveliness),
+        )
+
+    def tear_down(self) -> None:
+        """Disconnect."""
+        self._end_stop()
+        self.destroy_subscription(self._subscription)
+        self.destroy_publisher(self._publisher)
+
+    def halt(self) -> None:
+        """Leave the robot alone."""
+        self._end_stop()
+
+    def status(self) -> dict[str, Any]:
+        """Return whether the robot is being stopped."""
+        return {'stopping': self._stop_timer is not None}
+
+    def _on_state(self, message: bytes) -> None:
+        self._last = message
+
+    def _on_liveliness(self, event: Any) -> None:
+        if event.alive_count > 0:
+            if self._stop_timer is not None:
+                self.get_logger().info('the driver is back')
+            self._end_stop()
+        elif self.active and self._stop_timer is None:
+            self.get_logger().warning('the driver is gone: zeros on cmd_vel')
+            self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._stop)
+            self._stop()
+
+    def _end_stop(self) -> None:
+        if self._stop_timer is not None:
+            self._stop_timer.cancel()
+            self.destroy_timer(self._stop_timer)
+            self._stop_timer = None
+
+    def _stop(self) -> None:
+        if self._stop_timer is None:
+            return
+        if self.settings.command_type == 'twist':
+            self._publisher.publish(Twist())
+            return
+        command = TwistStamped()
+        if self._last:
+            command.header.stamp = deserialize_message(self._last, AgentState).header.stamp
+        self._publisher.publish(command)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the guard."""
+    return run(GuardNode, arguments)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

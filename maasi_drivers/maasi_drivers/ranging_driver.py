@@ -1,0 +1,60 @@
+"""The driver of a robot with a sensor of range, bearing and elevation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from maasi_drivers.agent_driver import AgentDriver, FloatArray, Sighting
+from maasi_drivers.odometry import StampedPose
+from maasi_filter.conversions import stamp_from_ros
+from maasi_filter.qos import sensor_reader
+from maasi_filter.search_node import run
+from maasi_msgs.msg import RangeArray
+
+
+class RangingDriver(AgentDriver[FloatArray]):
+    """
+    A robot that measures range and direction of what is near.
+
+    Subscribes
+    ----------
+    `ranges` (maasi_msgs/RangeArray)
+    """
+
+    def set_up_sensor(self) -> None:
+        """Connect."""
+        quality = sensor_reader(self.settings.lockstep)
+        self.create_subscription(RangeArray, 'ranges', self._on_ranges, quality)
+
+    def _on_ranges(self, message: RangeArray) -> None:
+        values = np.array(
+            [(item.range, item.bearing, item.elevation) for item in message.ranges], dtype=float
+        ).reshape(-1, 3)[:, : self.dimension]
+        limits = np.array([math.inf, math.pi, 0.5 * math.pi][: self.dimension]) + 1e-6
+        good = np.isfinite(values).all(axis=1) & (values[:, 0] >= 0.0)
+        good &= (np.abs(values) <= limits).all(axis=1)
+        if not good.all():
+            first = values[np.flatnonzero(~good)[0]].tolist()
+            self.drop(
+                'range',
+                f'ranges: read {first}, allowed are a finite range from 0 [m], a bearing within pi '
+                'and an elevation within pi/2 [rad]',
+                int(np.count_nonzero(~good)),
+            )
+        self.take_frame('ranges', stamp_from_ros(message.header.stamp), values[good])
+
+    def look(self, data: FloatArray, pose: StampedPose) -> Sighting:
+        """Return the measurements of one sweep, as they came."""
+        positions = self.sensor.measurement.inverse(data, pose.pose)
+        return Sighting(data, None, positions, {})
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the driver."""
+    return run(RangingDriver, arguments)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
