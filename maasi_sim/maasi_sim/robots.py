@@ -204,6 +204,13 @@ class SimulatedRobot:
         self.battery.drain(float(np.sqrt((velocity * velocity).sum())), dt)
         self.odometry = self._odometry.step(self.state, step)
 
+    def stand(self, step: int) -> None:
+        """Stay where it is until the discrete step `step`, at rest; the last command is void."""
+        self._command = np.zeros(4)
+        if self.state.velocity.any() or self.state.angular_velocity.any():
+            self._halt(self.state.pose)
+        self.odometry = self._odometry.step(self.state, step)
+
     def image(self, step: int, time: float) -> NDArray[np.uint8]:
         """Return what the camera sees now, (h, w, 3) uint8 in R, G, B."""
         if self.camera is None:

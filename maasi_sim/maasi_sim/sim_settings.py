@@ -1,0 +1,30 @@
+"""Settings of the simulation node."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from maasi_filter.node_settings import NodeSettings
+
+
+class SimNodeSettings(NodeSettings):
+    """Settings of the simulation node; all else is in the scenario file."""
+
+    step: float = Field(
+        default=0.0, ge=0.0, le=10.0, description="Duration of a step; 0: the scenario's [s]"
+    )
+    scenario: str = Field(
+        min_length=1, description='Scenario file, or the name of one in config/scenarios'
+    )
+    rate: float = Field(
+        default=1.0,
+        ge=0.0,
+        description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
+    )
+    recorder: bool = Field(default=False, description='Whether it waits for the recorder, too')
+    command_age: float = Field(
+        default=1.0,
+        gt=0.0,
+        description='Simulated time after which a command is too old; in lockstep each is for its '
+        'step [s]',
+    )

@@ -1,0 +1,457 @@
+"""The simulation node over real topics, against nodes that play the rest of the team."""
+
+import time
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import rclpy
+import yaml
+from geometry_msgs.msg import PoseArray, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
+from visualization_msgs.msg import MarkerArray
+
+from maasi_filter.qos import LATCHED, RELIABLE
+from maasi_filter.search_node import SettingsError
+from maasi_msgs.msg import LockstepDone, LockstepStep, RangeArray
+from maasi_sim.sim_node import SimNode
+
+DOMAIN = 69
+STEP = 0.05
+SCENARIO = {
+    'version': 1,
+    'environment': {
+        'bounds': [[-0.3, 2.4], [-0.3, 2.4]],
+        'obstacles': [{'centre': [1.0, 2.0], 'radius': 0.1}],
+    },
+    'step': STEP,
+    'targets': {'positions': [[1.9, 1.95], [0.3, 0.4]]},
+    'robots': {
+        'mambo': {
+            'type': 'mambo',
+            'start': [1.9, 1.9, 1.0],
+            'yaw': 0.5,
+            'candidates': {'grid': [2, 2], 'spacing': 1.0, 'corner': [0.5, 0.5]},
+        },
+        'turtlebot': {
+            'type': 'turtlebot3_burger',
+            'start': [0.0, 0.0, 0.0],
+            'candidates': {'grid': [2, 2], 'spacing': 1.0, 'corner': [0.5, 0.5]},
+        },
+    },
+    'stop': 'planner_done',
+}
+RANGING = {
+    'version': 1,
+    'environment': {'bounds': [[0.0, 260.0], [0.0, 260.0], [0.0, 260.0]]},
+    'step': 0.1,
+    'targets': {'count': 12, 'separation': 10.0},
+    'robots': {
+        'drone': {
+            'type': 'ranging_drone',
+            'start': [100.0, 100.0, 100.0],
+            'candidates': {'grid': [3, 3, 3], 'spacing': 100.0, 'corner': [20.0, 20.0, 20.0]},
+            'sensor': {'detection': {'size': [500.0, 500.0, 500.0]}},
+        },
+    },
+}
+FORWARD = (0.2, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def context(monkeypatch):
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    context = Context()
+    rclpy.init(context=context, domain_id=DOMAIN, signal_handler_options=SignalHandlerOptions.NO)
+    yield context
+    rclpy.shutdown(context=context)
+
+
+class Member(Node):
+    """The driver of a robot, the filter or the planner: says `done`, and sends commands."""
+
+    def __init__(self, context, name, robot='', command=FORWARD, lockstep=True):
+        super().__init__(
+            name, context=context, namespace=f'/{robot}', start_parameter_services=False
+        )
+        self.robot = robot
+        self.velocity = command
+        self.stamp_shift = 0
+        self.quiet = False
+        self.steps = []
+        self.seen = defaultdict(list)
+        self.ready = self.create_publisher(LockstepDone, '/lockstep/ready', LATCHED)
+        self.done = self.create_publisher(LockstepDone, '/lockstep/done', RELIABLE)
+        self.create_subscription(LockstepStep, '/lockstep/step', self.on_step, RELIABLE)
+        self.command = self.create_publisher(TwistStamped, 'cmd_vel', RELIABLE)
+        for topic, kind in {
+            'odom': Odometry,
+            'camera/image_raw': Image,
+            'camera/camera_info': CameraInfo,
+            'scan': LaserScan,
+            'battery': BatteryState,
+            'ranges': RangeArray,
+        }.items():
+            if robot:
+                self.listen(f'/{robot}/{topic}', kind, RELIABLE)
+
+    def listen(self, topic, kind, qos):
+        self.create_subscription(kind, topic, self.seen[topic].append, qos)
+
+    def of(self, topic):
+        return self.seen[f'/{self.robot}/{topic}']
+
+    def say_ready(self):
+        self.ready.publish(LockstepDone(node=self.get_fully_qualified_name()))
+
+    def on_step(self, message):
+        self.steps.append(message)
+        if self.quiet:
+            return
+        if self.robot in message.robots:
+            self.send(self.velocity, seconds(message.stamp) + self.stamp_shift)
+        self.done.publish(LockstepDone(node=self.get_fully_qualified_name(), step=message.step))
+
+    def send(self, velocity, stamp):
+        command = TwistStamped()
+        command.header.stamp.sec, command.header.stamp.nanosec = divmod(round(stamp * 1e9), 10**9)
+        twist = command.twist
+        twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z = velocity
+        self.command.publish(command)
+
+
+class Team:
+    """A simulation node and those it waits for, in one executor."""
+
+    def __init__(self, context, folder, content, robots=('mambo', 'turtlebot'), **parameters):
+        file = folder / 'scenario.yaml'
+        file.write_text(yaml.safe_dump(content))
+        values = {'scenario': str(file), 'seed': 3, 'lockstep': True, 'rate': 0.0} | parameters
+        self.context = context
+        self.closed = False
+        self.sim = SimNode(
+            context=context,
+            parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
+        )
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.sim)
+        self.drivers = {name: self.add('driver', name) for name in robots}
+        self.filter, self.planner = self.add('filter_node'), self.add('planner_node')
+        self.filter.listen('/clock', Clock, RELIABLE)
+        self.filter.listen('/ground_truth/targets', PoseArray, LATCHED)
+        self.filter.listen('/ground_truth/markers', MarkerArray, LATCHED)
+        assert self.sim.trigger_configure().name == 'SUCCESS'
+        assert self.sim.trigger_activate().name == 'SUCCESS'
+
+    def add(self, name, robot='', **options):
+        node = Member(self.context, name, robot, **options)
+        self.executor.add_node(node)
+        return node
+
+    @property
+    def members(self):
+        return [*self.drivers.values(), self.filter, self.planner]
+
+    def say_ready(self):
+        for member in self.members:
+            member.say_ready()
+
+    def spin_until(self, condition, limit=10.0):
+        end = time.monotonic() + limit
+        while not condition():
+            assert time.monotonic() < end, self.sim.status()
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def settle(self, seconds_=0.2):
+        """Let all that is under way arrive."""
+        end = time.monotonic() + seconds_
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def run(self, steps):
+        """Go on until all that belongs to a step has arrived: the one after the next is there."""
+        self.spin_until(
+            lambda: all(m.steps and m.steps[-1].step >= steps + 2 for m in self.members)
+        )
+
+    def close(self):
+        if self.closed:
+            return
+        self.closed = True
+        self.sim.halt()
+        self.executor.shutdown()
+        for node in (*self.members, self.sim):
+            node.destroy_node()
+
+
+@pytest.fixture
+def make_team(context, tmp_path):
+    teams = []
+
+    def make(content=SCENARIO, **options):
+        teams.append(Team(context, tmp_path, content, **options))
+        return teams[-1]
+
+    yield make
+    for team in teams:
+        team.close()
+
+
+def seconds(stamp):
+    return stamp.sec + stamp.nanosec * 1e-9
+
+
+def steps_of(messages, step=STEP):
+    return [round(seconds(message.header.stamp) / step) for message in messages]
+
+
+def test_every_topic_comes_at_its_rate_with_the_stamps_of_the_steps(make_team):
+    team = make_team()
+    team.say_ready()
+    team.run(50)
+    mambo, turtlebot = team.drivers['mambo'], team.drivers['turtlebot']
+    for driver in (mambo, turtlebot):
+        assert steps_of(driver.of('odom'))[:51] == list(range(51))
+        assert steps_of(driver.of('camera/image_raw'))[:26] == list(range(0, 51, 2))
+        assert steps_of(driver.of('camera/camera_info'))[:26] == list(range(0, 51, 2))
+        assert steps_of(driver.of('battery'))[:3] == [0, 20, 40]
+    assert steps_of(turtlebot.of('scan'))[:13] == list(range(0, 51, 4))
+    assert not mambo.of('scan') and not mambo.of('ranges')
+    steps = team.filter.steps[:51]
+    assert [message.step for message in steps] == list(range(51))
+    np.testing.assert_allclose(
+        [seconds(message.stamp) for message in steps], STEP * np.arange(51), atol=1e-9
+    )
+    assert all(message.robots == ['mambo', 'turtlebot'] for message in steps)
+    assert [message.imaging for message in steps[:2]] == [['mambo', 'turtlebot'], []]
+    clock = [round(seconds(message.clock) / STEP) for message in team.filter.seen['/clock']]
+    assert clock[:51] == list(range(51))
+
+
+def test_what_the_messages_say(make_team):
+    team = make_team()
+    team.say_ready()
+    team.run(40)
+    mambo, turtlebot = team.drivers['mambo'], team.drivers['turtlebot']
+    first, last = mambo.of('odom')[0], mambo.of('odom')[40]
+    assert (first.header.frame_id, first.child_frame_id) == ('mambo/odom', 'mambo/base_link')
+    position = first.pose.pose.position
+    assert max(abs(position.x), abs(position.y), abs(position.z)) < 0.02
+    assert np.all(np.diag(np.reshape(first.pose.covariance, (6, 6))) > 0.0)
+    assert np.all(np.diag(np.reshape(first.twist.covariance, (6, 6))) > 0.0)
+    # It flies along its own x axis, with which its odometry begins, whatever its heading.
+    assert last.pose.pose.position.x > 0.2
+    assert abs(last.pose.pose.position.y) < 0.05
+    assert last.twist.twist.linear.x == pytest.approx(0.2, abs=0.05)
+    image, info = mambo.of('camera/image_raw')[0], mambo.of('camera/camera_info')[0]
+    assert (image.width, image.height, image.encoding) == (160, 120, 'rgb8')
+    assert (image.step, len(image.data)) == (480, 160 * 120 * 3)
+    assert list(info.k) == [220.0, 0.0, 79.5, 0.0, 220.0, 59.5, 0.0, 0.0, 1.0]
+    assert np.asarray(image.data).std() > 1.0
+    scan = turtlebot.of('scan')[0]
+    assert len(scan.ranges) == 360
+    assert scan.ranges[0] == pytest.approx(2.7, abs=0.1)
+    assert mambo.of('battery')[1].percentage < mambo.of('battery')[0].percentage <= 1.0
+    truth = team.filter.seen['/ground_truth/targets'][0]
+    assert truth.header.frame_id == 'map'
+    np.testing.assert_allclose(
+        [[pose.position.x, pose.position.y, pose.position.z] for pose in truth.poses],
+        [[1.9, 1.95, 0.0], [0.3, 0.4, 0.0]],
+    )
+    kinds = [marker.ns for marker in team.filter.seen['/ground_truth/markers'][0].markers]
+    assert kinds == ['truth', 'truth', 'obstacles']
+
+
+def test_two_runs_are_the_same_to_the_bit_and_another_seed_is_not(make_team):
+    runs = []
+    for seed in (3, 3, 4):
+        team = make_team(seed=seed)
+        team.say_ready()
+        team.run(20)
+        driver = team.drivers['mambo']
+        images = [bytes(message.data) for message in driver.of('camera/image_raw')[:11]]
+        poses = [message.pose.pose.position.x for message in driver.of('odom')[:21]]
+        runs.append((images, poses))
+        team.close()
+    assert runs[0] == runs[1]
+    assert runs[0][0] != runs[2][0]
+    assert runs[0][1] != runs[2][1]
+
+
+def test_nothing_is_published_until_everybody_is_there(make_team):
+    team = make_team(recorder=True)
+    team.say_ready()
+    team.settle()
+    assert team.sim.status()['waits for'] == '/recorder'
+    assert not team.drivers['mambo'].of('odom') and not team.filter.steps
+    recorder = team.add('recorder')
+    recorder.say_ready()
+    team.run(5)
+    recorder.destroy_node()
+
+
+def test_a_step_waits_for_everybody_and_for_every_command(make_team):
+    team = make_team()
+    team.filter.quiet = True
+    team.drivers['turtlebot'].stamp_shift = -STEP
+    team.say_ready()
+    team.spin_until(lambda: team.sim.dropped['stale command'] == 1)
+    team.settle()
+    assert team.sim.status()['waits for'] == '/filter_node, turtlebot/cmd_vel'
+    team.filter.done.publish(LockstepDone(node='/filter_node', step=0))
+    team.settle()
+    assert team.sim.status()['waits for'] == 'turtlebot/cmd_vel'
+    team.drivers['turtlebot'].stamp_shift = 0
+    team.filter.quiet = False
+    team.drivers['turtlebot'].send(FORWARD, 0.0)
+    team.run(5)
+
+
+def test_a_command_that_is_not_finite_is_refused_and_the_one_before_holds(make_team):
+    team = make_team()
+    team.say_ready()
+    team.run(20)
+    team.drivers['mambo'].velocity = (float('nan'), 0.0, 0.0, 0.0)
+    team.run(40)
+    assert team.sim.dropped['bad command'] >= 15
+    place = [message.pose.pose.position.x for message in team.drivers['mambo'].of('odom')]
+    assert place[40] > place[25] > place[20]
+
+
+def test_a_robot_that_is_away_is_silent_stands_still_and_goes_on_from_there(make_team):
+    events = [
+        {'at': 1.0, 'robot': 'turtlebot', 'do': 'leave'},
+        {'at': 2.0, 'robot': 'turtlebot', 'do': 'back'},
+    ]
+    team = make_team(SCENARIO | {'events': events})
+    team.say_ready()
+    team.run(60)
+    turtlebot = team.drivers['turtlebot']
+    there = [*range(20), *range(40, 61)]
+    assert steps_of(turtlebot.of('odom'))[:41] == there
+    assert steps_of(turtlebot.of('camera/image_raw'))[:21] == [k for k in there if k % 2 == 0]
+    teams = [message.robots for message in team.filter.steps[:61]]
+    assert all(('turtlebot' in teams[k]) == (k in there) for k in range(61))
+    assert all('turtlebot' not in team.filter.steps[k].imaging for k in range(20, 40))
+    place = {
+        step: message.pose.pose.position.x
+        for step, message in zip(steps_of(turtlebot.of('odom')), turtlebot.of('odom'))
+    }
+    assert abs(place[40] - place[19]) < 0.03
+    assert abs(turtlebot.of('odom')[20].twist.twist.linear.x) < 0.03
+    assert place[60] > place[40] + 0.1
+
+
+def test_a_driver_that_was_started_again_gets_the_step_anew(make_team):
+    team = make_team()
+    team.say_ready()
+    team.run(10)
+    old = team.drivers['mambo']
+    old.quiet = True
+    # The step after which it is gone: the old one has done nothing for it.
+    team.spin_until(lambda: old.steps[-1].step == team.sim.step and len(team.sim._waiting) == 2)
+    step = team.sim.step
+    team.executor.remove_node(old)
+    old.destroy_node()
+    new = team.add('driver', 'mambo')
+    team.drivers['mambo'] = new
+    new.say_ready()
+    team.run(step + 5)
+    assert steps_of(new.of('odom'))[:3] == [step, step + 1, step + 2]
+    assert [message.step for message in new.steps[:3]] == [step, step + 1, step + 2]
+    assert team.sim.dropped == {}
+
+
+def test_a_filter_that_was_started_again_gets_the_step_anew(make_team):
+    team = make_team()
+    team.planner.quiet = True
+    team.say_ready()
+    team.spin_until(lambda: team.sim._waiting == {'/planner_node'})
+    team.executor.remove_node(team.filter)
+    team.filter.destroy_node()
+    team.filter = team.add('filter_node')
+    team.filter.say_ready()
+    team.spin_until(lambda: len(team.filter.steps) == 1 and len(team.planner.steps) == 2)
+    assert team.filter.steps[0].step == 0
+    assert len(team.drivers['mambo'].of('odom')) == 1
+    team.planner.quiet = False
+    team.planner.done.publish(LockstepDone(node='/planner_node', step=0))
+    team.run(5)
+
+
+def test_ranging_robots_send_sweeps_at_the_period_of_their_sensor(make_team):
+    team = make_team(RANGING, robots=('drone',))
+    team.say_ready()
+    team.run(30)
+    drone = team.drivers['drone']
+    sweeps = drone.of('ranges')
+    assert steps_of(sweeps, 0.1)[:4] == [0, 10, 20, 30]
+    assert [message.imaging for message in team.filter.steps[9:12]] == [[], ['drone'], []]
+    assert not drone.of('camera/image_raw')
+    truth = team.filter.seen['/ground_truth/targets'][0].poses
+    offsets = [
+        np.array([pose.position.x, pose.position.y, pose.position.z]) - 100.0 for pose in truth
+    ]
+    distances = np.array([np.linalg.norm(offset) for offset in offsets])
+    assert len(sweeps[0].ranges) >= 3
+    for item in sweeps[0].ranges:
+        nearest = offsets[int(np.argmin(np.abs(distances - item.range)))]
+        assert np.abs(distances - item.range).min() < 6.0
+        assert np.isfinite([item.bearing, item.elevation]).all()
+        assert abs(item.elevation) <= np.pi / 2
+        assert nearest.shape == (3,)
+
+
+def test_free_running_goes_on_by_itself_and_the_last_command_holds(make_team):
+    team = make_team(lockstep=False, rate=20.0)
+    driver = team.drivers['mambo']
+    for member in team.members:
+        member.quiet = True
+    team.say_ready()
+    team.spin_until(lambda: team.sim.step >= 0)
+    driver.send((0.3, 0.0, 0.0, 0.0), 0.0)
+    team.run(60)
+    place = [message.pose.pose.position.x for message in driver.of('odom')]
+    assert place[60] > place[40] + 0.2
+    # Too old, of the future, not finite: refused. To stop is never refused.
+    driver.send((-0.3, 0.0, 0.0, 0.0), 0.05)
+    driver.send((-0.3, 0.0, 0.0, 0.0), 1e6)
+    driver.send((float('inf'), 0.0, 0.0, 0.0), 0.0)
+    team.spin_until(lambda: sum(team.sim.dropped.values()) == 3)
+    assert dict(team.sim.dropped) == {'stale command': 2, 'bad command': 1}
+    driver.send((0.0, 0.0, 0.0, 0.0), 0.05)
+    step = team.sim.step
+    team.run(step + 80)
+    place = [message.pose.pose.position.x for message in driver.of('odom')]
+    assert abs(place[-1] - place[-20]) < 0.02
+
+
+def test_lockstep_keeps_to_the_rate_that_is_asked_for(make_team):
+    team = make_team(rate=10.0)
+    team.say_ready()
+    team.spin_until(lambda: team.sim.step >= 0)
+    begin = time.monotonic()
+    team.run(40)
+    # 40 steps are 2 s; at ten times the speed they take 0.2 s, however fast the machine is.
+    assert time.monotonic() - begin > 0.18
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'text'),
+    [
+        ({'scenario': 'nowhere.yaml'}, 'nowhere.yaml'),
+        ({'lockstep': False, 'rate': 0.0}, 'parameter rate: read 0'),
+        ({'rate': -1.0}, 'rate'),
+        ({'step': 0.03}, 'whole multiples of step'),
+    ],
+)
+def test_wrong_parameters_are_refused_with_what_is_wrong(make_team, parameters, text):
+    with pytest.raises(SettingsError, match=text):
+        make_team(**parameters)
