@@ -446,9 +446,9 @@ def _normalise(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
         for chunk in range(chunks):
             scale[chunk, m] = 0.0
         log_sum = log_other
-        if total > 0.0:
-            # Beyond this the particles explain nothing that a number could hold.
-            relative = math.exp(min(log_other - log_peak, 700.0))
+        # Where something else explains it e^600 times better, the particles' share is nothing.
+        if total > 0.0 and log_other - log_peak < 600.0:
+            relative = math.exp(log_other - log_peak)
             own_mass[m] = total / (total + relative)
             log_sum = log_peak + math.log(total + relative)
             for chunk in range(chunks):

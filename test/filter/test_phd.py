@@ -192,6 +192,17 @@ def test_very_narrow_noise_does_not_underflow():
     assert update.log_normaliser[0] < -1e6
 
 
+def test_particles_that_are_far_leave_a_detection_to_what_else_explains_it():
+    positions = np.array([[1.0, 0.0], [2.0, 0.0]])
+    for range_variance in (1e-4, 1e-6, 1e-8, 1e-12):
+        prepared = polar([[2.1, 0.0]], np.diag([range_variance, 1e-4]))
+        other = np.array([1e-3])
+        update = associate(positions, np.ones(2), np.full(2, 0.9), prepared, ORIGIN, other)
+        assert update.other_scale[0] * other[0] + update.own_mass[0] == pytest.approx(1.0)
+        assert (update.factor <= 0.1 + 1.0 + 1e-12).all()
+    assert update.own_mass[0] == 0.0
+
+
 def test_a_detection_that_nothing_explains_is_told_by_its_normaliser():
     positions = np.array([[1.0, 0.0]])
     prepared = polar([[1.0, 0.0]], np.eye(2) * 0.01)

@@ -1,0 +1,415 @@
+"""The step as its users call it: searches, order, threads, and bad input."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from searches import CUBE, FLOOR, RADIANS, cube_sensor, floor_sensor, mow_floor, observe, separated
+
+from maasi_filter import (
+    AgentMeasurement,
+    DetectionSettings,
+    FilterSettings,
+    FunctionDetection,
+    NoiseSettings,
+    Pose,
+    SearchFilter,
+    Sensor,
+    SensorSettings,
+    match_targets,
+    warm_up,
+)
+
+
+def cube_search(seed=0, **options):
+    return SearchFilter(FilterSettings(**options), CUBE, np.random.default_rng(seed))
+
+
+def drone(values, position=(100.0, 100.0, 100.0), name='drone', sensor=None, **options):
+    return AgentMeasurement(
+        name, Pose(np.array(position)), sensor or cube_sensor(), np.array(values), **options
+    )
+
+
+def state(search):
+    """Return everything a step may change, as bytes."""
+    return (
+        search.particles.tobytes(),
+        search.weights.tobytes(),
+        [(t.id, t.position.tobytes(), t.covariance.tobytes()) for t in search.found_targets],
+        search.exploration.values.tobytes(),
+        str(search.generator.bit_generator.state),
+    )
+
+
+def visit(search, targets, poses, generator, sensors=None):
+    """Step the filter through what robots see at rows of poses."""
+    sensors = sensors or [cube_sensor()] * len(poses[0])
+    for step, row in enumerate(poses):
+        members = [
+            AgentMeasurement(
+                f'robot_{r}', Pose(p), sensors[r], observe(generator, sensors[r], targets, Pose(p))
+            )
+            for r, p in enumerate(row)
+        ]
+        search.step(members, 1, float(step))
+
+
+def flight(generator, steps, robots=1):
+    centres = np.cumsum(generator.normal(0.0, 12.0, (steps, robots, 3)), axis=0)
+    return np.clip(130.0 + centres, 0.0, 260.0)
+
+
+@pytest.mark.parametrize(
+    ('pose_error', 'camera'), [(0.0, False), (0.012, False), (0.0, True), (0.015, True)]
+)
+def test_the_floor_is_searched_without_false_targets(pose_error, camera):
+    for seed in range(3):
+        search, targets = mow_floor(seed, pose_error, camera)
+        found = np.array([target.position for target in search.found_targets])
+        match = match_targets(found, targets, 0.06)
+        assert (match.true_found, match.false_found) == (12, 0)
+        assert match.rmse < 0.008 + 1.2 * pose_error
+
+
+def test_targets_in_the_cube_are_found_and_refined():
+    generator = np.random.default_rng(7)
+    targets = separated(generator, 4, 90.0, 170.0, 30.0, 3)
+    search = cube_search(1)
+    visit(search, targets, flight(generator, 120), generator)
+    found = np.array([target.position for target in search.found_targets])
+    match = match_targets(found, targets, 5.0)
+    assert (match.true_found, match.false_found) == (4, 0)
+    assert match.rmse < 0.6
+    assert [target.id for target in search.found_targets] == [1, 2, 3, 4]
+    assert search.expected_number < 0.5
+
+
+def test_robots_are_processed_by_name_whatever_their_order():
+    generator = np.random.default_rng(3)
+    targets = generator.uniform(80.0, 180.0, (6, 3))
+    poses = flight(generator, 15, robots=3)
+    sensors = [cube_sensor(), cube_sensor(RADIANS), cube_sensor()]
+    searches = [cube_search(5), cube_search(5)]
+    for step, row in enumerate(poses):
+        members = [
+            drone(observe(generator, sensors[r], targets, Pose(p)), p, f'robot_{r}', sensors[r])
+            for r, p in enumerate(row)
+        ]
+        searches[0].step(members, 1, float(step))
+        searches[1].step(members[::-1], 1, float(step))
+    assert state(searches[0]) == state(searches[1])
+    assert len(searches[0].found_targets) >= 4
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.permutations(range(5)), st.integers(0, 1000))
+def test_the_order_of_detections_is_irrelevant_to_the_bit(order, seed):
+    generator = np.random.default_rng(seed)
+    values = cube_sensor().measurement.measure(
+        generator.uniform(60.0, 140.0, (5, 3)), Pose([100.0, 100.0, 100.0])
+    )
+    covariances = cube_sensor().covariance * (1.0 + generator.random((5, 1, 1)))
+    searches = [cube_search(2), cube_search(2)]
+    for index in (np.arange(5), np.array(order)):
+        search = searches.pop()
+        for step in range(3):
+            search.step([drone(values[index], covariances=covariances[index])], 1, float(step))
+        searches.insert(0, search)
+    assert state(searches[0]) == state(searches[1])
+
+
+def test_threads_change_nothing():
+    generator = np.random.default_rng(4)
+    targets = generator.uniform(80.0, 180.0, (4, 3))
+    poses = flight(generator, 6)
+    outcome = []
+    for threads in (1, 4):
+        search = cube_search(3, threads=threads, particles=150_000, particles_per_target=150_000)
+        visit(search, targets, poses, np.random.default_rng(0))
+        assert len(search.particles) > 70_000
+        outcome.append(state(search))
+    assert outcome[0] == outcome[1]
+
+
+def test_seeing_nothing_lowers_mass_and_exploration_by_what_was_missed():
+    search = cube_search()
+    sensor = cube_sensor()
+    search.step([drone([[20.0, 0.3, 0.1]])], 1, 0.0)
+    particles, weights = search.particles, search.weights
+    explored = search.exploration.values.copy()
+    pose = Pose([110.0, 100.0, 100.0])
+    search.step([AgentMeasurement('drone', pose, sensor, np.empty((0, 3)))], 1, 1.0)
+    missed = 1.0 - sensor.detection.probability(particles, pose)
+    np.testing.assert_array_equal(search.weights, weights * missed)
+    nodes = search.exploration.nodes()
+    np.testing.assert_allclose(
+        search.exploration.values.ravel(),
+        explored.ravel() * (1.0 - sensor.detection.probability(nodes, pose)),
+    )
+
+
+def test_nobody_measuring_changes_nothing_but_survival():
+    search = cube_search(survival_probability=0.9)
+    search.step([drone([[20.0, 0.3, 0.1]])], 1, 0.0)
+    weights = search.weights
+    result = search.step([], 3, 1.0)
+    np.testing.assert_allclose(search.weights, weights * 0.9**3)
+    assert result.expected_number == pytest.approx(weights.sum() * 0.9**3)
+
+
+def test_a_first_detection_is_a_cluster_of_mass_one_and_not_yet_found():
+    search = cube_search()
+    result = search.step([drone([[20.0, 0.3, 0.1]])], 1, 0.0)
+    assert result.newly_found == []
+    assert len(result.clusters) == 1
+    assert result.clusters[0].mass == pytest.approx(1.0)
+    expected = cube_sensor().measurement.inverse([[20.0, 0.3, 0.1]], Pose([100.0] * 3))[0]
+    np.testing.assert_allclose(result.clusters[0].position, expected, atol=0.5)
+
+
+def test_two_targets_at_one_point_are_two():
+    """Two detections of one place in every scan are two targets: one causes at most one."""
+    generator = np.random.default_rng(0)
+    search = cube_search()
+    sensor = cube_sensor()
+    target = np.array([[110.0, 105.0, 100.0]] * 2)
+    for step in range(12):
+        pose = Pose([90.0 + 4.0 * step, 95.0, 90.0 + 2.0 * step])
+        values = sensor.measurement.measure(target, pose)
+        values += generator.multivariate_normal(np.zeros(3), sensor.covariance, 2)
+        search.step([AgentMeasurement('drone', pose, sensor, values, None, step)], 1, step)
+    assert len(search.found_targets) == 2
+    for found in search.found_targets:
+        np.testing.assert_allclose(found.position, target[0], atol=1.5)
+
+
+def test_a_thousand_detections_at_once_are_all_used():
+    generator = np.random.default_rng(0)
+    sensor = cube_sensor()
+    pose = Pose([130.0, 130.0, 130.0])
+    values = sensor.measurement.measure(generator.uniform(0.0, 260.0, (1000, 3)), pose)
+    search = cube_search()
+    for step in range(2):
+        result = search.step([AgentMeasurement('drone', pose, sensor, values)], 1, step)
+    assert result.dropped == {}
+    assert len(search.particles) <= 10_000
+    assert 700.0 < result.expected_number + len(search.found_targets) < 3000.0
+
+
+def test_detections_outside_the_environment_are_counted():
+    search = cube_search()
+    result = search.step([drone([[200.0, np.pi, 0.0], [20.0, 0.0, 0.0]])], 1, 0.0)
+    assert result.dropped == {'outside': 1}
+    assert result.expected_number == pytest.approx(1.0)
+
+
+def test_detections_where_nothing_can_be_seen_are_counted():
+    search = SearchFilter(FilterSettings(), FLOOR, np.random.default_rng(0))
+    pose = Pose([1.0, 1.0, 1.0])
+    values = np.array([[0.6, 0.0], [0.1, 0.0]])
+    result = search.step([AgentMeasurement('mambo', pose, floor_sensor(), values)], 1, 0.0)
+    assert result.dropped == {'unseen': 1}
+
+
+def test_detections_beyond_the_largest_range_are_counted():
+    sensor = cube_sensor()
+    sensor.maximum_range = 50.0
+    result = cube_search().step([drone([[60.0, 0.3, 0.1]], sensor=sensor)], 1, 0.0)
+    assert result.dropped == {'range': 1}
+    assert result.expected_number == 0.0
+
+
+def test_a_target_right_below_the_robot_is_found():
+    generator = np.random.default_rng(0)
+    for camera in (False, True):
+        search = SearchFilter(FilterSettings(), FLOOR, np.random.default_rng(1))
+        sensor = floor_sensor()
+        target = np.array([[1.0, 1.0]])
+        for step in range(5):
+            pose = Pose([1.0, 1.0, 1.0])
+            if camera:
+                placed = target + 0.005 * generator.standard_normal((1, 2))
+                values = sensor.measurement.measure(placed, pose)
+                jacobian = sensor.measurement.jacobian(placed, pose)
+                covariances = 0.005**2 * np.einsum('nij,nkj->nik', jacobian, jacobian)
+            else:
+                values = np.array([[0.016 * generator.standard_normal(), 3.0]])
+                covariances = None
+            search.step([AgentMeasurement('mambo', pose, sensor, values, covariances)], 1, step)
+        assert len(search.found_targets) == 1
+        np.testing.assert_allclose(search.found_targets[0].position, target[0], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ('members', 'word'),
+    [
+        ([drone([[np.nan, 0.0, 0.0]])], 'values'),
+        ([drone([[1.0, np.inf, 0.0]])], 'values'),
+        ([drone([[1.0, 0.0]])], 'values'),
+        ([drone([[1.0, 0.0, 0.0]], sensor=floor_sensor())], 'dimensions'),
+        ([drone([[1.0, 0.0, 0.0]], covariances=np.zeros((1, 3, 3)))], 'positive definite'),
+        ([drone([[1.0, 0.0, 0.0]], covariances=np.ones((1, 3, 3)))], 'positive definite'),
+        ([drone([[1.0, 0.0, 0.0]], covariances=np.full((1, 3, 3), np.nan))], 'covariances'),
+        ([drone([[1.0, 0.0, 0.0]], covariances=np.eye(3))], 'covariances'),
+        ([drone([[1.0, 0.0, 0.0]]), drone([[1.0, 0.0, 0.0]])], 'once'),
+    ],
+)
+def test_bad_measurements_are_refused_and_change_nothing(members, word):
+    search = cube_search()
+    search.step([drone([[20.0, 0.3, 0.1]], name='other')], 1, 0.0)
+    before = state(search)
+    with pytest.raises(ValueError, match=word):
+        search.step([drone([[25.0, 0.3, 0.1]], name='a_good_one'), *members], 1, 1.0)
+    assert state(search) == before
+
+
+@pytest.mark.parametrize(('steps', 'time'), [(-1, 0.0), (0.5, 0.0), (True, 0.0), (1, np.nan)])
+def test_bad_steps_and_times_are_refused(steps, time):
+    with pytest.raises(ValueError, match=r'steps|time'):
+        cube_search().step([], steps, time)
+
+
+def test_bad_sensors_are_refused():
+    good = cube_sensor()
+    with pytest.raises(ValueError, match='positive definite'):
+        Sensor('bad', good.detection, good.measurement, np.zeros((3, 3)))
+    with pytest.raises(ValueError, match='clutter'):
+        Sensor('bad', good.detection, good.measurement, np.eye(3), clutter=np.nan)
+
+
+def test_bad_particles_are_refused():
+    search = cube_search()
+    with pytest.raises(ValueError, match='weights'):
+        search.restore_particles(np.zeros((2, 3)), [1.0])
+    with pytest.raises(ValueError, match='finite'):
+        search.restore_particles(np.full((1, 3), np.nan), [1.0])
+    with pytest.raises(ValueError, match='weights'):
+        search.restore_particles(np.zeros((1, 3)), [-1.0])
+
+
+def test_no_particles_are_a_state_like_any_other():
+    search = cube_search()
+    search.restore_particles(np.empty((0, 3)), [])
+    result = search.step([drone(np.empty((0, 3)))], 1, 0.0)
+    assert (result.clusters, result.expected_number) == ([], 0.0)
+    assert search.step([drone([[20.0, 0.3, 0.1]])], 1, 1.0).expected_number == pytest.approx(1.0)
+
+
+def test_a_users_own_probability_of_detection_gives_the_same_as_the_models():
+    generator = np.random.default_rng(3)
+    targets = generator.uniform(100.0, 160.0, (3, 3))
+    model = cube_sensor()
+    own = cube_sensor()
+    own.detection = FunctionDetection(model.detection.probability)
+    searches = []
+    for sensor in (model, own):
+        search = cube_search(5)
+        visit(
+            search,
+            targets,
+            flight(np.random.default_rng(1), 10),
+            np.random.default_rng(2),
+            [sensor],
+        )
+        searches.append(search)
+    np.testing.assert_allclose(searches[0].particles, searches[1].particles, rtol=1e-9)
+
+
+def test_clutter_shares_a_detection():
+    sensor = cube_sensor()
+    sensor.clutter = 1e6
+    result = cube_search().step([drone([[20.0, 0.3, 0.1]], sensor=sensor)], 1, 0.0)
+    assert result.expected_number < 1e-3
+
+
+@pytest.mark.parametrize('preset', ['paper_000', 'paper_001', 'paper_002', 'paper_003'])
+def test_the_papers_presets_find_a_target(preset):
+    generator = np.random.default_rng(11)
+    target = np.array([[130.0, 140.0, 120.0]])
+    sensor = cube_sensor()
+    search = SearchFilter(FilterSettings(preset=preset), CUBE, np.random.default_rng(0))
+    for step in range(40):
+        angle = 0.4 * step
+        offset = 15.0 * np.array([np.cos(angle), np.sin(angle), np.sin(0.7 * angle)])
+        pose = Pose(target[0] + offset)
+        values = observe(generator, sensor, target, pose)
+        search.step([AgentMeasurement('drone', pose, sensor, values)], 1, step)
+    assert len(search.found_targets) >= 1
+    assert np.linalg.norm(search.found_targets[0].position - target[0]) < 2.0
+
+
+def test_papers_ignore_covariances_of_detections():
+    covariances = np.broadcast_to(25.0 * cube_sensor().covariance, (1, 3, 3))
+    spreads = {}
+    for preset in ('recommended', 'paper_000'):
+        search = cube_search(preset=preset)
+        wide = search.step([drone([[50.0, 0.3, 0.1]], covariances=covariances)], 1, 0.0)
+        spreads[preset] = wide.clusters[0].radius
+    assert spreads['recommended'] > 3.0 * spreads['paper_000']
+
+
+@pytest.mark.parametrize('scheme', ['systematic', 'stratified', 'multinomial'])
+@pytest.mark.parametrize('births', ['measurement', 'uniform', 'gaussian'])
+def test_every_scheme_and_birth_model_gives_finite_numbers(scheme, births):
+    generator = np.random.default_rng(3)
+    targets = generator.uniform(100.0, 160.0, (3, 3))
+    search = cube_search(resampling=scheme, births=births, birth_targets=1.0, birth_particles=400)
+    visit(search, targets, flight(generator, 10), generator)
+    assert np.isfinite(search.particles).all()
+    assert np.isfinite(search.weights).all()
+    assert (search.weights >= 0.0).all()
+    assert search.expected_number + len(search.found_targets) > 0.1
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 100_000),
+    st.sampled_from(['recommended', 'paper_000', 'paper_002', 'paper_003']),
+    st.sampled_from([2, 3]),
+)
+def test_whatever_is_measured_the_expected_number_stays_sound(seed, preset, dimension):
+    generator = np.random.default_rng(seed)
+    bounds = np.array([[0.0, 10.0]] * dimension)
+    kind = str(generator.choice(['exponential', 'gaussian', 'box']))
+    sensor = SensorSettings(
+        detection=DetectionSettings(kind=kind, size=[3.0] * dimension),
+        noise=NoiseSettings(range=0.2, bearing=0.1, elevation=0.1),
+        clutter=float(generator.choice([0.0, 0.01])),
+    ).build('any', dimension)
+    search = SearchFilter(
+        FilterSettings(preset=preset, particles=300, found_radius=0.5), bounds, generator
+    )
+    total = 0
+    for step in range(6):
+        values = generator.normal(0.0, 4.0, (generator.integers(0, 4), dimension))
+        total += len(values)
+        pose = Pose.from_yaw(generator.uniform(-2.0, 12.0, 3), generator.normal())
+        result = search.step([AgentMeasurement('any', pose, sensor, values)], 1, step)
+        assert np.isfinite(result.expected_number)
+        assert 0.0 <= result.expected_number <= total + 6.0 + 1e-9
+        assert ((search.particles >= 0.0) & (search.particles <= 10.0)).all()
+        for cluster in result.clusters:
+            assert np.isfinite(cluster.position).all()
+            assert np.isfinite(cluster.covariance).all()
+            assert cluster.mass > 0.0
+
+
+def test_warm_up_leaves_nothing_to_compile():
+    """A second call only runs what the first one compiled."""
+    from maasi_filter import births, clusters, found_targets, particles, phd
+
+    warm_up()
+    kernels = [
+        value
+        for module in (births, clusters, found_targets, particles, phd)
+        for value in vars(module).values()
+        if hasattr(value, 'signatures')
+    ]
+    before = [len(kernel.signatures) for kernel in kernels]
+    generator = np.random.default_rng(0)
+    targets = generator.uniform(100.0, 160.0, (3, 3))
+    visit(cube_search(), targets, flight(generator, 10, robots=2), generator)
+    mow_floor(0)
+    assert [len(kernel.signatures) for kernel in kernels] == before
+    assert sum(before) > 20
