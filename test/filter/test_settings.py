@@ -1,0 +1,89 @@
+"""Settings: what is refused, and what the presets fill in."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from maasi_filter import (
+    DetectionSettings,
+    EnvironmentSettings,
+    FilterSettings,
+    NoiseSettings,
+    SearchFilter,
+    SensorSettings,
+)
+from maasi_filter.settings import PRESETS
+
+
+@pytest.mark.parametrize(
+    ('model', 'values', 'word'),
+    [
+        (FilterSettings, {'particels': 5}, 'particels'),
+        (FilterSettings, {'particles': 0}, 'particles'),
+        (FilterSettings, {'preset': 'paper_005'}, 'preset'),
+        (FilterSettings, {'found_radius': float('nan')}, 'found_radius'),
+        (FilterSettings, {'survival_probability': 1.5}, 'survival_probability'),
+        (DetectionSettings, {'kind': 'circle'}, 'kind'),
+        (DetectionSettings, {'size': [25.0]}, 'size'),
+        (DetectionSettings, {'size': [25.0, -1.0]}, 'size'),
+        (DetectionSettings, {'lower': [0.3, -0.2]}, 'lower'),
+        (DetectionSettings, {'lower': [-0.2, -0.2, -0.2]}, 'length'),
+        (NoiseSettings, {'range': 0.0}, 'range'),
+        (NoiseSettings, {'angles': 'gradians'}, 'angles'),
+        (EnvironmentSettings, {'bounds': [[0.0, 1.0]]}, 'bounds'),
+        (EnvironmentSettings, {'bounds': [[0.0, 1.0], [1.0, 1.0]]}, 'bounds'),
+        (EnvironmentSettings, {'bounds': [[0.0, 1.0], [0.0, float('inf')]]}, 'bounds'),
+        (SensorSettings, {'clutter': -1.0}, 'clutter'),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(model, values, word):
+    with pytest.raises(ValidationError, match=word):
+        model(**values)
+
+
+def test_every_setting_says_what_it_is():
+    for model in (
+        FilterSettings,
+        DetectionSettings,
+        NoiseSettings,
+        SensorSettings,
+        EnvironmentSettings,
+    ):
+        for name, field in model.model_fields.items():
+            assert field.description, f'{model.__name__}.{name}'
+
+
+def test_presets_fill_in_what_is_not_given():
+    settings = FilterSettings(preset='paper_001', found_mass=0.9).resolved()
+    assert settings.particles == 5000
+    assert settings.found_mass == 0.9
+    assert settings.extraction == 'kmeans'
+    assert FilterSettings(preset='paper_001', particles=777).resolved().particles == 777
+    assert FilterSettings().resolved().particles == 10_000
+
+
+def test_papers_differ_where_they_differ():
+    assert PRESETS['paper_002']['corrector'] == 'predicted'
+    assert PRESETS['paper_000']['corrector'] == 'running'
+    assert PRESETS['paper_003']['removal'] == 'every'
+    assert PRESETS['paper_001']['removal'] == 'closest'
+    assert PRESETS['paper_003']['births'] == 'gaussian'
+    known = set(FilterSettings.model_fields)
+    assert all(set(values) <= known for values in PRESETS.values())
+
+
+def test_lengths_follow_the_environment():
+    large = SearchFilter(FilterSettings(), [[0.0, 260.0]] * 3, np.random.default_rng(0))
+    small = SearchFilter(FilterSettings(), [[0.0, 2.6]] * 3, np.random.default_rng(0))
+    assert large.exploration.values.shape == small.exploration.values.shape
+    own = SearchFilter(
+        FilterSettings(exploration_spacing=26.0), [[0.0, 260.0]] * 3, np.random.default_rng(0)
+    )
+    assert own.exploration.values.shape == (11, 11, 11)
+
+
+def test_three_dimensional_noise_needs_an_elevation():
+    noise = NoiseSettings(range=0.016, bearing=0.052, elevation=0.0)
+    assert noise.covariance(2).shape == (2, 2)
+    with pytest.raises(ValueError, match='elevation'):
+        noise.covariance(3)
