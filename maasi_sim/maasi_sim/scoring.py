@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import pdist
 
 from maasi_filter.metrics import Gospa, Match, gospa, match_targets
+from maasi_sim.scenario import Scenario
 
 FloatArray = NDArray[np.float64]
 
@@ -44,6 +45,13 @@ def matching_radius(removal_distance: float, truth: ArrayLike) -> float:
             raise ValueError('truth: got two targets at the same place, allowed are different ones')
         radius = min(radius, 0.5 * nearest)
     return radius
+
+
+def scoring_radius(scenario: Scenario, truth: FloatArray) -> float:
+    """Return the scenario's matching radius, or the one that follows from T_z and the targets."""
+    if scenario.scoring.radius is not None:
+        return scenario.scoring.radius
+    return matching_radius(scenario.removal_distance(), truth)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,303 @@
+"""The whole search in one process, without ROS: the very filter, planner and drivers' library."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_drivers.marker_detector import MarkerDetector
+from maasi_drivers.odometry import MapOdometry, StampedPose
+from maasi_drivers.waypoint_follower import Goal, GoalStatus, WaypointFollower
+from maasi_filter.found_targets import FoundTarget
+from maasi_filter.node_settings import NodeSettings
+from maasi_filter.pose import Pose
+from maasi_filter.search_filter import AgentMeasurement, SearchFilter
+from maasi_planner.coordinator import Coordinator, PresentRobot
+from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.obstacles import Obstacles
+from maasi_planner.team import Decision
+from maasi_sim.robots import Equipment, SimulatedRobot
+from maasi_sim.scenario import Scenario, steps_of
+from maasi_sim.scoring import score, scoring_radius
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Found:
+    """When a search stood how.
+
+    Attributes
+    ----------
+    time : float
+        [s].
+    measurements : int
+        Taken by then, by all robots.
+    found, true_found : int
+        Targets found by then, and how many of them are true.
+    """
+
+    time: float
+    measurements: int
+    found: int
+    true_found: int
+
+
+@dataclass
+class SearchResult:
+    """What a search has come to.
+
+    Attributes
+    ----------
+    end_reason : str
+        'all_found', 'planner_done' or 'time_limit'.
+    found_targets : list of FoundTarget
+        At the end.
+    truth : (n, d) array
+        True targets [m].
+    missed, false_found : int
+        True targets without a found one, and found ones without a true one.
+    rmse : float
+        Of the true ones among those found [m]; nan without any.
+    measurements : dict
+        Number of each robot.
+    distance : dict
+        Way of each robot [m].
+    steps : int
+        Length of the search.
+    progress : list of Found
+        After each measurement batch.
+    decisions : list of Decision
+        In their order.
+    """
+
+    end_reason: str
+    found_targets: list[FoundTarget]
+    truth: FloatArray
+    missed: int
+    false_found: int
+    rmse: float
+    measurements: dict[str, int]
+    distance: dict[str, float]
+    steps: int
+    progress: list[Found] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
+
+    @property
+    def total_measurements(self) -> int:
+        """Measurements of all robots."""
+        return sum(self.measurements.values())
+
+    @property
+    def complete(self) -> bool:
+        """Whether all targets are found, and nothing else."""
+        return self.missed == 0 and self.false_found == 0
+
+
+class _Robot:
+    """A simulated robot with what its driver does."""
+
+    def __init__(self, name: str, scenario: Scenario, seed: int, world: object) -> None:
+        settings = scenario.robots[name]
+        self.name = name
+        self.sensor = settings.sensor.build(name, scenario.dimension)
+        start = Pose.from_yaw(settings.start, settings.yaw)
+        self.body = SimulatedRobot(
+            name,
+            Equipment(
+                motion=settings.motion,
+                radius=settings.radius,
+                camera=settings.camera,
+                sensor=self.sensor if settings.camera is None else None,
+                laser=None,
+                odometry=settings.odometry,
+                battery=settings.battery,
+            ),
+            start,
+            world,  # type: ignore[arg-type]
+            scenario.floor,
+            seed,
+        )
+        obstacles = Obstacles.from_settings(scenario.environment.obstacles)
+        self.follower = WaypointFollower(make_motion(settings.motion, obstacles, settings.radius))
+        self.odometry = MapOdometry(start)
+        self.detector = (
+            None
+            if settings.camera is None
+            else MarkerDetector(settings.camera, scenario.dimension)
+        )
+        period = scenario.robots[name].sensor.period
+        rate = period if settings.camera is None else 1.0 / settings.camera.rate
+        self.imaging_steps = steps_of(rate, scenario.step) if rate > 0.0 else 1
+        self.pose: StampedPose
+        self.state: RobotState
+        self.distance = 0.0
+
+    def observe(self, stamp: int) -> None:
+        """Take the odometry of a step."""
+        reading = self.body.odometry
+        self.pose = self.odometry.apply(
+            stamp,
+            reading.pose,
+            reading.covariance,
+            reading.velocity,
+            reading.angular_velocity,
+        )
+        self.state = RobotState(self.pose.pose, self.pose.velocity, self.pose.angular_velocity)
+
+    def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
+        """Return what the robot sees at a step."""
+        if self.detector is None:
+            values = self.body.ranges(step)
+            return AgentMeasurement(self.name, self.pose.pose, self.sensor, values, None, index)
+        image = self.body.image(step, time)
+        covariance = self.pose.covariance if self.pose.covariance.any() else None
+        seen = self.detector.detect(image, self.pose.pose, covariance)
+        positions = seen.positions
+        dimension = self.sensor.covariance.shape[0]
+        if dimension == 3:
+            positions = np.pad(positions, ((0, 0), (0, 1)))
+        inside = self.sensor.detection.probability(positions, self.pose.pose) > 0.0
+        return AgentMeasurement(
+            self.name,
+            self.pose.pose,
+            self.sensor,
+            seen.values[inside],
+            seen.covariances[inside],
+            index,
+        )
+
+
+def planner_settings(scenario: Scenario, common: NodeSettings) -> PlannerNodeSettings:
+    """Return the planner's settings of a scenario."""
+    return PlannerNodeSettings.model_validate(
+        {
+            **common.model_dump(),
+            'environment': scenario.environment.model_dump(),
+            'planner': scenario.planner.model_dump(),
+            'robots': {
+                name: {
+                    'candidates': robot.candidates.model_dump(),
+                    'motion': robot.motion.model_dump(),
+                    'sensor': robot.sensor.model_dump(),
+                    'radius': robot.radius,
+                    'start': robot.start,
+                }
+                for name, robot in scenario.robots.items()
+            },
+            # As the filter has it.
+            'exploration_spacing': scenario.filter.exploration_spacing,
+        }
+    )
+
+
+def search(scenario: Scenario, seed: int, most_measurements: int | None = None) -> SearchResult:
+    """Run a scenario in this process, step by step as in lockstep; events are not played.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What to search, by whom.
+    seed : int
+        Of all random numbers.
+    most_measurements : int, optional
+        End after so many measurements of all robots.
+    """
+    world = scenario.world(seed)
+    robots = {name: _Robot(name, scenario, seed, world) for name in scenario.names()}
+    coordinator = Coordinator(
+        planner_settings(scenario, NodeSettings(step=scenario.step, seed=seed, lockstep=True))
+    )
+    search_filter = SearchFilter(
+        scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
+    )
+    truth = np.asarray(world.targets, dtype=float)
+    radius = scoring_radius(scenario, truth)
+    counts = dict.fromkeys(robots, 0)
+    progress: list[Found] = []
+    decisions: list[Decision] = []
+    end_reason = 'time_limit'
+    last_batch: int | None = None
+    step = -1
+    for step in range(steps_of(scenario.limits.time, scenario.step)):
+        time = step * scenario.step
+        for robot in robots.values():
+            robot.observe(round(time * 1e9))
+        commands = {name: robot.follower.update(robot.state, step)[0]
+                    for name, robot in robots.items()}
+        present = {
+            name: PresentRobot(
+                robot.state,
+                coordinator.is_idle(name)
+                or (
+                    robot.follower.goal is not None
+                    and robot.follower.goal.id == coordinator.decision_index(name) + 1
+                    and robot.follower.status != GoalStatus.MOVING
+                ),
+            )
+            for name, robot in robots.items()
+        }
+        decision = coordinator.plan(step, present)
+        if decision is not None:
+            decisions.append(decision)
+            for name, chosen in decision.robots.items():
+                if not chosen.stays:
+                    number = coordinator.decision_index(name) + 1
+                    robots[name].follower.take(Goal(number, step, chosen.waypoint))
+        able = {name for name, robot in robots.items() if step % robot.imaging_steps == 0}
+        members = coordinator.measuring(step, present, able)
+        if members:
+            measurements = [
+                robots[item.robot].measure(step, time, item.measurement) for item in members
+            ]
+            gone = 1 if last_batch is None else step - last_batch
+            last_batch = step
+            result = search_filter.step(measurements, gone, time)
+            coordinator.absorb(
+                {item.robot: item.pose for item in measurements}, result.clusters
+            )
+            for item in members:
+                counts[item.robot] += 1
+            positions = [target.position for target in search_filter.found_targets]
+            scores = score(positions, truth, radius, scenario.scoring.order)
+            progress.append(
+                Found(
+                    time,
+                    sum(counts.values()),
+                    len(positions),
+                    scores.match.true_found,
+                )
+            )
+            if len(truth) and scores.complete and scenario.stop == 'all_found':
+                end_reason = 'all_found'
+                break
+        if coordinator.finished is not None:
+            end_reason = 'planner_done'
+            break
+        if most_measurements is not None and sum(counts.values()) >= most_measurements:
+            end_reason = 'measurement_limit'
+            break
+        for name, robot in robots.items():
+            before = robot.body.state.pose.position
+            robot.body.command(commands[name])
+            robot.body.step(step + 1, scenario.step)
+            moved = robot.body.state.pose.position - before
+            robot.distance += float(np.sqrt((moved * moved).sum()))
+    positions = [target.position for target in search_filter.found_targets]
+    scores = score(positions, truth, radius, scenario.scoring.order)
+    return SearchResult(
+        end_reason=end_reason,
+        found_targets=search_filter.found_targets,
+        truth=truth,
+        missed=len(truth) - scores.match.true_found,
+        false_found=len(positions) - scores.match.true_found,
+        rmse=scores.match.rmse,
+        measurements=counts,
+        distance={name: robot.distance for name, robot in robots.items()},
+        steps=step + 1,
+        progress=progress,
+        decisions=decisions,
+    )
