@@ -128,9 +128,7 @@ class Recorder:
     def discover(self) -> None:
         """Subscribe to the topics that have come up since the last time."""
         for topic, types in self.node.get_topic_names_and_types():
-            if topic in self._subscriptions or topic in _SKIPPED or topic in self._refused:
-                continue
-            if not self._wants(topic):
+            if topic in self._subscriptions or topic in self._refused or not self._wants(topic):
                 continue
             infos = self.node.get_publishers_info_by_topic(topic)
             if not infos:
@@ -175,6 +173,9 @@ class Recorder:
         ]
 
     def _wants(self, topic: str) -> bool:
+        # A name with an underscore in front is hidden: the inner topics of actions.
+        if topic in _SKIPPED or '/_' in topic:
+            return False
         return self.bag is not None or topic in self._wanted
 
     def take_ready(self) -> set[str]:

@@ -17,8 +17,9 @@ from maasi_sim.processes import Domain, NodeProcess, find_executable, stop
 
 FILTER = '/filter_node'
 EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
-# Wall time that one update may take, and the start of the node [s].
+# Wall time that one update may take, and the start of the node, which may have to compile [s].
 _PATIENCE = 60.0
+_START_PATIENCE = 180.0
 # There is no clock, no step and nobody late; nothing is loaded, and nothing saved.
 _REPLAYED = {
     'use_sim_time': False,
@@ -218,19 +219,21 @@ def _feed(
 ) -> int:
     first_difference = None
 
-    def wait_for(condition: Callable[[], bool], what: str) -> int | None:
-        deadline = time.monotonic() + _PATIENCE
+    def wait_for(
+        condition: Callable[[], bool], what: str, patience: float = _PATIENCE
+    ) -> int | None:
+        deadline = time.monotonic() + patience
         while not condition():
             if interrupted():
                 return INTERRUPTED
             if not process.running:
                 return _failed(f'{process.name} {process.how_it_ended()}', process)
             if time.monotonic() > deadline:
-                return _failed(f'{process.name}: {what} for {_PATIENCE:g} s', process)
+                return _failed(f'{process.name}: {what} for {patience:g} s', process)
             node.spin()
         return None
 
-    code = wait_for(lambda: node.ready, 'was not ready')
+    code = wait_for(lambda: node.ready, 'was not ready', _START_PATIENCE)
     if code is not None:
         return code
     for index, batch in enumerate(recording.batches):

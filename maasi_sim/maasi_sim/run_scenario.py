@@ -28,6 +28,8 @@ DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 _BACKLOG = 8 * 2**20
 # Wall time between two looks at processes and topics, where no step comes in between [s].
 _POLL = 0.02
+# Wall time after which it says whom it waits for, again and again [s].
+_START_PATIENCE = 10.0
 # One thread for each linear algebra: there is a process for each node already.
 _NODE_ENVIRONMENT = {
     'PYTHONUNBUFFERED': '1',
@@ -339,7 +341,8 @@ class ScenarioRun:
 
     def _wait_until_ready(self, recorder: Recorder) -> Ending | None:
         """Wait until every node takes part, the recorder last; return an ending if one does not."""
-        deadline = time.monotonic() + self.scenario.limits.start
+        begin = time.monotonic()
+        patience = _START_PATIENCE
         expected = [plan.full_name for plan in self.plans if plan.says_ready]
         needed = [topic for plan in self.plans for topic in plan.topics]
         while True:
@@ -352,12 +355,18 @@ class ScenarioRun:
             missing = recorder.missing(needed)
             if not late and not missing:
                 break
-            if time.monotonic() > deadline:
-                what = [f'{name} is not ready' for name in late] or [
-                    f'nobody publishes {topic}' for topic in missing
-                ]
-                limit = f'after {self.scenario.limits.start:g} s'
-                return Ending('not_ready', NODE_FAILED, f'{", ".join(what)} {limit}')
+            waited = time.monotonic() - begin
+            what = ', '.join(
+                [f'{name} is not ready' for name in late]
+                or [f'nobody publishes {topic}' for topic in missing]
+            )
+            if waited > self.scenario.limits.start:
+                self._failed.update(late)
+                text = f'{what} after {self.scenario.limits.start:g} s'
+                return Ending('not_ready', NODE_FAILED, text)
+            if waited > patience:
+                self.display.say(f'waiting: {what}')
+                patience += _START_PATIENCE
             recorder.wait(_POLL)
         for complaint in recorder.complaints:
             self.display.say(f'warning: {complaint}')

@@ -97,7 +97,9 @@ class LimitSettings(Settings):
 
     time: float = Field(default=600.0, gt=0.0, description='Simulated time [s]')
     start: float = Field(
-        default=60.0, gt=0.0, description='Wall time until all nodes are ready [s]'
+        default=180.0,
+        gt=0.0,
+        description='Wall time until all nodes are ready; they may have to compile [s]',
     )
     silence: float = Field(
         default=30.0,
