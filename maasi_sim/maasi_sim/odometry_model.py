@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from maasi_filter.pose import Pose, compose, inverse, quaternion_product
+from maasi_filter.pose import Pose, inverse
 from maasi_filter.settings import Settings
 from maasi_planner.motion import RobotState
 from maasi_sim.noise_streams import noise_stream
@@ -90,17 +90,21 @@ class OdometryModel:
         self.settings = settings
         self.seed = seed
         self.robot = robot
-        self._to_start = inverse(Pose.from_yaw(start.position, start.yaw))
-        self._last = compose(self._to_start, start)
-        self._offset = np.zeros(2)
+        # Plain numbers throughout: for so few of them arrays take several times as long.
+        to_start = inverse(Pose.from_yaw(start.position, start.yaw))
+        self._shift = to_start.position.tolist()
+        self._rotation = to_start.rotation().tolist()
+        self._quaternion = to_start.orientation.tolist()
+        self._last = self._from_start(*start.position.tolist())
+        self._offset = (0.0, 0.0)
         self._turn = 0.0
         self._noise_covariance = np.diag(
             [settings.position_noise**2 + _LEAST_VARIANCE] * 3
             + [_LEAST_VARIANCE] * 2
             + [settings.heading_noise**2 + _LEAST_VARIANCE]
         )
-        # Covariance of the drift: x and y of the estimate, heading.
-        self._drift = np.zeros((3, 3))
+        # Covariance of the drift of x, y of the estimate and heading h: xx, xy, yy, xh, yh, hh.
+        self._drift = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def step(self, state: RobotState, step: int) -> OdometryReading:
         """
@@ -116,51 +120,109 @@ class OdometryModel:
         """
         settings = self.settings
         generator = noise_stream(self.seed, self.robot, step, 'odometry')
-        drift, noise = generator.standard_normal(3), generator.standard_normal(10)
-        true = compose(self._to_start, state.pose)
-        moved = true.position[:2] - self._last.position[:2]
-        way = math.sqrt(float(moved[0] * moved[0] + moved[1] * moved[1]))
+        dx, dy, dh, nx, ny, nz, nh, *twist_noise = generator.standard_normal(13).tolist()
+        x, y, z = self._from_start(*state.pose.position.tolist())
+        move_x, move_y = x - self._last[0], y - self._last[1]
+        way = math.sqrt(move_x * move_x + move_y * move_y)
         if way > 0.0 and (settings.position_drift > 0.0 or settings.heading_drift > 0.0):
-            before = self._place(true)
-            self._turn += settings.heading_drift * math.sqrt(way) * float(drift[2])
+            root = math.sqrt(way)
+            before = self._place(x, y)
+            self._turn += settings.heading_drift * root * dh
             # The heading turns about where the robot is, not about the origin.
-            self._offset += before - self._place(true)
-            self._offset += settings.position_drift * math.sqrt(way) * drift[:2]
-            self._grow(moved, way)
-        self._last = true
-        half = 0.5 * (self._turn + settings.heading_noise * float(noise[3]))
-        position = np.append(self._place(true), true.position[2])
-        position = position + settings.position_noise * noise[:3]
-        orientation = quaternion_product(
-            [math.cos(half), 0.0, 0.0, math.sin(half)], true.orientation
-        )
-        body = state.pose.rotation().T
+            after = self._place(x, y)
+            drift = settings.position_drift * root
+            self._offset = (
+                self._offset[0] + before[0] - after[0] + drift * dx,
+                self._offset[1] + before[1] - after[1] + drift * dy,
+            )
+            self._grow(move_x, move_y, way)
+        self._last = (x, y, z)
+        noise = settings.position_noise
+        place = self._place(x, y)
+        half = 0.5 * (self._turn + settings.heading_noise * nh)
+        w1, z1 = math.cos(half), math.sin(half)
+        attitude = state.pose.orientation.tolist()
+        w2, x2, y2, z2 = _product(self._quaternion, attitude)
+        linear, angular = settings.velocity_noise, settings.heading_noise
+        velocity = _into_body(attitude, state.velocity.tolist())
+        turning = state.angular_velocity.tolist()
         return OdometryReading(
-            Pose(position, orientation),
+            Pose(
+                np.array([place[0] + noise * nx, place[1] + noise * ny, z + noise * nz]),
+                np.array(
+                    [w1 * w2 - z1 * z2, w1 * x2 - z1 * y2, w1 * y2 + z1 * x2, w1 * z2 + z1 * w2]
+                ),
+            ),
             self._covariance(),
-            body @ state.velocity + settings.velocity_noise * noise[4:7],
-            state.angular_velocity + settings.heading_noise * noise[7:10],
+            np.array([v + linear * n for v, n in zip(velocity, twist_noise[:3])]),
+            np.array([v + angular * n for v, n in zip(turning, twist_noise[3:])]),
         )
 
-    def _place(self, true: Pose) -> Array:
-        cosine, sine = math.cos(self._turn), math.sin(self._turn)
-        x, y = float(true.position[0]), float(true.position[1])
-        return self._offset + np.array([cosine * x - sine * y, sine * x + cosine * y])
+    def _from_start(self, x: float, y: float, z: float) -> tuple[float, float, float]:
+        """Return a position of the map in the frame of the start."""
+        (a, b, c), (d, e, f), (g, h, i) = self._rotation
+        tx, ty, tz = self._shift
+        return (
+            tx + a * x + b * y + c * z,
+            ty + d * x + e * y + f * z,
+            tz + g * x + h * y + i * z,
+        )
 
-    def _grow(self, moved: Array, way: float) -> None:
+    def _place(self, x: float, y: float) -> tuple[float, float]:
+        """Return where the odometry believes the robot is when it is at x, y."""
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
-        step = np.array([cosine * moved[0] - sine * moved[1], sine * moved[0] + cosine * moved[1]])
-        motion = np.eye(3)
-        motion[0, 2], motion[1, 2] = -step[1], step[0]
-        settings = self.settings
-        self._drift = motion @ self._drift @ motion.T + way * np.diag(
-            [settings.position_drift**2, settings.position_drift**2, settings.heading_drift**2]
+        return (
+            self._offset[0] + cosine * x - sine * y,
+            self._offset[1] + sine * x + cosine * y,
+        )
+
+    def _grow(self, move_x: float, move_y: float, way: float) -> None:
+        """Carry the covariance of the drift along a move: an error of heading leads astray."""
+        cosine, sine = math.cos(self._turn), math.sin(self._turn)
+        # d(x, y) / d(heading).
+        a = -(sine * move_x + cosine * move_y)
+        b = cosine * move_x - sine * move_y
+        xx, xy, yy, xh, yh, hh = self._drift
+        place = way * self.settings.position_drift**2
+        self._drift = (
+            xx + 2.0 * a * xh + a * a * hh + place,
+            xy + a * yh + b * xh + a * b * hh,
+            yy + 2.0 * b * yh + b * b * hh + place,
+            xh + a * hh,
+            yh + b * hh,
+            hh + way * self.settings.heading_drift**2,
         )
 
     def _covariance(self) -> Array:
         covariance = self._noise_covariance.copy()
-        covariance[:2, :2] += self._drift[:2, :2]
-        covariance[:2, 5] += self._drift[:2, 2]
-        covariance[5, :2] += self._drift[2, :2]
-        covariance[5, 5] += self._drift[2, 2]
+        xx, xy, yy, xh, yh, hh = self._drift
+        covariance[0, 0] += xx
+        covariance[1, 1] += yy
+        covariance[5, 5] += hh
+        covariance[0, 1] = covariance[1, 0] = xy
+        covariance[0, 5] = covariance[5, 0] = xh
+        covariance[1, 5] = covariance[5, 1] = yh
         return covariance
+
+
+def _product(first: list[float], second: list[float]) -> tuple[float, float, float, float]:
+    """Return the Hamilton product of two quaternions w, x, y, z."""
+    w1, x1, y1, z1 = first
+    w2, x2, y2, z2 = second
+    return (
+        w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+        w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+        w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+        w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+    )
+
+
+def _into_body(orientation: list[float], vector: list[float]) -> tuple[float, float, float]:
+    """Return a vector of the map in the axes of a body with an orientation w, x, y, z."""
+    w, x, y, z = orientation
+    a, b, c = vector
+    return (
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
+        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
+        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )

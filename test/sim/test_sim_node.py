@@ -1,5 +1,6 @@
 """The simulation node over real topics, against nodes that play the rest of the team."""
 
+import threading
 import time
 from collections import defaultdict
 
@@ -128,7 +129,7 @@ class Member(Node):
 
 
 class Team:
-    """A simulation node and those it waits for, in one executor."""
+    """A simulation node in a thread of its own, and those it waits for."""
 
     def __init__(self, context, folder, content, robots=('mambo', 'turtlebot'), **parameters):
         file = folder / 'scenario.yaml'
@@ -141,7 +142,6 @@ class Team:
             parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
         )
         self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.sim)
         self.drivers = {name: self.add('driver', name) for name in robots}
         self.filter, self.planner = self.add('filter_node'), self.add('planner_node')
         self.filter.listen('/clock', Clock, RELIABLE)
@@ -149,6 +149,15 @@ class Team:
         self.filter.listen('/ground_truth/markers', MarkerArray, LATCHED)
         assert self.sim.trigger_configure().name == 'SUCCESS'
         assert self.sim.trigger_activate().name == 'SUCCESS'
+        self.thread = threading.Thread(target=self.spin_sim)
+        self.thread.start()
+
+    def spin_sim(self):
+        executor = SingleThreadedExecutor(context=self.context)
+        executor.add_node(self.sim)
+        while not self.closed:
+            executor.spin_once(timeout_sec=0.05)
+        executor.shutdown()
 
     def add(self, name, robot='', **options):
         node = Member(self.context, name, robot, **options)
@@ -185,6 +194,7 @@ class Team:
         if self.closed:
             return
         self.closed = True
+        self.thread.join()
         self.sim.halt()
         self.executor.shutdown()
         for node in (*self.members, self.sim):
