@@ -58,6 +58,7 @@ _FEEDBACK_PERIOD = 500_000_000
 # Longest wait for the last command and the last results to arrive [s].
 _FAREWELL = 0.3
 _STOP_COMMANDS = 3
+_LAST_TASKS = 5
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._trouble = ''
         self._no_odometry = False
         self._odometry_at = time.monotonic()
+        self._watched_at = self._odometry_at
+        self._stalled = False
         self._watches = 0
         self._feedback_at = 0
         self._awaited: int | None = None
@@ -245,8 +248,12 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         """Let those who wait for a goal know how it ended, and leave."""
         self.active = False
         deadline = time.monotonic() + _FAREWELL
-        while self._ended and self.executor is not None and time.monotonic() < deadline:
-            self.executor.spin_once(timeout_sec=0.01)
+        if self._ended and self.executor is not None:
+            while self._ended and time.monotonic() < deadline:
+                self.executor.spin_once(timeout_sec=0.01)
+            # What was concluded is sent by tasks that come after.
+            for _ in range(_LAST_TASKS):
+                self.executor.spin_once(timeout_sec=0.0)
         if self._server is not None:
             self._server.destroy()
             self._server = None
@@ -516,7 +523,13 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if not self.active:
             return
         self._watches += 1
-        age = time.monotonic() - self._odometry_at
+        now, before = time.monotonic(), self._watched_at
+        self._watched_at = now
+        self._stalled = now - before > 2.0 * _WATCH_PERIOD and not self._stalled
+        if self._stalled:
+            # It was this process that stood still: the odometry may be waiting to be read.
+            return
+        age = now - self._odometry_at
         if self._history.latest is None:
             if age > _PATIENCE:
                 self.warn_throttled('no odometry', f'odom: nothing yet, for {age:.0f} s')

@@ -62,8 +62,8 @@ class CameraDriver(AgentDriver[Picture]):
             )
             if margin < 0.0:
                 self.get_logger().warning(
-                    'sensor.detection: the box is not all inside what the camera sees from '
-                    f'{self.settings.start[2]} m, by {-margin:.1f} px'
+                    'sensor.detection: the box is not all inside what the camera sees'
+                    + (f', by {-margin:.1f} px' if np.isfinite(margin) else '')
                 )
 
     def set_up_sensor(self) -> None:

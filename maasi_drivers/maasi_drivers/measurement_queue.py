@@ -65,18 +65,16 @@ class MeasurementQueue(Generic[DataT]):
         self._frames: deque[Frame[DataT]] = deque(maxlen=frames)
         self._requests: deque[MeasurementRequest] = deque()
         self._capacity = requests
+        #: Stamp of the last image [ns].
+        self.latest: int | None = None
 
     def __len__(self) -> int:
         return len(self._requests)
 
-    @property
-    def latest(self) -> int | None:
-        """Stamp of the last image [ns]."""
-        return self._frames[-1].stamp if self._frames else None
-
     def add_frame(self, frame: Frame[DataT]) -> None:
         """Add an image, later than all before."""
         self._frames.append(frame)
+        self.latest = frame.stamp
 
     def add_request(self, request: MeasurementRequest) -> list[MeasurementRequest]:
         """Add a request; return those that are given up for it."""
@@ -90,6 +88,7 @@ class MeasurementQueue(Generic[DataT]):
         """Forget everything, as after a jump of the clock."""
         self._frames.clear()
         self._requests.clear()
+        self.latest = None
 
     def next(self) -> tuple[MeasurementRequest, Frame[DataT], StampedPose] | None:
         """

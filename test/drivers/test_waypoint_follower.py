@@ -1,0 +1,112 @@
+"""What a robot does about its goal."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from maasi_drivers.waypoint_follower import Goal, GoalStatus, WaypointFollower
+from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.settings import MotionSettings
+
+
+def follower_of(model='unicycle'):
+    return WaypointFollower(make_motion(MotionSettings(model=model, speed=0.2, tolerance=0.05)))
+
+
+def at(x, y=0.0, z=1.0):
+    return RobotState.at_rest([x, y, z])
+
+
+def goal(x, step=0, number=1, tolerance=0.0):
+    return Goal(number, step, np.array([x, 0.0, 1.0]), tolerance)
+
+
+def test_a_ground_robot_without_a_goal_stands_still():
+    follower = follower_of()
+    command, reached = follower.update(at(0.3))
+    assert_array_equal(command, np.zeros(4))
+    assert reached is None and follower.status == GoalStatus.IDLE
+
+
+def test_a_flying_robot_without_a_goal_goes_back_to_where_it_was_first():
+    follower = follower_of('constant_speed')
+    follower.update(at(0.3))
+    command, _ = follower.update(at(0.4))
+    assert command[0] < -0.01
+
+
+def test_a_goal_is_reached_in_the_step_in_which_the_robot_is_there():
+    follower = follower_of()
+    target = goal(1.0)
+    assert follower.take(target) is None
+    command, reached = follower.update(at(0.0))
+    assert command[0] > 0.1 and reached is None and follower.status == GoalStatus.MOVING
+    command, reached = follower.update(at(0.96))
+    assert reached is target and follower.status == GoalStatus.REACHED
+    assert_array_equal(command, np.zeros(4))
+    assert follower.current is None
+    # Pushed away, it does not start again.
+    assert follower.update(at(0.5))[1] is None
+    assert follower.status == GoalStatus.REACHED
+
+
+def test_a_flying_robot_holds_the_waypoint_that_it_has_reached():
+    follower = follower_of('constant_speed')
+    follower.take(goal(1.0))
+    follower.update(at(0.97))
+    command, _ = follower.update(at(0.8))
+    assert follower.status == GoalStatus.REACHED
+    assert command[0] > 0.05
+
+
+@pytest.mark.parametrize(('tolerance', 'status'), [(0.0, 'MOVING'), (0.2, 'REACHED')])
+def test_a_goal_may_bring_its_own_tolerance(tolerance, status):
+    follower = follower_of()
+    follower.take(goal(1.0, tolerance=tolerance))
+    follower.update(at(0.85))
+    assert follower.status.name == status
+
+
+def test_the_height_of_a_waypoint_is_nothing_to_a_ground_robot():
+    follower = follower_of()
+    follower.take(Goal(1, 0, np.array([1.0, 0.0, 0.7]), 0.1))
+    assert follower.update(at(0.95, z=0.0))[1] is not None
+
+
+def test_a_goal_of_a_step_acts_from_the_next_one_on():
+    follower = follower_of()
+    follower.take(goal(1.0, step=7))
+    assert_array_equal(follower.update(at(0.0), 7)[0], np.zeros(4))
+    assert follower.status == GoalStatus.IDLE
+    assert follower.update(at(0.0), 8)[0][0] > 0.1
+    assert follower.status == GoalStatus.MOVING
+
+
+def test_a_new_goal_replaces_the_one_before():
+    follower = follower_of()
+    first, second = goal(1.0), goal(-1.0, number=2)
+    follower.take(first)
+    follower.update(at(0.0))
+    assert follower.take(second) is first
+    assert (first.status, first.reason) == (GoalStatus.ABORTED, 'replaced')
+    follower.update(at(0.0))
+    assert follower.goal is second and follower.status == GoalStatus.MOVING
+
+
+def test_a_goal_that_did_not_act_yet_can_be_ended():
+    follower = follower_of()
+    target = goal(1.0, step=5)
+    follower.take(target)
+    assert follower.end(GoalStatus.CANCELED, 'cancelled') is target
+    assert follower.end(GoalStatus.CANCELED, 'again') is None
+    assert_array_equal(follower.update(at(0.0), 6)[0], np.zeros(4))
+    assert follower.status == GoalStatus.CANCELED and target.reason == 'cancelled'
+
+
+def test_a_flying_robot_stops_where_its_goal_is_cancelled():
+    follower = follower_of('constant_speed')
+    follower.take(goal(1.0))
+    follower.update(at(0.2))
+    follower.end(GoalStatus.CANCELED, 'cancelled')
+    assert_allclose(follower.update(at(0.4))[0], np.zeros(4), atol=1e-12)
+    assert follower.update(at(0.5))[0][0] < 0.0
