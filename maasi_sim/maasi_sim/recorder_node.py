@@ -19,6 +19,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 
+from maasi_filter.conversions import stamp_of_step
 from maasi_msgs.msg import (
     AgentState,
     ClusterArray,
@@ -254,9 +255,14 @@ class Recorder:
         """Return the messages up to a step, as far as they say to which they belong."""
         progress = self.observer.progress
         batch = progress[-1].batch if progress else 0
+        end = stamp_of_step(step, self.observer.scenario.step)
         kept = []
         for topic, data in taken:
             kind = self._subscriptions[topic].msg_type
+            if _has_stamp_first(kind):
+                seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
+                if seconds * 10**9 + nanoseconds > end:
+                    continue
             if kind in _WITH_STEP and deserialize_message(data, kind).step > step:
                 continue
             if kind in _WITH_BATCH and deserialize_message(data, kind).batch_id > batch:
@@ -307,6 +313,11 @@ def _take(subscription: Subscription) -> list[bytes]:
         if item is None:
             return taken
         taken.append(item[0])
+
+
+def _has_stamp_first(kind: Any) -> bool:
+    """Return whether messages of a type begin with a stamp: with a header, or as the clock."""
+    return next(iter(kind.get_fields_and_field_types())) in ('header', 'clock')
 
 
 def _message_class(name: str) -> type:
