@@ -83,7 +83,7 @@ def detection_probability_at(
     return parameters[0] * math.exp(-0.5 * math.sqrt(square))
 
 
-@njit(cache=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy')
 def _probabilities(
     kind: int,
     parameters: FloatArray,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -83,8 +84,8 @@ class Pose:
     @property
     def yaw(self) -> float:
         """Heading in radians, in (-pi, pi]."""
-        w, x, y, z = self.orientation
-        return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+        w, x, y, z = self.orientation.tolist()
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
     def rotation(self) -> FloatArray:
         """Return the (3, 3) matrix that turns body axes into map axes."""

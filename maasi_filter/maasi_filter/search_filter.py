@@ -32,7 +32,14 @@ from maasi_filter.found_targets import (
     remove_measurements,
 )
 from maasi_filter.particles import gather, group_moments, jitter, resample, total_weight
-from maasi_filter.phd import MeasurementSet, associate, prepare_measurements, regroup
+from maasi_filter.phd import (
+    CHUNK,
+    MeasurementSet,
+    associate,
+    prepare_measurements,
+    regroup,
+    run_chunks,
+)
 from maasi_filter.pose import Pose
 from maasi_filter.sensor import Sensor, is_covariance
 from maasi_filter.settings import (
@@ -63,10 +70,10 @@ JITTER_DEVIATIONS = 0.03
 # A box's edge is as uncertain as the robot's position; so are its measurements.
 POSE_ERROR_OF_BOX = 0.05
 # Cells along the mean side of the environment, in 2D and 3D.
-EXPLORATION_CELLS = {2: 54, 3: 16}
+EXPLORATION_CELLS = {2: 54, 3: 13}
 LEAST_CLUSTER_MASS = 0.1
 # Two estimates whose difference is below this many deviations, squared, may be one target.
-SAME_TARGET = 12.0
+SAME_TARGET = 16.0
 # Particles of a birth when there are more detections than there are particles for.
 LEAST_BIRTHS = 20
 UNLIMITED_INFORMATION = 1e12
@@ -569,6 +576,21 @@ class SearchFilter:
             self._pool = ThreadPoolExecutor(threads)
         return self._pool
 
+    def _probability(
+        self, detection: DetectionModel, pose: Pose, pool: ThreadPoolExecutor | None
+    ) -> FloatArray:
+        """Return pi at the particles; a user's own function is called once, in this thread."""
+        if pool is None or detection.kernel() is None:
+            return detection.probability(self.particles, pose)
+        out = np.empty(len(self.particles))
+
+        def fill(first: int, last: int) -> None:
+            part = slice(first * CHUNK, last * CHUNK)
+            out[part] = detection.probability(self.particles[part], pose)
+
+        run_chunks(fill, len(out), pool)
+        return out
+
     def _correct(
         self,
         member: _Member,
@@ -583,16 +605,17 @@ class SearchFilter:
         numbers = self._numbers
         sensor = member.sensor
         detection = self._detection(sensor)
-        reach = member.values[:, 0] <= sensor.maximum_range
-        _count(dropped, 'range', int((~reach).sum()))
-        member = member.only(reach)
+        if math.isfinite(sensor.maximum_range):
+            reach = member.values[:, 0] <= sensor.maximum_range
+            _count(dropped, 'range', int((~reach).sum()))
+            member = member.only(reach)
         count = len(member.values)
-        probability = detection.probability(self.particles, member.pose)
+        pool = self._threads()
+        probability = self._probability(detection, member.pose, pool)
         if count == 0:
             self.weights = self.weights * (1.0 - probability)
             self.exploration.update(detection, member.pose)
             return 0, False
-        pool = self._threads()
         prepared = self._prepared(member)
         other = np.full(count, sensor.clutter)
         born = None
