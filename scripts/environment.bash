@@ -144,61 +144,13 @@ maasi_set_up() {
   export PATH="$maasi_venv/bin:$PATH"
   key="$(maasi_build_key "$key")"
   [ "$(cat "$maasi_workspace/install/.maasi_key" 2> /dev/null)" = "$key" ] || maasi_build "$key"
-  flock -u "$maasi_lock"
-  exec {maasi_lock}>&-
   # The generated file reads unset variables.
   set +u
   # shellcheck disable=SC1091
   source "$maasi_workspace/install/local_setup.bash"
   maasi_compile
-}
-
-# Compiled kernels do not notice that a kernel they call in another file has changed, so each
-# state of the sources has a folder of its own. Compiled here, so that no node waits for it.
-maasi_compile() {
-  local key
-  key="$(cd "$maasi_root" && grep -rl --include='*.py' njit maasi_*/maasi_* | sort \
-    | xargs cat | maasi_hash)"
-  export NUMBA_CACHE_DIR="$maasi_workspace/numba/${key:0:16}"
-  [ ! -e "$NUMBA_CACHE_DIR/complete" ] || return 0
-  echo "Compiling (a minute, once) ..." >&2
-  if ! python "$maasi_root/scripts/compile_kernels.py" > "$maasi_workspace/compile.log" 2>&1; then
-    tail -n 15 "$maasi_workspace/compile.log" >&2
-    maasi_fail "compiling failed; the whole log: $maasi_workspace/compile.log"
-  fi
-  touch "$NUMBA_CACHE_DIR/complete"
-}
-
-maasi_set_up() {
-  local python mode key
-  python="$(maasi_find_python)" || exit 2
-  if maasi_has_jazzy "$python"; then mode=jazzy; else mode=wheels; fi
-  key="$( (cat "$maasi_root"/requirements.txt "$maasi_root"/requirements-build.txt \
-    "$maasi_root"/requirements-ros.txt "$maasi_root/scripts/mend_wheels.py"
-    "$python" -c 'import sys; print(sys.version, sys.prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
-  mkdir -p "$maasi_workspace"
-  exec {maasi_lock}> "$maasi_workspace/lock"
-  flock "$maasi_lock"
-  [ "$(cat "$maasi_venv/.maasi_key" 2> /dev/null)" = "$key" ] \
-    || maasi_make_venv "$python" "$mode" "$key"
-  if [ "$mode" = wheels ]; then
-    export AMENT_PREFIX_PATH="$maasi_venv" CMAKE_PREFIX_PATH="$maasi_venv"
-    export ROS_DISTRO=jazzy MAASI_WHEELS=1
-    unset PYTHONPATH
-  fi
-  export PATH="$maasi_venv/bin:$PATH"
-  key="$(maasi_build_key "$key")"
-  [ "$(cat "$maasi_workspace/install/.maasi_key" 2> /dev/null)" = "$key" ] || maasi_build "$key"
   flock -u "$maasi_lock"
   exec {maasi_lock}>&-
-  # The generated file reads unset variables.
-  set +u
-  # shellcheck disable=SC1091
-  source "$maasi_workspace/install/local_setup.bash"
-  # Compiled kernels do not notice that a kernel they call in another file has changed.
-  key="$(cd "$maasi_root" && find maasi_*/maasi_* -name '*.py' -print0 | sort -z \
-    | xargs -0 cat | maasi_hash)"
-  export NUMBA_CACHE_DIR="${NUMBA_CACHE_DIR:-$maasi_workspace/numba/${key:0:16}}"
 }
 
 maasi_set_up

@@ -15,11 +15,12 @@ from pydantic import ValidationError
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 
+from maasi_filter.executor import LeanExecutor
 from maasi_filter.node_settings import NodeSettings
 from maasi_filter.parameters import parameter_fields, unflatten
 from maasi_filter.qos import LATCHED, RELIABLE
@@ -342,13 +343,12 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
     node: SearchNode[Any] | None = None
     try:
         node = make_node()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        executor = LeanExecutor(node)
         if node.settings.autostart:
             node.trigger_configure()
             node.trigger_activate()
         while rclpy.ok():
-            executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
+            executor.spin_for(_SIGNAL_PERIOD)
     except SettingsError as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
