@@ -47,8 +47,8 @@ RECORDER = '/recorder'
 
 # Between two looks at who is there [s].
 _LOOK_PERIOD = 0.02
-# After so long it says whom it waits for [s].
-_PATIENCE = 3.0
+# After so long it says whom it waits for, and again for the same ones [s].
+_PATIENCE, _REMINDER = 3.0, 15.0
 # Longest wait for the subscriptions of a node that says that it is ready [s].
 _CONNECTION_PATIENCE = 5.0
 # Of simulated time, between two messages on a battery [s].
@@ -257,6 +257,7 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._waiting: set[str] = set()
         self._last_command: dict[str, int] = {}
         self._due = 0.0
+        self._said, self._said_at = '', 0.0
         self._wall_start = self._wall_step = time.monotonic()
 
     # ---- life cycle --------------------------------------------------------------------------
@@ -389,7 +390,7 @@ class SimNode(SearchNode[SimNodeSettings]):
         missing = self._missing()
         if missing:
             if now - self._wall_start > _PATIENCE:
-                self.warn_throttled('missing', f'waits for {missing}')
+                self._say_waiting(f'waits for {missing}', now)
             return
         if self._ready_since is None:
             self._ready_since = now
@@ -443,10 +444,16 @@ class SimNode(SearchNode[SimNodeSettings]):
 
     def _watch(self) -> None:
         """Say whom a step waits for when it takes long."""
-        if self._waiting and self.active and time.monotonic() - self._wall_step > _PATIENCE:
-            self.warn_throttled(
-                'slow', f'step {self.step} waits for {", ".join(sorted(self._waiting))}'
-            )
+        now = time.monotonic()
+        if self._waiting and self.active and now - self._wall_step > _PATIENCE:
+            waiting = ', '.join(sorted(self._waiting))
+            self._say_waiting(f'step {self.step} waits for {waiting}', now)
+
+    def _say_waiting(self, text: str, now: float) -> None:
+        """Warn of what is waited for when it changes, else seldom: compiling takes its time."""
+        if text != self._said or now - self._said_at >= _REMINDER:
+            self._said, self._said_at = text, now
+            self.get_logger().warning(text)
 
     # ---- the steps ---------------------------------------------------------------------------
 
