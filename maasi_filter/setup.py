@@ -15,7 +15,10 @@ setup(
     zip_safe=True,
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',
-    description='What the team believes: sensors, exploration and the particle PHD filter, with the filter node',
+    description=(
+        'What the team believes: sensors, exploration and the particle PHD filter, with '
+        'the filter node'
+    ),
     license='Apache-2.0',
     entry_points={
         'console_scripts': [

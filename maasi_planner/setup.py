@@ -15,7 +15,10 @@ setup(
     zip_safe=True,
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',
-    description='Where each robot goes: motion models, objective and planners, with the planner node',
+    description=(
+        'Where each robot goes: motion models, objective and planners, with the planner '
+        'node'
+    ),
     license='Apache-2.0',
     entry_points={
         'console_scripts': [

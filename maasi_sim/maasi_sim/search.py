@@ -125,9 +125,7 @@ class _Robot:
         self.follower = WaypointFollower(make_motion(settings.motion, obstacles, settings.radius))
         self.odometry = MapOdometry(start)
         self.detector = (
-            None
-            if settings.camera is None
-            else MarkerDetector(settings.camera, scenario.dimension)
+            None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)
         )
         period = scenario.robots[name].sensor.period
         rate = period if settings.camera is None else 1.0 / settings.camera.rate
@@ -226,8 +224,9 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
         time = step * scenario.step
         for robot in robots.values():
             robot.observe(round(time * 1e9))
-        commands = {name: robot.follower.update(robot.state, step)[0]
-                    for name, robot in robots.items()}
+        commands = {
+            name: robot.follower.update(robot.state, step)[0] for name, robot in robots.items()
+        }
         present = {
             name: PresentRobot(
                 robot.state,
@@ -256,9 +255,7 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
             gone = 1 if last_batch is None else step - last_batch
             last_batch = step
             result = search_filter.step(measurements, gone, time)
-            coordinator.absorb(
-                {item.robot: item.pose for item in measurements}, result.clusters
-            )
+            coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
             for item in members:
                 counts[item.robot] += 1
             positions = [target.position for target in search_filter.found_targets]
