@@ -247,6 +247,8 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._period = self._length / settings.rate if settings.rate > 0.0 else 0.0
         self._entities: list[Any] = []
         self._stamp = 0
+        # Of the last step that was published anew.
+        self._repeated = -1
         # Topics on which each expected node listens.
         self._expected: dict[str, list[str]] = {}
         self._ready: set[str] = set()
@@ -415,6 +417,7 @@ class SimNode(SearchNode[SimNodeSettings]):
             if not self._unheard(node) or now - since > _CONNECTION_PATIENCE:
                 del self._returned[node]
                 self._remember_endpoints()
+                self._repeated = self._stamp
                 robot = self._robot_of.get(node)
                 self._publish([robot] if robot is not None else [])
         if not self._returned:
@@ -550,6 +553,9 @@ class SimNode(SearchNode[SimNodeSettings]):
         if self.settings.lockstep:
             if stamp == self._stamp:
                 return True
+            if stamp == self._repeated:
+                # The others answer a step that comes twice twice.
+                return False
             # Nothing moves while a step waits: those who stop a robot are right already.
             oldest = newest = self._stamp
         else:

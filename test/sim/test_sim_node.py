@@ -400,6 +400,12 @@ def test_a_filter_that_was_started_again_gets_the_step_anew(make_team):
     team.planner.quiet = False
     team.planner.done.publish(LockstepDone(node='/planner_node', step=0))
     team.run(5)
+    # A late second answer to the step that came twice is nothing wrong; one to another step is.
+    team.drivers['mambo'].send(FORWARD, 0.0)
+    team.run(team.sim.step + 5)
+    assert team.sim.dropped == {}
+    team.drivers['mambo'].send(FORWARD, STEP)
+    team.spin_until(lambda: team.sim.dropped == {'stale command': 1})
 
 
 def test_ranging_robots_send_sweeps_at_the_period_of_their_sensor(make_team):
