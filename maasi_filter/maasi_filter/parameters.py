@@ -147,9 +147,9 @@ def _nest(model: type[BaseModel], flat: Mapping[str, Any], prefix: str) -> dict[
                 for item in flat.get(key) or []
             }
         elif inner is not None:
-            part = _nest(inner, flat, f'{key}.')
-            if part or type(None) not in get_args(info.annotation):
-                nested[target] = part
+            optional = type(None) in get_args(info.annotation)
+            if not optional or any(item.startswith(f'{key}.') for item in flat):
+                nested[target] = _nest(inner, flat, f'{key}.')
         elif flat.get(key) is not None:
             value = flat[key]
             if isinstance(value, (list, tuple)):

@@ -1,0 +1,75 @@
+"""Runs of whole scenarios as processes."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+# Far more than any of the runs takes, for a machine that is busy with something else.
+PATIENCE = 400.0
+
+
+class Run:
+    """A finished run."""
+
+    def __init__(self, folder, code, output):
+        self.folder = Path(folder)
+        self.code = code
+        self.output = output
+
+    @property
+    def report(self):
+        return json.loads((self.folder / 'report.json').read_text())
+
+    @property
+    def bag(self):
+        return self.folder / 'bag'
+
+
+def command(scenario, folder, *options):
+    return [
+        sys.executable,
+        '-m',
+        'maasi_sim.run_scenario',
+        str(scenario),
+        '--out',
+        str(folder),
+        *map(str, options),
+    ]
+
+
+def run_scenario(scenario, folder, *options, environment=None):
+    done = subprocess.run(
+        command(scenario, folder, *options),
+        env={**os.environ, **(environment or {})},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    return Run(folder, done.returncode, done.stdout)
+
+
+def wait_for(condition, what):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, f'{what} within {PATIENCE:g} s'
+        time.sleep(0.05)
+
+
+def processes_with(text):
+    """Return the ids of the processes whose command line has a text in it."""
+    found = []
+    for entry in Path('/proc').iterdir():
+        if entry.name.isdigit():
+            try:
+                line = (entry / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
+            except OSError:
+                continue
+            if text in line and int(entry.name) != os.getpid():
+                found.append(int(entry.name))
+    return found

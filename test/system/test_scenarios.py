@@ -1,0 +1,179 @@
+"""Whole scenarios: separate processes over DDS, from camera image to found target."""
+
+import os
+import signal
+import subprocess
+
+import pytest
+import yaml
+from scenario_runs import PATIENCE, command, processes_with, run_scenario, wait_for
+
+from maasi_sim.bag import Bag
+from maasi_sim.replay import plain
+from maasi_sim.scenario import load_scenario
+from maasi_sim.search import search
+
+pytestmark = pytest.mark.system
+
+
+def of_topic(run, topic):
+    with Bag(run.bag) as bag:
+        return [plain(item.message) for item in bag.messages([topic])]
+
+
+def test_the_demo_finds_all_targets(tmp_path):
+    run = run_scenario('mambo_turtlebot', tmp_path / 'run', '--seed', 2, '--lockstep')
+    assert run.code == 0, run.output
+    report = run.report
+    assert report['true_found'] == 12
+    assert report['missed'] == report['false_found'] == 0
+    assert report['rmse'] <= 0.08
+    assert report['end_reason'] == 'all_found'
+    assert (run.folder / 'report.png').stat().st_size > 10_000
+    for name in ('sim_node', 'mambo_driver', 'turtlebot_driver', 'filter_node', 'planner_node'):
+        assert (run.folder / f'{name}.log').exists()
+
+
+def test_the_same_seed_gives_the_same_run_to_the_bit(repeated):
+    first, second = repeated
+    assert first.code == second.code, first.output + second.output
+    decisions = of_topic(first, '/decisions')
+    assert len(decisions) > 3
+    assert decisions == of_topic(second, '/decisions')
+    updates = of_topic(first, '/filter_update')
+    assert len(updates) > 50
+    assert updates == of_topic(second, '/filter_update')
+    assert first.report['found'] == second.report['found']
+
+
+def test_the_nodes_decide_as_the_search_in_one_process(repeated):
+    run, _ = repeated
+    scenario = load_scenario('mambo_turtlebot', {'limit': (('limits', 'time'), 20.0)})
+    result = search(scenario, 3)
+    decisions = of_topic(run, '/decisions')
+    assert len(result.decisions) == len(decisions)
+    for ours, theirs in zip(result.decisions, decisions):
+        assert ours.step == theirs['step']
+        for robot in theirs['robots']:
+            waypoint = ours.robots[robot['robot']].waypoint.tolist()
+            assert waypoint == [robot['waypoint'][axis] for axis in 'xyz']
+    found = [target.position.tolist() for target in result.found_targets]
+    assert found == [list(item['position']) for item in run.report['found']]
+
+
+def test_the_bag_holds_the_run(repeated):
+    run, _ = repeated
+    with Bag(run.bag) as bag:
+        facts = bag.scenario()
+        topics = {topic for topic, _, _, _ in bag.raw(None)}
+    assert facts['seed'] == 3
+    for topic in ('/clock', '/mambo/odom', '/turtlebot/scan', '/particles', '/markers'):
+        assert topic in topics
+    assert any(topic.endswith('image_raw/compressed') for topic in topics)
+
+
+def test_a_replay_finds_the_same(repeated, tmp_path):
+    run, _ = repeated
+    done = subprocess.run(
+        [*command('mambo_turtlebot', tmp_path / 'replay')[:3], '--replay', str(run.bag)],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    assert 'equal to the bit' in done.stdout
+
+
+def test_the_others_plan_on_when_a_robot_leaves(tmp_path):
+    scenario = load_scenario('mambo_turtlebot').content()
+    scenario['events'] = [
+        {'at': 3.0, 'robot': 'mambo', 'do': 'leave'},
+        {'at': 22.0, 'robot': 'mambo', 'do': 'back'},
+    ]
+    scenario['limits']['time'] = 27.0
+    file = tmp_path / 'leaving.yaml'
+    file.write_text(yaml.safe_dump(scenario))
+    run = run_scenario(file, tmp_path / 'run', '--seed', 1, '--lockstep')
+    assert run.code in (0, 1), run.output
+    events = [(item['agent'], item['event']) for item in run.report['events']]
+    assert ('mambo', 'lost') in events
+    assert ('mambo', 'joined') in events
+    alone = [
+        robot['robot']
+        for decision in of_topic(run, '/decisions')
+        if 3.0 / 0.05 < decision['step'] < 22.0 / 0.05
+        for robot in decision['robots']
+    ]
+    assert alone
+    assert set(alone) == {'turtlebot'}
+    later = [
+        robot['robot']
+        for decision in of_topic(run, '/decisions')
+        if decision['step'] >= 22.0 / 0.05
+        for robot in decision['robots']
+    ]
+    assert 'mambo' in later
+
+
+def test_ranging_drones_search_space(tmp_path):
+    options = ('--seed', 1, '--lockstep', '--time-limit', 30)
+    run = run_scenario('ranging_pair_3d', tmp_path / 'run', *options)
+    assert run.code in (0, 1), run.output
+    assert sum(run.report['measurements'].values()) >= 40
+    assert len(run.report['found']) >= 1
+
+
+def test_free_running_finds_targets_too(tmp_path):
+    options = ('--seed', 1, '--time-limit', 12, '--rate', 1)
+    run = run_scenario('mambo_turtlebot', tmp_path / 'run', *options)
+    assert run.code in (0, 1), run.output
+    assert run.report['false_found'] == 0
+    assert sum(run.report['measurements'].values()) >= 20
+
+
+@pytest.mark.parametrize('name', ['filter_node', 'turtlebot_driver'])
+def test_a_killed_node_ends_the_run(tmp_path, name):
+    folder = tmp_path / 'run'
+    process = subprocess.Popen(
+        command('mambo_turtlebot', folder, '--lockstep'),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    parameters = f'{folder}/'
+    wait_for(
+        lambda: (
+            any((folder / 'bag').glob('*.mcap'))
+            and next((folder / 'bag').glob('*.mcap')).stat().st_size > 300_000
+        ),
+        'the run is under way',
+    )
+    victims = [pid for pid in processes_with(parameters) if name in _command_line(pid)]
+    os.kill(victims[0], signal.SIGKILL)
+    output, _ = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 3, output
+    assert name.split('_', maxsplit=1)[0] in output
+    with Bag(folder / 'bag') as bag:
+        assert any(True for _ in bag.raw(['/clock']))
+    assert not processes_with(parameters)
+
+
+def _command_line(pid):
+    with open(f'/proc/{pid}/cmdline', 'rb') as file:
+        return file.read().decode()
+
+
+def test_a_wrong_file_is_refused_before_anything_starts(tmp_path):
+    scenario = load_scenario('mambo_turtlebot').content()
+    scenario['planer'] = scenario.pop('planner')
+    file = tmp_path / 'wrong.yaml'
+    file.write_text(yaml.safe_dump(scenario))
+    run = run_scenario(file, tmp_path / 'run')
+    assert run.code == 2
+    assert 'planer' in run.output
+    assert str(file) in run.output
+    assert not (tmp_path / 'run').exists()
