@@ -153,6 +153,7 @@ class RunObserver:
         self._found: dict[int, Found] = {}
         self._updates: list[Any] = []
         self._arrays: list[Any] = []
+        self._last_scores: Scores | None = None
         self._team: list[str] | None = None
         self.progress: list[Progress] = []
         self.measurements = dict.fromkeys(scenario.names(), 0)
@@ -217,13 +218,17 @@ class RunObserver:
                 self._take(update)
 
     def _take(self, update: Any) -> None:
-        self._apply_arrays(int(update.batch_id))
+        changed = self._apply_arrays(int(update.batch_id))
         for item in update.newly_found:
-            self._found.setdefault(int(item.id), self._target(item))
+            if int(item.id) not in self._found:
+                self._found[int(item.id)] = self._target(item)
+                changed = True
         for member in update.members:
             self.measurements[member.robot] = self.measurements.get(member.robot, 0) + 1
         self.expected_number = float(update.expected_number)
-        scores = self._scores()
+        if changed or self._last_scores is None:
+            self._last_scores = self._scores()
+        scores = self._last_scores
         now = Progress(
             seconds(update.header.stamp),
             int(update.step),
@@ -237,11 +242,14 @@ class RunObserver:
         if len(self.truth) and scores.complete and self.scenario.stop == 'all_found':
             self.completed = now
 
-    def _apply_arrays(self, batch: int) -> None:
-        """Take the found targets as they stood after a batch."""
+    def _apply_arrays(self, batch: int) -> bool:
+        """Take the found targets as they stood after a batch; return whether any came."""
+        changed = False
         while self._arrays and self._arrays[0].batch_id <= batch:
             targets = self._arrays.pop(0).targets
             self._found = {int(item.id): self._target(item) for item in targets}
+            changed = True
+        return changed
 
     def _scores(self) -> Scores:
         positions = [self._found[key].position for key in sorted(self._found)]

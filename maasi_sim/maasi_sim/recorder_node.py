@@ -39,7 +39,7 @@ CLOCK, READY, DONE = '/clock', '/lockstep/ready', '/lockstep/done'
 # What is left out: of no use to who reads the recording.
 _SKIPPED = ('/parameter_events', READY)
 # What is recorded while the nodes are ended.
-_AT_THE_END = ('cmd_vel', 'odom', 'rosout', 'diagnostics', 'transition_event')
+_AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
 _WITH_STEP = (
     AgentState,
     DetectionArray,
@@ -106,6 +106,7 @@ class Recorder:
         self._last_done: deque[bytes] = deque(maxlen=100)
         self.ready: set[str] = set()
         self._finished = False
+        self._last_step = -1
         self.complaints: list[str] = []
         self._wanted = {*observer.topics, CLOCK, DONE}
         self._subscriptions: dict[str, Subscription] = {}
@@ -215,6 +216,8 @@ class Recorder:
         limit : int, optional
             Simulated time at which the run ends [ns].
         """
+        # Left where they are they would end each wait at once.
+        self.take_ready()
         # What belongs to an update was published before it: take updates first, read them last.
         updates = self._take_from(UPDATE)
         steps = self._take_from(STEP)
@@ -230,9 +233,10 @@ class Recorder:
         taken += [(UPDATE, data) for data in updates]
         taken += [(STEP, data) for data in steps]
         if self._finished:
-            taken = [item for item in taken if item[0].rpartition('/')[2] in _AT_THE_END]
+            taken = self._until(taken, self._last_step)
         elif limit is not None and self.step is not None and self.time >= limit:
-            taken = self._until(taken, self.step - 1)
+            self._last_step = self.step - 1
+            taken = self._until(taken, self._last_step)
         now = time.monotonic()
         for topic, data in taken:
             self.last_seen[topic] = now
@@ -242,14 +246,17 @@ class Recorder:
                 self.observer.add(topic, data)
         self.observer.settle()
         if self.observer.end_step is not None and not self._finished:
-            taken = self._until(taken, self.observer.end_step)
+            self._last_step = self.observer.end_step
+            taken = self._until(taken, self._last_step)
         if self.bag is not None:
             for topic, data in taken:
                 self.bag.write(topic, self.time, data)
 
     def finish(self) -> None:
-        """Keep from now on only what tells how robots and nodes are stopped."""
+        """Keep from now on only what belongs to the steps so far, and how all is stopped."""
         self._finished = True
+        if self._last_step < 0 and self.step is not None:
+            self._last_step = self.step
 
     def _until(self, taken: list[tuple[str, bytes]], step: int) -> list[tuple[str, bytes]]:
         """Return the messages up to a step, as far as they say to which they belong."""
@@ -259,6 +266,9 @@ class Recorder:
         kept = []
         for topic, data in taken:
             kind = self._subscriptions[topic].msg_type
+            if self._finished and topic.rpartition('/')[2] in _AT_THE_END:
+                kept.append((topic, data))
+                continue
             if _has_stamp_first(kind):
                 seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
                 if seconds * 10**9 + nanoseconds > end:

@@ -26,8 +26,10 @@ DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 
 # Bytes that may wait for the disk when the recorder says that it is done with a step.
 _BACKLOG = 8 * 2**20
-# Wall time between two looks at processes and topics, where no step comes in between [s].
+# Longest wall time until the next look at processes and topics [s].
 _POLL = 0.02
+# Wall time between two looks at processes, where steps come in quick succession [s].
+_LOOK_PERIOD = 0.05
 # Wall time after which it says whom it waits for, again and again [s].
 _START_PATIENCE = 10.0
 # One thread for each linear algebra: there is a process for each node already.
@@ -237,6 +239,7 @@ class ScenarioRun:
         self._begun: float | None = None
         self._ended: float | None = None
         self._failed: set[str] = set()
+        self._looked = 0.0
 
     def execute(self) -> int:
         """Run it and return the exit code."""
@@ -414,6 +417,10 @@ class ScenarioRun:
         """Return an ending if the run was interrupted or a node has died for good."""
         if self.interruption:
             return Ending('interrupted', INTERRUPTED)
+        # Asking the system about each process takes longer than a step may.
+        if time.monotonic() - self._looked < _LOOK_PERIOD:
+            return None
+        self._looked = time.monotonic()
         for name, process in self.processes.items():
             if process.running:
                 continue
