@@ -92,6 +92,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_wall_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics)
         self._started = time.monotonic()
+        self._clock_patience = _CLOCK_PATIENCE
         if self.get_parameter('use_sim_time').value:
             self.create_wall_timer(_CLOCK_PATIENCE, self._look_for_clock)
         self.get_clock().create_jump_callback(_backward_threshold(), post_callback=self._on_jump)
@@ -265,10 +266,16 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
             self.reset()
 
     def _look_for_clock(self) -> None:
-        if self.get_clock().now().nanoseconds == 0:
+        waited = time.monotonic() - self._started
+        if (
+            self.active
+            and waited >= self._clock_patience
+            and not self.get_clock().now().nanoseconds
+        ):
+            # Said less and less often.
+            self._clock_patience = 2.0 * waited
             self.get_logger().warning(
-                f'no /clock for {time.monotonic() - self._started:.0f} s: waiting for it '
-                '(use_sim_time is true)'
+                f'no /clock for {waited:.0f} s: waiting for it (use_sim_time is true)'
             )
 
     # ---- diagnostics -------------------------------------------------------------------------

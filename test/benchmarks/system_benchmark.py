@@ -1,0 +1,99 @@
+"""Whole scenarios as processes: speed in lockstep, time to start, latency of the filter node."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maasi_sim.node_plan import NodePlan
+from maasi_sim.processes import Domain, NodeProcess, find_executable, stop
+from maasi_sim.replay import FILTER, read_recording
+from maasi_sim.replay_node import ReplayNode
+
+SECONDS = 40.0
+
+
+def row(name: str, value: float, unit: str) -> dict[str, Any]:
+    """Return one result; there is nothing to compare whole systems with."""
+    return {'name': name, 'value': value, 'unit': unit, 'baseline': None, 'ratio': None}
+
+
+def scenario(name: str, folder: Path, limit: float) -> float:
+    """Run a scenario in lockstep, recorded; return the wall time of all of it [s]."""
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [
+            *(sys.executable, '-m', 'maasi_sim.run_scenario', name, '--lockstep', '--seed', '1'),
+            *('--out', str(folder), '--time-limit', str(limit)),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode not in (0, 1):
+        raise RuntimeError(f'{name} ended with {done.returncode}:\n{done.stdout}{done.stderr}')
+    return time.perf_counter() - begin
+
+
+def real_time_factor(folder: Path) -> float:
+    """Return how many simulated seconds a second of a run took in."""
+    return float(json.loads((folder / 'report.json').read_text())['real_time_factor'])
+
+
+def latencies(bag: Path, folder: Path) -> list[float]:
+    """Return the times from detections to the update that holds them, over DDS [s]."""
+    recording = read_recording(bag)
+    facts = recording.facts['nodes'][FILTER]
+    parameters = {**facts['parameters'], 'lockstep': True}
+    plan = NodePlan(facts['package'], facts['executable'], FILTER.strip('/'), parameters=parameters)
+    file = folder / 'filter_node.yaml'
+    file.write_text(plan.parameter_text(), encoding='utf-8')
+    times = []
+    with Domain(None) as domain:
+        os.environ.update(domain.environment())
+        executable = find_executable(plan.package, plan.executable)
+        process = NodeProcess(
+            plan.full_name, plan.command(executable, file), folder / 'filter_node.log'
+        )
+        process.start()
+        node = ReplayNode(domain.number, sorted(recording.facts['scenario']['robots']))
+        try:
+            while not node.ready:
+                node.spin()
+            for number, batch in enumerate(recording.batches, start=1):
+                begin = time.perf_counter()
+                node.publish(batch)
+                while len(node.updates) < number:
+                    node.spin()
+                times.append(time.perf_counter() - begin)
+        finally:
+            node.close()
+            stop([process])
+    return times
+
+
+def run() -> list[dict[str, Any]]:
+    """Run the benchmarks."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        # The first run finds everything cold.
+        scenario('mambo_turtlebot', folder / 'cold', 0.1)
+        start = scenario('mambo_turtlebot', folder / 'start', 0.1)
+        scenario('mambo_turtlebot', folder / 'floor', SECONDS)
+        scenario('ranging_pair_3d', folder / 'space', 2.0 * SECONDS)
+        times = latencies(folder / 'floor' / 'bag', folder)
+        return [
+            row('demo_real_time_factor', real_time_factor(folder / 'floor'), 'x'),
+            row('ranging_pair_real_time_factor', real_time_factor(folder / 'space'), 'x'),
+            row('start_and_end', start, 's'),
+            row('detections_to_update_p50', 1e3 * float(np.percentile(times, 50)), 'ms'),
+            row('detections_to_update_p99', 1e3 * float(np.percentile(times, 99)), 'ms'),
+        ]
