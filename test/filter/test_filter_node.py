@@ -1,0 +1,203 @@
+"""The filter node over real topics: batches, trouble, and what it says of it."""
+
+import math
+import time
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from maasi_filter.executor import LeanExecutor
+from maasi_filter.filter_node import FilterNode
+from maasi_filter.node_settings import FilterNodeSettings
+from maasi_filter.parameters import flatten
+from maasi_filter.qos import LATCHED, RELIABLE, UPDATES
+from maasi_filter.search_node import SettingsError
+from maasi_msgs.msg import (
+    BatchMember,
+    Detection,
+    DetectionArray,
+    FilterUpdate,
+    FoundTargetArray,
+    MeasurementBatch,
+)
+from maasi_sim.processes import Domain
+
+PATIENCE = 60.0
+BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}
+NOISE = {'range': 0.01, 'bearing': 0.03}
+SETTINGS = FilterNodeSettings.model_validate(
+    {
+        'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+        'filter': {'particles': 2000},
+        'robots': {name: {'sensor': {'detection': BOX, 'noise': NOISE}} for name in ('a', 'b')},
+        'batch_timeout': 0.3,
+    }
+)
+
+
+def overrides(settings):
+    return [Parameter(name, value=value) for name, value in flatten(settings).items()]
+
+
+class Team:
+    """The rest of the team: planner and drivers."""
+
+    def __init__(self, context):
+        self.node = Node('team', context=context)
+        self.updates = []
+        self.found = []
+        self.batch = self.node.create_publisher(MeasurementBatch, 'measurement_batch', RELIABLE)
+        self.detections = {
+            name: self.node.create_publisher(DetectionArray, f'{name}/detections', RELIABLE)
+            for name in ('a', 'b')
+        }
+        self.node.create_subscription(FilterUpdate, 'filter_update', self.updates.append, UPDATES)
+        self.node.create_subscription(FoundTargetArray, 'found_targets', self.found.append, LATCHED)
+        self.counts = dict.fromkeys(('a', 'b'), 0)
+
+    def measure(self, number, robots, seen, **changes):
+        """Publish a batch, and what its robots see from (1, 1): lists of range and bearing."""
+        members = [BatchMember(robot=name, measurement=self.counts[name]) for name in robots]
+        stamp = rclpy.time.Time(seconds=0.1 * number).to_msg()
+        self.batch.publish(MeasurementBatch(id=number, step=number, stamp=stamp, members=members))
+        for name in robots:
+            if name not in seen:
+                continue
+            message = DetectionArray(
+                batch_id=number, step=number, robot=name, measurement=self.counts[name]
+            )
+            message.header.stamp = stamp
+            message.header.frame_id = 'map'
+            message.pose.pose.position.x = message.pose.pose.position.y = 1.0
+            message.pose.pose.orientation.w = 1.0
+            message.detections = [
+                Detection(range=float(item[0]), bearing=float(item[1])) for item in seen[name]
+            ]
+            for path, value in changes.items():
+                target = message
+                *parts, last = path.split('__')
+                for part in parts:
+                    target = getattr(target, part)
+                setattr(target, last, value)
+            self.counts[name] += 1
+            self.detections[name].publish(message)
+
+
+@pytest.fixture
+def world():
+    with Domain(None) as domain:
+        context = Context()
+        rclpy.init(context=context, domain_id=domain.number)
+        node = FilterNode(context=context, parameter_overrides=overrides(SETTINGS))
+        node.trigger_configure()
+        node.trigger_activate()
+        team = Team(context)
+        lean = LeanExecutor(node, context=context)
+        other = SingleThreadedExecutor(context=context)
+        other.add_node(team.node)
+
+        def until(condition):
+            deadline = time.monotonic() + PATIENCE
+            while not condition():
+                assert time.monotonic() < deadline
+                lean.spin_for(0.01)
+                other.spin_once(timeout_sec=0.01)
+
+        until(lambda: team.batch.get_subscription_count() == 1)
+        until(lambda: all(item.get_subscription_count() for item in team.detections.values()))
+        until(lambda: team.node.count_publishers('/filter_update') == 1)
+        yield node, team, until
+        lean.shutdown()
+        other.shutdown()
+        node.destroy_node()
+        team.node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_a_target_seen_again_and_again_is_found(world):
+    node, team, until = world
+    for number in range(1, 9):
+        team.measure(number, ['a', 'b'], {'a': [(0.3, 0.5)], 'b': [(0.3, 0.5)]})
+        until(lambda number=number: len(team.updates) == number)
+    until(lambda: team.found and len(team.found[-1].targets) == 1)
+    target = team.found[-1].targets[0]
+    assert target.position.x == pytest.approx(1.0 + 0.3 * math.cos(0.5), abs=0.02)
+    assert target.position.y == pytest.approx(1.0 + 0.3 * math.sin(0.5), abs=0.02)
+    assert [update.batch_id for update in team.updates] == list(range(1, 9))
+    assert [item.robot for item in team.updates[0].members] == ['a', 'b']
+    assert not node.dropped
+
+
+def test_a_missing_robot_is_named_and_its_late_answer_is_a_batch_of_its_own(world):
+    _, team, until = world
+    team.measure(1, ['a', 'b'], {'a': []})
+    until(lambda: len(team.updates) == 1)
+    assert list(team.updates[0].missing) == ['b']
+    late = DetectionArray(batch_id=1, step=1, robot='b')
+    late.header.frame_id = 'map'
+    late.pose.pose.orientation.w = 1.0
+    team.detections['b'].publish(late)
+    until(lambda: len(team.updates) == 2)
+    assert [item.robot for item in team.updates[1].members] == ['b']
+
+
+@pytest.mark.parametrize(
+    ('changes', 'reason'),
+    [
+        ({'header__frame_id': 'odom'}, 'bad detections'),
+        ({'robot': 'nobody'}, 'bad detections'),
+        ({'pose__pose__position__x': math.nan}, 'bad detections'),
+        ({'pose__pose__orientation__w': 0.0}, 'bad detections'),
+        ({'detections': [Detection(range=math.nan)]}, 'bad detection'),
+        ({'detections': [Detection(range=-1.0)]}, 'bad detection'),
+        ({'detections': [Detection(range=1.0, bearing=9.0)]}, 'bad detection'),
+        ({'detections': [Detection(range=1.0, covariance=[1.0])]}, 'bad detection'),
+        (
+            {'detections': [Detection(range=1.0, covariance=[1.0, 2.0, 2.0, 1.0])]},
+            'bad detection',
+        ),
+    ],
+)
+def test_what_is_wrong_is_dropped_and_counted_and_the_node_goes_on(world, changes, reason):
+    node, team, until = world
+    team.measure(1, ['a'], {'a': [(0.3, 0.5)]}, **changes)
+    until(lambda: len(team.updates) == 1)
+    assert node.dropped[reason] == 1
+    assert team.updates[0].expected_number == 0.0
+    team.measure(2, ['a'], {'a': [(0.3, 0.5)]})
+    until(lambda: len(team.updates) == 2)
+    assert team.updates[1].expected_number > 0.0
+
+
+def test_a_stamp_before_the_last_one_is_dropped(world):
+    node, team, until = world
+    team.measure(5, ['a'], {'a': []})
+    until(lambda: len(team.updates) == 1)
+    early = rclpy.time.Time(seconds=0.2).to_msg()
+    team.measure(6, ['a'], {'a': []}, header__stamp=early)
+    until(lambda: len(team.updates) == 2)
+    assert node.dropped['bad detections'] == 1
+    assert list(team.updates[1].missing) == ['a']
+
+
+def test_wrong_parameters_are_refused_by_name():
+    flat = flatten(SETTINGS)
+    with Domain(None) as domain:
+        context = Context()
+        rclpy.init(context=context, domain_id=domain.number)
+        try:
+            for name, value in (('filter.particles', -3), ('filter.partikles', 10)):
+                wrong = {**flat, name: value}
+                with pytest.raises(SettingsError, match=name):
+                    FilterNode(
+                        context=context,
+                        parameter_overrides=[
+                            Parameter(key, value=item) for key, item in wrong.items()
+                        ],
+                    )
+        finally:
+            rclpy.shutdown(context=context)

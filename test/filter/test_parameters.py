@@ -1,0 +1,48 @@
+"""Settings as flat parameters, and back."""
+
+import pytest
+
+from maasi_filter.node_settings import FilterNodeSettings
+from maasi_filter.parameters import flatten, parameter_fields, unflatten
+
+CONTENT = {
+    'step': 0.1,
+    'seed': 7,
+    'environment': {
+        'bounds': [[-0.3, 2.4], [0.0, 2.0]],
+        'obstacles': [{'centre': [0.8, 1.2], 'radius': 0.1}],
+    },
+    'filter': {'particles': 500, 'found_radius': 0.02},
+    'robots': {
+        'b': {'sensor': {'detection': {'kind': 'box', 'lower': [-0.1, -0.1], 'upper': [0.2, 0.2]}}},
+        'a': {'sensor': {'noise': {'range': 0.1, 'bearing': 2.0, 'as': 'variance'}}},
+    },
+}
+
+
+def test_round_trip():
+    settings = FilterNodeSettings.model_validate(CONTENT)
+    flat = flatten(settings)
+    assert flat['environment.bounds'] == ['-0.3 2.4', '0.0 2.0']
+    assert flat['environment.obstacles'] == ['0.8 1.2 0.1']
+    assert flat['robots'] == ['a', 'b']
+    assert flat['robot.a.sensor.noise.as'] == 'variance'
+    assert 'filter.found_mass' not in flat
+    assert FilterNodeSettings.model_validate(unflatten(FilterNodeSettings, flat)) == settings
+
+
+def test_every_field_is_a_parameter_with_a_description():
+    flat = flatten(FilterNodeSettings.model_validate(CONTENT))
+    fields = {item.name: item for item in parameter_fields(FilterNodeSettings, flat)}
+    assert set(flat) <= set(fields)
+    assert all(item.description for item in fields.values())
+    assert fields['filter.particles'].constraints == 'at least 1 and at most 5000000'
+    assert 'recommended' in fields['filter.preset'].constraints
+    assert fields['filter.found_mass'].default is None
+
+
+def test_a_list_that_is_no_numbers_is_named():
+    flat = flatten(FilterNodeSettings.model_validate(CONTENT))
+    flat['environment.bounds'] = ['zero one']
+    with pytest.raises(ValueError, match=r'environment\.bounds.*zero one'):
+        unflatten(FilterNodeSettings, flat)
