@@ -306,9 +306,18 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         steps = 1 if last is None else max(batch.step - last, 0)
         self._last_step = batch.step
         members = [item for item in batch.members if item.robot in batch.measurements]
-        result = self.filter.step(
-            [batch.measurements[item.robot] for item in members], steps, batch.stamp * 1e-9
-        )
+        now = batch.stamp * 1e-9
+        try:
+            result = self.filter.step(
+                [batch.measurements[item.robot] for item in members], steps, now
+            )
+        except ValueError as error:
+            # What the filter refuses leaves it as it was.
+            self.drop('refused measurement', f'batch {batch.id}: {error}')
+            for item in members:
+                del batch.measurements[item.robot]
+            members = []
+            result = self.filter.step([], steps, now)
         for reason, number in sorted(result.dropped.items()):
             self.dropped[reason] += number
         header = Header(stamp=stamp_to_ros(batch.stamp), frame_id=self.settings.frame)
