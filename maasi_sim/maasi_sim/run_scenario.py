@@ -240,6 +240,7 @@ class ScenarioRun:
         self._ended: float | None = None
         self._failed: set[str] = set()
         self._looked = 0.0
+        self._clocks: set[str] = set()
 
     def execute(self) -> int:
         """Run it and return the exit code."""
@@ -270,6 +271,7 @@ class ScenarioRun:
             recorder=True,
             file=file,
         )
+        self._clocks = {plan.full_name for plan in self.plans if plan.is_clock}
         parameters = self.folder / 'parameters'
         parameters.mkdir(exist_ok=True)
         for plan in self.plans:
@@ -430,6 +432,9 @@ class ScenarioRun:
             if robot is not None and name.endswith('/driver'):
                 recorder.stop_robot(robot)
             tries = self.scenario.limits.restarts
+            # Another sim would begin with another time.
+            if name in self._clocks:
+                tries = 0
             if self.scenario.on_exit == 'respawn' and process.restarts < tries:
                 self.events.append({**event, 'event': 'restarted'})
                 process.restart()
