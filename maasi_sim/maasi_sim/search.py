@@ -19,9 +19,10 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.team import Decision
-from maasi_sim.robots import Equipment, SimulatedRobot
 from maasi_sim.scenario import Scenario, steps_of
 from maasi_sim.scoring import score, scoring_radius
+from maasi_sim.simulation import simulated_robot
+from maasi_sim.world import World
 
 FloatArray = NDArray[np.float64]
 
@@ -100,30 +101,14 @@ class SearchResult:
 class _Robot:
     """A simulated robot with what its driver does."""
 
-    def __init__(self, name: str, scenario: Scenario, seed: int, world: object) -> None:
+    def __init__(self, name: str, scenario: Scenario, seed: int, world: World) -> None:
         settings = scenario.robots[name]
         self.name = name
         self.sensor = settings.sensor.build(name, scenario.dimension)
-        start = Pose.from_yaw(settings.start, settings.yaw)
-        self.body = SimulatedRobot(
-            name,
-            Equipment(
-                motion=settings.motion,
-                radius=settings.radius,
-                camera=settings.camera,
-                sensor=self.sensor if settings.camera is None else None,
-                laser=None,
-                odometry=settings.odometry,
-                battery=settings.battery,
-            ),
-            start,
-            world,  # type: ignore[arg-type]
-            scenario.floor,
-            seed,
-        )
+        self.body = simulated_robot(name, scenario, world, seed)
         obstacles = Obstacles.from_settings(scenario.environment.obstacles)
         self.follower = WaypointFollower(make_motion(settings.motion, obstacles, settings.radius))
-        self.odometry = MapOdometry(start)
+        self.odometry = MapOdometry(Pose.from_yaw(settings.start, settings.yaw))
         self.detector = (
             None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)
         )
