@@ -16,8 +16,7 @@ setup(
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',
     description=(
-        'Where each robot goes: motion models, objective and planners, with the planner '
-        'node'
+        'Where each robot goes: motion models, objective and planners, with the planner node'
     ),
     license='Apache-2.0',
     entry_points={
