@@ -14,7 +14,9 @@ import yaml
 from maasi_sim.bag import Bag
 
 WITH_FAKES = Path(__file__).with_name('run_with_fakes.py')
-LIMIT = 60.0
+LIMIT = 120.0
+
+pytestmark = pytest.mark.system
 
 TARGETS = [[0.5, 0.5], [1.5, 0.5], [1.0, 1.5]]
 

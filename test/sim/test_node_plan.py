@@ -1,0 +1,104 @@
+"""Plans of a scenario's nodes: who is started, with which parameters."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from maasi_drivers.driver_settings import DriverSettings
+from maasi_filter.node_settings import FilterNodeSettings
+from maasi_filter.parameters import unflatten
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_sim.node_plan import NodePlan, plan_nodes
+from maasi_sim.scenario import config_folder, load_scenario
+from maasi_sim.sim_settings import SimNodeSettings
+
+SCENARIOS = sorted(path.stem for path in (config_folder() / 'scenarios').glob('*.yaml'))
+
+
+def plans_of(scenario, **changes):
+    options = {'seed': 4, 'lockstep': True, 'rate': None, 'recorder': True, 'file': Path('/s.yaml')}
+    return {plan.full_name: plan for plan in plan_nodes(scenario, **{**options, **changes})}
+
+
+def read_back(plan, model):
+    """Return the settings that a node makes of its parameter file."""
+    flat = yaml.safe_load(plan.parameter_text())['/**']['ros__parameters']
+    simulated = flat.pop('use_sim_time', False)
+    return model.model_validate(unflatten(model, flat)), simulated
+
+
+def test_the_demo_has_a_sim_two_drivers_a_guard_a_filter_and_a_planner():
+    plans = plans_of(load_scenario('mambo_turtlebot'))
+    assert {name: (plan.package, plan.executable) for name, plan in plans.items()} == {
+        '/sim_node': ('maasi_sim', 'sim_node'),
+        '/mambo/driver': ('maasi_drivers', 'mambo_driver'),
+        '/turtlebot/driver': ('maasi_drivers', 'turtlebot_driver'),
+        '/turtlebot/guard': ('maasi_drivers', 'guard_node'),
+        '/filter_node': ('maasi_filter', 'filter_node'),
+        '/planner_node': ('maasi_planner', 'planner_node'),
+    }
+    assert {name for name, plan in plans.items() if plan.says_ready} == {
+        '/mambo/driver',
+        '/turtlebot/driver',
+        '/filter_node',
+        '/planner_node',
+    }
+    assert [name for name, plan in plans.items() if plan.is_clock] == ['/sim_node']
+    assert plans['/mambo/driver'].file_name == 'mambo_driver'
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
+    scenario = load_scenario(name)
+    plans = plans_of(scenario)
+    search, simulated = read_back(plans['/filter_node'], FilterNodeSettings)
+    assert simulated
+    assert (search.step, search.seed, search.lockstep) == (scenario.step, 4, True)
+    assert search.environment == scenario.environment
+    assert search.filter == scenario.filter
+    planner, simulated = read_back(plans['/planner_node'], PlannerNodeSettings)
+    assert simulated
+    assert planner.environment == scenario.environment
+    assert planner.planner == scenario.planner
+    for robot, settings in scenario.robots.items():
+        assert search.robots[robot].sensor == settings.sensor
+        for key in ('candidates', 'motion', 'sensor', 'radius', 'start'):
+            assert getattr(planner.robots[robot], key) == getattr(settings, key)
+        driver, simulated = read_back(plans[f'/{robot}/driver'], DriverSettings)
+        assert simulated
+        for key in ('start', 'yaw', 'radius', 'motion', 'sensor', 'camera'):
+            assert getattr(driver, key) == getattr(settings, key)
+        assert driver.environment == scenario.environment
+
+
+@pytest.mark.parametrize(
+    'lockstep, rate, expected', [(True, None, 0.0), (True, 2.0, 2.0), (False, None, 1.0)]
+)
+def test_the_sim_gets_the_file_and_how_fast_it_goes(lockstep, rate, expected):
+    plans = plans_of(load_scenario('mambo'), lockstep=lockstep, rate=rate, recorder=False)
+    settings, simulated = read_back(plans['/sim_node'], SimNodeSettings)
+    assert settings.scenario == '/s.yaml'
+    assert settings.seed == 4
+    assert settings.lockstep is lockstep
+    assert settings.rate == expected
+    assert settings.recorder is False
+    # The clock is its own.
+    assert not simulated
+
+
+def test_command_lines_name_the_node_and_its_parameters():
+    plan = NodePlan('maasi_drivers', 'mambo_driver', 'driver', 'mambo', {'a.b': 1.5})
+    command = plan.command(Path('/lib/mambo_driver'), Path('/run/p.yaml'))
+    assert command[:2] == ['/lib/mambo_driver', '--ros-args']
+    assert '__node:=driver' in command
+    assert '__ns:=/mambo' in command
+    assert command[command.index('--params-file') + 1] == '/run/p.yaml'
+    assert plan.full_name == '/mambo/driver'
+    assert yaml.safe_load(plan.parameter_text()) == {'/**': {'ros__parameters': {'a.b': 1.5}}}
+
+
+def test_a_node_without_namespace_is_at_the_root():
+    plan = NodePlan('maasi_filter', 'filter_node', 'filter_node')
+    assert plan.full_name == '/filter_node'
+    assert '__ns:=/' in plan.command(Path('/x'), Path('/y'))
