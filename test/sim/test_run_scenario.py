@@ -12,6 +12,8 @@ import pytest
 import yaml
 
 from maasi_sim.bag import Bag
+from maasi_sim.run_scenario import Options, ScenarioRun, build_parser, make_folder
+from maasi_sim.yaml_files import ScenarioError
 
 WITH_FAKES = Path(__file__).with_name('run_with_fakes.py')
 LIMIT = 120.0
@@ -187,7 +189,7 @@ def test_the_planner_may_end_a_run(tmp_path, scenario, stop, code):
     assert run.report['end_reason'] == 'planner_done'
 
 
-@pytest.mark.parametrize('node', ['filter_node', 'planner_node', 'mambo/driver', 'sim_node'])
+@pytest.mark.parametrize('node', ['filter_node', 'mambo/driver', 'sim_node'])
 def test_a_node_that_dies_ends_the_run_and_is_named(tmp_path, scenario, node):
     script = {node: {'trouble': 'die', 'trouble_step': 15}}
     run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
@@ -200,15 +202,9 @@ def test_a_node_that_dies_ends_the_run_and_is_named(tmp_path, scenario, node):
     assert run.nodes() == []
     with Bag(run.folder) as bag:
         assert bag.counts['/lockstep/step'] >= 15
-
-
-def test_the_robot_of_a_dead_driver_is_told_to_stop(tmp_path, scenario):
-    script = {'mambo/driver': {'trouble': 'die', 'trouble_step': 15}}
-    run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
-    assert run.wait()[0] == 3
-    with Bag(run.folder) as bag:
         *_, last = bag.messages(['/mambo/cmd_vel'])
-    assert last.message.twist.linear.x == 0.0
+    # The robot of a dead driver is told to stop.
+    assert node != 'mambo/driver' or last.message.twist.linear.x == 0.0
 
 
 def test_an_error_is_shown_with_the_end_of_the_log(tmp_path, scenario):
@@ -243,8 +239,8 @@ def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, scenario):
     assert 'after 1 restarts' in output
 
 
-@pytest.mark.parametrize('node', ['filter_node', 'second/driver'])
-def test_a_node_that_hangs_ends_the_run_and_is_named(tmp_path, scenario, node):
+def test_a_node_that_hangs_ends_the_run_and_is_named(tmp_path, scenario):
+    node = 'second/driver'
     script = {node: {'trouble': 'hang', 'trouble_step': 7}}
     run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
     code, output = run.wait()
@@ -273,8 +269,10 @@ def test_a_deaf_node_is_killed(tmp_path, scenario):
     assert run.nodes() == []
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('said', ['nodes in ROS domain', 'measurements'])
+@pytest.mark.parametrize(
+    'number, said',
+    [(signal.SIGINT, 'nodes in ROS domain'), (signal.SIGTERM, 'measurements')],
+)
 def test_an_interrupt_leaves_no_process_and_a_readable_recording(tmp_path, scenario, number, said):
     script = {'found': 0}
     run = Run(tmp_path / 'run', scenario(), '--rate', '1.0', script=script)
@@ -312,24 +310,47 @@ def test_wrong_input_is_told_before_anything_starts(tmp_path, scenario):
 @pytest.mark.parametrize(
     'options, words',
     [
-        (['--planner', 'masi'], "--planner: planner.name: unknown value 'masi'"),
-        (['--domain-id', '300'], 'domain id: read 300'),
+        (['--domain-id', '-1'], '--domain-id'),
         (['--seed', '-1'], '--seed'),
+        (['--seed', '1.5'], '--seed'),
         (['--rate', '0'], '--rate'),
         (['--time-limit', 'nan'], '--time-limit'),
-        (['--replay', 'x'], 'either a scenario or --replay'),
+        (['--time-limit', 'inf'], '--time-limit'),
+        (['--lockstepp'], '--lockstepp'),
     ],
 )
-def test_wrong_options_are_named(tmp_path, scenario, options, words):
-    run = Run(tmp_path / 'run', scenario(), *options)
-    code, output = run.wait()
-    assert code == 2, output
-    assert words in output
+def test_wrong_options_are_named(options, words, capsys):
+    with pytest.raises(SystemExit) as caught:
+        build_parser().parse_args(['mambo', *options])
+    assert caught.value.code == 2
+    assert words in capsys.readouterr().err
 
 
-def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path, scenario):
-    (tmp_path / 'run').mkdir()
+def test_a_wrong_planner_is_named_with_the_option():
+    with pytest.raises(ScenarioError, match="--planner: planner.name: unknown value 'masi'"):
+        ScenarioRun(Options('mambo', planner='masi'), interruption=False)
+
+
+def test_options_win_over_the_scenario():
+    options = Options('mambo', planner='lawnmower', seed=9, time_limit=3.0)
+    run = ScenarioRun(options, interruption=False)
+    assert run.scenario.planner.name == 'lawnmower'
+    assert run.scenario.limits.time == 3.0
+    assert run.seed == run.scenario.seed == 9
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path):
+    assert make_folder(tmp_path / 'run') == tmp_path / 'run'
     (tmp_path / 'run' / 'report.json').write_text('{}')
-    code, output = Run(tmp_path / 'run', scenario()).wait()
-    assert code == 2
-    assert 'holds a run already' in output
+    with pytest.raises(ScenarioError, match='holds a run already'):
+        make_folder(tmp_path / 'run')
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(ScenarioError, match='--out: .*file'):
+        make_folder(tmp_path / 'file')
+
+
+def test_folders_named_by_the_time_are_new_ones(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = {make_folder(None) for _ in range(3)}
+    assert len(folders) == 3
+    assert all(folder.parent == tmp_path / 'runs' for folder in folders)
