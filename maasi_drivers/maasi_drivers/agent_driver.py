@@ -89,6 +89,10 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     """
     The driver of a robot, in the robot's namespace.
 
+    It reaches the robot by topics; one with a link of its own overrides `connect_robot`,
+    `disconnect_robot`, `send_command`, `stop_robot` and `watch_robot`, and hands what comes in to
+    `take_pose` and `take_charge`.
+
     Subscribes
     ----------
     `odom` (nav_msgs/Odometry), `battery` (sensor_msgs/BatteryState);
@@ -126,9 +130,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._queue: MeasurementQueue[DataT] = MeasurementQueue(self._history)
         self._unseen: Counter[str] = Counter()
         self._battery = -1.0
-        # Why the robot cannot go on; empty where it can.
-        self._trouble = ''
-        self._no_odometry = False
+        # Why the robot cannot go on, by kind; empty where it can.
+        self._troubles: dict[str, str] = {}
         self._odometry_at = time.monotonic()
         self._watched_at = self._odometry_at
         self._stalled = False
@@ -165,6 +168,57 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
         """
 
+    # ---- the robot's link: topics, unless overridden -----------------------------------------
+
+    def connect_robot(self) -> None:
+        """Reach the robot, in *configure*."""
+        settings = self.settings
+        self._command_publisher = self.create_publisher(
+            TwistStamped if settings.command_type == 'stamped' else Twist, 'cmd_vel', RELIABLE
+        )
+        quality = sensor_reader(settings.lockstep)
+        self._entities += [
+            self._command_publisher,
+            self.create_subscription(Odometry, 'odom', self._on_odometry, quality),
+            self.create_subscription(BatteryState, 'battery', self._on_battery, quality),
+        ]
+        self.expect_subscribers(self._command_publisher)
+
+    def disconnect_robot(self) -> None:
+        """Undo `connect_robot`; what is in `_entities` goes by itself."""
+        self._command_publisher = None
+
+    def send_command(self, placed: StampedPose, command: list[float]) -> None:
+        """
+        Have the robot move.
+
+        Parameters
+        ----------
+        placed : StampedPose
+            Where it is.
+        command : list of float
+            vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+
+        """
+        self._publish_command(command)
+
+    def stop_robot(self) -> None:
+        """Stop the robot because the driver ends; it has no goal any more."""
+        if self._command_publisher is None:
+            return
+        for _ in range(_STOP_COMMANDS):
+            self._publish_command([0.0, 0.0, 0.0, 0.0])
+        self._command_publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
+
+    def hold_robot(self) -> None:
+        """Stop the robot now, as its goal was cancelled or its pose is not known."""
+        self._publish_command([0.0, 0.0, 0.0, 0.0])
+
+    def watch_robot(self) -> None:
+        """Look after the link, ten times a second on wall time."""
+        if self._command_publisher.get_subscription_count() == 0:
+            self._say_nobody_listens()
+
     # ---- life cycle --------------------------------------------------------------------------
 
     def set_up(self) -> None:
@@ -177,20 +231,14 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._queue.offset = self.offset
         self._state_publisher = self.create_publisher(AgentState, 'state', LIVELY)
         self._detections_publisher = self.create_publisher(DetectionArray, 'detections', RELIABLE)
-        self._command_publisher = self.create_publisher(
-            TwistStamped if settings.command_type == 'stamped' else Twist, 'cmd_vel', RELIABLE
-        )
-        quality = sensor_reader(settings.lockstep)
         self._entities = [
             self._state_publisher,
             self._detections_publisher,
-            self._command_publisher,
-            self.create_subscription(Odometry, 'odom', self._on_odometry, quality),
-            self.create_subscription(BatteryState, 'battery', self._on_battery, quality),
             self.create_subscription(
                 MeasurementBatch, self.team_topic('measurement_batch'), self._on_batch, RELIABLE
             ),
         ]
+        self.connect_robot()
         self._server = ActionServer(
             self,
             GoToWaypoint,
@@ -205,7 +253,6 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._entities += list(self.subscriptions)[known:]
         if not settings.lockstep:
             self._entities.append(self.create_wall_timer(_WATCH_PERIOD, self._watch))
-        self.expect_subscribers(self._command_publisher)
         self.expect(lambda: self._heard(self._state_publisher, {'planner_node'}))
         self.expect(
             lambda: self._heard(self._detections_publisher, {'filter_node', 'planner_node'})
@@ -223,20 +270,18 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._odometry_at = time.monotonic()
 
     def halt(self) -> None:
-        """Publish zeros, and give the goal up."""
-        if self._command_publisher is None:
+        """Give the goal up, and stop the robot."""
+        if not self._entities:
             return
         self._end_goal(GoalStatus.ABORTED, 'the driver stops')
-        for _ in range(_STOP_COMMANDS):
-            self._publish_command([0.0, 0.0, 0.0, 0.0])
-        self._command_publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
+        self.stop_robot()
 
     def tear_down(self) -> None:
         """Disconnect."""
         if self._server is not None:
             self._server.destroy()
             self._server = None
-        self._command_publisher = None
+        self.disconnect_robot()
         for entity in self._entities:
             for destroy in (self.destroy_publisher, self.destroy_subscription, self.destroy_timer):
                 if destroy(entity):
@@ -276,7 +321,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         """Return what the robot does."""
         return {
             'goal': f'{self._state.goal_id}: {self._follower.status.name}',
-            'trouble': self._trouble,
+            'trouble': self.trouble,
             'battery': f'{self._battery:.2f}',
             'open batches': len(self._queue),
             **{f'detections left out: {key}': number for key, number in self._unseen.items()},
@@ -288,21 +333,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if not self.active:
             return
         stamp = stamp_from_ros(message.header.stamp)
-        latest = self._history.latest
-        if latest is not None and stamp <= latest.stamp:
-            if latest.stamp - stamp <= _JUMP:
-                if stamp < latest.stamp or not self.settings.lockstep:
-                    self.drop(
-                        'odometry stamp',
-                        f'odom.header.stamp: read {stamp} ns, allowed are stamps after '
-                        f'{latest.stamp} ns',
-                    )
-                return
-            self.get_logger().warning(
-                f'odom.header.stamp jumped back by {1e-9 * (latest.stamp - stamp):.3f} s: '
-                'starting anew'
-            )
-            self.reset()
+        if not self._is_new('odom.header.stamp', stamp):
+            return
         try:
             placed = self._place(stamp, message)
         except ValueError as error:
@@ -310,11 +342,31 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             self._unusable = stamp
             self._answer_step()
             return
+        self.take_pose(placed)
+
+    def _is_new(self, what: str, stamp: int) -> bool:
+        """Return whether a stamp [ns] of odometry is of use; one far back begins another time."""
+        latest = self._history.latest
+        if latest is None or stamp > latest.stamp:
+            return True
+        if latest.stamp - stamp <= _JUMP:
+            if stamp < latest.stamp or not self.settings.lockstep:
+                self.drop(
+                    'odometry stamp',
+                    f'{what}: read {stamp} ns, allowed are stamps after {latest.stamp} ns',
+                )
+            return False
+        self.get_logger().warning(
+            f'{what} jumped back by {1e-9 * (latest.stamp - stamp):.3f} s: starting anew'
+        )
+        self.reset()
+        return True
+
+    def take_pose(self, placed: StampedPose) -> None:
+        """Take where the robot is, later than all before."""
         self._history.add(placed)
         self._odometry_at = time.monotonic()
-        if self._no_odometry:
-            self._no_odometry = False
-            self._trouble = ''
+        if self.end_trouble('odometry'):
             self.get_logger().info('odometry is back')
         if not self.settings.lockstep:
             self._control(placed)
@@ -352,7 +404,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             self._finish(reached)
         self._fill_state(placed, step)
         self._state_publisher.publish(self._state)
-        self._publish_command(command.tolist())
+        self.send_command(placed, command.tolist())
         if (
             follower.status == GoalStatus.MOVING
             and placed.stamp - self._feedback_at >= _FEEDBACK_PERIOD
@@ -383,9 +435,9 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         state.goal_id = 0 if goal is None else goal.id
         state.goal_status = int(self._follower.status)
         state.reason = '' if goal is None else goal.reason
-        if self._trouble:
+        if self.trouble:
             state.goal_status = AgentState.UNAVAILABLE
-            state.reason = self._trouble
+            state.reason = self.trouble
 
     def _publish_command(self, command: list[float]) -> None:
         twist = self._command.twist
@@ -444,8 +496,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             return 'the driver is not active'
         if self._away:
             return 'the robot has left'
-        if self._trouble:
-            return f'the robot cannot go on: {self._trouble}'
+        if self.trouble:
+            return f'the robot cannot go on: {self.trouble}'
         if request.waypoint.header.frame_id != self.settings.frame:
             return (
                 f'waypoint.header.frame_id: read {request.waypoint.header.frame_id!r}, '
@@ -490,7 +542,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             return CancelResponse.REJECT
         self._end_goal(GoalStatus.CANCELED, 'cancelled')
         if not self.settings.lockstep:
-            self._publish_command([0.0, 0.0, 0.0, 0.0])
+            self.hold_robot()
         return CancelResponse.ACCEPT
 
     def _end_goal(self, status: GoalStatus, reason: str) -> None:
@@ -518,6 +570,34 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     # ---- when it cannot go on ----------------------------------------------------------------
 
+    @property
+    def trouble(self) -> str:
+        """Why the robot cannot go on; empty where it can."""
+        return next(iter(self._troubles.values()), '')
+
+    def begin_trouble(self, kind: str, text: str) -> bool:
+        """
+        Note that the robot cannot go on; return whether that is new: then its goal ends.
+
+        Parameters
+        ----------
+        kind : str
+            To end it by.
+        text : str
+            Why, for the planner.
+
+        """
+        new = kind not in self._troubles
+        self._troubles[kind] = text
+        if new:
+            self._end_goal(GoalStatus.ABORTED, text)
+            self._follower.let_go()
+        return new
+
+    def end_trouble(self, kind: str) -> bool:
+        """Note that this is over; return whether it was there."""
+        return self._troubles.pop(kind, None) is not None
+
     def _watch(self) -> None:
         """Stop a robot without odometry; on wall time, as a clock may stand still with it."""
         if not self.active:
@@ -529,26 +609,20 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if self._stalled:
             # It was this process that stood still: the odometry may be waiting to be read.
             return
+        self.watch_robot()
         age = now - self._odometry_at
         if self._history.latest is None:
             if age > _PATIENCE:
                 self.warn_throttled('no odometry', f'odom: nothing yet, for {age:.0f} s')
-            return
-        if self._command_publisher.get_subscription_count() == 0:
-            self._say_nobody_listens()
-        if age <= self.settings.odometry_timeout:
-            return
-        self._trouble = f'no odometry for {age:.1f} s'
-        if not self._no_odometry:
-            self._no_odometry = True
-            self.get_logger().warning(f'odom: {self._trouble}: the robot is stopped')
-            self._end_goal(GoalStatus.ABORTED, self._trouble)
-            self._follower.let_go()
-            self._watches = 0
-        self._publish_command([0.0, 0.0, 0.0, 0.0])
-        if self._watches % _WATCHES_PER_STATE == 0:
-            self._fill_status()
-            self._state_publisher.publish(self._state)
+        elif age > self.settings.odometry_timeout:
+            text = f'no odometry for {age:.1f} s'
+            if self.begin_trouble('odometry', text):
+                self.get_logger().warning(f'odom: {text}: the robot is stopped')
+                self._watches = 0
+            self.hold_robot()
+            if self._watches % _WATCHES_PER_STATE == 0:
+                self._fill_status()
+                self._state_publisher.publish(self._state)
 
     def _say_nobody_listens(self) -> None:
         types = {
@@ -567,17 +641,20 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         # Some robots say per cent.
         if 1.0 < charge <= 100.0:
             charge *= 0.01
+        self.take_charge(charge)
+
+    def take_charge(self, charge: float) -> None:
+        """Take how full the battery is, 0 to 1; anything else is unknown."""
         self._battery = charge if 0.0 <= charge <= 1.0 else -1.0
         minimum = self.settings.battery_minimum
-        if self._no_odometry or not minimum:
+        if not minimum:
             return
-        low = 0.0 <= self._battery < minimum
-        if low and not self._trouble:
-            self._trouble = f'battery at {self._battery:.2f}, below {minimum:.2f}'
-            self.get_logger().warning(f'{self._trouble}: the robot goes nowhere any more')
-            self._end_goal(GoalStatus.ABORTED, self._trouble)
-        elif not low:
-            self._trouble = ''
+        if not 0.0 <= self._battery < minimum:
+            self.end_trouble('battery')
+            return
+        text = f'battery at {self._battery:.2f}, below {minimum:.2f}'
+        if self.begin_trouble('battery', text):
+            self.get_logger().warning(f'{text}: the robot goes nowhere any more')
 
     # ---- measurements ------------------------------------------------------------------------
 
