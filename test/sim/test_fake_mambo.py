@@ -1,0 +1,302 @@
+"""The fake Mambo's firmware, and its wire under pyparrot as it is on PyPI."""
+
+import itertools
+import json
+import math
+import os
+import socket
+import struct
+import time
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from maasi_drivers.mambo_link import MamboLink, MamboLinkError
+from maasi_filter.pose import Pose
+from maasi_planner.settings import MotionSettings
+from maasi_sim.fake_mambo import FakeMambo, Frame, FrameError, frames
+from maasi_sim.mambo_firmware import (
+    FirmwareSettings,
+    FlyingState,
+    MamboFirmware,
+    Piloting,
+)
+from maasi_sim.robots import BatterySettings
+
+# Longest wait for anything; the machine may be busy.
+LIMIT = 30.0
+MOTION = MotionSettings(model='mambo', speed=0.4, tilt=0.1)
+START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
+# Of this process, so that several can be tested at a time on one host.
+_NUMBERS = itertools.count(os.getpid() % 1000 * 20)
+
+
+def own_address():
+    number = next(_NUMBERS)
+    return f'127.{77 + number // 60000}.{number // 250 % 240}.{1 + number % 250}'
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as test:
+        test.bind(('0.0.0.0', 0))
+        return test.getsockname()[1]
+
+
+def until(condition, what='nothing came of it'):
+    end = time.monotonic() + LIMIT
+    while not condition():
+        assert time.monotonic() < end, what
+        time.sleep(0.01)
+
+
+def firmware(**changes):
+    return MamboFirmware(MOTION, START, **changes)
+
+
+def hovering(**changes):
+    made = firmware(**changes)
+    made.hear()
+    made.take_off()
+    while made.flying_state != FlyingState.HOVERING:
+        made.hear()
+        made.advance(0.1)
+        assert made.time < 10.0
+    return made
+
+
+def fly(made, seconds, piloting=None):
+    for _ in range(round(seconds / 0.05)):
+        made.hear()
+        if piloting is not None:
+            made.pilot(piloting)
+        made.advance(0.05)
+
+
+# ---- firmware --------------------------------------------------------------------------------
+
+
+def test_it_stays_on_the_floor_until_told():
+    made = firmware()
+    fly(made, 2.0, Piloting(climb=100))
+    assert made.flying_state == FlyingState.LANDED and made.height == 0.0
+
+
+def test_take_off_and_landing():
+    made = hovering()
+    assert made.height >= made.settings.take_off_height
+    assert_allclose(made.state.pose.position[:2], START.position[:2], atol=1e-9)
+    made.land()
+    fly(made, 6.0)
+    assert made.flying_state == FlyingState.LANDED
+    assert made.height == 0.0 and not made.state.velocity.any()
+
+
+def test_piloting_moves_it_along_its_own_axes():
+    made = hovering()
+    made.limit_tilt(5.0)
+    before = made.state.pose.position
+    fly(made, 2.0, Piloting(pitch=50))
+    assert made.flying_state == FlyingState.FLYING
+    move = made.state.pose.position - before
+    # It faces the map's y axis.
+    assert move[1] > 0.15 and abs(move[0]) < 1e-6
+    fly(made, 2.0)
+    before = made.state.pose.position
+    fly(made, 2.0, Piloting(roll=50))
+    move = made.state.pose.position - before
+    assert move[0] > 0.15 and abs(move[1]) < 2e-3
+    estimate = made.estimate()
+    # Forward, left: from the take-off point.
+    assert estimate.position[0] > 0.15 and estimate.position[1] < -0.15
+    fly(made, 1.0, Piloting(yaw=50))
+    assert made.estimate().yaw < -0.2
+
+
+def test_the_speed_of_a_tilt_is_that_of_its_model():
+    made = hovering()
+    made.limit_tilt(math.degrees(0.1))
+    fly(made, 5.0, Piloting(pitch=60))
+    first = made.state.pose.position
+    fly(made, 2.0, Piloting(pitch=60))
+    speed = np.linalg.norm(made.state.pose.position - first) / 2.0
+    assert_allclose(speed, 0.6 * 0.1 / made._tilt_of_speed, rtol=1e-3)
+
+
+def test_without_new_commands_it_hovers_and_without_its_controller_it_lands():
+    made = hovering()
+    fly(made, 2.0, Piloting(pitch=60))
+    assert np.linalg.norm(made.state.velocity) > 0.15
+    silent = made.time
+    states = []
+    while made.flying_state != FlyingState.LANDED:
+        made.advance(0.05)
+        states.append((made.time - silent, made.flying_state))
+        assert made.time - silent < 15.0
+    first = {}
+    for after, state in states:
+        first.setdefault(state, after)
+    settings = made.settings
+    assert_allclose(first[FlyingState.HOVERING], settings.command_timeout, atol=0.11)
+    assert_allclose(first[FlyingState.LANDING], settings.landing_timeout, atol=0.11)
+    assert made.height == 0.0
+
+
+def test_an_empty_battery_lands_it_and_keeps_it_on_the_floor():
+    made = hovering(battery=BatterySettings(capacity=100.0, idle_power=2.0))
+    charge = made.charge.charge
+    fly(made, 1.0)
+    assert made.charge.charge < charge
+    fly(made, 80.0)
+    assert made.flying_state == FlyingState.LANDED
+    made.take_off()
+    fly(made, 1.0)
+    assert made.flying_state == FlyingState.LANDED
+
+
+def test_emergency_drops_it():
+    made = hovering()
+    made.emergency()
+    assert made.flying_state == FlyingState.EMERGENCY and made.height == 0.0
+
+
+# ---- frames ----------------------------------------------------------------------------------
+
+
+def test_frames_are_read_as_they_are_written():
+    written = [Frame(4, 11, 255, b'\x02\x00\x01\x00'), Frame(1, 254, 0, b'\x07'), Frame(2, 0, 3)]
+    data = b''.join(frame.encode() for frame in written)
+    assert list(frames(data)) == written
+    assert data[:7] == struct.pack('<BBBI', 4, 11, 255, 11)
+
+
+@pytest.mark.parametrize(
+    'data', [b'\x01\x02', struct.pack('<BBBI', 2, 10, 0, 3), struct.pack('<BBBI', 2, 10, 0, 900)]
+)
+def test_bytes_that_are_no_frame_are_refused(data):
+    with pytest.raises(FrameError):
+        list(frames(data))
+
+
+# ---- the wire, under pyparrot ----------------------------------------------------------------
+
+
+@pytest.fixture
+def pair():
+    """Return a function that starts a fake in real time, and a link to it."""
+    started = []
+
+    def start(connect=True, settings=None, **changes):
+        made = MamboFirmware(MOTION, START, settings=settings or FirmwareSettings(), **changes)
+        fake = FakeMambo(made, own_address())
+        fake.run()
+        link = MamboLink('wifi', fake.address, free_port(), tilt=0.1)
+        started.extend([link, fake])
+        if connect:
+            link.connect()
+            until(lambda: link.connected or link.error)
+            assert not link.error
+        return fake, link
+
+    yield start
+    for item in started:
+        item.close()
+
+
+def test_pyparrot_flies_it(pair):
+    fake, link = pair(battery=BatterySettings(charge=0.5))
+    until(lambda: link.battery == 0.5 and link.flying_state == 'landed')
+    until(lambda: link.position is not None)
+    assert_allclose(link.position.position, 0.0, atol=0.011)
+    assert fake.heard[(0, 4, 0)] == 1
+    assert_allclose(fake.firmware.limits.tilt, 0.1, rtol=1e-5)
+    assert fake.firmware.take_offs == 0
+    link.take_off()
+    until(lambda: link.flying_state == 'hovering')
+    end = time.monotonic() + 2.0
+    while time.monotonic() < end:
+        link.steer(0.5, 0.25, 0.0, 0.0)
+        time.sleep(0.05)
+    until(lambda: link.position.position[0] > 0.1)
+    forward, left, up = link.position.position
+    assert 0.02 < left < forward and up > 0.6
+    link.hover()
+    link.land()
+    until(lambda: link.flying_state == 'landed')
+    assert fake.refused == 0
+    # Acknowledged commands are not repeated.
+    assert fake.heard[(2, 0, 1)] == 1 and fake.heard[(2, 0, 3)] == 1
+    assert not fake._unacked
+
+
+def test_pyparrot_that_repeats_its_last_packet_is_not_believed(pair):
+    fake, link = pair()
+    until(lambda: link.position is not None)
+    fake.cut_down = True
+    time.sleep(0.2)
+    heard, received = link.heard_at, link.position.received
+    repeated = link._drone.drone_connection.handle_data
+    count = 0
+
+    def counting(data):
+        nonlocal count
+        count += 1
+        repeated(data)
+
+    link._drone.drone_connection.handle_data = counting
+    # It waits five seconds for a packet, then hands out the last one again.
+    until(lambda: count >= 1)
+    assert link.heard_at == heard and link.position.received == received
+    fake.cut_down = False
+    until(lambda: link.position.received > received)
+
+
+def test_a_landing_is_asked_for_again_when_commands_are_lost(pair):
+    fake, link = pair(settings=FirmwareSettings(landing_timeout=60.0))
+    link.take_off()
+    until(lambda: link.flying_state == 'hovering')
+    fake.cut_up = True
+    link.land()
+    time.sleep(1.0)
+    assert fake.firmware.flying_state == FlyingState.HOVERING
+    fake.cut_up = False
+    until(lambda: fake.firmware.flying_state == FlyingState.LANDED)
+
+
+def test_position_events_that_are_no_numbers_are_left_out(pair):
+    fake, link = pair()
+    until(lambda: link.position is not None)
+    fake.position_sent = 'nan'
+    until(lambda: link.bad_events >= 2)
+    assert np.isfinite(link.position.position).all()
+    with pytest.raises(ValueError, match='finite'):
+        link.steer(math.nan, 0.0, 0.0, 0.0)
+
+
+def test_a_port_that_is_taken_is_refused(pair):
+    _, link = pair()
+    _, other = pair(connect=False)
+    other.port = link.port
+    with pytest.raises(MamboLinkError, match=f'UDP port {link.port}.*one Mambo per process'):
+        other.connect()
+
+
+def test_no_drone_and_no_bluetooth_are_said():
+    link = MamboLink('wifi', own_address(), free_port())
+    link.connect()
+    until(lambda: link.error)
+    assert link.address in link.error and 'refused' in link.error.lower()
+    link.close()
+    with pytest.raises(MamboLinkError, match='bluepy is not installed'):
+        MamboLink('ble', 'e0:14:00:00:00:00').connect()
+
+
+def test_the_fake_refuses_what_is_no_handshake(pair):
+    fake, _ = pair(connect=False)
+    for request, status in ((b'hello', -1), (b'{"d2c_port": 43210}', 0)):
+        with socket.create_connection((fake.address, 44444), timeout=LIMIT) as client:
+            client.sendall(request)
+            answer = client.recv(4096)
+        assert answer[-1:] == b'\0'
+        assert json.loads(answer[:-1])['status'] == status
+    assert fake.refused == 1
