@@ -20,6 +20,7 @@ setup(
     entry_points={
         'console_scripts': [
             'sim_node = maasi_sim.sim_node:main',
+            'fake_mambo = maasi_sim.fake_mambo:main',
             'run_scenario = maasi_sim.run_scenario:main',
         ],
     },

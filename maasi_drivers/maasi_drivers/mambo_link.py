@@ -185,7 +185,7 @@ class MamboLink:
         self.steer(0.0, 0.0, 0.0, 0.0)
 
     def close(self, patience: float = 3.0) -> None:
-        """Leave the drone; what it does then is up to its firmware. Waits for at most `patience`."""
+        """Leave the drone to its firmware, waiting for `patience` seconds at most."""
         self._closing.set()
         self._wake.set()
         if self._thread is not None:

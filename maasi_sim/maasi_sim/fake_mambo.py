@@ -7,6 +7,7 @@ Speaks what pyparrot 1.5.20 speaks: a handshake in JSON over TCP, then frames ov
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import signal
@@ -231,11 +232,9 @@ class FakeMambo:
     def _transmit(self, frame: Frame) -> None:
         if self._controller is None or self.cut_down:
             return
-        try:
+        # A controller that is gone is nothing to the drone.
+        with contextlib.suppress(OSError):
             self._air.sendto(frame.encode(), self._controller)
-        except OSError:
-            # A controller that is gone is nothing to the drone.
-            pass
 
     def _send(self, kind: int, buffer: int, payload: bytes) -> Frame:
         sequence = (self._sequences.get(buffer, -1) + 1) % 256
@@ -289,9 +288,7 @@ class FakeMambo:
             x = math.nan
         psi = round(math.degrees(-estimate.yaw))
         # Its stamp is the time since the one before, unlike that of the others.
-        self._event(
-            (2, 18, 0), struct.pack('<ffhhh', x, y, round(z), psi, round(1000.0 * elapsed))
-        )
+        self._event((2, 18, 0), struct.pack('<ffhhh', x, y, round(z), psi, round(1000.0 * elapsed)))
 
     # ---- what it hears -----------------------------------------------------------------------
 
@@ -416,7 +413,9 @@ def build_parser() -> argparse.ArgumentParser:
         description='A simulated Parrot Mambo on the network of this host, for a driver with '
         'link: mambo_wifi, or for any program that uses pyparrot over WiFi.',
     )
-    parser.add_argument('--address', default='127.0.0.1', help='of this host (default: %(default)s)')
+    parser.add_argument(
+        '--address', default='127.0.0.1', help='of this host (default: %(default)s)'
+    )
     parser.add_argument(
         '--type', default='mambo', metavar='NAME', help='robot type (default: %(default)s)'
     )
@@ -433,6 +432,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     options = build_parser().parse_args(arguments)
     try:
+        if not 0.0 <= options.charge <= 1.0:
+            raise ScenarioError(f'--charge: read {options.charge}, allowed is 0 to 1')
         robot = robot_type(options.type)
         firmware = MamboFirmware(
             robot.motion,
@@ -441,8 +442,6 @@ def main(arguments: list[str] | None = None) -> int:
             odometry=robot.odometry,
             seed=options.seed,
         )
-        if not 0.0 <= options.charge <= 1.0:
-            raise ScenarioError(f'--charge: read {options.charge}, allowed is 0 to 1')
         fake = FakeMambo(firmware, options.address, COMMAND_PORT)
     except (ScenarioError, OSError) as error:
         print(f'error: {error}', file=sys.stderr)

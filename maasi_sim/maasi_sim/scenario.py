@@ -311,6 +311,23 @@ def _robot_layer(path: Path, own: Layer, key: Key) -> Layer:
     return merge(*layers, own)
 
 
+def robot_type(name: str) -> RobotSettings:
+    """Return a robot of a type in `config/robots`, on its own.
+
+    Raises
+    ------
+    ScenarioError
+        If there is no such type, or its file is wrong.
+    """
+    content = {
+        'type': name,
+        'start': [0.0, 0.0, 0.0],
+        'candidates': {'ring': 4, 'distance': 1.0},
+    }
+    own = Layer(content, {(): f'robot type {name}'})
+    return validate(RobotSettings, _robot_layer(config_folder() / 'scenarios' / name, own, ()))
+
+
 def _problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
     """Yield what is wrong between the keys: key and text."""
     yield from _world_problems(scenario)

@@ -4,8 +4,11 @@ import itertools
 import json
 import math
 import os
+import signal
 import socket
 import struct
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -300,3 +303,23 @@ def test_the_fake_refuses_what_is_no_handshake(pair):
         assert answer[-1:] == b'\0'
         assert json.loads(answer[:-1])['status'] == status
     assert fake.refused == 1
+
+
+def test_the_command_runs_a_fake_that_a_link_finds():
+    address, lines = own_address(), []
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'maasi_sim.fake_mambo', '--address', address, '--charge', '0.4'],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    link = MamboLink('wifi', address, free_port())
+    try:
+        lines.append(process.stdout.readline())
+        link.connect()
+        until(lambda: link.battery == 0.4)
+    finally:
+        link.close()
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=LIMIT)
+    assert process.returncode == 0
+    assert address in lines[0] and 'landed' in output
