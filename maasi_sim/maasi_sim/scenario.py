@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -253,14 +254,22 @@ def load_scenario(
     """
     path = find_scenario(path)
     layer = read_layer(path)
-    robots = layer.data.get('robots')
-    if isinstance(robots, dict):
-        for name in robots:
-            if isinstance(robots[name], dict):
-                key: Key = ('robots', name)
-                place(layer, key, _robot_layer(path, layer.part(key), key))
+    _lay_types_under(layer, path)
     for origin, (key, value) in (overrides or {}).items():
         override(layer, key, value, origin)
+    return check_scenario(layer)
+
+
+def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
+    """Return the scenario of values as a scenario file has them: types come from config/robots.
+
+    Raises
+    ------
+    ScenarioError
+        As `load_scenario`.
+    """
+    layer = Layer(deepcopy(values), {(): origin})
+    _lay_types_under(layer, config_folder() / 'scenarios' / origin)
     return check_scenario(layer)
 
 
@@ -286,6 +295,16 @@ def check_scenario(layer: Layer) -> Scenario:
             )
         )
     return scenario
+
+
+def _lay_types_under(layer: Layer, path: Path) -> None:
+    """Put the layers of each robot's type under what the scenario says of it."""
+    robots = layer.data.get('robots')
+    if isinstance(robots, dict):
+        for name in robots:
+            if isinstance(robots[name], dict):
+                key: Key = ('robots', name)
+                place(layer, key, _robot_layer(path, layer.part(key), key))
 
 
 def _robot_layer(path: Path, own: Layer, key: Key) -> Layer:

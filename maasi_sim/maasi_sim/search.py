@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,12 +40,24 @@ class Found:
         Taken by then, by all robots.
     found, true_found : int
         Targets found by then, and how many of them are true.
+    rmse : float
+        Of the true ones [m]; nan without any.
+    step : int
+        k.
+    members : tuple of str
+        Who measured.
+    positions : dict
+        Where every robot is, (3,) [m].
     """
 
     time: float
     measurements: int
     found: int
     true_found: int
+    rmse: float
+    step: int
+    members: tuple[str, ...]
+    positions: dict[str, FloatArray]
 
 
 @dataclass
@@ -73,6 +86,8 @@ class SearchResult:
         After each measurement batch.
     decisions : list of Decision
         In their order.
+    filter_times, planning_times : list of float
+        Wall time of each filter step and of each decision [s].
     """
 
     end_reason: str
@@ -86,6 +101,8 @@ class SearchResult:
     steps: int
     progress: list[Found] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
+    filter_times: list[float] = field(default_factory=list)
+    planning_times: list[float] = field(default_factory=list)
 
     @property
     def total_measurements(self) -> int:
@@ -202,6 +219,8 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
     counts = dict.fromkeys(robots, 0)
     progress: list[Found] = []
     decisions: list[Decision] = []
+    filter_times: list[float] = []
+    planning_times: list[float] = []
     end_reason = 'time_limit'
     last_batch: int | None = None
     step = -1
@@ -224,8 +243,10 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
             )
             for name, robot in robots.items()
         }
+        begin = perf_counter()
         decision = coordinator.plan(step, present)
         if decision is not None:
+            planning_times.append(perf_counter() - begin)
             decisions.append(decision)
             for name, chosen in decision.robots.items():
                 if not chosen.stays:
@@ -239,7 +260,9 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
             ]
             gone = 1 if last_batch is None else step - last_batch
             last_batch = step
+            begin = perf_counter()
             result = search_filter.step(measurements, gone, time)
+            filter_times.append(perf_counter() - begin)
             coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
             for item in members:
                 counts[item.robot] += 1
@@ -251,6 +274,10 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
                     sum(counts.values()),
                     len(positions),
                     scores.match.true_found,
+                    scores.match.rmse,
+                    step,
+                    tuple(item.robot for item in members),
+                    {name: robot.body.state.pose.position for name, robot in robots.items()},
                 )
             )
             if len(truth) and scores.complete and scenario.stop == 'all_found':
@@ -282,4 +309,6 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
         steps=step + 1,
         progress=progress,
         decisions=decisions,
+        filter_times=filter_times,
+        planning_times=planning_times,
     )

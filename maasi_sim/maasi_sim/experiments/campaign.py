@@ -1,0 +1,314 @@
+"""Runs the cases of an experiment on its maps: here, in several processes, or on a Dask cluster.
+
+Which worker makes a run changes nothing: its seed is that of the map. Runs that are there already
+are not made again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from maasi_sim.experiments.registry import Case, Experiment, find
+from maasi_sim.experiments.results import (
+    DamagedRun,
+    Results,
+    Run,
+    RunFolder,
+    from_text,
+    run_of,
+    to_text,
+)
+
+# One thread for each worker: there are as many workers as wanted.
+ONE_THREAD = {
+    'OMP_NUM_THREADS': '1',
+    'OPENBLAS_NUM_THREADS': '1',
+    'MKL_NUM_THREADS': '1',
+    'NUMBA_NUM_THREADS': '1',
+}
+# Runs handed out ahead of those that are made, for each worker.
+_AHEAD = 2
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run to be made; names and numbers only, so that it can be sent anywhere."""
+
+    experiment: str
+    case: str
+    number: int
+    seed: int
+    small: bool
+    digest: str
+
+
+class WorkersLost(RuntimeError):
+    """The workers are gone; what they had finished is kept."""
+
+
+def execute(task: Task) -> tuple[str, str]:
+    """Make a run and return the text of its file, or '' and what went wrong."""
+    try:
+        experiment = find(task.experiment)
+        case = next((c for c in experiment.cases(task.small) if c.name == task.case), None)
+        if case is None or case.digest() != task.digest:
+            return '', 'this worker has other settings for it: another version of the code'
+        seed = experiment.seed(task.number, task.seed)
+        outcome = experiment.run(case.settings, seed)
+        return to_text(run_of(experiment, case, task.number, seed, outcome)), ''
+    except Exception as error:
+        return '', f'{type(error).__name__}: {error}'
+
+
+class Workers(Protocol):
+    """Who makes the runs."""
+
+    number: int
+
+    def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
+        """Yield each task with what `execute` returned, as they are done."""
+
+    def close(self) -> None:
+        """Let them go; what is not done stays undone."""
+
+
+class Here:
+    """This process."""
+
+    number = 1
+
+    def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
+        """See `Workers.make`."""
+        for task in tasks:
+            yield (task, *execute(task))
+
+    def close(self) -> None:
+        """See `Workers.close`."""
+
+
+def _begin_worker() -> None:
+    # Ctrl-C is for the one that writes; it lets its workers go.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class Processes:
+    """Several processes on this machine, one thread each.
+
+    Parameters
+    ----------
+    number : int
+        How many.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        before = {name: os.environ.get(name) for name in ONE_THREAD}
+        os.environ.update(ONE_THREAD)
+        try:
+            # Spawned, so that they begin as a fresh interpreter does on every system.
+            self._pool = ProcessPoolExecutor(
+                number, multiprocessing.get_context('spawn'), initializer=_begin_worker
+            )
+            # Started while the environment is as they need it.
+            list(self._pool.map(_nothing, range(number)))
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+
+    def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
+        """See `Workers.make`."""
+        left = list(reversed(tasks))
+        waiting: dict[Future[tuple[str, str]], Task] = {}
+        try:
+            while left or waiting:
+                while left and len(waiting) < _AHEAD * self.number:
+                    task = left.pop()
+                    waiting[self._pool.submit(execute, task)] = task
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    yield (waiting.pop(future), *future.result())
+        except BrokenProcessPool:
+            raise WorkersLost('a worker died; the same command goes on where it stopped') from None
+
+    def close(self) -> None:
+        """See `Workers.close`."""
+        workers = list((self._pool._processes or {}).values())
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            with contextlib.suppress(OSError, ValueError):
+                worker.terminate()
+
+
+def _nothing(number: int) -> None:
+    time.sleep(0.01)
+
+
+class Cluster:
+    """A Dask cluster.
+
+    Parameters
+    ----------
+    address : str
+        Of its scheduler, such as 'tcp://127.0.0.1:8786'.
+    patience : float
+        How long to wait for the scheduler and a first worker [s].
+
+    Raises
+    ------
+    WorkersLost
+        If there is no scheduler, or it has no workers.
+    """
+
+    def __init__(self, address: str, patience: float = 20.0) -> None:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise WorkersLost("--cluster needs the package 'dask[distributed]'") from None
+        try:
+            self._client: Any = Client(address, timeout=patience, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise WorkersLost(f'--cluster: no scheduler answers at {address}: {error}') from None
+        try:
+            self._client.wait_for_workers(1, timeout=patience)
+        except TimeoutError:
+            self._client.close()
+            raise WorkersLost(f'--cluster: the scheduler at {address} has no workers') from None
+        self.number = sum(self._client.nthreads().values())
+
+    def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
+        """See `Workers.make`."""
+        from distributed import as_completed
+
+        # Once more where a worker is lost; not pure: the same task twice is made twice.
+        futures = {
+            self._client.submit(execute, task, pure=False, retries=1): task for task in tasks
+        }
+        for future in as_completed(futures):
+            try:
+                result = future.result()
+            except Exception as error:
+                raise WorkersLost(f'--cluster: {type(error).__name__}: {error}') from None
+            yield (futures[future], *result)
+            future.release()
+
+    def close(self) -> None:
+        """See `Workers.close`."""
+        self._client.close()
+
+
+@dataclass
+class Plan:
+    """What is to be done for one experiment.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        Which.
+    cases : list of Case
+        Its cases.
+    done : dict
+        Runs that are there, by case and map.
+    tasks : list of Task
+        Runs to be made, map by map: an interrupted campaign has all cases on the first maps.
+    folder : RunFolder
+        Where they are kept.
+    complaints : list of str
+        Damaged files.
+    """
+
+    experiment: Experiment
+    cases: list[Case]
+    done: dict[tuple[str, int], Run]
+    tasks: list[Task]
+    folder: RunFolder
+    complaints: list[str]
+
+    def results(self) -> Results:
+        """Return the runs that are there."""
+        runs: dict[str, list[Run]] = {case.name: [] for case in self.cases}
+        for (name, _), run in sorted(self.done.items(), key=lambda item: item[0][1]):
+            runs[name].append(run)
+        return Results(self.experiment, self.cases, runs)
+
+
+def plan(experiment: Experiment, out: Path, runs: int, seed: int = 1, small: bool = False) -> Plan:
+    """Look at what is there and return what is to be done.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Which.
+    out : Path
+        Folder of all experiments.
+    runs : int
+        Maps.
+    seed : int
+        Of the campaign.
+    small : bool
+        Whether the small cases are meant.
+    """
+    folder = RunFolder(out / experiment.name, experiment)
+    result = Plan(experiment, experiment.cases(small), {}, [], folder, [])
+    for number in range(runs):
+        for case in result.cases:
+            if case.runs is not None and number >= case.runs:
+                continue
+            try:
+                run = folder.load(case, number, experiment.seed(number, seed))
+            except DamagedRun as error:
+                result.complaints.append(f'{error}; this run is made again')
+                run = None
+            if run is not None:
+                result.done[case.name, number] = run
+            else:
+                result.tasks.append(
+                    Task(experiment.name, case.name, number, seed, small, case.digest())
+                )
+    return result
+
+
+def carry_out(
+    work: Plan, workers: Workers, advance: Callable[[Run | None], None] = lambda run: None
+) -> list[str]:
+    """Make the runs of a plan, keep each as soon as it is there, and return what went wrong.
+
+    Parameters
+    ----------
+    work : Plan
+        Its `done` grows.
+    workers : Workers
+        Who makes them.
+    advance : function
+        Called after each run, with None if it failed.
+
+    Raises
+    ------
+    NoRoom
+        If a run cannot be written; those before are kept.
+    WorkersLost
+        If the workers are gone.
+    """
+    cases = {case.name: case for case in work.cases}
+    problems = []
+    for task, text, problem in workers.make(work.tasks):
+        if problem:
+            problems.append(f'{task.experiment}, {task.case}, map {task.number}: {problem}')
+            advance(None)
+            continue
+        work.folder.write(cases[task.case], task.number, text)
+        run = from_text(text)
+        work.done[task.case, task.number] = run
+        advance(run)
+    return problems

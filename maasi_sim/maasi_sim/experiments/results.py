@@ -1,0 +1,303 @@
+"""Keeps the runs: a file for each, written at once or not at all, that tells when it is damaged."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import errno
+import hashlib
+import io
+import json
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_sim.experiments.registry import Case, Experiment, Outcome, Value
+
+FloatArray = NDArray[np.float64]
+
+_HEAD = '# maasi run, sha256 '
+
+
+class DamagedRun(ValueError):
+    """A file that does not hold what was written."""
+
+
+class NoRoom(OSError):
+    """Nothing more can be written."""
+
+
+@dataclass
+class Run:
+    """One run of one case on one map.
+
+    Attributes
+    ----------
+    experiment, case : str
+        Names.
+    number : int
+        Of the map, from 0.
+    seed : int
+        Of all its random numbers.
+    digest : str
+        Of the case's settings.
+    summary, columns, details, timing
+        See `Outcome`.
+    """
+
+    experiment: str
+    case: str
+    number: int
+    seed: int
+    digest: str
+    summary: dict[str, Value]
+    columns: dict[str, FloatArray] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
+    timing: dict[str, float] = field(default_factory=dict)
+
+    def value(self, quantity: str) -> float | None:
+        """Return a measured quantity; None where the run has none."""
+        read = self.summary.get(quantity, self.timing.get(quantity))
+        return None if read is None or isinstance(read, str) else float(read)
+
+
+def run_of(experiment: Experiment, case: Case, number: int, seed: int, outcome: Outcome) -> Run:
+    """Return an outcome as a run.
+
+    Raises
+    ------
+    ValueError
+        If the columns are not of one length.
+    """
+    columns = {name: np.asarray(values, float) for name, values in outcome.columns.items()}
+    lengths = {len(values) for values in columns.values()}
+    if len(lengths) > 1:
+        raise ValueError(f'{experiment.name}: columns of {sorted(lengths)} rows, allowed is one')
+    return Run(
+        experiment.name,
+        case.name,
+        number,
+        seed,
+        case.digest(),
+        _plain(outcome.summary),
+        columns,
+        _plain(outcome.details),
+        _plain(outcome.timing),
+    )
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON holds it; what is not finite is None."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def to_text(run: Run) -> str:
+    """Return a run as the text of its file: checksum, facts as JSON, rows as CSV."""
+    facts = {
+        'experiment': run.experiment,
+        'case': run.case,
+        'number': run.number,
+        'seed': run.seed,
+        'digest': run.digest,
+        'summary': run.summary,
+        'details': run.details,
+        'timing': run.timing,
+    }
+    body = io.StringIO()
+    body.write(f'# {json.dumps(facts, allow_nan=False)}\n')
+    writer = csv.writer(body, lineterminator='\n')
+    writer.writerow(run.columns)
+    for row in zip(*run.columns.values()):
+        writer.writerow([_number(value) for value in row])
+    text = body.getvalue()
+    return f'{_HEAD}{hashlib.sha256(text.encode()).hexdigest()}\n{text}'
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if float(value).is_integer() else repr(float(value))
+
+
+def from_text(text: str, origin: str = 'run') -> Run:
+    """Return the run of a file's text.
+
+    Raises
+    ------
+    DamagedRun
+        If anything is missing or was changed.
+    """
+    head, _, body = text.partition('\n')
+    if not head.startswith(_HEAD):
+        raise DamagedRun(f'{origin}: does not begin as a run does')
+    if head[len(_HEAD) :] != hashlib.sha256(body.encode()).hexdigest():
+        raise DamagedRun(f'{origin}: its checksum is that of other content')
+    first, _, rows = body.partition('\n')
+    facts = json.loads(first[2:])
+    read = list(csv.reader(io.StringIO(rows)))
+    names = read[0] if read else []
+    table = np.array(read[1:], dtype=float).reshape(-1, len(names))
+    return Run(columns={name: table[:, i] for i, name in enumerate(names)}, **facts)
+
+
+def load_run(path: Path) -> Run:
+    """Return the run in a file.
+
+    Raises
+    ------
+    DamagedRun
+        If it is not whole.
+    """
+    try:
+        return from_text(path.read_bytes().decode('utf-8'), str(path))
+    except UnicodeDecodeError:
+        raise DamagedRun(f'{path}: is not text') from None
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file at once: it is there whole, or as it was before.
+
+    Raises
+    ------
+    NoRoom
+        If the disk is full or nothing may be written there; says where.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    draft = path.with_name(f'.{path.name}.{os.getpid()}')
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with draft.open('wb') as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        draft.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            draft.unlink(missing_ok=True)
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        reason = 'no room on the disk' if full else error.strerror
+        raise NoRoom(error.errno, f'{path}: cannot be written: {reason}') from None
+
+
+@dataclass
+class Results:
+    """The runs of one experiment.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        Which.
+    cases : list of Case
+        All of its cases.
+    runs : dict
+        Runs of each case by name, in the order of the maps.
+    """
+
+    experiment: Experiment
+    cases: list[Case]
+    runs: dict[str, list[Run]]
+
+    def names(self) -> list[str]:
+        """Return the cases that have runs."""
+        return [case.name for case in self.cases if self.runs.get(case.name)]
+
+    def case(self, name: str) -> Case:
+        """Return a case by its name."""
+        return next(case for case in self.cases if case.name == name)
+
+    def values(self, case: str, quantity: str) -> list[float | None]:
+        """Return a quantity in each run of a case."""
+        return [run.value(quantity) for run in self.runs[case]]
+
+    def pairs(self, first: str, second: str) -> list[tuple[Run, Run]]:
+        """Return the runs of two cases on the same maps."""
+        other = {run.number: run for run in self.runs.get(second, [])}
+        return [(run, other[run.number]) for run in self.runs.get(first, []) if run.number in other]
+
+
+class RunFolder:
+    """The folder of an experiment's runs.
+
+    Parameters
+    ----------
+    path : Path
+        Made when the first run is written.
+    experiment : Experiment
+        Whose runs.
+    """
+
+    def __init__(self, path: Path, experiment: Experiment) -> None:
+        self.path = path
+        self.experiment = experiment
+
+    def file(self, case: Case, number: int) -> Path:
+        """Return where a run is kept."""
+        return self.path / 'runs' / f'{case.slug}-{number:04d}.csv'
+
+    def load(self, case: Case, number: int, seed: int) -> Run | None:
+        """Return a run that is there, None where there is none of these settings and seed.
+
+        Raises
+        ------
+        DamagedRun
+            If its file is not whole.
+        """
+        path = self.file(case, number)
+        if not path.exists():
+            return None
+        run = load_run(path)
+        wanted = (self.experiment.name, case.name, number, seed, case.digest())
+        found = (run.experiment, run.case, run.number, run.seed, run.digest)
+        return run if found == wanted else None
+
+    def write(self, case: Case, number: int, text: str) -> None:
+        """Keep the text of a run."""
+        write_file(self.file(case, number), text)
+
+
+def steps_text(runs: Iterable[Run]) -> str:
+    """Return all runs as one CSV, one row per run and step."""
+    listed = list(runs)
+    names = list(dict.fromkeys(name for run in listed for name in run.columns))
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator='\n')
+    writer.writerow(['case', 'map', *names])
+    for run in listed:
+        length = max((len(values) for values in run.columns.values()), default=0)
+        for row in range(length):
+            writer.writerow(
+                [
+                    run.case,
+                    run.number,
+                    *(_number(run.columns[n][row]) if n in run.columns else '' for n in names),
+                ]
+            )
+    return out.getvalue()
+
+
+def runs_text(runs: Iterable[Run]) -> str:
+    """Return what each run has come to as CSV, one row per run."""
+    listed = list(runs)
+    names = list(dict.fromkeys(name for run in listed for name in (*run.summary, *run.timing)))
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator='\n')
+    writer.writerow(['case', 'map', 'seed', *names])
+    for run in listed:
+        known = {**run.summary, **run.timing}
+        writer.writerow(
+            [run.case, run.number, run.seed]
+            + ['' if known.get(name) is None else known[name] for name in names]
+        )
+    return out.getvalue()

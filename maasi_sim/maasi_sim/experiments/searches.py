@@ -1,0 +1,142 @@
+"""Searches in one process as experiments: settings, what is measured, and cases of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+
+from maasi_sim.experiments.registry import Case, Outcome, Quantity
+from maasi_sim.scenario import scenario_from_content, scenario_from_values
+from maasi_sim.search import SearchResult, search
+
+MEASUREMENTS = Quantity(
+    'measurements_to_find_all', 'measurements to find all', '', 'restricted', 'limit'
+)
+TIME = Quantity('time_to_find_all', 'time to find all', 's', 'restricted', 'time_limit')
+TAKEN = Quantity('measurements', 'measurements taken')
+FOUND = Quantity('found', 'targets found')
+FALSE = Quantity('false_found', 'false targets')
+RMSE = Quantity('rmse', 'RMSE', 'm')
+STEP_TIME = Quantity('step_time', 'computation per measurement', 's')
+FILTER_TIME = Quantity('filter_time', 'filter step', 's')
+PLANNING_TIME = Quantity('planning_time', 'decision', 's')
+DISTANCE = Quantity('distance', 'way of all robots', 'm')
+
+# Measurements, and particles, of a small case.
+_SMALL = 12
+_SMALL_PARTICLES = 1000
+
+# Poses are known, as the papers have it.
+PERFECT_ODOMETRY = {
+    'position_noise': 0.0,
+    'heading_noise': 0.0,
+    'velocity_noise': 0.0,
+    'position_drift': 0.0,
+    'heading_drift': 0.0,
+}
+# Runs end when all is found or the cap is reached, not when the planner says that nothing is left.
+NEVER_DONE = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
+
+
+def merged(*layers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return mappings merged key by key, later ones on top."""
+    result: dict[str, Any] = {}
+    for layer in layers:
+        for key, value in layer.items():
+            below = result.get(key)
+            both = isinstance(below, Mapping) and isinstance(value, Mapping)
+            result[key] = merged(below, value) if both else deepcopy(value)  # type: ignore[arg-type]
+    return result
+
+
+def search_case(
+    name: str,
+    values: Mapping[str, Any],
+    most_measurements: int,
+    preset: str = 'paper',
+    small: bool = False,
+    runs: int | None = None,
+) -> Case:
+    """Return a case that is a search.
+
+    Parameters
+    ----------
+    name : str
+        Of the case.
+    values : mapping
+        The scenario as a file has it; robot types come from config/robots.
+    most_measurements : int
+        Cap on the measurements of all robots.
+    preset : str
+        'paper' or 'recommended'.
+    small : bool
+        Only a few measurements and particles.
+    runs : int, optional
+        See `Case`.
+    """
+    if small:
+        most_measurements = min(most_measurements, _SMALL)
+        values = merged(values, {'filter': {'particles': _SMALL_PARTICLES}})
+    scenario = scenario_from_values(merged(values, {'filter': {'threads': 1}}), name)
+    settings = {'scenario': scenario.content(), 'most_measurements': most_measurements}
+    return Case(name, settings, preset, runs)  # type: ignore[arg-type]
+
+
+def run_search(settings: dict[str, Any], seed: int) -> Outcome:
+    """Run a search and return what is measured of it."""
+    scenario = scenario_from_content(settings['scenario'], 'settings')
+    result = search(scenario, seed, settings['most_measurements'])
+    return outcome_of(result, settings['most_measurements'], scenario.limits.time)
+
+
+def outcome_of(result: SearchResult, most_measurements: int, time_limit: float) -> Outcome:
+    """Return what is measured of a search."""
+    progress = result.progress
+    complete = next(
+        (item for item in progress if len(result.truth) and item.true_found == len(result.truth)),
+        None,
+    )
+    names = sorted(result.measurements)
+    columns: dict[str, Any] = {
+        'step': [item.step for item in progress],
+        'time': [item.time for item in progress],
+        'measurements': [item.measurements for item in progress],
+        'found': [item.found for item in progress],
+        'true_found': [item.true_found for item in progress],
+        'rmse': [item.rmse for item in progress],
+    }
+    for name in names:
+        places = np.array([item.positions[name] for item in progress]).reshape(-1, 3)
+        for axis, values in zip('xyz', places.T):
+            columns[f'{name}_{axis}'] = values
+        columns[f'{name}_measures'] = [name in item.members for item in progress]
+    filter_time, planning_time = sum(result.filter_times), sum(result.planning_times)
+    return Outcome(
+        summary={
+            'end_reason': result.end_reason,
+            'measurements_to_find_all': complete.measurements if complete else None,
+            'time_to_find_all': complete.time if complete else None,
+            'limit': most_measurements,
+            'time_limit': time_limit,
+            'targets': len(result.truth),
+            'found': len(result.truth) - result.missed,
+            'false_found': result.false_found,
+            'rmse': result.rmse,
+            'measurements': result.total_measurements,
+            'decisions': len(result.decisions),
+            'distance': sum(result.distance.values()),
+        },
+        columns=columns,
+        details={
+            'truth': result.truth.tolist(),
+            'found': [target.position.tolist() for target in result.found_targets],
+        },
+        timing={
+            'filter_time': filter_time / max(len(result.filter_times), 1),
+            'planning_time': planning_time / max(len(result.planning_times), 1),
+            'step_time': (filter_time + planning_time) / max(result.total_measurements, 1),
+        },
+    )

@@ -1,0 +1,245 @@
+"""Tables of what we measure beside what the paper reports."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from maasi_sim.experiments.registry import Quantity, array
+from maasi_sim.experiments.results import Results
+from maasi_sim.experiments.statistics import (
+    Interval,
+    from_published,
+    independent_difference,
+    mean_interval,
+    paired_difference,
+    restricted_mean,
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of ours beside the paper's.
+
+    Attributes
+    ----------
+    case, preset : str
+        Of which case.
+    quantity : Quantity
+        What.
+    runs, finished : int
+        Runs, and how many have the quantity.
+    ours : Interval
+        What we measure.
+    paper, difference : Interval or None
+        What the paper reports, and ours minus it.
+    note : str
+        Where it stands in the paper.
+    """
+
+    case: str
+    preset: str
+    quantity: Quantity
+    runs: int
+    finished: int
+    ours: Interval
+    paper: Interval | None
+    difference: Interval | None
+    note: str
+
+
+@dataclass(frozen=True)
+class Paired:
+    """A paired difference on the same maps."""
+
+    first: str
+    second: str
+    quantity: Quantity
+    difference: Interval
+
+
+def interval(results: Results, case: str, quantity: Quantity) -> Interval:
+    """Return the mean of a quantity over the runs of a case."""
+    values = array(results.values(case, quantity.name))
+    if quantity.kind == 'mean':
+        return mean_interval(values)
+    limits = array(results.values(case, quantity.limit))
+    return restricted_mean(
+        np.where(np.isnan(values), limits, values), ~np.isnan(values), float(limits.min())
+    )
+
+
+def rows(results: Results) -> list[Row]:
+    """Return the table of an experiment: every quantity of every case that has one."""
+    experiment = results.experiment
+    published = {(item.case, item.quantity): item for item in experiment.published}
+    table = []
+    for name in results.names():
+        for quantity in experiment.quantities:
+            values = array(results.values(name, quantity.name))
+            finished = int((~np.isnan(values)).sum())
+            if finished == 0 and quantity.kind == 'mean':
+                continue
+            ours = interval(results, name, quantity)
+            theirs = published.get((name, quantity.name))
+            paper = difference = None
+            if theirs is not None:
+                paper = from_published(theirs.value, theirs.half_width, theirs.runs)
+                if finished:
+                    difference = independent_difference(ours, paper)
+            table.append(
+                Row(
+                    name,
+                    results.case(name).preset,
+                    quantity,
+                    len(values),
+                    finished,
+                    ours,
+                    paper,
+                    difference,
+                    theirs.note if theirs is not None else '',
+                )
+            )
+    return table
+
+
+def paired_rows(results: Results) -> list[Paired]:
+    """Return the paired differences that the experiment asks for."""
+    table = []
+    for item in results.experiment.comparisons:
+        pairs = results.pairs(item.first, item.second)
+        if not pairs:
+            continue
+        quantity = results.experiment.quantity(item.quantity)
+        first, second = (array([pair[i].value(item.quantity) for pair in pairs]) for i in (0, 1))
+        if quantity.kind == 'restricted':
+            limits = [array([pair[i].value(quantity.limit) for pair in pairs]) for i in (0, 1)]
+            limit = float(min(values.min() for values in limits))
+            first, second = (
+                np.minimum(np.where(np.isnan(values), limit, values), limit)
+                for values in (first, second)
+            )
+        table.append(Paired(item.first, item.second, quantity, paired_difference(first, second)))
+    return table
+
+
+def number(value: float) -> str:
+    """Return a number with as many digits as a reader needs."""
+    if not math.isfinite(value):
+        return '-'
+    if abs(value) >= 100.0:
+        return f'{value:.0f}'
+    return f'{value:.3g}' if value else '0'
+
+
+def shown(value: Interval | None, sign: bool = False) -> str:
+    """Return a mean with its half width."""
+    if value is None or not math.isfinite(value.mean):
+        return '-'
+    text = ('+' if sign and value.mean > 0.0 else '') + number(value.mean)
+    return f'{text} ± {number(value.half_width)}' if math.isfinite(value.half_width) else text
+
+
+def _label(quantity: Quantity) -> str:
+    return f'{quantity.label} [{quantity.unit}]' if quantity.unit else quantity.label
+
+
+def markdown(results: Results) -> str:
+    """Return the tables in Markdown."""
+    lines = [
+        '| case | measured | runs | ours | paper | difference |',
+        '|---|---|---|---|---|---|',
+    ]
+    for row in rows(results):
+        runs = str(row.runs)
+        if row.quantity.kind == 'restricted' or row.finished < row.runs:
+            runs = f'{row.finished} of {row.runs}'
+        paper = shown(row.paper)
+        if row.note:
+            paper += f' ({row.note})'
+        name = row.case if row.preset == 'paper' else f'{row.case} (recommended)'
+        # Where no run got there, the mean restricted to what was tried says nothing else.
+        ours = shown(row.ours) if row.finished else f'more than {number(row.ours.mean)}'
+        lines.append(
+            f'| {name} | {_label(row.quantity)} | {runs} | {ours} | {paper} | '
+            f'{shown(row.difference, sign=True)} |'
+        )
+    pairs = paired_rows(results)
+    if pairs:
+        lines += [
+            '',
+            '| paired on the same maps | measured | maps | difference |',
+            '|---|---|---|---|',
+        ]
+        lines += [
+            f'| {pair.first} minus {pair.second} | {_label(pair.quantity)} | '
+            f'{pair.difference.number} | {shown(pair.difference, sign=True)} |'
+            for pair in pairs
+        ]
+    return '\n'.join(lines) + '\n'
+
+
+def table_text(results: Results) -> str:
+    """Return the table of ours against the paper's as CSV, in full precision."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator='\n')
+    writer.writerow(
+        [
+            'case',
+            'preset',
+            'quantity',
+            'unit',
+            'runs',
+            'finished',
+            'ours',
+            'ours_95',
+            'paper',
+            'paper_95',
+            'difference',
+            'difference_95',
+            'note',
+        ]
+    )
+    for row in rows(results):
+        cells: list[float | str] = []
+        for item in (row.ours, row.paper, row.difference):
+            if item is None:
+                cells += ['', '']
+            else:
+                cells += [v if math.isfinite(v) else '' for v in (item.mean, item.half_width)]
+        writer.writerow(
+            [
+                row.case,
+                row.preset,
+                row.quantity.name,
+                row.quantity.unit,
+                row.runs,
+                row.finished,
+                *cells,
+                row.note,
+            ]
+        )
+    for pair in paired_rows(results):
+        half = pair.difference.half_width
+        writer.writerow(
+            [
+                f'{pair.first} - {pair.second}',
+                'paired',
+                pair.quantity.name,
+                pair.quantity.unit,
+                pair.difference.number,
+                '',
+                '',
+                '',
+                '',
+                '',
+                pair.difference.mean,
+                half if math.isfinite(half) else '',
+                'paired on the same maps',
+            ]
+        )
+    return out.getvalue()
