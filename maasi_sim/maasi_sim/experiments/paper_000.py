@@ -104,8 +104,8 @@ def drone(start: list[float], candidates: dict[str, Any], at_waypoints: bool) ->
         'start': start,
         'candidates': candidates,
         'motion': {'speed': 12.0, 'acceleration': None, 'tolerance': 0.01},
-        # Longer than any way: what is left is the measurement at each decision.
-        'sensor': {'period': 1000.0 if at_waypoints else 1.0, 'noise': _DEGREES},
+        # Longer than the way to a neighbour: what is left is the measurement on arrival.
+        'sensor': {'period': 2.0 if at_waypoints else 1.0, 'noise': _DEGREES},
         'odometry': PERFECT_ODOMETRY,
     }
 
@@ -132,7 +132,7 @@ def cube(
         'filter': search_filter or PAPER_FILTER,
         'planner': merged(NEVER_DONE, planner),
         'scoring': {'radius': 5.0},
-        'limits': {'time': 100000.0},
+        'limits': {'time': 3000.0},
     }
 
 
