@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
@@ -17,6 +18,7 @@ from rclpy.duration import Duration
 from rclpy.qos import HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState
 
+from maasi_drivers.command_publisher import CommandPublisher
 from maasi_drivers.driver_settings import LIVELINESS_LEASE, DriverSettings
 from maasi_drivers.measurement_queue import Frame, MeasurementQueue, MeasurementRequest
 from maasi_drivers.odometry import MapOdometry, PoseHistory, StampedPose
@@ -33,7 +35,7 @@ from maasi_filter.qos import RELIABLE, sensor_reader
 from maasi_filter.search_node import SearchNode
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState, DetectionArray, LockstepStep, MeasurementBatch
-from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
 
 FloatArray = NDArray[np.float64]
@@ -59,6 +61,10 @@ _FEEDBACK_PERIOD = 500_000_000
 _FAREWELL = 0.3
 _STOP_COMMANDS = 3
 _LAST_TASKS = 5
+# Commands below these are not expected to change the pose [m/s, rad/s].
+_LEAST_SPEED, _LEAST_TURN = 0.02, 0.05
+# Kinds of trouble.
+_ODOMETRY, _FROZEN_POSE, _SENSOR, _BATTERY = 'odometry', 'frozen pose', 'sensor', 'battery'
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     Publishes
     ---------
     `state` (maasi_msgs/AgentState), with each odometry;
-    `cmd_vel` (geometry_msgs/TwistStamped or Twist), with each odometry, and zeros at the end;
+    `cmd_vel` (geometry_msgs/TwistStamped or Twist, as the robot listens), with each odometry, and
+    zeros when it cannot go on and at the end;
     `detections` (maasi_msgs/DetectionArray), for each batch that this robot is in
 
     Actions
@@ -109,19 +116,19 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     `go_to` (maasi_msgs/GoToWaypoint): the newest goal replaces the one before
     """
 
+    # What its sensor delivers, in words.
+    sensed = 'sweep'
+
     def __init__(self, **options: Any) -> None:
         super().__init__('driver', DriverSettings, in_robot=True, **options)
         settings = self.settings
-        self.robot = self.get_namespace().rstrip('/').rpartition('/')[2]
+        self._namespace = self.get_namespace().strip('/')
+        self.robot = self._namespace.rpartition('/')[2]
         self.dimension = settings.environment.dimension
         self.sensor = settings.sensor.build(self.robot, self.dimension)
         self.offset = 0
         self._bounds = settings.environment.array()
-        self._motion = make_motion(
-            settings.motion,
-            Obstacles.from_settings(settings.environment.obstacles),
-            settings.radius,
-        )
+        self._motion = self.make_motion()
         self._start = Pose.from_yaw(settings.start, settings.yaw)
         self._history = PoseHistory()
         self._odometry: MapOdometry | None = None
@@ -132,6 +139,10 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._battery = -1.0
         # Why the robot cannot go on, by kind; empty where it can.
         self._troubles: dict[str, str] = {}
+        self._in_per_cent = False
+        self._moving = False
+        self._changed_at = 0
+        self._sensed_at: int | None = None
         self._odometry_at = time.monotonic()
         self._watched_at = self._odometry_at
         self._stalled = False
@@ -142,7 +153,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._unusable: int | None = None
         self._away = False
         self._entities: list[Any] = []
-        self._command_publisher: Any = None
+        self._command_publisher: CommandPublisher | None = None
         self._server: ActionServer | None = None
         self._state = AgentState(robot=self.robot, battery=-1.0)
         self._state.header.frame_id = settings.frame
@@ -168,25 +179,35 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
         """
 
+    def make_motion(self) -> MotionModel:
+        """Return the controller."""
+        settings = self.settings
+        obstacles = Obstacles.from_settings(settings.environment.obstacles)
+        return make_motion(settings.motion, obstacles, settings.radius)
+
+    def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
+        """Return the command (4,), and the goal that is reached; see `WaypointFollower.update`."""
+        return self._follower.update(robot, step)
+
     # ---- the robot's link: topics, unless overridden -----------------------------------------
 
     def connect_robot(self) -> None:
         """Reach the robot, in *configure*."""
         settings = self.settings
-        self._command_publisher = self.create_publisher(
-            TwistStamped if settings.command_type == 'stamped' else Twist, 'cmd_vel', RELIABLE
-        )
+        commands = CommandPublisher(self, 'cmd_vel', settings.command_type, settings.lockstep)
+        self._command_publisher = commands
         quality = sensor_reader(settings.lockstep)
         self._entities += [
-            self._command_publisher,
             self.create_subscription(Odometry, 'odom', self._on_odometry, quality),
             self.create_subscription(BatteryState, 'battery', self._on_battery, quality),
         ]
-        self.expect_subscribers(self._command_publisher)
+        self.expect(lambda: commands.listeners() > 0)
 
     def disconnect_robot(self) -> None:
         """Undo `connect_robot`; what is in `_entities` goes by itself."""
-        self._command_publisher = None
+        if self._command_publisher is not None:
+            self._command_publisher.destroy()
+            self._command_publisher = None
 
     def send_command(self, placed: StampedPose, command: list[float]) -> None:
         """
@@ -208,7 +229,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             return
         for _ in range(_STOP_COMMANDS):
             self._publish_command([0.0, 0.0, 0.0, 0.0])
-        self._command_publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
+        self._command_publisher.wait(_FAREWELL)
 
     def hold_robot(self) -> None:
         """Stop the robot now, as its goal was cancelled or its pose is not known."""
@@ -216,8 +237,10 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     def watch_robot(self) -> None:
         """Look after the link, ten times a second on wall time."""
-        if self._command_publisher.get_subscription_count() == 0:
-            self._say_nobody_listens()
+        if self._command_publisher is not None:
+            self._command_publisher.look()
+            if problem := self._command_publisher.problem():
+                self.warn_throttled('cmd_vel', problem)
 
     # ---- life cycle --------------------------------------------------------------------------
 
@@ -314,6 +337,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._queue.clear()
         self._follower = WaypointFollower(self._motion)
         self._awaited = self._answered = self._unusable = None
+        self._sensed_at = None
+        self._moving = False
         if self.settings.odometry_origin == 'first':
             self._odometry = None
 
@@ -364,10 +389,15 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     def take_pose(self, placed: StampedPose) -> None:
         """Take where the robot is, later than all before."""
-        self._history.add(placed)
         self._odometry_at = time.monotonic()
-        if self.end_trouble('odometry'):
+        if self.end_trouble(_ODOMETRY):
             self.get_logger().info('odometry is back')
+            # The sensor may have been silent with it.
+            self._sensed_at = None
+        if not self.settings.lockstep:
+            self._watch_pose(placed)
+            self._watch_sensor(placed)
+        self._history.add(placed)
         if not self.settings.lockstep:
             self._control(placed)
             self._serve()
@@ -399,7 +429,13 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         follower = self._follower
         step = self._step_of(placed.stamp)
         robot = RobotState(placed.pose, placed.velocity, placed.angular_velocity)
-        command, reached = follower.update(robot, step if self.settings.lockstep else None)
+        command, reached = self.steer(robot, step if self.settings.lockstep else None)
+        if _FROZEN_POSE in self._troubles:
+            # Nothing can be controlled by such a pose.
+            command = np.zeros(4)
+        self._moving = bool(
+            math.hypot(*command[:3]) > _LEAST_SPEED or abs(command[3]) > _LEAST_TURN
+        )
         if reached is not None:
             self._finish(reached)
         self._fill_state(placed, step)
@@ -442,8 +478,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     def _publish_command(self, command: list[float]) -> None:
         twist = self._command.twist
         twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z = command
-        stamped = self.settings.command_type == 'stamped'
-        self._command_publisher.publish(self._command if stamped else twist)
+        if self._command_publisher is not None:
+            self._command_publisher.publish(self._command)
 
     # ---- lockstep ----------------------------------------------------------------------------
 
@@ -466,7 +502,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if stamp == self._answered:
             # Said again for somebody who was started again.
             self._state_publisher.publish(self._state)
-            self._command_publisher.publish(self._command)
+            if self._command_publisher is not None:
+                self._command_publisher.publish(self._command)
         elif latest is not None and latest.stamp == stamp:
             self._control(latest)
         elif stamp == self._unusable:
@@ -573,7 +610,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     @property
     def trouble(self) -> str:
         """Why the robot cannot go on; empty where it can."""
-        return next(iter(self._troubles.values()), '')
+        return '; '.join(self._troubles.values())
 
     def begin_trouble(self, kind: str, text: str) -> bool:
         """
@@ -616,7 +653,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
                 self.warn_throttled('no odometry', f'odom: nothing yet, for {age:.0f} s')
         elif age > self.settings.odometry_timeout:
             text = f'no odometry for {age:.1f} s'
-            if self.begin_trouble('odometry', text):
+            if self.begin_trouble(_ODOMETRY, text):
                 self.get_logger().warning(f'odom: {text}: the robot is stopped')
                 self._watches = 0
             self.hold_robot()
@@ -624,22 +661,37 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
                 self._fill_status()
                 self._state_publisher.publish(self._state)
 
-    def _say_nobody_listens(self) -> None:
-        types = {
-            item.topic_type
-            for item in self.get_subscriptions_info_by_topic(self._command_publisher.topic_name)
-        }
-        listens = (
-            f'the robot wants {", ".join(sorted(types))}: see the parameter command_type'
-            if types
-            else 'is the robot there?'
-        )
-        self.warn_throttled('cmd_vel', f'cmd_vel: nobody listens; {listens}')
+    def _watch_pose(self, placed: StampedPose) -> None:
+        """Stop a robot whose pose stays the same to the bit while it is told to move."""
+        timeout, before = self.settings.frozen_pose_timeout, self._history.latest
+        same = before is not None and placed.pose == before.pose
+        if not same and self.end_trouble(_FROZEN_POSE):
+            self.get_logger().info('the pose changes again')
+        if not timeout or not same or not self._moving:
+            self._changed_at = placed.stamp
+            return
+        age = 1e-9 * (placed.stamp - self._changed_at)
+        if age > timeout:
+            text = f'the pose has not changed for {age:.1f} s'
+            if self.begin_trouble(_FROZEN_POSE, text):
+                self.get_logger().warning(f'odom: {text}: the robot is stopped')
+
+    def _watch_sensor(self, placed: StampedPose) -> None:
+        """Stop a robot whose sensor is silent."""
+        timeout = self.settings.sensor_patience
+        if self._sensed_at is None:
+            self._sensed_at = placed.stamp
+        age = 1e-9 * (placed.stamp - self._sensed_at)
+        if timeout and age > timeout:
+            text = f'no new {self.sensed} for {age:.1f} s'
+            if self.begin_trouble(_SENSOR, text):
+                self.get_logger().warning(f'{text}: the robot is stopped')
 
     def _on_battery(self, message: BatteryState) -> None:
         charge = message.percentage
         # Some robots say per cent.
-        if 1.0 < charge <= 100.0:
+        self._in_per_cent |= 1.0 < charge <= 100.0
+        if self._in_per_cent:
             charge *= 0.01
         self.take_charge(charge)
 
@@ -650,10 +702,10 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if not minimum:
             return
         if not 0.0 <= self._battery < minimum:
-            self.end_trouble('battery')
+            self.end_trouble(_BATTERY)
             return
         text = f'battery at {self._battery:.2f}, below {minimum:.2f}'
-        if self.begin_trouble('battery', text):
+        if self.begin_trouble(_BATTERY, text):
             self.get_logger().warning(f'{text}: the robot goes nowhere any more')
 
     # ---- measurements ------------------------------------------------------------------------
@@ -671,8 +723,21 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
                 self._serve()
                 return
 
-    def take_frame(self, topic: str, stamp: int, data: DataT) -> None:
-        """Take an image or sweep stamped in nanoseconds."""
+    def take_frame(self, topic: str, stamp: int, data: DataT, *, repeated: bool = False) -> None:
+        """
+        Take an image or sweep.
+
+        Parameters
+        ----------
+        topic : str
+            Where it came from.
+        stamp : int
+            [ns].
+        data : object
+            For `look`.
+        repeated : bool
+            Whether it is the one before over again, as of a sensor that hangs.
+        """
         if not self.active:
             return
         latest = self._queue.latest
@@ -687,6 +752,13 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
                 f'{topic}.header.stamp jumped back by {1e-9 * (latest - stamp):.3f} s'
             )
             self._queue.clear()
+        # A robot that stands may see the same twice; what hung is trusted once that changes.
+        if self._history.latest is not None and (
+            not repeated or not (self._moving or _SENSOR in self._troubles)
+        ):
+            self._sensed_at = self._history.latest.stamp
+            if self.end_trouble(_SENSOR):
+                self.get_logger().info(f'{topic}: it is back')
         self._queue.add_frame(Frame(stamp, data))
         self._serve()
 

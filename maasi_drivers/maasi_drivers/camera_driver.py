@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
+from zlib import crc32
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from maasi_drivers.agent_driver import AgentDriver, Sighting
-from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.camera_settings import CameraSettings, load_calibration
 from maasi_drivers.image_encoding import image_to_array
 from maasi_drivers.marker_detector import MarkerDetector
 from maasi_drivers.odometry import StampedPose
@@ -20,7 +21,7 @@ from maasi_drivers.warm_up import warm_up
 from maasi_filter.conversions import stamp_from_ros
 from maasi_filter.detection_model import BoxDetection
 from maasi_filter.pose import Pose
-from maasi_filter.qos import sensor_reader
+from maasi_filter.qos import RELIABLE, SENSOR, sensor_reader
 from maasi_filter.search_node import SettingsError
 
 ImageArray = NDArray[np.uint8]
@@ -32,11 +33,16 @@ class CameraDriver(AgentDriver[Picture]):
     """
     A robot with a camera that sees markers on the floor.
 
+    Calibration: from the file that the parameter `calibration_file` names, else from the parameters;
+    a `camera_info` with a focal length replaces either.
+
     Subscribes
     ----------
     `camera/image_raw` (sensor_msgs/Image) or `camera/image_raw/compressed`;
     `camera/camera_info` (sensor_msgs/CameraInfo), whose calibration replaces the parameters'
     """
+
+    sensed = 'image'
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -46,7 +52,14 @@ class CameraDriver(AgentDriver[Picture]):
                 '(camera.width, ...)'
             )
         self._calibration: tuple[object, ...] | None = None
-        self._use(self.settings.camera)
+        self._checksum: int | None = None
+        camera = self.settings.camera
+        if self.settings.calibration_file:
+            try:
+                camera = load_calibration(self.settings.calibration_file, camera)
+            except (OSError, ValueError) as error:
+                raise SettingsError(f'parameter calibration_file: {error}') from error
+        self._use(camera)
         self.offset = round(self.settings.camera.stamp_offset * 1e9)
 
     def _use(self, camera: CameraSettings) -> None:
@@ -76,6 +89,9 @@ class CameraDriver(AgentDriver[Picture]):
         self.detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0), np.zeros((6, 6)))
         quality = sensor_reader(self.settings.lockstep)
         self.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
+        # Images read reliably are sent again when lost: on a thin link that delays the next ones.
+        if self.settings.image_reliability == 'reliable':
+            quality = RELIABLE if self.settings.lockstep else SENSOR
         if self.settings.image_transport == 'raw':
             self.create_subscription(Image, 'camera/image_raw', self._on_image, quality)
         else:
@@ -111,7 +127,12 @@ class CameraDriver(AgentDriver[Picture]):
         except ValueError as error:
             self.drop('image', f'camera/image_raw: {error}')
             return
-        self.take_frame('camera/image_raw', stamp_from_ros(message.header.stamp), lambda: image)
+        self.take_frame(
+            'camera/image_raw',
+            stamp_from_ros(message.header.stamp),
+            lambda: image,
+            repeated=self._is_repeated(message),
+        )
 
     def _on_compressed(self, message: CompressedImage) -> None:
         def decode() -> ImageArray:
@@ -125,7 +146,15 @@ class CameraDriver(AgentDriver[Picture]):
             return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
         topic = 'camera/image_raw/compressed'
-        self.take_frame(topic, stamp_from_ros(message.header.stamp), decode)
+        stamp = stamp_from_ros(message.header.stamp)
+        self.take_frame(topic, stamp, decode, repeated=self._is_repeated(message))
+
+    def _is_repeated(self, message: Image | CompressedImage) -> bool:
+        """Return whether an image is the one before to the bit: noise never is."""
+        if self.settings.lockstep or not self.settings.sensor_patience:
+            return False
+        before, self._checksum = self._checksum, crc32(message.data)
+        return self._checksum == before
 
     def _check_size(self, image: ImageArray) -> None:
         camera = self.camera

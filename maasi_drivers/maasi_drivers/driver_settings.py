@@ -11,7 +11,7 @@ from maasi_filter.node_settings import NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings
 from maasi_planner.settings import MotionSettings
 
-CommandType = Literal['stamped', 'twist']
+CommandType = Literal['auto', 'stamped', 'twist']
 # A driver that is silent for so long is dead to its guard [s].
 LIVELINESS_LEASE = 0.5
 
@@ -39,6 +39,21 @@ class DriverSettings(NodeSettings):
         default='raw',
         description='Images as camera/image_raw, or as camera/image_raw/compressed',
     )
+    image_reliability: Literal['best_effort', 'reliable'] = Field(
+        default='best_effort',
+        description='Quality of service with which images are read; best_effort matches every '
+        'camera',
+    )
+    calibration_file: str = Field(
+        default='',
+        description="Calibration of the camera as ROS's camera_calibration writes it (YAML); "
+        'none: the parameters of the camera',
+    )
+    odometry_frame: str = Field(
+        default='',
+        description='What odom.header.frame_id has to be; none: odom, with this namespace or '
+        'without one',
+    )
     odometry_origin: Literal['zero', 'first'] = Field(
         default='zero',
         description='What the odometry shows at the start: zero, or what its first message says',
@@ -49,8 +64,23 @@ class DriverSettings(NodeSettings):
         description='Wall time without odometry after which the robot is stopped; not in lockstep '
         '[s]',
     )
+    frozen_pose_timeout: float = Field(
+        default=1.0,
+        ge=0.0,
+        description='Time by the odometry for which its pose may be the same to the bit under a '
+        'command to move, before the robot is stopped; 0: not looked at; not in lockstep [s]',
+    )
+    sensor_timeout: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='Time by the odometry without a new image or sweep after which the robot is '
+        'stopped; none: three periods of the sensor, at least 1 s; 0: not looked at; not in '
+        'lockstep [s]',
+    )
     command_type: CommandType = Field(
-        default='stamped', description='Type of cmd_vel: TwistStamped or Twist'
+        default='auto',
+        description='Type of cmd_vel: TwistStamped, Twist, or what the robot listens to; auto is '
+        'stamped in lockstep',
     )
     battery_minimum: float = Field(
         default=0.0,
@@ -59,11 +89,18 @@ class DriverSettings(NodeSettings):
         description='Charge below which the robot goes nowhere any more; 0: not looked at [1]',
     )
 
+    @property
+    def sensor_patience(self) -> float:
+        """Time without a new image or sweep after which the robot is stopped [s]; 0: never."""
+        if self.sensor_timeout is not None:
+            return self.sensor_timeout
+        return max(1.0, 3.0 * self.sensor.period)
+
     @model_validator(mode='after')
     def _consistent(self) -> DriverSettings:
-        if self.lockstep and self.command_type != 'stamped':
+        if self.lockstep and self.command_type == 'twist':
             raise ValueError(
-                f'command_type: got {self.command_type!r}, allowed is stamped in lockstep'
+                f'command_type: got {self.command_type!r}, allowed is stamped (or auto) in lockstep'
             )
         if self.lockstep and self.camera is not None and self.camera.stamp_offset > 0.0:
             raise ValueError(
@@ -77,5 +114,7 @@ class GuardSettings(NodeSettings):
     """What the guard of a robot needs to know."""
 
     command_type: CommandType = Field(
-        default='stamped', description='Type of cmd_vel: TwistStamped or Twist'
+        default='auto',
+        description='Type of cmd_vel: TwistStamped, Twist, or what the robot listens to; auto is '
+        'stamped in lockstep',
     )

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import TwistStamped
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
+from maasi_drivers.command_publisher import CommandPublisher
 from maasi_drivers.driver_settings import LIVELINESS_LEASE, GuardSettings
-from maasi_filter.qos import RELIABLE
 from maasi_filter.search_node import SearchNode, run
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1
+# Between two looks at who listens: zeros must not wait for a publisher to be discovered.
+_LOOK_PERIOD = 0.5
 
 
 class GuardNode(SearchNode[GuardSettings]):
@@ -41,10 +43,10 @@ class GuardNode(SearchNode[GuardSettings]):
 
     def set_up(self) -> None:
         """Connect."""
-        stamped = self.settings.command_type == 'stamped'
-        self._publisher = self.create_publisher(
-            TwistStamped if stamped else Twist, 'cmd_vel', RELIABLE
+        self._publisher = CommandPublisher(
+            self, 'cmd_vel', self.settings.command_type, self.settings.lockstep
         )
+        self._look_timer = self.create_wall_timer(_LOOK_PERIOD, self._publisher.look)
         quality = QoSProfile(
             depth=1,
             reliability=ReliabilityPolicy.BEST_EFFORT,
@@ -65,7 +67,8 @@ class GuardNode(SearchNode[GuardSettings]):
         """Disconnect."""
         self._end_stop()
         self.destroy_subscription(self._subscription)
-        self.destroy_publisher(self._publisher)
+        self.destroy_timer(self._look_timer)
+        self._publisher.destroy()
 
     def halt(self) -> None:
         """Leave the robot alone."""
@@ -96,9 +99,6 @@ class GuardNode(SearchNode[GuardSettings]):
 
     def _stop(self) -> None:
         if self._stop_timer is None:
-            return
-        if self.settings.command_type == 'twist':
-            self._publisher.publish(Twist())
             return
         command = TwistStamped()
         if self._last:

@@ -62,6 +62,8 @@ TURTLEBOT = {
     'yaw': 0.7,
     'radius': 0.11,
     'odometry_timeout': 30.0,
+    # Most tests have no images.
+    'sensor_timeout': 0.0,
     'motion': {'model': 'unicycle', 'speed': 0.2, 'acceleration': 0.5, 'heading': 'travel'},
     'sensor': {'detection': {'kind': 'box', 'lower': [-0.1, -0.1], 'upper': [0.2, 0.2]}},
     'camera': {
@@ -80,6 +82,7 @@ RANGING = {
     'environment': {'bounds': [[0.0, 20.0], [0.0, 20.0], [0.0, 20.0]]},
     'start': [5.0, 5.0, 5.0],
     'odometry_timeout': 30.0,
+    'sensor_timeout': 0.0,
     'motion': {'model': 'constant_speed', 'speed': 2.0},
     'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
 }
@@ -115,7 +118,7 @@ class Team(Node):
         self.states, self.commands, self.detections = [], [], []
         self.ready, self.done = [], []
         lockstep = self.settings.lockstep
-        kind = TwistStamped if self.settings.command_type == 'stamped' else Twist
+        kind = Twist if self.settings.command_type == 'twist' else TwistStamped
         self.create_subscription(AgentState, 'state', self.states.append, RELIABLE)
         self.create_subscription(kind, 'cmd_vel', self.commands.append, RELIABLE)
         self.create_subscription(DetectionArray, 'detections', self.detections.append, RELIABLE)

@@ -2,6 +2,7 @@
 
 from array import array
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,7 +21,7 @@ def _message(encoding, padding, height=3, width=5):
     return padded.shape[1], padded.tobytes()
 
 
-@pytest.mark.parametrize('encoding', COLOUR_ENCODINGS)
+@pytest.mark.parametrize('encoding', CHANNELS)
 @pytest.mark.parametrize('padding', [0, 7])
 @pytest.mark.parametrize('container', [bytes, bytearray, memoryview, lambda b: array('B', b)])
 def test_channels_come_out_in_rgb_order_without_the_padding(encoding, padding, container):
@@ -33,8 +34,59 @@ def test_channels_come_out_in_rgb_order_without_the_padding(encoding, padding, c
         np.testing.assert_array_equal(image[..., channel], 40 * channel + 8 * rows + columns)
 
 
+# A smooth picture: what subsampling loses is little.
+ROWS, COLUMNS = np.mgrid[:24, :32]
+SMOOTH = np.stack([40 + 4 * ROWS, 200 - 3 * COLUMNS, 60 + 2 * ROWS + 2 * COLUMNS], axis=2).astype(
+    np.uint8
+)
+
+
+def luminance_and_colour():
+    planar = cv2.cvtColor(SMOOTH, cv2.COLOR_RGB2YUV_I420).reshape(-1)
+    size = SMOOTH[..., 0].size
+    half = (12, 16)
+    return (
+        planar[:size].reshape(24, 32),
+        planar[size : size + size // 4].reshape(half),
+        planar[size + size // 4 :].reshape(half),
+    )
+
+
+def encoded(encoding):
+    """Return rows of bytes, by the layouts of sensor_msgs and not by the code under test."""
+    if encoding.startswith('bayer'):
+        pattern = np.array(['rgb'.index(name) for name in encoding[6:10]]).reshape(2, 2)
+        channel = np.tile(pattern, (12, 16))
+        return np.take_along_axis(SMOOTH, channel[..., None], axis=2)[..., 0]
+    light, u, v = luminance_and_colour()
+    if encoding in ('nv12', 'nv21'):
+        pair = (u, v) if encoding == 'nv12' else (v, u)
+        return np.concatenate([light, np.stack(pair, axis=2).reshape(12, 32)])
+    colour = np.repeat(np.stack([u, v], axis=2).reshape(12, 32), 2, axis=0)
+    order = (colour, light) if encoding in ('uyvy', 'yuv422') else (light, colour)
+    return np.stack(order, axis=2).reshape(24, 64)
+
+
+@pytest.mark.parametrize('encoding', sorted(set(COLOUR_ENCODINGS) - set(CHANNELS)))
+@pytest.mark.parametrize('padding', [0, 6])
+def test_what_cameras_of_small_computers_send_is_decoded(encoding, padding):
+    rows = np.pad(encoded(encoding), ((0, 0), (0, padding)), constant_values=255)
+    image = image_to_array(24, 32, encoding, rows.shape[1], rows.tobytes())
+    assert image.shape == SMOOTH.shape
+    inner = np.s_[2:-2, 2:-2]
+    assert np.abs(image[inner].astype(int) - SMOOTH[inner]).max() <= 8
+
+
 @pytest.mark.parametrize(
-    'encoding', ['mono8', 'mono16', '16UC1', 'bayer_rggb8', 'nv12', '', 'RGB8']
+    ('encoding', 'height', 'width'), [('yuyv', 4, 5), ('nv12', 5, 4), ('nv21', 4, 5)]
+)
+def test_odd_sizes_of_subsampled_colours_are_refused(encoding, height, width):
+    with pytest.raises(ValueError, match='image size: got .* allowed are even numbers'):
+        image_to_array(height, width, encoding, 2 * width, bytes(2 * width * height))
+
+
+@pytest.mark.parametrize(
+    'encoding', ['mono8', 'mono16', '16UC1', 'bayer_rggb16', 'nv24', '', 'RGB8']
 )
 def test_encodings_without_colour_or_unknown_are_refused_by_name(encoding):
     with pytest.raises(ValueError, match=f"encoding: got '{encoding}', allowed rgb8, bgr8"):
