@@ -33,7 +33,8 @@ class CameraDriver(AgentDriver[Picture]):
     """
     A robot with a camera that sees markers on the floor.
 
-    Calibration: from the file that the parameter `calibration_file` names, else from the parameters;
+    Calibration: from the file that the parameter `calibration_file` names, else from the
+    parameters;
     a `camera_info` with a focal length replaces either.
 
     Subscribes

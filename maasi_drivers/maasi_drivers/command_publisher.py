@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
@@ -46,33 +47,39 @@ class CommandPublisher:
             else QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
         )
         self.topic = node.resolve_topic_name(topic)
-        self._publishers: dict[type, Any] = {}
+        self._publisher: Any = None
+        self._kind: type = TwistStamped
         self._auto = kind == 'auto' and not lockstep
         if self._auto:
             self.look()
         else:
-            self._add(Twist if kind == 'twist' else TwistStamped)
+            self._use(Twist if kind == 'twist' else TwistStamped)
 
-    def _add(self, kind: type) -> None:
-        self._publishers[kind] = self._node.create_publisher(kind, self.topic, self._quality)
+    def _use(self, kind: type) -> None:
+        # A process can have only one type under one name.
+        self.destroy()
+        self._kind = kind
+        self._publisher = self._node.create_publisher(kind, self.topic, self._quality)
 
     def look(self) -> None:
         """Look who listens, and for what type; to be called again and again."""
-        if not self._auto:
+        if not self._auto or self.listeners():
             return
         for name in self.wanted():
             kind = _TYPES.get(name)
-            if kind is not None and kind not in self._publishers:
-                self._add(kind)
+            if kind is not None:
+                if self._publisher is None or kind is not self._kind:
+                    self._use(kind)
+                return
 
     def wanted(self) -> list[str]:
-        """Return the names of the types that are subscribed."""
+        """Return the names of the types that are subscribed, the most frequent first."""
         known = self._node.get_subscriptions_info_by_topic(self.topic)
-        return sorted({item.topic_type for item in known})
+        return [name for name, _ in Counter(item.topic_type for item in known).most_common()]
 
     def listeners(self) -> int:
         """Return how many subscriptions are matched."""
-        return sum(item.get_subscription_count() for item in self._publishers.values())
+        return 0 if self._publisher is None else self._publisher.get_subscription_count()
 
     def problem(self) -> str:
         """Return why nobody hears a command; empty where somebody does."""
@@ -88,16 +95,16 @@ class CommandPublisher:
 
     def publish(self, command: TwistStamped) -> None:
         """Publish a command, without its header where that is what is listened to."""
-        for kind, publisher in self._publishers.items():
-            publisher.publish(command if kind is TwistStamped else command.twist)
+        if self._publisher is not None:
+            self._publisher.publish(command if self._kind is TwistStamped else command.twist)
 
     def wait(self, seconds: float) -> None:
         """Wait until what was published has arrived, for at most so long."""
-        for publisher in self._publishers.values():
-            publisher.wait_for_all_acked(Duration(nanoseconds=round(seconds * 1e9)))
+        if self._publisher is not None:
+            self._publisher.wait_for_all_acked(Duration(nanoseconds=round(seconds * 1e9)))
 
     def destroy(self) -> None:
         """Leave the graph."""
-        for publisher in self._publishers.values():
-            self._node.destroy_publisher(publisher)
-        self._publishers = {}
+        if self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = None

@@ -1,16 +1,31 @@
-"""Rendered sequences that are hard to segment, and how a detector does on them."""
+"""What the tests of the drivers share: sequences that are hard to segment, and drivers at work."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
+import yaml
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from robot_team import DOMAIN, KINDS, TURTLEBOT, Team, parameters_of
 
 from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.marker_detector import MarkerDetector
 from maasi_drivers.projection import Camera
+from maasi_filter.parameters import flatten
 from maasi_filter.pose import Pose, quaternion_product
 from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
@@ -155,3 +170,75 @@ def hard_score() -> Callable[[str, int, int], Score]:
         return score(MarkerDetector(settings), sequence(settings, hard_floor(seed), seed, frames))
 
     return run
+
+
+@pytest.fixture
+def context(monkeypatch):
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
+    context = Context()
+    rclpy.init(context=context, domain_id=DOMAIN, signal_handler_options=SignalHandlerOptions.NO)
+    yield context
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def play(context):
+    """
+    Return a function that starts a driver in this process, and the team around it.
+
+    Its kind: a name in KINDS, or class and settings.
+    """
+    started = []
+    executor = SingleThreadedExecutor(context=context)
+
+    def start(kind='turtlebot', wants=None, **changes):
+        made, settings = KINDS[kind] if isinstance(kind, str) else kind
+        settings = settings | changes
+        driver = made(
+            context=context, namespace='/rover', parameter_overrides=parameters_of(settings)
+        )
+        executor.add_node(driver)
+        team = Team(context, settings, executor, wants)
+        started.extend([driver, team])
+        assert driver.trigger_configure().name == 'SUCCESS'
+        assert driver.trigger_activate().name == 'SUCCESS'
+        team.connect()
+        return driver, team
+
+    yield start
+    for node in started:
+        if hasattr(node, 'halt'):
+            node.halt()
+        node.destroy_node()
+    executor.shutdown()
+
+
+@pytest.fixture
+def process(context, tmp_path):
+    """Return a function that starts a driver as a process of its own."""
+    running = []
+
+    def start(**changes):
+        file = tmp_path / 'parameters.yaml'
+        flat = flatten(DriverSettings.model_validate(TURTLEBOT | changes))
+        file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
+        command = [sys.executable, '-m', 'maasi_drivers.turtlebot_driver', '--ros-args']
+        command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
+        running.append(subprocess.Popen(command, env=os.environ.copy()))
+        return running[-1]
+
+    yield start
+    for item in running:
+        if item.poll() is None:
+            item.kill()
+        item.wait()
+
+
+@pytest.fixture
+def team(context):
+    executor = SingleThreadedExecutor(context=context)
+    team = Team(context, TURTLEBOT, executor)
+    yield team
+    executor.shutdown()
+    team.destroy_node()

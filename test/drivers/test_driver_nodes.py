@@ -1,308 +1,32 @@
 """Drivers and guard over real topics, against a robot and a team that the tests play."""
 
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
-import rclpy
-import yaml
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry
 from numpy.testing import assert_allclose, assert_array_equal
-from rclpy.action import ActionClient
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import BatteryState, CameraInfo, Image
+from robot_team import (
+    NANOSECONDS,
+    TURTLEBOT,
+    image_message,
+    lockstep_step,
+    rendered,
+    stamped,
+)
+from sensor_msgs.msg import CameraInfo
 
 from maasi_drivers.driver_settings import DriverSettings
-from maasi_drivers.guard_node import GuardNode
-from maasi_drivers.mambo_driver import MamboDriver
-from maasi_drivers.projection import Camera
-from maasi_drivers.ranging_driver import RangingDriver
-from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import pose_from_ros, pose_to_ros, stamp_to_ros
-from maasi_filter.parameters import flatten
-from maasi_filter.pose import Pose, compose, inverse
-from maasi_filter.qos import LATCHED_ALL, RELIABLE
-from maasi_filter.settings import EnvironmentSettings
-from maasi_msgs.action import GoToWaypoint
+from maasi_filter.conversions import pose_from_ros, stamp_to_ros
+from maasi_filter.qos import RELIABLE
 from maasi_msgs.msg import (
     AgentState,
-    BatchMember,
     DetectionArray,
-    LockstepDone,
     LockstepStep,
-    MeasurementBatch,
     RangeArray,
     RangeMeasurement,
 )
-from maasi_planner.motion import RobotState, make_motion
-from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
-from maasi_sim.world import TargetSettings, World
-
-DOMAIN = 74
-STEP = 0.05
-NANOSECONDS = round(STEP * 1e9)
-# Longest wait for anything; the machine may be busy.
-LIMIT = 60.0
-BOUNDS = [[-0.3, 2.4], [-0.3, 2.4]]
-TURTLEBOT = {
-    'step': STEP,
-    'environment': {'bounds': BOUNDS},
-    'start': [0.4, 0.3, 0.0],
-    'yaw': 0.7,
-    'radius': 0.11,
-    'odometry_timeout': 30.0,
-    # Most tests have no images.
-    'sensor_timeout': 0.0,
-    'motion': {'model': 'unicycle', 'speed': 0.2, 'acceleration': 0.5, 'heading': 'travel'},
-    'sensor': {'detection': {'kind': 'box', 'lower': [-0.1, -0.1], 'upper': [0.2, 0.2]}},
-    'camera': {
-        'focal_length': [120.0, 120.0],
-        'mount': {'position': [0.05, 0.05, 0.4], 'rpy': [0.0, math.pi / 2, 0.0]},
-    },
-}
-MAMBO = TURTLEBOT | {
-    'start': [1.0, 1.0, 1.0],
-    'motion': {'model': 'mambo', 'speed': 0.4, 'tilt': 0.1},
-    'sensor': {'detection': {'kind': 'box'}},
-    'camera': {'focal_length': [220.0, 220.0]},
-}
-RANGING = {
-    'step': STEP,
-    'environment': {'bounds': [[0.0, 20.0], [0.0, 20.0], [0.0, 20.0]]},
-    'start': [5.0, 5.0, 5.0],
-    'odometry_timeout': 30.0,
-    'sensor_timeout': 0.0,
-    'motion': {'model': 'constant_speed', 'speed': 2.0},
-    'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
-}
-KINDS = {
-    'turtlebot': (TurtlebotDriver, TURTLEBOT),
-    'mambo': (MamboDriver, MAMBO),
-    'ranging': (RangingDriver, RANGING),
-}
-
-
-@pytest.fixture
-def context(monkeypatch):
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN, signal_handler_options=SignalHandlerOptions.NO)
-    yield context
-    rclpy.shutdown(context=context)
-
-
-class Team(Node):
-    """The robot, its camera, and whoever the driver talks to."""
-
-    def __init__(self, context, settings, executor):
-        super().__init__('robot', context=context, namespace='/rover')
-        self.settings = DriverSettings.model_validate(settings)
-        self.start = Pose.from_yaw(self.settings.start, self.settings.yaw)
-        self.motion = make_motion(self.settings.motion, radius=self.settings.radius)
-        self.body = self.motion.body(RobotState(self.start))
-        self.executor_used = executor
-        executor.add_node(self)
-        self.step = -1
-        self.states, self.commands, self.detections = [], [], []
-        self.ready, self.done = [], []
-        lockstep = self.settings.lockstep
-        kind = Twist if self.settings.command_type == 'twist' else TwistStamped
-        self.create_subscription(AgentState, 'state', self.states.append, RELIABLE)
-        self.create_subscription(kind, 'cmd_vel', self.commands.append, RELIABLE)
-        self.create_subscription(DetectionArray, 'detections', self.detections.append, RELIABLE)
-        self.create_subscription(LockstepDone, '/lockstep/ready', self.ready.append, LATCHED_ALL)
-        self.odometry = self.create_publisher(Odometry, 'odom', RELIABLE)
-        self.battery = self.create_publisher(BatteryState, 'battery', RELIABLE)
-        self.batches = self.create_publisher(MeasurementBatch, '/measurement_batch', RELIABLE)
-        self.images = self.create_publisher(Image, 'camera/image_raw', RELIABLE)
-        self.calibrations = self.create_publisher(CameraInfo, 'camera/camera_info', RELIABLE)
-        self.ranges = self.create_publisher(RangeArray, 'ranges', RELIABLE)
-        self.used = [self.odometry, self.battery, self.batches]
-        self.used += [self.images] if self.settings.camera else [self.ranges]
-        if lockstep:
-            self.steps = self.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)
-            self.create_subscription(LockstepDone, '/lockstep/done', self.done.append, RELIABLE)
-            self.used.append(self.steps)
-        self.go_to = ActionClient(self, GoToWaypoint, 'go_to')
-        self.batch = 0
-
-    def until(self, condition, what=''):
-        end = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < end, what or 'nothing came of it'
-            self.executor_used.spin_once(timeout_sec=0.02)
-
-    def until_done(self, steps):
-        self.until(
-            lambda: all(len(heard) == steps for heard in (self.done, self.states, self.commands)),
-            'a step has no end',
-        )
-
-    def connect(self):
-        self.until(
-            lambda: (
-                all(publisher.get_subscription_count() for publisher in self.used)
-                and self.go_to.server_is_ready()
-                and self.count_publishers('state')
-                and self.count_publishers('cmd_vel')
-            ),
-            'no driver',
-        )
-
-    # ---- what the robot says -----------------------------------------------------------------
-
-    def odometry_message(self, stamp=None):
-        state = self.body.robot_state()
-        message = Odometry()
-        message.header.stamp = stamp_to_ros(self.step * NANOSECONDS if stamp is None else stamp)
-        message.pose.pose = pose_to_ros(compose(inverse(self.start), state.pose))
-        turn = state.pose.rotation().T
-        linear, angular = message.twist.twist.linear, message.twist.twist.angular
-        linear.x, linear.y, linear.z = (turn @ state.velocity).tolist()
-        angular.x, angular.y, angular.z = state.angular_velocity.tolist()
-        return message
-
-    def move(self, steps=1):
-        """Go on in time: odometry, and the command for it."""
-        for _ in range(steps):
-            self.step += 1
-            known = len(self.commands)
-            self.odometry.publish(self.odometry_message())
-            self.until(
-                lambda known=known: (
-                    len(self.commands) > known and self.states[-1:] and self.state.step == self.step
-                ),
-                'no command',
-            )
-            self.body.step(self.command, STEP)
-
-    def awaken(self):
-        """Send odometry until the driver hears it: whether it does is not known from here."""
-
-        def heard():
-            self.step += 1
-            self.odometry.publish(self.odometry_message())
-            return self.states and self.commands
-
-        self.until(heard, 'no driver')
-        self.until(lambda: self.state.step == self.step, 'no state')
-
-    @property
-    def state(self):
-        return self.states[-1]
-
-    @property
-    def command(self):
-        return numbers(self.commands[-1])
-
-    # ---- what the team says ------------------------------------------------------------------
-
-    def goal(self, position, number=1, frame='map', tolerance=0.0, step=0):
-        goal = GoToWaypoint.Goal(goal_id=number, step=step, tolerance=tolerance)
-        goal.waypoint.header.frame_id = frame
-        point = goal.waypoint.pose.position
-        point.x, point.y, point.z = (float(value) for value in position)
-        return goal
-
-    def send(self, *arguments, **options):
-        future = self.go_to.send_goal_async(self.goal(*arguments, **options))
-        self.until(future.done, 'no answer to the goal')
-        return future.result()
-
-    def send_accepted(self, *arguments, **options):
-        handle = self.send(*arguments, **options)
-        assert handle.accepted
-        return handle, handle.get_result_async()
-
-    def ask(self, stamp, robots=('rover',), step=0):
-        self.batch += 1
-        members = [
-            BatchMember(robot=name, decision=3, measurement=self.batch + 6) for name in robots
-        ]
-        self.batches.publish(
-            MeasurementBatch(id=self.batch, step=step, stamp=stamp_to_ros(stamp), members=members)
-        )
-
-    def answer(self, number=1):
-        self.until(lambda: len(self.detections) >= number, 'no detections')
-        return self.detections[number - 1]
-
-
-def numbers(message):
-    twist = message.twist if isinstance(message, TwistStamped) else message
-    return np.array([twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z])
-
-
-def parameters_of(settings):
-    return [
-        Parameter(name, value=value)
-        for name, value in flatten(DriverSettings.model_validate(settings)).items()
-    ]
-
-
-@pytest.fixture
-def play(context):
-    """Return a function that starts a driver in this process, and the team around it."""
-    started = []
-    executor = SingleThreadedExecutor(context=context)
-
-    def start(kind='turtlebot', **changes):
-        made, settings = KINDS[kind]
-        settings = settings | changes
-        driver = made(
-            context=context, namespace='/rover', parameter_overrides=parameters_of(settings)
-        )
-        executor.add_node(driver)
-        team = Team(context, settings, executor)
-        started.extend([driver, team])
-        assert driver.trigger_configure().name == 'SUCCESS'
-        assert driver.trigger_activate().name == 'SUCCESS'
-        team.connect()
-        return driver, team
-
-    yield start
-    for node in started:
-        if hasattr(node, 'halt'):
-            node.halt()
-        node.destroy_node()
-    executor.shutdown()
-
-
-def rendered(team, targets, pose):
-    """Return what the robot's camera sees, as an image message without its stamp."""
-    floor = RenderSettings.ideal()
-    world = World.from_settings(
-        EnvironmentSettings(bounds=BOUNDS), TargetSettings(positions=targets), 1
-    )
-    camera = Camera.from_settings(team.settings.camera)
-    image = CameraRenderer(camera, floor, scene_of(world, floor, 1), 1, 'rover').render(pose, 0, 0)
-    return image_message(image)
-
-
-def image_message(image, stamp=0):
-    height, width, _ = image.shape
-    message = Image(height=height, width=width, encoding='rgb8', step=3 * width)
-    message.data = image.tobytes()
-    message.header.stamp = stamp_to_ros(stamp)
-    return message
-
-
-def stamped(message, stamp):
-    message.header.stamp = stamp_to_ros(stamp)
-    return message
-
 
 # ---- goals -----------------------------------------------------------------------------------
 
@@ -418,36 +142,6 @@ def test_a_goal_that_makes_no_sense_is_refused(play, capfd, changes, field):
 # ---- odometry that is missing or bad ---------------------------------------------------------
 
 
-@pytest.mark.parametrize('frozen', [False, True])
-def test_without_odometry_the_robot_is_stopped(play, frozen):
-    _, team = play(odometry_timeout=0.3)
-    team.move()
-    _, result = team.send_accepted([1.5, 1.5, 0.0])
-    team.move(20)
-    assert np.any(team.command != 0.0)
-
-    def stopped():
-        if frozen:
-            team.odometry.publish(team.odometry_message())
-        return team.state.goal_status == AgentState.UNAVAILABLE
-
-    team.until(stopped)
-    assert 'no odometry for' in team.state.reason
-    team.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert 'no odometry for' in result.result().result.reason
-    known = len(team.commands), len(team.states)
-    team.until(lambda: len(team.commands) >= known[0] + 3 and len(team.states) > known[1])
-    assert_array_equal([numbers(item) for item in team.commands[-3:]], np.zeros((3, 4)))
-    assert not team.send([1.0, 1.0, 0.0]).accepted
-    team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
-    team.step += 1
-    team.odometry.publish(team.odometry_message())
-    team.until(lambda: team.state.step == team.step)
-    assert team.state.goal_status == AgentState.ABORTED
-    assert team.send([1.0, 1.0, 0.0]).accepted
-
-
 def test_bad_odometry_is_counted_and_nothing_else(play):
     driver, team = play()
     team.move(3)
@@ -482,28 +176,6 @@ def test_a_jump_of_the_stamps_begins_anew(play):
     team.until(result.done)
     assert result.result().status == GoalStatus.STATUS_ABORTED
     assert 'back' in result.result().result.reason
-
-
-def test_a_low_battery_ends_the_way(play):
-    _, team = play(battery_minimum=0.2)
-    team.move()
-    _, result = team.send_accepted([1.5, 1.5, 0.0])
-    team.battery.publish(BatteryState(percentage=0.5))
-    team.until(lambda: team.move() or team.state.battery == pytest.approx(0.5))
-    assert team.state.goal_status == AgentState.MOVING
-    team.battery.publish(BatteryState(percentage=0.1))
-    team.until(result.done)
-    team.move()
-    assert team.state.goal_status == AgentState.UNAVAILABLE
-    assert 'battery at 0.10' in team.state.reason
-    assert_array_equal(team.command, np.zeros(4))
-
-
-def test_a_twist_without_a_stamp_for_a_robot_that_wants_it(play):
-    _, team = play(command_type='twist')
-    team.send_accepted([1.0, 1.0, 0.0])
-    team.move(3)
-    assert np.any(team.command != 0.0)
 
 
 # ---- measurements ----------------------------------------------------------------------------
@@ -644,16 +316,6 @@ def test_ranges_pass_through_as_they_come(play):
 # ---- lockstep --------------------------------------------------------------------------------
 
 
-def lockstep_step(team, k, robots=('rover',), first='odom'):
-    team.step = k
-    message = LockstepStep(step=k, stamp=stamp_to_ros(k * NANOSECONDS), robots=robots)
-    if first == 'odom' and 'rover' in robots:
-        team.odometry.publish(team.odometry_message())
-    team.steps.publish(message)
-    if first != 'odom':
-        team.odometry.publish(team.odometry_message())
-
-
 @pytest.mark.parametrize('first', ['odom', 'step'])
 def test_in_lockstep_each_step_has_a_state_a_command_and_an_end(play, first):
     _, team = play(lockstep=True)
@@ -746,82 +408,3 @@ def test_a_driver_is_ready_once_filter_and_planner_hear_it(play, context):
 def test_what_lockstep_cannot_wait_for_is_wrong_input(changes):
     with pytest.raises(ValueError, match=r'command_type|stamp_offset'):
         DriverSettings.model_validate(TURTLEBOT | {'lockstep': True} | changes)
-
-
-# ---- processes -------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def process(context, tmp_path):
-    """Return a function that starts a driver as a process of its own."""
-    running = []
-
-    def start():
-        file = tmp_path / 'parameters.yaml'
-        flat = flatten(DriverSettings.model_validate(TURTLEBOT))
-        file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-        command = [sys.executable, '-m', 'maasi_drivers.turtlebot_driver', '--ros-args']
-        command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
-        running.append(subprocess.Popen(command, env=os.environ.copy()))
-        return running[-1]
-
-    yield start
-    for item in running:
-        if item.poll() is None:
-            item.kill()
-        item.wait()
-
-
-@pytest.fixture
-def team(context):
-    executor = SingleThreadedExecutor(context=context)
-    team = Team(context, TURTLEBOT, executor)
-    yield team
-    executor.shutdown()
-    team.destroy_node()
-
-
-def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, team):
-    guard = GuardNode(context=context, namespace='/rover')
-    team.executor_used.add_node(guard)
-    assert guard.trigger_configure().name == 'SUCCESS'
-    assert guard.trigger_activate().name == 'SUCCESS'
-    driver = process()
-    team.connect()
-    team.awaken()
-    team.send_accepted([1.5, 1.5, 0.0])
-    team.move(20)
-    assert np.any(team.command != 0.0)
-    assert all(message.header.frame_id for message in team.commands), 'the guard has spoken'
-    driver.send_signal(signal.SIGKILL)
-    driver.wait()
-    known = len(team.commands)
-    team.until(lambda: len(team.commands) >= known + 3)
-    assert_array_equal([numbers(item) for item in team.commands[known:]], np.zeros((3, 4)))
-    assert team.commands[-1].header.stamp == stamp_to_ros(team.step * NANOSECONDS)
-    process()
-    team.until(lambda: not guard.status()['stopping'])
-    team.connect()
-    team.states.clear()
-    team.awaken()
-    known = len(team.commands)
-    team.move(20)
-    assert len(team.commands) == known + 20
-    guard.destroy_node()
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_driver_that_is_told_to_end_leaves_zeros(process, team, number):
-    driver = process()
-    team.connect()
-    team.awaken()
-    _, result = team.send_accepted([1.5, 1.5, 0.0])
-    team.move(20)
-    assert np.any(team.command != 0.0)
-    driver.send_signal(number)
-    team.until(lambda: driver.poll() is not None)
-    assert driver.returncode == 0
-    team.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert result.result().result.reason == 'the driver stops'
-    team.until(lambda: not np.any(team.command))

@@ -81,7 +81,7 @@ def test_what_cameras_of_small_computers_send_is_decoded(encoding, padding):
     ('encoding', 'height', 'width'), [('yuyv', 4, 5), ('nv12', 5, 4), ('nv21', 4, 5)]
 )
 def test_odd_sizes_of_subsampled_colours_are_refused(encoding, height, width):
-    with pytest.raises(ValueError, match='image size: got .* allowed are even numbers'):
+    with pytest.raises(ValueError, match=r'image size: got .* allowed are even numbers'):
         image_to_array(height, width, encoding, 2 * width, bytes(2 * width * height))
 
 

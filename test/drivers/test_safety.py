@@ -1,0 +1,294 @@
+"""
+What goes wrong, and what the robot does about it.
+
+Where time counts it is that of the odometry's stamps, or a setting: see `LATEST`.
+"""
+
+import math
+import signal
+import time
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import Twist
+from numpy.testing import assert_array_equal
+from rclpy.executors import SingleThreadedExecutor
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, image_message, numbers
+from sensor_msgs.msg import BatteryState
+
+from maasi_drivers.agent_driver import _WATCH_PERIOD
+from maasi_drivers.driver_settings import LIVELINESS_LEASE, DriverSettings
+from maasi_drivers.guard_node import _STOP_PERIOD, GuardNode
+from maasi_filter.conversions import stamp_to_ros
+from maasi_msgs.msg import AgentState
+
+# After a fault the robot has been stopped by then [s].
+LATEST = 1.5
+
+
+def noise(seed):
+    generator = np.random.default_rng(seed)
+    return generator.integers(100, 140, (120, 160, 3)).astype(np.uint8)
+
+
+def gives_up(team, result, reason):
+    """Check that the robot is stopped, the goal is ended, and that the planner hears why."""
+    team.until(result.done)
+    assert result.result().status == GoalStatus.STATUS_ABORTED
+    assert reason in result.result().result.reason
+    assert team.state.goal_status == AgentState.UNAVAILABLE
+    assert reason in team.state.reason
+    assert_array_equal(team.command, np.zeros(4))
+    assert not team.send([1.0, 1.0, 0.0]).accepted
+
+
+def steps_until_stopped(team, move=None):
+    """Go on until the robot cannot; return for how long [s]."""
+    for step in range(1, 200):
+        (move or team.move)()
+        if team.state.goal_status == AgentState.UNAVAILABLE:
+            return step * STEP
+    raise AssertionError('the robot goes on')
+
+
+def test_what_is_waited_for_is_short_enough():
+    settings = DriverSettings.model_validate({'environment': TURTLEBOT['environment']})
+    # A stalled driver looks once more before it believes that the odometry is gone.
+    assert settings.odometry_timeout + 3.0 * _WATCH_PERIOD <= LATEST
+    assert LIVELINESS_LEASE + _STOP_PERIOD <= LATEST
+    assert settings.frozen_pose_timeout + 2.0 * STEP <= LATEST
+    assert settings.sensor_patience + 2.0 * STEP <= LATEST
+
+
+@pytest.mark.parametrize('frozen', [False, True])
+def test_without_odometry_the_robot_is_stopped(play, frozen):
+    _, team = play(odometry_timeout=0.3)
+    team.move()
+    _, result = team.send_accepted([1.5, 1.5, 0.0])
+    team.move(20)
+    assert np.any(team.command != 0.0)
+
+    def stopped():
+        if frozen:
+            team.odometry.publish(team.odometry_message())
+        return team.state.goal_status == AgentState.UNAVAILABLE
+
+    team.until(stopped)
+    assert 'no odometry for' in team.state.reason
+    team.until(result.done)
+    assert result.result().status == GoalStatus.STATUS_ABORTED
+    assert 'no odometry for' in result.result().result.reason
+    known = len(team.commands), len(team.states)
+    team.until(lambda: len(team.commands) >= known[0] + 3 and len(team.states) > known[1])
+    assert_array_equal([numbers(item) for item in team.commands[-3:]], np.zeros((3, 4)))
+    assert not team.send([1.0, 1.0, 0.0]).accepted
+    team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
+    team.step += 1
+    team.odometry.publish(team.odometry_message())
+    team.until(lambda: team.state.step == team.step)
+    assert team.state.goal_status == AgentState.ABORTED
+    assert team.send([1.0, 1.0, 0.0]).accepted
+
+
+def test_a_low_battery_ends_the_way(play):
+    _, team = play(battery_minimum=0.2)
+    team.move()
+    _, result = team.send_accepted([1.5, 1.5, 0.0])
+    team.battery.publish(BatteryState(percentage=0.5))
+    team.until(lambda: team.move() or team.state.battery == pytest.approx(0.5))
+    assert team.state.goal_status == AgentState.MOVING
+    team.battery.publish(BatteryState(percentage=0.1))
+    team.until(result.done)
+    team.move()
+    assert team.state.goal_status == AgentState.UNAVAILABLE
+    assert 'battery at 0.10' in team.state.reason
+    assert_array_equal(team.command, np.zeros(4))
+
+
+def test_a_twist_without_a_stamp_for_a_robot_that_wants_it(play):
+    _, team = play(command_type='twist')
+    team.send_accepted([1.0, 1.0, 0.0])
+    team.move(3)
+    assert np.any(team.command != 0.0)
+
+
+def test_odometry_that_is_not_finite_is_no_odometry(play):
+    driver, team = play(odometry_timeout=0.3)
+    team.move()
+    _, result = team.send_accepted([1.5, 1.5, 0.0])
+    team.move(20)
+
+    def stopped():
+        team.step += 1
+        bad = team.odometry_message()
+        bad.pose.pose.position.y = math.nan
+        team.odometry.publish(bad)
+        return team.state.goal_status == AgentState.UNAVAILABLE
+
+    team.until(stopped)
+    team.until(lambda: not np.any(team.command))
+    gives_up(team, result, 'no odometry for')
+    assert driver.dropped['odometry'] > 3
+
+
+@pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
+def test_a_pose_that_hangs_under_a_command_to_move_stops_the_robot(play, kind):
+    _, team = play(kind)
+    team.move()
+    _, result = team.send_accepted(team.start.position + np.array([0.8, 0.5, 0.0]))
+    team.move(20)
+    message = team.odometry_message()
+
+    def hang():
+        team.step += 1
+        message.header.stamp = stamp_to_ros(team.step * NANOSECONDS)
+        team.odometry.publish(message)
+        team.until(lambda: team.state.step == team.step)
+
+    assert steps_until_stopped(team, hang) <= LATEST
+    team.until(lambda: not np.any(team.command))
+    gives_up(team, result, 'the pose has not changed for')
+    # It is pushed, and says so: it can be trusted.
+    team.body.step([0.2, 0.0, 0.0, 0.3], 0.5)
+    team.move()
+    assert team.state.goal_status == AgentState.ABORTED
+    assert team.send([1.0, 1.0, 1.0 if kind == 'mambo' else 0.0]).accepted
+
+
+def test_a_robot_that_stands_may_have_the_same_pose_for_long(play):
+    _, team = play()
+    team.move(60)
+    assert team.state.goal_status == AgentState.IDLE
+
+
+@pytest.mark.parametrize('fault', ['silent', 'repeats itself'])
+def test_a_camera_that_hangs_stops_the_robot(play, fault):
+    _, team = play(sensor_timeout=None)
+    seed = 0
+
+    def move(new=True):
+        nonlocal seed
+        team.move()
+        seed += new
+        if new or fault == 'repeats itself':
+            team.images.publish(image_message(noise(seed), team.step * NANOSECONDS))
+
+    move()
+    _, result = team.send_accepted([1.5, 1.5, 0.0])
+    for _ in range(30):
+        move()
+    assert team.state.goal_status == AgentState.MOVING
+    assert steps_until_stopped(team, lambda: move(new=False)) <= LATEST
+    gives_up(team, result, 'no new image for')
+    for _ in range(30):
+        move(new=False)
+    assert team.state.goal_status == AgentState.UNAVAILABLE
+    for _ in range(3):
+        move()
+    team.until(lambda: move() or team.state.goal_status == AgentState.ABORTED)
+    assert team.send([1.0, 1.0, 0.0]).accepted
+
+
+def test_a_camera_that_was_never_there_is_said(play):
+    _, team = play(sensor_timeout=None)
+    assert steps_until_stopped(team) <= LATEST
+    assert 'no new image' in team.state.reason
+    assert not team.send([1.0, 1.0, 0.0]).accepted
+
+
+def test_a_battery_that_speaks_per_cent_is_not_full_at_one_per_cent(play):
+    _, team = play(battery_minimum=0.2)
+    team.move()
+    for percentage in (80.0, 15.0, 0.9):
+        team.battery.publish(BatteryState(percentage=percentage))
+        charge = pytest.approx(0.01 * percentage)
+        team.until(lambda charge=charge: team.move() or team.state.battery == charge)
+    assert team.state.goal_status == AgentState.UNAVAILABLE
+    team.battery.publish(BatteryState(percentage=90.0))
+    team.until(lambda: team.move() or team.state.goal_status == AgentState.IDLE)
+
+
+@pytest.mark.parametrize('frame', ['other/odom', '/other/odom'])
+def test_the_odometry_of_another_robot_is_refused(play, capfd, frame):
+    driver, team = play()
+    for allowed in ('odom', 'rover/odom', '/rover/odom', ''):
+        team.odometry_frame = allowed
+        team.move()
+    team.odometry_frame = frame
+    team.step += 1
+    team.odometry.publish(team.odometry_message())
+    team.until(lambda: driver.dropped['odometry'] == 1)
+    assert 'header.frame_id: read' in capfd.readouterr().err
+
+
+def test_the_type_of_the_commands_is_found_out(play):
+    """Humble's TurtleBot3 listens to Twist, Jazzy's to TwistStamped."""
+    _, team = play(wants=Twist)
+    team.send_accepted([1.0, 1.0, 0.0])
+    team.move(3)
+    assert np.any(team.command != 0.0)
+
+
+def test_it_is_said_that_nobody_listens(context, process, capfd):
+    """The robot is a process of its own: one process cannot have two types under one name."""
+    driver = process(command_type='stamped')
+    executor = SingleThreadedExecutor(context=context)
+    team = Team(context, TURTLEBOT, executor, wants=Twist, deaf=True)
+    end = time.monotonic() + 30.0
+    said = ''
+    while 'see the parameter command_type' not in said and time.monotonic() < end:
+        team.step += 1
+        team.odometry.publish(team.odometry_message())
+        team.executor_used.spin_once(timeout_sec=0.05)
+        said += capfd.readouterr().err
+    assert 'nobody listens; the robot wants geometry_msgs/msg/Twist' in said
+    assert driver.poll() is None
+    executor.shutdown()
+    team.destroy_node()
+
+
+def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, team):
+    guard = GuardNode(context=context, namespace='/rover')
+    team.executor_used.add_node(guard)
+    assert guard.trigger_configure().name == 'SUCCESS'
+    assert guard.trigger_activate().name == 'SUCCESS'
+    driver = process()
+    team.connect()
+    team.awaken()
+    team.send_accepted([1.5, 1.5, 0.0])
+    team.move(20)
+    assert np.any(team.command != 0.0)
+    assert all(message.header.frame_id for message in team.commands), 'the guard has spoken'
+    driver.send_signal(signal.SIGKILL)
+    driver.wait()
+    known = len(team.commands)
+    team.until(lambda: len(team.commands) >= known + 3)
+    assert_array_equal([numbers(item) for item in team.commands[known:]], np.zeros((3, 4)))
+    assert team.commands[-1].header.stamp == stamp_to_ros(team.step * NANOSECONDS)
+    process()
+    team.until(lambda: not guard.status()['stopping'])
+    team.connect()
+    team.states.clear()
+    team.awaken()
+    known = len(team.commands)
+    team.move(20)
+    assert len(team.commands) == known + 20
+    guard.destroy_node()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_driver_that_is_told_to_end_leaves_zeros(process, team, number):
+    driver = process()
+    team.connect()
+    team.awaken()
+    _, result = team.send_accepted([1.5, 1.5, 0.0])
+    team.move(20)
+    assert np.any(team.command != 0.0)
+    driver.send_signal(number)
+    team.until(lambda: driver.poll() is not None)
+    assert driver.returncode == 0
+    team.until(result.done)
+    assert result.result().status == GoalStatus.STATUS_ABORTED
+    assert result.result().result.reason == 'the driver stops'
+    team.until(lambda: not np.any(team.command))
