@@ -405,6 +405,13 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             self._answer_step()
 
     def _place(self, stamp: int, message: Odometry) -> StampedPose:
+        frame, wanted = message.header.frame_id.lstrip('/'), self.settings.odometry_frame
+        space = frame.rpartition('/')[0]
+        if (frame != wanted) if wanted else (space not in ('', self.robot, self._namespace)):
+            raise ValueError(
+                f'header.frame_id: read {frame!r}, allowed is '
+                + (repr(wanted) if wanted else f"'odom' or '{self.robot}/odom' (odometry_frame)")
+            )
         pose = pose_from_ros(message.pose.pose)
         covariance = np.asarray(message.pose.covariance)
         if self._odometry is None:
