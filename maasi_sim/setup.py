@@ -21,6 +21,7 @@ setup(
         'console_scripts': [
             'sim_node = maasi_sim.sim_node:main',
             'fake_mambo = maasi_sim.fake_mambo:main',
+            'fake_mavlink_vehicle = maasi_sim.fake_mavlink_vehicle:main',
             'run_scenario = maasi_sim.run_scenario:main',
         ],
     },

@@ -1,0 +1,116 @@
+"""A vehicle's driver side and a fake autopilot on a wire in memory, in simulated time."""
+
+import numpy as np
+from pymavlink import mavutil
+
+from maasi_drivers.mavlink.settings import MavlinkSettings
+from maasi_drivers.mavlink.vehicle import Phase, Vehicle
+from maasi_sim.fake_autopilot import AutopilotSettings, FakeAutopilot
+
+mavlink = mavutil.mavlink
+PERIOD = 0.02
+FIRMWARES = ('arducopter', 'px4', 'ardusub')
+HEIGHTS = {'arducopter': 2.0, 'px4': 2.0, 'ardusub': -1.5}
+
+
+class Wire:
+    """One direction: bytes in, messages out."""
+
+    def __init__(self):
+        self.data = bytearray()
+        self.messages = []
+        self.cut = False
+        self._parser = mavlink.MAVLink(None)
+
+    def write(self, data):
+        if not self.cut:
+            self.data += data
+
+    def take(self):
+        data, self.data = bytes(self.data), bytearray()
+        messages = self._parser.parse_buffer(data) or []
+        self.messages += messages
+        return messages
+
+
+class Play:
+    """Both sides, and what went over the wire."""
+
+    def __init__(self, firmware='arducopter', autopilot=None, **changes):
+        kind = 'submarine' if firmware == 'ardusub' else 'copter'
+        settings = {'vehicle': kind, 'arm': True} | changes
+        self.to_driver, self.to_autopilot = Wire(), Wire()
+        self.vehicle = Vehicle(
+            MavlinkSettings.model_validate(settings),
+            HEIGHTS[firmware],
+            mavlink.MAVLink(self.to_autopilot, 255, 190),
+        )
+        self.vehicle.wanted = True
+        self.autopilot = FakeAutopilot(
+            AutopilotSettings.model_validate({'firmware': firmware} | (autopilot or {})),
+            mavlink.MAVLink(self.to_driver, 1, 1),
+            0.3,
+            np.random.default_rng(1),
+        )
+        self.now = 100.0
+        self.driver_lives = True
+        self.reports = []
+
+    def cut(self):
+        self.to_driver.cut = self.to_autopilot.cut = True
+
+    def turn(self):
+        self.now += PERIOD
+        self.autopilot.advance(PERIOD)
+        heard = self.to_driver.take()
+        if self.driver_lives:
+            for message in heard:
+                self.vehicle.handle(message, self.now)
+            self.vehicle.tick(self.now)
+            self.reports += self.vehicle.reports()
+        for message in self.to_autopilot.take():
+            self.autopilot.handle(message)
+
+    def run(self, seconds):
+        for _ in range(round(seconds / PERIOD)):
+            self.turn()
+
+    def until(self, condition, limit=60.0):
+        end = self.now + limit
+        while not condition():
+            assert self.now < end, (self.vehicle.trouble, self.reports[-8:])
+            self.turn()
+
+    def fly(self):
+        self.until(lambda: self.vehicle.flying)
+        return self
+
+    def go(self, ahead=0.4, direction=(1.0, 0.0, 0.0), seconds=2.0):
+        """Fly with the setpoint so far ahead, as the driver has it."""
+        end = self.now + seconds
+        while self.now < end:
+            self.lead(ahead, direction)
+            self.turn()
+        return self
+
+    def lead(self, ahead, direction=(1.0, 0.0, 0.0)):
+        if self.vehicle.phase is Phase.FLYING:
+            position = self.vehicle.telemetry.position
+            self.vehicle.set_target(position + ahead * np.array(direction), 0.3)
+
+    def until_lost(self):
+        self.until(lambda: self.vehicle.trouble)
+
+    @property
+    def speed(self):
+        return float(np.linalg.norm(self.autopilot.body.velocity))
+
+    @property
+    def said(self):
+        return ' | '.join(text for _, text in self.reports)
+
+    def sent(self, kind):
+        return [item for item in self.to_autopilot.messages if item.get_type() == kind]
+
+    def commands(self, number):
+        return [item for item in self.sent('COMMAND_LONG') if item.command == number]

@@ -1,0 +1,346 @@
+"""What the driver says to an autopilot, against a fake one, in simulated time."""
+
+import math
+
+import numpy as np
+import pytest
+from mavlink_play import FIRMWARES, HEIGHTS, Play, mavlink
+from numpy.testing import assert_allclose
+from pydantic import ValidationError
+
+from maasi_drivers.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, identify
+from maasi_drivers.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation, swap_yaw
+from maasi_drivers.mavlink.settings import MavlinkSettings
+from maasi_drivers.mavlink.vehicle import Phase
+from maasi_filter.pose import Pose
+
+# What the robot may take until it has stopped [s], and what counts as that [m/s].
+AT_MOST, STOPPED = 1.5, 0.1
+SPEED = 0.4
+ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+firmwares = pytest.mark.parametrize('firmware', FIRMWARES)
+
+
+def test_north_east_down_is_east_north_up():
+    assert_allclose(swap_enu_ned([1.0, 2.0, 3.0]), [2.0, 1.0, -3.0])
+    assert_allclose(swap_flu_frd([1.0, 2.0, 3.0]), [1.0, -2.0, -3.0])
+    assert swap_yaw(0.0) == pytest.approx(math.pi / 2)
+    assert swap_yaw(swap_yaw(2.5)) == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.3, 2.0, -3.0])
+def test_orientations_turn_their_axes_with_them(yaw):
+    half = 0.5 * yaw
+    ned = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+    pose = Pose(np.zeros(3), swap_orientation(ned))
+    # Forward, left and up of the body, in ENU.
+    forward, left, up = pose.rotation().T
+    assert_allclose(forward, swap_enu_ned([math.cos(yaw), math.sin(yaw), 0.0]), atol=1e-12)
+    assert_allclose(left, swap_enu_ned([math.sin(yaw), -math.cos(yaw), 0.0]), atol=1e-12)
+    assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-12)
+    assert_allclose(np.abs(swap_orientation(swap_orientation(ned)) @ ned), 1.0)
+
+
+def test_a_heartbeat_tells_the_firmware():
+    assert identify(3, 2) is ARDUCOPTER
+    assert identify(3, 12) is ARDUSUB
+    assert identify(12, 2) is PX4_COPTER
+    with pytest.raises(ValueError, match='HEARTBEAT: read autopilot 3, type 10'):
+        identify(3, 10)
+
+
+@pytest.mark.parametrize(
+    'changes, word',
+    [
+        ({'geofence': [[0, 1], [1, 0], [0, 1]]}, 'geofence'),
+        ({'system': 255}, 'own_system'),
+        ({'lead': math.nan}, 'lead'),
+        ({'url': ''}, 'url'),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(changes, word):
+    with pytest.raises(ValidationError, match=word):
+        MavlinkSettings.model_validate(changes)
+
+
+@firmwares
+def test_a_vehicle_is_armed_and_brought_to_its_height(firmware):
+    play = Play(firmware).fly()
+    assert play.autopilot.armed
+    assert play.autopilot.mode_name in ('GUIDED', 'OFFBOARD')
+    play.run(4.0)
+    assert play.autopilot.body.position[2] == pytest.approx(HEIGHTS[firmware], abs=0.1)
+    assert_allclose(play.autopilot.body.position[:2], 0.0, atol=0.1)
+    assert play.speed < STOPPED
+    took_off = play.commands(mavlink.MAV_CMD_NAV_TAKEOFF)
+    assert bool(took_off) == (firmware == 'arducopter')
+    assert play.vehicle.trouble == ''
+
+
+@firmwares
+def test_it_flies_to_a_target_and_stays_there(firmware):
+    play = Play(firmware).fly()
+    target = np.array([1.0, -2.0, HEIGHTS[firmware] + 0.3])
+    play.vehicle.set_target(target, -1.0)
+    play.run(12.0)
+    assert_allclose(play.autopilot.body.position, target, atol=0.05)
+    assert play.autopilot.body.yaw == pytest.approx(-1.0, abs=0.01)
+    telemetry = play.vehicle.telemetry
+    assert_allclose(telemetry.position, target, atol=0.08)
+    assert Pose(np.zeros(3), telemetry.orientation).yaw == pytest.approx(-1.0, abs=0.01)
+    assert play.autopilot.crashed == ''
+
+
+@firmwares
+def test_nothing_is_armed_without_being_told(firmware):
+    play = Play(firmware, arm=False)
+    play.run(20.0)
+    assert play.vehicle.phase is Phase.WAITING
+    assert play.vehicle.trouble == 'vehicle: not armed: arm is false'
+    assert not play.autopilot.armed
+    assert not play.commands(ARM)
+    assert not play.commands(mavlink.MAV_CMD_DO_SET_MODE)
+    assert not play.sent('SET_POSITION_TARGET_LOCAL_NED')
+
+
+def test_nothing_is_armed_while_the_driver_is_not_active():
+    play = Play()
+    play.vehicle.wanted = False
+    play.run(10.0)
+    assert not play.commands(ARM)
+    assert 'not active' in play.vehicle.trouble
+
+
+def test_nothing_is_armed_without_a_failsafe_for_the_link():
+    play = Play(autopilot={'parameters': {'FS_GCS_ENABLE': 0}})
+    play.run(10.0)
+    assert not play.commands(ARM)
+    assert 'failsafe FS_GCS_ENABLE is 0, and require_failsafe is true' in play.vehicle.trouble
+    play = Play(autopilot={'parameters': {'FS_GCS_ENABLE': 0}}, require_failsafe=False)
+    assert play.fly().autopilot.armed
+
+
+@firmwares
+def test_failsafes_are_read_and_shown(firmware):
+    play = Play(firmware)
+    play.run(6.0)
+    guard, value = {
+        'arducopter': ('FS_GCS_ENABLE', 5),
+        'ardusub': ('FS_GCS_ENABLE', 4),
+        'px4': ('COM_OBL_RC_ACT', 4),
+    }[firmware]
+    # PX4 sends whole numbers as bytes.
+    assert play.vehicle.parameters[guard] == value
+    assert f'{guard} is {value}' in play.said
+    if firmware == 'ardusub':
+        assert 'FS_EKF_ACTION is 0, which is off' in play.said
+
+
+def test_another_ground_station_is_warned_of():
+    play = Play(own_system=250)
+    play.run(6.0)
+    assert 'SYSID_MYGCS or MAV_GCS_SYSID is 255, own_system is 250' in play.said
+
+
+def test_reasons_against_arming_are_shown():
+    play = Play(autopilot={'charge': 0.01})
+    play.run(12.0)
+    assert 'PreArm: Battery below minimum' in play.said
+    assert 'MAV_CMD_COMPONENT_ARM_DISARM: FAILED' in play.said
+    assert 'PreArm: Battery below minimum' in play.vehicle.trouble
+    assert not play.autopilot.armed
+
+
+def test_before_the_estimate_nothing_is_asked_for():
+    play = Play(autopilot={'estimator_time': 15.0})
+    play.run(14.0)
+    assert 'no position estimate yet' in play.vehicle.trouble
+    assert not play.commands(ARM)
+    play.fly()
+
+
+@pytest.mark.parametrize('kind', [{'vehicle': 'submarine'}, {'vehicle': 'copter', 'system': 7}])
+def test_vehicles_of_another_kind_or_id_are_left_alone(kind):
+    play = Play(**kind)
+    play.run(8.0)
+    assert not play.autopilot.armed
+    assert not play.sent('COMMAND_LONG')
+    assert ('is left alone' in play.vehicle.trouble) == ('system' not in kind)
+
+
+@pytest.mark.parametrize('bad', [math.nan, math.inf])
+def test_targets_that_are_not_finite_are_refused(bad):
+    play = Play().fly()
+    with pytest.raises(ValueError, match='setpoint: got'):
+        play.vehicle.set_target([0.0, bad, 2.0], 0.0)
+    with pytest.raises(ValueError, match='setpoint: got'):
+        play.vehicle.set_target([0.0, 0.0, 2.0], bad)
+    play.run(2.0)
+    assert play.autopilot.crashed == ''
+
+
+def test_a_setpoint_that_is_not_finite_crashes_the_fake():
+    play = Play().fly()
+    play.vehicle._sender.set_position_target_local_ned_send(
+        0, 1, 1, 1, 0x9F8, math.nan, *[0.0] * 10
+    )
+    play.run(1.0)
+    assert 'not finite' in play.autopilot.crashed
+    assert 'floating point exception' in play.said
+
+
+@firmwares
+def test_a_dead_driver_leaves_a_vehicle_that_stops(firmware):
+    play = Play(firmware).fly().go(SPEED)
+    before = play.autopilot.body.position.copy()
+    assert play.speed > 0.7 * SPEED
+    play.driver_lives = False
+    play.run(AT_MOST)
+    assert play.speed < STOPPED or play.autopilot.mode == play.autopilot.firmware.land
+    assert np.linalg.norm((play.autopilot.body.position - before)[:2]) <= SPEED + 0.05
+    # The autopilot's own failsafe ends it.
+    play.run(8.0)
+    assert play.autopilot.mode == play.autopilot.firmware.land
+
+
+@firmwares
+def test_with_a_cut_link_it_stops_and_the_driver_says_so(firmware):
+    play = Play(firmware).fly().go(SPEED)
+    play.cut()
+    play.run(AT_MOST)
+    assert np.linalg.norm(play.autopilot.body.velocity[:2]) < STOPPED
+    assert play.vehicle.trouble == 'link: nothing heard from system 1'
+    assert not play.vehicle.flying
+    assert 'link: nothing heard for 0.6 s' in play.said
+
+
+def test_after_a_short_cut_it_holds_where_it_is():
+    play = Play().fly().go(SPEED)
+    play.cut()
+    play.run(1.0)
+    play.to_driver.cut = play.to_autopilot.cut = False
+    play.run(1.0)
+    assert play.vehicle.flying
+    assert 'link: it is back' in play.said
+    play.run(2.0)
+    assert play.speed < STOPPED
+
+
+def test_a_frozen_position_is_no_news():
+    play = Play().fly()
+    play.autopilot.freeze()
+    play.run(0.2)
+    number = play.vehicle.telemetry.number
+    play.run(AT_MOST)
+    assert play.vehicle.telemetry.number == number
+    assert play.vehicle.dropped['LOCAL_POSITION_NED that is frozen'] > 10
+
+
+def test_a_position_that_is_not_finite_is_dropped():
+    play = Play().fly()
+    number = play.vehicle.telemetry.number
+    play.autopilot._frozen = (math.nan, *[0.0] * 5)
+    play.run(1.0)
+    assert play.vehicle.telemetry.number - number <= 1
+    assert play.vehicle.dropped['LOCAL_POSITION_NED that is not finite'] > 10
+    play.autopilot._frozen = None
+
+
+@firmwares
+def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
+    play = Play(firmware).fly().go(SPEED)
+    play.autopilot.take_mode({'px4': 'POSCTL'}.get(firmware, 'ALT_HOLD'))
+    play.run(AT_MOST)
+    assert 'the pilot has taken over: mode' in play.vehicle.trouble
+    assert 'the driver lets go' in play.said
+    sent = len(play.to_autopilot.messages)
+    for _ in range(200):
+        play.lead(SPEED)
+        play.turn()
+    # Heartbeats go on, as the autopilot would miss them; nothing else does.
+    kinds = {item.get_type() for item in play.to_autopilot.messages[sent:]}
+    assert kinds == {'HEARTBEAT'}
+    # The end of the driver is no reason to take it back.
+    play.vehicle.finish('land')
+    assert play.vehicle.at_rest
+    play.run(1.0)
+    assert play.autopilot.mode_name in ('POSCTL', 'ALT_HOLD')
+
+
+def test_a_pilot_can_give_the_mode_back():
+    play = Play().fly().go(SPEED)
+    play.autopilot.take_mode('LOITER')
+    play.run(2.0)
+    here = play.autopilot.body.position.copy()
+    play.autopilot.take_mode('GUIDED')
+    play.run(3.0)
+    assert play.vehicle.flying
+    assert 'the pilot gives GUIDED back' in play.said
+    assert_allclose(play.autopilot.body.position, here, atol=0.15)
+
+
+@firmwares
+@pytest.mark.parametrize('ending', ['hold', 'land'])
+def test_the_end_is_to_hold_or_to_land(firmware, ending):
+    play = Play(firmware).fly().go(SPEED)
+    play.vehicle.finish(ending)
+    play.run(AT_MOST)
+    assert play.vehicle.at_rest
+    assert np.linalg.norm(play.autopilot.body.velocity[:2]) < STOPPED
+    fake = play.autopilot
+    assert fake.mode == (fake.firmware.land if ending == 'land' else fake.firmware.hold)
+    play.run(8.0)
+    if ending == 'land':
+        assert fake.body.position[2] == pytest.approx(0.0, abs=0.05)
+    else:
+        assert fake.armed
+        assert play.speed < 0.02
+
+
+def test_after_landing_it_is_not_armed_again():
+    play = Play().fly()
+    play.vehicle.finish('land')
+    play.run(15.0)
+    assert not play.autopilot.armed
+    assert play.vehicle.trouble == 'vehicle: is disarmed: it has landed'
+    armed = len(play.commands(ARM))
+    play.run(10.0)
+    assert len(play.commands(ARM)) == armed
+
+
+def test_a_vehicle_that_is_disarmed_in_the_air_is_left_alone():
+    play = Play().fly().go(SPEED)
+    play.autopilot._disarm('Crash: Disarming')
+    play.run(AT_MOST)
+    assert play.vehicle.phase is Phase.STOPPED
+    armed = len(play.commands(ARM))
+    play.run(10.0)
+    assert len(play.commands(ARM)) == armed
+
+
+def test_a_copter_that_the_pilot_has_in_the_air_is_taken_over_without_arming():
+    play = Play().fly()
+    other = Play(arm=False)
+    other.autopilot.armed = True
+    other.autopilot.body.position = play.autopilot.body.position.copy()
+    other.autopilot.mode = ARDUCOPTER.external
+    other.autopilot._hold()
+    other.run(6.0)
+    assert other.vehicle.flying
+    assert not other.commands(ARM)
+
+
+def test_a_vehicle_that_stands_elsewhere_counts_heights_from_there():
+    play = Play(origin='here', autopilot={'estimator_time': 0.5})
+    play.autopilot.body.position[:2] = [3.0, 4.0]
+    play.fly()
+    assert_allclose(play.vehicle.origin, [3.0, 4.0, 0.0], atol=0.05)
+
+
+def test_commands_that_are_lost_are_said_again():
+    play = Play()
+    lossy = np.random.default_rng(5)
+    write = play.to_autopilot.write
+    play.to_autopilot.write = lambda data: write(data) if lossy.random() > 0.4 else None
+    play.fly()
+    assert play.autopilot.armed
