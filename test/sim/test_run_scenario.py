@@ -327,7 +327,7 @@ def test_wrong_options_are_named(options, words, capsys):
 
 
 def test_a_wrong_planner_is_named_with_the_option():
-    with pytest.raises(ScenarioError, match="--planner: planner.name: unknown value 'masi'"):
+    with pytest.raises(ScenarioError, match=r"--planner: planner\.name: unknown value 'masi'"):
         ScenarioRun(Options('mambo', planner='masi'), interruption=False)
 
 
@@ -345,7 +345,7 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path):
     with pytest.raises(ScenarioError, match='holds a run already'):
         make_folder(tmp_path / 'run')
     (tmp_path / 'file').write_text('')
-    with pytest.raises(ScenarioError, match='--out: .*file'):
+    with pytest.raises(ScenarioError, match=r'--out: .*file'):
         make_folder(tmp_path / 'file')
 
 
