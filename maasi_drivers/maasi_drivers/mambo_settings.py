@@ -1,0 +1,106 @@
+"""Settings of the link to a Parrot Mambo."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from maasi_filter.settings import Finite, Settings
+
+Interval = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+
+
+class MamboSettings(Settings):
+    """How the driver reaches a Mambo, and what it may have it do."""
+
+    arm: bool = Field(
+        default=False, description='Whether the driver lets it take off; it never does without'
+    )
+    address: str = Field(
+        default='192.168.99.3',
+        min_length=1,
+        description='IP address over WiFi, or Bluetooth address, as pyparrot takes them',
+    )
+    port: int = Field(
+        default=43210,
+        ge=1024,
+        le=65535,
+        description='UDP port on which the drone is heard, on all interfaces of this host',
+    )
+    ground: Finite = Field(
+        default=0.0, description='Height of the floor below its start in the map [m]'
+    )
+    pose: Literal['events', 'odometry', 'pose'] = Field(
+        default='events',
+        description='Where its pose comes from: its own position events, or a topic of another '
+        'system, odom (nav_msgs/Odometry) or pose (geometry_msgs/PoseStamped, in the map)',
+    )
+    latency: float = Field(
+        default=0.0, ge=0.0, le=1.0, description='Age of a position event when it arrives [s]'
+    )
+    position_noise: float = Field(
+        default=0.01, ge=0.0, description="Deviation of a position event's numbers [m]"
+    )
+    position_growth: float = Field(
+        default=0.04,
+        ge=0.0,
+        description='Deviation of the position after each second of dead reckoning [m/s]',
+    )
+    attitude_noise: float = Field(
+        default=0.02, ge=0.0, description='Deviation of roll, pitch and heading [rad]'
+    )
+    full_speed: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=10.0,
+        description='Steady speed at the full tilt of motion.tilt; none: that of the motion model '
+        '[m/s]',
+    )
+    full_turn: float = Field(
+        default=2.6, gt=0.0, le=7.0, description='Turn rate at full yaw [rad/s]'
+    )
+    climb: float = Field(
+        default=0.5, ge=0.5, le=2.0, description='Climb at full throttle, set in the drone [m/s]'
+    )
+    link_timeout: float = Field(
+        default=1.0,
+        ge=0.6,
+        le=10.0,
+        description='Silence after which link or pose are lost: it hovers; events come every 0.5 s '
+        '[s]',
+    )
+    land_after: float = Field(
+        default=3.0, ge=0.0, description='Time without link or pose after which it lands [s]'
+    )
+    cancel_landing: float = Field(
+        default=5.0,
+        ge=0.0,
+        description='Time after a cancelled goal, without another one, after which it lands [s]',
+    )
+    take_off_timeout: float = Field(
+        default=10.0, gt=0.0, description='Time in which it has to take off [s]'
+    )
+    battery_minimum: float = Field(
+        default=0.1, ge=0.0, lt=1.0, description='Charge below which it lands [1]'
+    )
+    geofence: Annotated[list[Interval], Field(min_length=3, max_length=3)] | None = Field(
+        default=None,
+        description='Lowest and highest x, y and z of goals, and of itself with half a metre to '
+        'spare; none: the environment with the radius around it, from the ground to 1 m above '
+        'the start [m, map]',
+    )
+
+    @model_validator(mode='after')
+    def _consistent(self) -> MamboSettings:
+        for interval in self.geofence or []:
+            if interval[0] >= interval[1]:
+                raise ValueError(
+                    f'geofence: got {interval}, allowed is a lowest below a highest value'
+                )
+        return self
+
+
+# Tilt that a Mambo lets itself be set to [rad].
+LEAST_TILT, MOST_TILT = math.radians(5.0), math.radians(25.0)
