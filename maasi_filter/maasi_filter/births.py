@@ -22,21 +22,33 @@ LEAST_UNEXPLORED = 1e-6
 
 @njit(cache=True, error_model='numpy')
 def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    values, cartesian, centres, roots, volume, sensor_position, bounds, noise, particles, jacobian
+    values,
+    cartesian,
+    centres,
+    roots,
+    volume,
+    sensor_position,
+    bounds,
+    noise,
+    starts,
+    particles,
+    jacobian,
+    inside,
 ):
-    """Fill birth particles (m, J, d), and |dx/dz| at each, 0 where it is outside the bounds."""
-    number, births, d = noise.shape
+    """Fill birth particles (n, d), and |dx/dz| at each, 0 where it is outside the bounds."""
+    d = noise.shape[1]
     z = np.empty(d)
-    for m in range(number):
-        for j in range(births):
+    for m in range(values.shape[0]):
+        inside[m] = False
+        for j in range(starts[m], starts[m + 1]):
             for a in range(d):
                 total = 0.0
                 for b in range(a + 1):
-                    total += roots[m, a, b] * noise[m, j, b]
+                    total += roots[m, a, b] * noise[j, b]
                 z[a] = total
             if cartesian[m]:
                 for a in range(d):
-                    particles[m, j, a] = centres[m, a] + z[a]
+                    particles[j, a] = centres[m, a] + z[a]
                 size = volume[m]
             else:
                 for a in range(d):
@@ -47,40 +59,43 @@ def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                     cosine = math.cos(z[2])
                     level *= cosine
                     size *= abs(level)
-                    particles[m, j, 2] = sensor_position[2] + z[0] * math.sin(z[2])
+                    particles[j, 2] = sensor_position[2] + z[0] * math.sin(z[2])
                     if cosine < 0.0:
                         # Beyond straight up no measurement can point.
                         size = 0.0
-                particles[m, j, 0] = sensor_position[0] + level * math.cos(z[1])
-                particles[m, j, 1] = sensor_position[1] + level * math.sin(z[1])
+                particles[j, 0] = sensor_position[0] + level * math.cos(z[1])
+                particles[j, 1] = sensor_position[1] + level * math.sin(z[1])
                 if z[0] <= 0.0:
                     size = 0.0
             for a in range(d):
-                if not bounds[a, 0] <= particles[m, j, a] <= bounds[a, 1]:
+                if not bounds[a, 0] <= particles[j, a] <= bounds[a, 1]:
                     size = 0.0
-            jacobian[m, j] = size
+            jacobian[j] = size
+            if size > 0.0:
+                inside[m] = True
 
 
 @njit(cache=True, error_model='numpy')
 def _weigh(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    particles, jacobian, probability, prior, unexplored, values, lower, step, least
+    particles, starts, jacobian, probability, prior, unexplored, values, lower, step, least, totals
 ):
-    number, births, d = particles.shape
-    totals = np.zeros(number)
-    for m in range(number):
-        for j in range(births):
+    """Replace |dx/dz| by the intensity b of each birth, and fill its sums."""
+    d = particles.shape[1]
+    for m in range(totals.shape[0]):
+        totals[m] = 0.0
+        births = starts[m + 1] - starts[m]
+        for j in range(starts[m], starts[m + 1]):
             weight = 0.0
-            if jacobian[m, j] > 0.0:
-                weight = prior * probability[m, j] * jacobian[m, j] / births
+            if jacobian[j] > 0.0:
+                weight = prior * probability[j] * jacobian[j] / births
                 if unexplored:
-                    z = particles[m, j, 2] if d == 3 else 0.0
+                    z = particles[j, 2] if d == 3 else 0.0
                     unseen = interpolate_at(
-                        values, lower, step, particles[m, j, 0], particles[m, j, 1], z
+                        values, lower, step, particles[j, 0], particles[j, 1], z
                     )
                     weight *= max(unseen, least)
-            jacobian[m, j] = weight
+            jacobian[j] = weight
             totals[m] += weight
-    return totals
 
 
 @dataclass
@@ -89,19 +104,22 @@ class MeasurementBirths:
 
     Parameters
     ----------
-    particles : (m, J, d) array
-        Metres.
-    intensity : (m, J) array
+    particles : (n, d) array
+        Metres; those of a measurement lie together.
+    intensity : (n,) array
         b: predicted intensity times psi_z over the density of the draw, divided by J. Its sum
-        over j belongs to C(z), and b / C(z) is the posterior weight.
+        belongs to C(z), and b / C(z) is the posterior weight.
+    starts : (m + 1,) int array
+        Where each measurement's births start, and the end.
     totals : (m,) array
-        The sum.
+        The sums.
     inside : (m,) bool array
         Whether any draw is inside the environment.
     """
 
     particles: FloatArray
     intensity: FloatArray
+    starts: IntArray
     totals: FloatArray
     inside: NDArray[np.bool_]
 
@@ -112,22 +130,31 @@ def measurement_births(
     detection: DetectionModel,
     exploration: Exploration,
     expected_targets: float,
-    number: int,
+    number: int | IntArray,
     generator: np.random.Generator,
     unexplored: bool = True,
 ) -> MeasurementBirths:
-    """Draw `number` births for each measurement from the prior of unseen targets.
+    """Draw births for each measurement from the prior of unseen targets.
 
     Draws are x = g^-1(z + N(0, R)) inside E; the intensity of targets not seen so far is
     (N0 / V) e(x), or N0 / V if not `unexplored`. b = (N0 / V) e(x) pi(x, q) |dx/dz| / J, with
     |dx/dz| = r in 2D and r^2 |cos eta| in 3D. A birth counts for its own measurement only.
+
+    Parameters
+    ----------
+    number : int or (m,) int array
+        J, for each measurement.
     """
     d = measurements.values.shape[1]
     count = len(measurements)
     bounds = exploration.bounds
-    noise = generator.standard_normal((count, number, d))
-    particles = np.empty((count, number, d))
-    jacobian = np.empty((count, number))
+    starts = np.zeros(count + 1, np.int64)
+    np.cumsum(np.broadcast_to(number, (count,)), out=starts[1:])
+    total = int(starts[-1])
+    noise = generator.standard_normal((total, d))
+    particles = np.empty((total, d))
+    jacobian = np.empty(total)
+    inside = np.empty(count, np.bool_)
     _draw(
         measurements.values,
         measurements.cartesian,
@@ -137,15 +164,18 @@ def measurement_births(
         pose.position,
         bounds,
         noise,
+        starts,
         particles,
         jacobian,
+        inside,
     )
-    inside: NDArray[np.bool_] = np.any(jacobian > 0.0, axis=1)
-    probability = detection.probability(particles.reshape(-1, d), pose).reshape(count, number)
+    probability = detection.probability(particles, pose)
     values, lower, step = exploration.kernel()
-    prior = expected_targets / float(np.prod(bounds[:, 1] - bounds[:, 0]))
-    totals = _weigh(
+    prior = expected_targets / exploration.volume
+    totals = np.empty(count)
+    _weigh(
         particles,
+        starts,
         jacobian,
         probability,
         prior,
@@ -154,33 +184,90 @@ def measurement_births(
         lower,
         step,
         LEAST_UNEXPLORED,
+        totals,
     )
-    return MeasurementBirths(particles, jacobian, totals, inside)
+    return MeasurementBirths(particles, jacobian, starts, totals, inside)
+
+
+@njit(cache=True, error_model='numpy')
+def _worth(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    values, cartesian, volume, covariances, log_own, prior, per_target, least, most, number
+):
+    d = values.shape[1]
+    for m in range(values.shape[0]):
+        square = values[m, 0] * values[m, 0] + covariances[m, 0, 0]
+        size = square if d == 3 else math.sqrt(square)
+        if cartesian[m]:
+            size = volume[m]
+        ratio = math.exp(min(log_own[m] - math.log(prior * size), 700.0))
+        number[m] = min(max(math.ceil(per_target / (1.0 + ratio)), least), most)
+
+
+def births_worth_drawing(
+    measurements: MeasurementSet,
+    log_own: FloatArray,
+    expected_targets: float,
+    volume: float,
+    per_target: int,
+    least: int,
+    most: int,
+) -> IntArray:
+    """Return how many births to draw for each measurement (m,).
+
+    As many as there would be particles for the share of the detection that births explain if
+    nothing around it were explored and nothing missed. Where particles explain a detection well
+    the sum of b is next to nothing in C(z), and a few draws are enough for it.
+
+    Parameters
+    ----------
+    log_own : (m,) array
+        Logarithm of what particles add to C(z).
+    expected_targets, volume : float
+        N0, and V of the environment.
+    per_target : int
+        Particles for each expected target.
+    least, most : int
+        Bounds of the result.
+    """
+    number = np.empty(len(measurements), np.int64)
+    _worth(
+        measurements.values,
+        measurements.cartesian,
+        measurements.volume,
+        measurements.covariances,
+        log_own,
+        expected_targets / volume,
+        float(per_target),
+        min(least, most),
+        most,
+        number,
+    )
+    return number
 
 
 @njit(cache=True, error_model='numpy')
 def _thin(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    particles, intensity, mass, number, offset, first_group, out, weights, group
+    particles, intensity, starts, mass, number, offset, first_group, out, weights, group
 ):
     """Fill systematically chosen births of each measurement, of equal weights."""
-    births, d = particles.shape[1], particles.shape[2]
+    d = particles.shape[1]
     filled = 0
-    for m in range(particles.shape[0]):
+    for m in range(number.shape[0]):
         wanted = number[m]
         if wanted == 0:
             continue
         total = 0.0
-        for j in range(births):
-            total += intensity[m, j]
+        for j in range(starts[m], starts[m + 1]):
+            total += intensity[j]
         step = total / wanted
         point = offset[m] * step
         cumulative = 0.0
         placed = 0
-        for j in range(births):
-            cumulative += intensity[m, j]
-            while placed < wanted and (point < cumulative or j == births - 1):
+        for j in range(starts[m], starts[m + 1]):
+            cumulative += intensity[j]
+            while placed < wanted and (point < cumulative or j == starts[m + 1] - 1):
                 for a in range(d):
-                    out[filled, a] = particles[m, j, a]
+                    out[filled, a] = particles[j, a]
                 weights[filled] = mass[m] / wanted
                 group[filled] = first_group + m
                 filled += 1
@@ -210,13 +297,14 @@ def thin_births(
         Group of the first measurement's births; the next ones have the next numbers.
     """
     total = int(number.sum())
-    out = np.empty((total, births.particles.shape[2]))
+    out = np.empty((total, births.particles.shape[1]))
     weights = np.empty(total)
     group = np.empty(total, np.int64)
     offset = generator.random(len(number))
     _thin(
         births.particles,
         births.intensity,
+        births.starts,
         mass,
         number,
         offset,

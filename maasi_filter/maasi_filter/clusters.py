@@ -41,7 +41,15 @@ class Cluster:
 def _merge(mass, means, covariances, least_mass, least_distance):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Merge groups that are at one place, in place; return the order and number of what is left."""
     groups, d = means.shape
-    order = np.argsort(-mass, kind='mergesort')
+    order = np.arange(groups)
+    # Heaviest first; there are few.
+    for position in range(1, groups):
+        g = order[position]
+        other = position - 1
+        while other >= 0 and mass[order[other]] < mass[g]:
+            order[other + 1] = order[other]
+            other -= 1
+        order[other + 1] = g
     kept = 0
     for position in range(groups):
         g = order[position]
@@ -110,7 +118,7 @@ def group_clusters(
     covariances = covariances.copy()
     order = _merge(mass, means, covariances, least_mass, least_distance)
     masses = mass.tolist()
-    traces = np.einsum('gii->g', covariances).tolist()
+    traces = covariances.trace(axis1=1, axis2=2).tolist()
     return [
         Cluster(means[g], covariances[g], math.sqrt(max(traces[g], 0.0)), masses[g])
         for g in order.tolist()

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from maasi_filter.elementary import exponentials
 from maasi_filter.pose import Pose
 
 FloatArray = NDArray[np.float64]
@@ -83,30 +84,90 @@ def detection_probability_at(
     return parameters[0] * math.exp(-0.5 * math.sqrt(square))
 
 
+@njit(cache=True, error_model='numpy')
+def fill_probabilities(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    kind, parameters, x, y, z, number, cos_yaw, sin_yaw, out, scratch, bits
+):
+    """Fill pi for the first `number` offsets (x, y, z) [m, map axes] from the sensor.
+
+    `scratch` is as long as `out`, and `bits` is a view of it as int64.
+    """
+    if kind == BOX:
+        for i in range(number):
+            out[i] = detection_probability_at(kind, parameters, x[i], y[i], z[i], cos_yaw, sin_yaw)
+        return
+    gain = parameters[0]
+    for i in range(number):
+        u = x[i] * parameters[1]
+        v = y[i] * parameters[2]
+        w = z[i] * parameters[3]
+        out[i] = u * u + v * v + w * w
+    if kind == GAUSSIAN:
+        for i in range(number):
+            out[i] = -0.5 * out[i]
+    else:
+        for i in range(number):
+            out[i] = -0.5 * math.sqrt(out[i])
+    exponentials(out, number, scratch, bits)
+    for i in range(number):
+        out[i] = gain * out[i]
+
+
+@njit(cache=True, error_model='numpy')
+def offsets(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    positions, start, number, sensor_position, x, y, z
+):
+    """Fill the offsets of `number` positions (n, d) from `start` on from the sensor, axes apart.
+
+    In two dimensions the height of the sensor plays no part, as in the papers: z is 0.
+    """
+    x0 = sensor_position[0]
+    y0 = sensor_position[1]
+    part = positions[start : start + number]
+    if positions.shape[1] == 3:
+        z0 = sensor_position[2]
+        # All axes in one loop: whole rows are read, and sorted in registers.
+        for i in range(number):
+            x[i] = part[i, 0] - x0
+            y[i] = part[i, 1] - y0
+            z[i] = part[i, 2] - z0
+    else:
+        for i in range(number):
+            x[i] = part[i, 0] - x0
+            y[i] = part[i, 1] - y0
+        for i in range(number):
+            z[i] = 0.0
+
+
 @njit(cache=True, nogil=True, error_model='numpy')
-def _probabilities(
-    kind: int,
-    parameters: FloatArray,
-    positions: FloatArray,
-    sensor_position: FloatArray,
-    yaw: float,
-) -> FloatArray:  # pragma: no cover - compiled
+def _probabilities(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    kind, parameters, positions, sensor_position, yaw
+):
     number = positions.shape[0]
-    dimension = positions.shape[1]
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
     out = np.empty(number)
-    for i in range(number):
-        # In two dimensions the height of the sensor plays no part, as in the papers.
-        dz = positions[i, 2] - sensor_position[2] if dimension == 3 else 0.0
-        out[i] = detection_probability_at(
+    size = min(number, 512)
+    x = np.empty(size)
+    y = np.empty(size)
+    z = np.empty(size)
+    scratch = np.empty(size)
+    bits = scratch.view(np.int64)
+    for start in range(0, number, 512):
+        part = min(512, number - start)
+        offsets(positions, start, part, sensor_position, x, y, z)
+        fill_probabilities(
             kind,
             parameters,
-            positions[i, 0] - sensor_position[0],
-            positions[i, 1] - sensor_position[1],
-            dz,
+            x,
+            y,
+            z,
+            part,
             cos_yaw,
             sin_yaw,
+            out[start : start + part],
+            scratch,
+            bits,
         )
     return out
 

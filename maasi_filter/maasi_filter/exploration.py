@@ -12,7 +12,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.detection_model import DetectionModel, detection_probability_at
+from maasi_filter.detection_model import (
+    DetectionModel,
+    detection_probability_at,
+    fill_probabilities,
+)
 from maasi_filter.pose import Pose
 
 FloatArray = NDArray[np.float64]
@@ -78,30 +82,32 @@ def _interpolate_many(
 
 
 @njit(cache=True, error_model='numpy')
-def _decrease(
-    values: FloatArray,
-    lower: FloatArray,
-    step: FloatArray,
-    kind: int,
-    parameters: FloatArray,
-    sensor_position: FloatArray,
-    yaw: float,
-    dimension: int,
-) -> None:  # pragma: no cover - compiled
+def _decrease(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    values, lower, step, kind, parameters, sensor_position, yaw, dimension
+):
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
+    # A plane at a time.
+    size = values.shape[1] * values.shape[2]
+    x = np.empty(size)
+    y = np.empty(size)
+    z = np.zeros(size)
+    probability = np.empty(size)
+    scratch = np.empty(size)
+    bits = scratch.view(np.int64)
+    for j in range(values.shape[1]):
+        for k in range(values.shape[2]):
+            y[j * values.shape[2] + k] = lower[1] + j * step[1] - sensor_position[1]
+            if dimension == 3:
+                z[j * values.shape[2] + k] = lower[2] + k * step[2] - sensor_position[2]
     for i in range(values.shape[0]):
-        dx = lower[0] + i * step[0] - sensor_position[0]
-        for j in range(values.shape[1]):
-            dy = lower[1] + j * step[1] - sensor_position[1]
-            for k in range(values.shape[2]):
-                dz = 0.0
-                if dimension == 3:
-                    dz = lower[2] + k * step[2] - sensor_position[2]
-                probability = detection_probability_at(
-                    kind, parameters, dx, dy, dz, cos_yaw, sin_yaw
-                )
-                values[i, j, k] *= 1.0 - probability
+        x[:] = lower[0] + i * step[0] - sensor_position[0]
+        fill_probabilities(
+            kind, parameters, x, y, z, size, cos_yaw, sin_yaw, probability, scratch, bits
+        )
+        plane = values[i].reshape(size)
+        for j in range(size):
+            plane[j] *= 1.0 - probability[j]
 
 
 @njit(cache=True, error_model='numpy')
@@ -176,6 +182,8 @@ class Exploration:
         e at the nodes, in [0, 1].
     step : (d,) array
         Spacing used on each axis, metres.
+    volume : float
+        Of the environment, m^d.
 
     Raises
     ------
@@ -196,6 +204,7 @@ class Exploration:
                 f'spacing: got {spacing}, which needs {np.prod(cells + 1.0):.3g} nodes, '
                 f'allowed are at most {MAXIMUM_NODES}'
             )
+        self.volume = float(np.prod(size))
         self.step = size / cells
         shape = [int(number) + 1 for number in cells]
         self._values = np.ones(shape + [1] * (3 - self.dimension))

@@ -23,6 +23,8 @@ LEAST_MISS = 0.02
 LARGEST_ANGLE = 0.25
 # Squared normalised innovation beyond which a detection is of something else.
 LARGEST_INNOVATION = 25.0
+# A share of the bound that a covariance may lack without being widened.
+LEAST_LACK = 0.05
 
 
 @dataclass
@@ -228,7 +230,7 @@ def _bound(covariance, information, bounded, lack):  # type: ignore[no-untyped-d
     much = False
     for j in range(d):
         missing = max(1.0 - values[j], 0.0)
-        much |= missing > 0.05
+        much |= missing > LEAST_LACK
         for i in range(d):
             total = 0.0
             for k in range(i, d):
@@ -244,16 +246,111 @@ def _bound(covariance, information, bounded, lack):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, error_model='numpy')
+def _exceeds(covariance, information, share, matrix, root):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return whether a covariance is above `share` of the inverse of the information.
+
+    Its inverse is below the information over `share` then. False too where that cannot be told.
+    """
+    d = covariance.shape[0]
+    _invert(covariance, matrix)
+    for i in range(d):
+        if not covariance[i, i] > 0.0:
+            return False
+        for j in range(d):
+            matrix[i, j] = information[i, j] / share - matrix[i, j]
+    for i in range(d):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            if i != j:
+                root[i, j] = total / root[j, j]
+            elif total > 1e-12 * information[i, i]:
+                root[i, i] = math.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@njit(cache=True, error_model='numpy')
 def _fill_groups(covariances, information, prior, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
     groups, d = covariances.shape[0], covariances.shape[1]
     bounded = np.empty((d, d))
+    total = np.empty((d, d))
     any_lack = False
     for g in range(groups):
-        if _bound(covariances[g], information[g] + prior, bounded, fill[g]):
+        for i in range(d):
+            for j in range(d):
+                total[i, j] = information[g, i, j] + prior[i, j]
+        lacks = False
+        # Most lack nothing, which a root of three numbers tells.
+        if not _exceeds(covariances[g], total, 1.0 - LEAST_LACK, bounded, fill[g]):
+            lacks = _bound(covariances[g], total, bounded, fill[g])
+        if lacks:
             any_lack = True
         else:
             fill[g] = 0.0
     return any_lack
+
+
+@njit(cache=True, error_model='numpy')
+def _narrow(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    mass, covariances, information, prior, least_mass, radius, bounded, narrow
+):
+    d = covariances.shape[1]
+    lack = np.empty((d, d))
+    total = np.empty((d, d))
+    some = False
+    for m in range(mass.shape[0]):
+        narrow[m] = False
+        if mass[m] <= least_mass:
+            continue
+        trace = 0.0
+        for a in range(d):
+            trace += covariances[m, a, a]
+        if trace > radius * radius:
+            continue
+        for i in range(d):
+            for j in range(d):
+                total[i, j] = information[m, i, j] + prior[i, j]
+        _bound(covariances[m], total, bounded[m], lack)
+        trace = 0.0
+        for a in range(d):
+            trace += bounded[m, a, a]
+        narrow[m] = trace <= radius * radius
+        some |= narrow[m]
+    return some
+
+
+def narrow_clouds(
+    mass: FloatArray,
+    covariances: FloatArray,
+    information: FloatArray,
+    prior: FloatArray,
+    least_mass: float,
+    radius: float,
+) -> tuple[IntArray, FloatArray]:
+    """Return which of m clouds are heavy and narrow, and covariances (m, d, d) of those.
+
+    Covariances are widened to the inverse of the information of their data, with which the root
+    mean square radius may not be above `radius` either.
+
+    Parameters
+    ----------
+    mass, covariances, information : (m,), (m, d, d), (m, d, d) arrays
+        Of the clouds, and of their detections.
+    prior : (d, d) array
+        Information before any detection, positive definite.
+    least_mass : float
+        T_m.
+    radius : float
+        T_r, metres.
+    """
+    bounded = np.empty_like(covariances)
+    narrow = np.empty(len(mass), np.bool_)
+    if not _narrow(mass, covariances, information, prior, least_mass, radius, bounded, narrow):
+        return np.empty(0, np.int64), bounded
+    return np.nonzero(narrow)[0], bounded
 
 
 def bounded_below(covariance: FloatArray, information: FloatArray) -> FloatArray:

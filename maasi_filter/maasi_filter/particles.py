@@ -9,13 +9,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.phd import CHUNK, finish_moments, run_chunks
+from maasi_filter.detection_model import offsets
+from maasi_filter.phd import CHUNK, SUMS, Workspace, add_moments, finish_moments, run_chunks
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', fastmath=SUMS)
 def _sum_chunks(first_chunk, last_chunk, weights, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
     for chunk in range(first_chunk, last_chunk):
         total = 0.0
@@ -24,11 +25,11 @@ def _sum_chunks(first_chunk, last_chunk, weights, sums):  # type: ignore[no-unty
         sums[chunk] = total
 
 
-def total_weight(weights: FloatArray) -> float:
+def total_weight(weights: FloatArray, pool: ThreadPoolExecutor | None = None) -> float:
     """Return the sum of the weights, added in chunks of fixed size, in order."""
-    chunks = -(-len(weights) // CHUNK)
-    sums = np.empty(chunks)
-    _sum_chunks(0, chunks, weights, sums)
+    sums = np.empty(-(-len(weights) // CHUNK))
+    if len(sums):
+        run_chunks(lambda c, e: _sum_chunks(c, e, weights, sums), len(weights), pool)
     total = 0.0
     for part in sums.tolist():
         total += part
@@ -60,16 +61,44 @@ def _select_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
             point += 1
 
 
+@njit(cache=True, nogil=True, error_model='numpy')
+def _select_evenly_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk, last_chunk, weights, bases, rate, offset, limits, index
+):
+    """Fill the ancestors of points (k + offset) / rate, without the points."""
+    cumulative = np.empty(CHUNK)
+    for chunk in range(first_chunk, last_chunk):
+        start = chunk * CHUNK
+        size = min(weights.shape[0], start + CHUNK) - start
+        total = bases[chunk]
+        for i in range(size):
+            total += weights[start + i]
+            cumulative[i] = total
+        for i in range(size):
+            cumulative[i] = np.ceil(cumulative[i] * rate - offset)
+        point = limits[chunk]
+        last = limits[chunk + 1]
+        holder = start
+        for i in range(size):
+            reached = min(np.int64(cumulative[i]), last)
+            while point < reached:
+                index[point] = start + i
+                point += 1
+            holder = start + i if weights[start + i] > 0.0 else holder
+        # Rounding can leave points just behind the last cumulative weight.
+        while point < last:
+            index[point] = holder
+            point += 1
+
+
 def resampling_points(
     scheme: str, number: int, total: float, generator: np.random.Generator
 ) -> FloatArray:
     """Return `number` sorted points in [0, total) where the cumulative weights are read.
 
-    `scheme` is 'systematic' (one draw), 'stratified' (one for each stratum) or 'multinomial'
-    (independent draws, sorted as ratios of sums of exponential ones).
+    `scheme` is 'stratified' (one draw for each stratum) or 'multinomial' (independent draws,
+    sorted as ratios of sums of exponential ones).
     """
-    if scheme == 'systematic':
-        return np.asarray((np.arange(number) + generator.random()) * (total / number), np.float64)
     if scheme == 'stratified':
         return (np.arange(number) + generator.random(number)) * (total / number)
     if scheme == 'multinomial':
@@ -105,18 +134,29 @@ def resample(
 
     run_chunks(lambda c, e: _sum_chunks(c, e, weights, sums), n, pool)
     bases = np.zeros(chunks + 1)
-    for chunk in range(chunks):
-        bases[chunk + 1] = bases[chunk] + sums[chunk]
+    np.cumsum(sums, out=bases[1:])
     total = float(bases[-1])
     if not (math.isfinite(total) and total > 0.0):
         raise ValueError(f'weights: got a sum of {total}, allowed is a finite number above 0')
+    index = np.empty(number, np.int64)
+    # The last chunk that holds any weight takes what rounding puts at the very end.
+    end = int(np.nonzero(sums > 0.0)[0][-1]) + 1
+    if scheme == 'systematic':
+        offset = generator.random()
+        rate = number / total
+        limits = np.clip(np.ceil(bases * rate - offset), 0, number).astype(np.int64)
+        limits[0] = 0
+        limits[end:] = number
+        run_chunks(
+            lambda c, e: _select_evenly_chunks(c, e, weights, bases, rate, offset, limits, index),
+            n,
+            pool,
+        )
+        return index
     points = resampling_points(scheme, number, total, generator)
     limits = np.searchsorted(points, bases, side='left')
     limits[0] = 0
-    # The last chunk that holds any weight takes what rounding puts at the very end.
-    limits[int(np.nonzero(sums > 0.0)[0][-1]) + 1 :] = number
-    index = np.empty(number, np.int64)
-
+    limits[end:] = number
     run_chunks(lambda c, e: _select_chunks(c, e, weights, bases, points, limits, index), n, pool)
     return index
 
@@ -130,15 +170,47 @@ def _mix(state):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def _count_chunks(first_chunk, last_chunk, index, group, counts):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for chunk in range(first_chunk, last_chunk):
+        for k in range(chunk * CHUNK, min(index.shape[0], (chunk + 1) * CHUNK)):
+            counts[chunk, group[index[k]]] += 1
+
+
+@njit(cache=True, error_model='numpy')
+def _place(counts, present, starts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Replace counts by where each chunk's part of a group begins; return the number of groups."""
+    position = 0
+    left = 0
+    for g in range(counts.shape[1]):
+        begin = position
+        for chunk in range(counts.shape[0]):
+            number = counts[chunk, g]
+            counts[chunk, g] = position
+            position += number
+        present[g] = position > begin
+        if position > begin:
+            starts[left] = begin
+            left += 1
+    starts[left] = position
+    return left
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def _gather_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    first_chunk, last_chunk, index, particles, group, compact, out, out_group
+    first_chunk, last_chunk, index, particles, group, places, out, copy
 ):
     d = particles.shape[1]
-    for i in range(first_chunk * CHUNK, min(index.shape[0], last_chunk * CHUNK)):
-        j = index[i]
-        for a in range(d):
-            out[i, a] = particles[j, a]
-        out_group[i] = compact[group[j]]
+    for chunk in range(first_chunk, last_chunk):
+        start = chunk * CHUNK
+        before = index[start - 1] if start > 0 else -1
+        for k in range(start, min(index.shape[0], start + CHUNK)):
+            i = index[k]
+            place = places[chunk, group[i]]
+            places[chunk, group[i]] = place + 1
+            for a in range(d):
+                out[place, a] = particles[i, a]
+            copy[place] = i == before
+            before = i
 
 
 def gather(
@@ -147,33 +219,55 @@ def gather(
     group: IntArray,
     groups: int,
     pool: ThreadPoolExecutor | None = None,
-) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
-    """Return the chosen particles, their groups renumbered from 0, and which groups are left."""
-    present = np.zeros(groups, np.bool_)
-    _mark_present(index, group, present)
-    compact = np.cumsum(present) - 1
-    out = np.empty((len(index), particles.shape[1]))
-    out_group = np.empty(len(index), np.int64)
+    workspace: Workspace | None = None,
+) -> tuple[FloatArray, NDArray[np.bool_], IntArray, NDArray[np.bool_]]:
+    """Return the chosen particles, group after group, and what belongs to them.
+
+    Parameters
+    ----------
+    index : (n,) int array
+        Chosen particles, ascending.
+    workspace : Workspace, optional
+        The arrays of n in the result are its own.
+
+    Returns
+    -------
+    particles : (n, d) array
+    copy : (n,) bool array
+        Whether the one before in the group is the same particle.
+    starts : (g + 1,) int array
+        Where each group that is left starts, and the end.
+    present : (groups,) bool array
+        Which groups are left.
+    """
+    workspace = Workspace() if workspace is None else workspace
+    n = len(index)
+    places = np.zeros((max(1, -(-n // CHUNK)), groups), np.int64)
+    run_chunks(lambda c, e: _count_chunks(c, e, index, group, places), n, pool)
+    present = np.empty(groups, np.bool_)
+    starts = np.empty(groups + 1, np.int64)
+    left = _place(places, present, starts)
+    out = workspace.take('gathered', (n, particles.shape[1]))
+    copy = workspace.take('copy', (n,), np.bool_)
     run_chunks(
-        lambda c, e: _gather_chunks(c, e, index, particles, group, compact, out, out_group),
-        len(index),
-        pool,
+        lambda c, e: _gather_chunks(c, e, index, particles, group, places, out, copy), n, pool
     )
-    return out, out_group, present
-
-
-@njit(cache=True, error_model='numpy')
-def _mark_present(index, group, present):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for i in range(index.shape[0]):
-        present[group[index[i]]] = True
+    return out, copy, starts[: left + 1], present
 
 
 @njit(cache=True, error_model='numpy')
 def _references(particles, group, references):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill the first particle of each group."""
-    for i in range(particles.shape[0] - 1, -1, -1):
-        for a in range(particles.shape[1]):
-            references[group[i], a] = particles[i, a]
+    missing = references.shape[0]
+    seen = np.zeros(missing, np.bool_)
+    for i in range(particles.shape[0]):
+        if not seen[group[i]]:
+            seen[group[i]] = True
+            for a in range(particles.shape[1]):
+                references[group[i], a] = particles[i, a]
+            missing -= 1
+            if missing == 0:
+                break
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -181,59 +275,31 @@ def _moments_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
     first_chunk, last_chunk, particles, weights, group, references, all_moments
 ):
     """Sum weight, and first and second moments about `references`, for each group."""
-    d = particles.shape[1]
+    x = np.empty(CHUNK)
+    y = np.empty(CHUNK)
+    z = np.empty(CHUNK)
+    origin = np.zeros(3)
     for chunk in range(first_chunk, last_chunk):
-        i = chunk * CHUNK
-        stop = min(particles.shape[0], i + CHUNK)
-        while i < stop:
+        first = chunk * CHUNK
+        stop = min(particles.shape[0], first + CHUNK)
+        while first < stop:
             # Particles of a group lie together: each run is summed by itself.
-            g = group[i]
-            c0 = references[g, 0]
-            c1 = references[g, 1]
-            c2 = references[g, 2] if d == 3 else 0.0
-            t0 = 0.0
-            tx = 0.0
-            ty = 0.0
-            tz = 0.0
-            txx = 0.0
-            txy = 0.0
-            tyy = 0.0
-            txz = 0.0
-            tyz = 0.0
-            tzz = 0.0
-            while i < stop and group[i] == g:
-                weight = weights[i]
-                x = particles[i, 0] - c0
-                y = particles[i, 1] - c1
-                t0 += weight
-                tx += weight * x
-                ty += weight * y
-                txx += weight * x * x
-                txy += weight * x * y
-                tyy += weight * y * y
-                if d == 3:
-                    z = particles[i, 2] - c2
-                    tz += weight * z
-                    txz += weight * x * z
-                    tyz += weight * y * z
-                    tzz += weight * z * z
-                i += 1
-            moments = all_moments[chunk, g]
-            moments[0] += t0
-            moments[1] += tx
-            moments[2] += ty
-            if d == 2:
-                moments[3] += txx
-                moments[4] += txy
-                moments[5] += tyy
-            else:
-                moments[3] += tz
-                moments[4] += txx
-                moments[5] += txy
-                moments[6] += tyy
-                moments[7] += txz
-                moments[8] += tyz
-                moments[9] += tzz
+            g = group[first]
+            last = first
+            while last < stop and group[last] == g:
+                last += 1
+            offsets(particles, first, last - first, origin, x, y, z)
+            add_moments(
+                weights[first:last],
+                x,
+                y,
+                z,
+                last - first,
+                references[g],
+                particles.shape[1] == 3,
+                all_moments[chunk, g],
+            )
+            first = last
 
 
 def group_moments(
@@ -260,27 +326,99 @@ def group_moments(
     return mass, means, covariances
 
 
-@njit(cache=True, error_model='numpy')
-def _order(group, groups):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return particle indices sorted by group (stable), and where each group starts."""
-    starts = np.zeros(groups + 1, np.int64)
-    for i in range(group.shape[0]):
-        starts[group[i] + 1] += 1
-    for g in range(groups):
-        starts[g + 1] += starts[g]
-    position = starts[:-1].copy()
-    order = np.empty(group.shape[0], np.int64)
-    for i in range(group.shape[0]):
-        order[position[group[i]]] = i
-        position[group[i]] += 1
-    return order, starts
+@njit(cache=True, nogil=True, error_model='numpy')
+def _clear_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk, last_chunk, particles, weights, group, centre, square, here, groups
+):
+    d = particles.shape[1]
+    for i in range(first_chunk * CHUNK, min(weights.shape[0], last_chunk * CHUNK)):
+        apart = 0.0
+        for a in range(d):
+            apart += (particles[i, a] - centre[a]) ** 2
+        gone = group[i] == here or (apart <= square and group[i] < groups)
+        weights[i] = 0.0 if gone else weights[i]
+
+
+def clear(
+    particles: FloatArray,
+    weights: FloatArray,
+    group: IntArray,
+    centre: FloatArray,
+    radius: float,
+    here: int,
+    groups: int,
+    pool: ThreadPoolExecutor | None = None,
+) -> None:
+    """Set to 0, in place, the weights of one group, and of others around it.
+
+    Parameters
+    ----------
+    centre : (d,) array
+        Metres.
+    radius : float
+        Of those around, metres.
+    here : int
+        The group.
+    groups : int
+        Only groups below this one are others.
+    """
+    run_chunks(
+        lambda c, e: _clear_chunks(
+            c, e, particles, weights, group, centre, radius * radius, here, groups
+        ),
+        len(weights),
+        pool,
+    )
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _fill_groups_chunks(first_chunk, last_chunk, starts, group):  # type: ignore[no-untyped-def]  # pragma: no cover
+    first = first_chunk * CHUNK
+    stop = min(group.shape[0], last_chunk * CHUNK)
+    g = np.searchsorted(starts, first, side='right') - 1
+    while first < stop:
+        last = min(starts[g + 1], stop)
+        for i in range(first, last):
+            group[i] = g
+        first = last
+        g += 1
+
+
+def groups_of(starts: IntArray, pool: ThreadPoolExecutor | None = None) -> IntArray:
+    """Return the group (n,) of each of n particles that lie group after group."""
+    group = np.empty(int(starts[-1]), np.int64)
+    run_chunks(lambda c, e: _fill_groups_chunks(c, e, starts, group), len(group), pool)
+    return group
 
 
 @njit(cache=True, error_model='numpy')
-def _count_copies(index, group, copies):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for i in range(1, index.shape[0]):
-        if index[i] == index[i - 1]:
-            copies[group[i]] += 1.0
+def _shrinkage(copy, starts, differential, shrink):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for g in range(shrink.shape[0]):
+        copies = 0
+        for i in range(starts[g], starts[g + 1]):
+            copies += np.int64(copy[i])
+        size = max(starts[g + 1] - starts[g], 1)
+        shrink[g] = 1.0 / math.sqrt(1.0 + copies / size * differential[g] * differential[g])
+
+
+@njit(cache=True, error_model='numpy')
+def _draw_in(source, mean, share, number, target):  # type: ignore[no-untyped-def]  # pragma: no cover
+    x = mean[0]
+    y = mean[1]
+    for i in range(number):
+        target[i, 0] = x + share * (source[i, 0] - x)
+        target[i, 1] = y + share * (source[i, 1] - y)
+
+
+@njit(cache=True, error_model='numpy')
+def _draw_in_solid(source, mean, share, number, target):  # type: ignore[no-untyped-def]  # pragma: no cover
+    x = mean[0]
+    y = mean[1]
+    z = mean[2]
+    for i in range(number):
+        target[i, 0] = x + share * (source[i, 0] - x)
+        target[i, 1] = y + share * (source[i, 1] - y)
+        target[i, 2] = z + share * (source[i, 2] - z)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -288,14 +426,12 @@ def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     first_chunk,
     last_chunk,
     seed,
-    index,
-    group,
-    order,
+    copy,
     starts,
     source,
     means,
     shrink,
-    scale,
+    differential,
     deviation,
     fill,
     filled,
@@ -307,49 +443,67 @@ def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     width = deviation * math.sqrt(6.0)
     low_half = np.uint64(0xFFFFFFFF)
     quarter = np.uint64(0xFFFF)
-    for i in range(first_chunk * CHUNK, min(source.shape[0], last_chunk * CHUNK)):
-        g = group[i]
-        state = seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1)
-        if i > 0 and index[i] == index[i - 1]:
-            first = starts[g]
-            size = np.uint64(starts[g + 1] - first)
-            bits = _mix(state)
-            a = order[first + np.int64(((bits & low_half) * size) >> np.uint64(32))]
-            b = order[first + np.int64(((bits >> np.uint64(32)) * size) >> np.uint64(32))]
-            for axis in range(d):
-                moved = source[i, axis] + scale[g] * (source[a, axis] - source[b, axis])
-                if width > 0.0:
-                    bits = _mix(bits + np.uint64(axis + 1))
-                    low = np.float64(np.int64(bits & low_half)) * 2.0**-32
-                    high = np.float64(np.int64(bits >> np.uint64(32))) * 2.0**-32
-                    moved += width * (low + high - 1.0)
-                target[i, axis] = means[g, axis] + shrink[g] * (moved - means[g, axis])
+    fifth = np.uint64(0x3FF)
+    x0 = bounds[0, 0]
+    x1 = bounds[0, 1]
+    y0 = bounds[1, 0]
+    y1 = bounds[1, 1]
+    i = first_chunk * CHUNK
+    stop = min(source.shape[0], last_chunk * CHUNK)
+    g = np.searchsorted(starts, i, side='right') - 1
+    while i < stop:
+        first = starts[g]
+        last = min(starts[g + 1], stop)
+        size = np.uint64(starts[g + 1] - first)
+        scale = differential[g] / math.sqrt(2.0)
+        drawn = shrink[g]
+        begin = i
+        here = source[begin:last]
+        there = target[begin:last]
+        if d == 3:
+            _draw_in_solid(here, means[g], drawn, last - begin, there)
         else:
+            _draw_in(here, means[g], drawn, last - begin, there)
+        for i in range(begin, last):
+            if not copy[i]:
+                continue
+            bits = _mix(seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1))
+            a = first + np.int64(((bits & low_half) * size) >> np.uint64(32))
+            b = first + np.int64(((bits >> np.uint64(32)) * size) >> np.uint64(32))
+            bits = _mix(bits)
             for axis in range(d):
-                target[i, axis] = means[g, axis] + shrink[g] * (source[i, axis] - means[g, axis])
+                # Two numbers of ten bits.
+                total = (bits & fifth) + ((bits >> np.uint64(10)) & fifth)
+                bits = bits >> np.uint64(20)
+                noise = (np.float64(np.int64(total)) + 1.0) * 2.0**-10 - 1.0
+                moved = scale * (source[a, axis] - source[b, axis]) + width * noise
+                target[i, axis] += drawn * moved
         if filled[g]:
-            bits = _mix(~state)
-            for axis in range(d):
-                # The sum of four uniform numbers on (-1/2, 1/2) has variance 1/3.
-                bits = _mix(bits + np.uint64(axis + 1))
-                total = (bits & quarter) + ((bits >> np.uint64(16)) & quarter)
-                total += ((bits >> np.uint64(32)) & quarter) + (bits >> np.uint64(48))
-                normal = (np.float64(np.int64(total)) * 2.0**-16 - 2.0) * math.sqrt(3.0)
-                for other in range(d):
-                    target[i, other] += fill[g, other, axis] * normal
-        inside = True
-        for axis in range(d):
-            if not bounds[axis, 0] <= target[i, axis] <= bounds[axis, 1]:
-                inside = False
-        if not inside:
-            for axis in range(d):
-                target[i, axis] = source[i, axis]
+            for i in range(begin, last):
+                bits = _mix(~(seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1)))
+                for axis in range(d):
+                    # The sum of four uniform numbers on (-1/2, 1/2) has variance 1/3.
+                    bits = _mix(bits + np.uint64(axis + 1))
+                    total = (bits & quarter) + ((bits >> np.uint64(16)) & quarter)
+                    total += ((bits >> np.uint64(32)) & quarter) + (bits >> np.uint64(48))
+                    normal = (np.float64(np.int64(total)) * 2.0**-16 - 2.0) * math.sqrt(3.0)
+                    for other in range(d):
+                        target[i, other] += fill[g, other, axis] * normal
+        for i in range(begin, last):
+            inside = x0 <= target[i, 0] <= x1 and y0 <= target[i, 1] <= y1
+            if d == 3:
+                inside = inside and bounds[2, 0] <= target[i, 2] <= bounds[2, 1]
+            if not inside:
+                for axis in range(d):
+                    target[i, axis] = source[i, axis]
+        i = last
+        g += 1
 
 
 def jitter(
     particles: FloatArray,
-    index: IntArray,
-    group: IntArray,
+    copy: NDArray[np.bool_],
+    starts: IntArray,
     means: FloatArray,
     differential: FloatArray,
     deviation: float,
@@ -370,11 +524,11 @@ def jitter(
     Parameters
     ----------
     particles : (n, d) array
-        Resampled, of equal weights, metres.
-    index : (n,) int array
-        Their ancestors, ascending: a duplicate is one that has the ancestor of the one before.
-    group : (n,) int array
-        Group of each, from 0.
+        Resampled, of equal weights, group after group, metres.
+    copy : (n,) bool array
+        Which of them are duplicates of the one before.
+    starts : (g + 1,) int array
+        Where each group starts, and the end.
     means : (g, d) array
         Of the groups, metres.
     differential : (g,) array
@@ -388,14 +542,9 @@ def jitter(
     """
     groups, d = means.shape
     seed = np.uint64(generator.integers(0, 2**63))
-    order, starts = _order(group, groups)
-    scale = differential / math.sqrt(2.0)
     shrink = np.ones(groups)
     if keep_covariance:
-        copies = np.zeros(groups)
-        _count_copies(index, group, copies)
-        size = np.maximum(starts[1:] - starts[:-1], 1)
-        shrink = 1.0 / np.sqrt(1.0 + copies / size * differential**2)
+        _shrinkage(copy, starts, differential, shrink)
     if fill is None:
         fill = np.zeros((groups, d, d))
     filled = fill.reshape(groups, d * d).any(axis=1)
@@ -405,14 +554,12 @@ def jitter(
             c,
             e,
             seed,
-            index,
-            group,
-            order,
+            copy,
             starts,
             particles,
             means,
             shrink,
-            scale,
+            differential,
             deviation,
             fill,
             filled,

@@ -12,21 +12,32 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from maasi_filter.detection_model import PARAMETERS, fill_probabilities, offsets
+from maasi_filter.elementary import arctan2, exponentials
 from maasi_filter.measurement_model import TWO_PI, wrap
 from maasi_filter.pose import Pose
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-CHUNK = 8192
+CHUNK = 2048
+TILE = 128
+TILES = CHUNK // TILE
 BLOCK = 16
+# The probability of detection is given, not a model's.
+GIVEN = -1
+# Sums may be added in vector lanes; there are no numbers that are not a number.
+SUMS = {'reassoc', 'nsz', 'nnan'}
 # Likelihoods exp(-q/2) with q this far above the smallest are below 1e-17 of it.
 RELATIVE_GATE = 80.0
+# Work for threads is cut into at most so many ranges of chunks.
+RANGES = 8
 # Closer than this many deviations of the range, a bearing says nothing and noise is Cartesian.
 POLE_DEVIATIONS = 3.0
 LARGEST_BEARING_VARIANCE = math.pi**2 / 3.0
@@ -56,6 +67,9 @@ class MeasurementSet:
         Logarithm of the density at its peak, per unit of measurement space.
     volume : (m,) array
         |dx/dz| at the detection: 1 / (unit of measurement space) times m^d.
+    gates : (m, 2) array
+        What squared errors of range and angles (Cartesian: of nothing and the position) are at
+        least multiplied with in the squared normalised error.
     """
 
     values: FloatArray
@@ -66,6 +80,7 @@ class MeasurementSet:
     information: FloatArray
     log_norm: FloatArray
     volume: FloatArray
+    gates: FloatArray
 
     def __len__(self) -> int:
         return len(self.values)
@@ -118,6 +133,28 @@ def _root(matrix, root):  # type: ignore[no-untyped-def]  # pragma: no cover - c
 
 
 @njit(cache=True, error_model='numpy')
+def _gates(covariance, cartesian, gate):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fill lower bounds of the inverse covariance on its axes.
+
+    The largest sum of a row bounds the eigenvalues of the correlation.
+    """
+    d = covariance.shape[0]
+    most = 1.0
+    for i in range(d):
+        total = 0.0
+        for j in range(d):
+            total += abs(covariance[i, j]) / math.sqrt(covariance[i, i] * covariance[j, j])
+        most = max(most, total)
+    widest = covariance[1, 1]
+    if d == 3:
+        widest = max(widest, covariance[2, 2])
+    if cartesian:
+        widest = max(widest, covariance[0, 0])
+    gate[0] = 1.0 / (most * covariance[0, 0])
+    gate[1] = 1.0 / (most * widest)
+
+
+@njit(cache=True, error_model='numpy')
 def spherical_frame(values, frame):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Fill dx/dz at a measurement (d, d), in place; return the magnitude of its determinant."""
     r = values[0]
@@ -157,6 +194,7 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     information,
     log_norm,
     volume,
+    gates,
 ):
     number, d = values.shape
     frame = np.zeros((d, d))
@@ -196,6 +234,7 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                 -0.5 * d * math.log(2.0 * math.pi) - 0.5 * log_determinant + math.log(volume[m])
             )
             _invert(matrix, information[m])
+            _gates(matrix, True, gates[m])
         else:
             if cap_angles:
                 for axis in range(1, d):
@@ -211,6 +250,7 @@ def _prepare(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             log_determinant = _root(covariance, roots[m])
             log_norm[m] = -0.5 * d * math.log(2.0 * math.pi) - 0.5 * log_determinant
             _invert(covariance, information[m])
+            _gates(covariance, False, gates[m])
 
 
 def prepare_measurements(
@@ -248,6 +288,7 @@ def prepare_measurements(
         information=np.empty((number, d, d)),
         log_norm=np.empty(number),
         volume=np.empty(number),
+        gates=np.empty((number, 2)),
     )
     _prepare(
         values,
@@ -262,6 +303,7 @@ def prepare_measurements(
         out.information,
         out.log_norm,
         out.volume,
+        out.gates,
     )
     return out
 
@@ -282,150 +324,379 @@ def position_measurements(values: FloatArray, covariances: FloatArray) -> Measur
         information=np.empty((number, d, d)),
         log_norm=np.empty(number),
         volume=np.ones(number),
+        gates=np.empty((number, 2)),
     )
     for m in range(number):
         log_determinant = _root(out.covariances[m], out.roots[m])
         _invert(out.covariances[m], out.information[m])
+        _gates(out.covariances[m], True, out.gates[m])
         out.log_norm[m] = -0.5 * (d * math.log(2.0 * math.pi) + log_determinant)
     return out
 
 
-@njit(cache=True, error_model='numpy')
-def arctan2(y: float, x: float) -> float:  # pragma: no cover - compiled
-    """Return the angle of (x, y), to about one unit in the last place; 0 at the origin.
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _extent(x, number, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    low = np.inf
+    high = -np.inf
+    for i in range(number):
+        value = x[i]
+        low = value if value < low else low
+        high = value if value > high else high
+    out[0] = low
+    out[1] = high
 
-    Cephes' rational approximation: several times faster than the C library's, and the same to
-    the bit on every machine.
+
+@njit(cache=True, error_model='numpy')
+def _least_square(box, c0, c1, c2, z0, cartesian, gate):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return a number that q is nowhere below in a tile, inf for an empty one.
+
+    In a tile offsets from the sensor lie in `box[:6]`, distances in `box[6:]`. With u the
+    smallest eigenvalue of the inverse correlation, q is at least u times the sum of squared errors
+    over variances; and for angles a and b, and distance r from the sensor, the distance s between
+    particle and detection has s^2 - (r - z)^2 <= r z (a^2 + b^2).
     """
-    ax = abs(x)
-    ay = abs(y)
-    small = min(ax, ay)
-    large = max(ax, ay)
-    # Choices instead of branches, so that loops over arrays become vector instructions.
-    upper = small > 0.66 * large
-    top = small - large if upper else small
-    bottom = small + large if upper else large
-    t = top / (bottom if bottom > 0.0 else 1.0)
-    z = t * t
-    top = -8.750608600031904122785e-1 * z - 1.615753718733365076637e1
-    top = (top * z - 7.500855792314704667340e1) * z - 1.228866684490136173410e2
-    top = top * z - 6.485021904942025371773e1
-    bottom = (z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2
-    bottom = (bottom * z + 4.328810604912902668951e2) * z + 4.853903996359136964868e2
-    bottom = bottom * z + 1.945506571482613964425e2
-    angle = (0.25 * math.pi if upper else 0.0) + (t + t * (z * top / bottom))
-    angle = 0.5 * math.pi - angle if ay > ax else angle
-    angle = math.pi - angle if x < 0.0 else angle
-    return angle if y >= 0.0 else -angle
+    if box[6] == np.inf:
+        return np.inf
+    a = max(max(box[0] - c0, c0 - box[1]), 0.0)
+    b = max(max(box[2] - c1, c1 - box[3]), 0.0)
+    c = max(max(box[4] - c2, c2 - box[5]), 0.0)
+    apart = a * a + b * b + c * c
+    if cartesian:
+        return gate[1] * apart
+    gap = max(max(box[6] - z0, z0 - box[7]), 0.0)
+    square = gate[0] * gap * gap
+    if z0 > 0.0 and box[7] > 0.0:
+        widest = max(abs(box[6] - z0), abs(box[7] - z0))
+        square += gate[1] * max(apart - widest * widest, 0.0) / (z0 * box[7])
+    return square
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def add_moments(weights, x, y, z, number, centre, solid, moments):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add weight, and first and second moments about `centre`, to `moments`; return the weight."""
+    c0 = centre[0]
+    c1 = centre[1]
+    t0 = 0.0
+    tx = 0.0
+    ty = 0.0
+    txx = 0.0
+    txy = 0.0
+    tyy = 0.0
+    for i in range(number):
+        w = weights[i]
+        a = x[i] - c0
+        b = y[i] - c1
+        t0 += w
+        tx += w * a
+        ty += w * b
+        txx += w * a * a
+        txy += w * a * b
+        tyy += w * b * b
+    moments[0] += t0
+    moments[1] += tx
+    moments[2] += ty
+    if solid:
+        c2 = centre[2]
+        tz = 0.0
+        txz = 0.0
+        tyz = 0.0
+        tzz = 0.0
+        for i in range(number):
+            c = z[i] - c2
+            w = weights[i] * c
+            tz += w
+            txz += w * (x[i] - c0)
+            tyz += w * (y[i] - c1)
+            tzz += w * c
+        moments[3] += tz
+        moments[4] += txx
+        moments[5] += txy
+        moments[6] += tyy
+        moments[7] += txz
+        moments[8] += tyz
+        moments[9] += tzz
+    else:
+        moments[3] += txx
+        moments[4] += txy
+        moments[5] += tyy
+    return t0
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _polar_squares(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    z, information, distance, bearing, elevation, number, row
+):
+    """Fill the squared normalised errors of a detection in range and angles."""
+    i00 = information[0, 0]
+    i11 = information[1, 1]
+    i01 = 2.0 * information[0, 1]
+    z0 = z[0]
+    z1 = wrap(z[1])
+    for i in range(number):
+        e0 = z0 - distance[i]
+        e1 = z1 - bearing[i]
+        e1 = e1 - TWO_PI if e1 >= math.pi else e1
+        e1 = e1 + TWO_PI if e1 < -math.pi else e1
+        row[i] = e0 * (e0 * i00 + e1 * i01) + e1 * e1 * i11
+    if len(z) == 3:
+        z2 = z[2]
+        i22 = information[2, 2]
+        i02 = 2.0 * information[0, 2]
+        i12 = 2.0 * information[1, 2]
+        if i02 == 0.0 and i12 == 0.0:
+            for i in range(number):
+                e2 = z2 - elevation[i]
+                row[i] += e2 * e2 * i22
+            return
+        for i in range(number):
+            e0 = z0 - distance[i]
+            e1 = z1 - bearing[i]
+            e1 = e1 - TWO_PI if e1 >= math.pi else e1
+            e1 = e1 + TWO_PI if e1 < -math.pi else e1
+            e2 = z2 - elevation[i]
+            row[i] += e2 * (e0 * i02 + e1 * i12 + e2 * i22)
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _cartesian_squares(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    c0, c1, c2, information, x, y, height, number, row
+):
+    """Fill the squared normalised distances from where a detection points at."""
+    i00 = information[0, 0]
+    i11 = information[1, 1]
+    i01 = 2.0 * information[0, 1]
+    for i in range(number):
+        e0 = c0 - x[i]
+        e1 = c1 - y[i]
+        row[i] = e0 * (e0 * i00 + e1 * i01) + e1 * e1 * i11
+    if information.shape[0] == 3:
+        i22 = information[2, 2]
+        i02 = 2.0 * information[0, 2]
+        i12 = 2.0 * information[1, 2]
+        for i in range(number):
+            e2 = c2 - height[i]
+            row[i] += e2 * ((c0 - x[i]) * i02 + (c1 - y[i]) * i12 + e2 * i22)
+
+
+@njit(cache=True, error_model='numpy')
+def _angles(x, y, height, solid, number, bearing, elevation):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(number):
+        bearing[i] = arctan2(y[i], x[i])
+    if solid:
+        for i in range(number):
+            elevation[i] = arctan2(height[i], math.sqrt(x[i] * x[i] + y[i] * y[i]))
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _smallest(row, seen, number):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    smallest = np.inf
+    for i in range(number):
+        square = row[i] if seen[i] > 0.0 else np.inf
+        smallest = square if square < smallest else smallest
+    return smallest
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _likelihoods(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    row, least, seen, probability, number, scratch, bits
+):
+    """Replace squares by pi exp(-(q - least) / 2), 0 beyond the gate; return the weighted sum."""
+    for i in range(number):
+        gap = row[i] - least
+        row[i] = -0.5 * gap if gap < RELATIVE_GATE and seen[i] > 0.0 else -1e4
+    exponentials(row, number, scratch, bits)
+    total = 0.0
+    for i in range(number):
+        total += row[i] * seen[i]
+    for i in range(number):
+        row[i] *= probability[i]
+    return total
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _bounding_box(x, y, height, distance, seen, number, box):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill lower and upper bounds of offsets and distances; inf if no particle counts."""
+    _extent(x, number, box[0:2])
+    _extent(y, number, box[2:4])
+    _extent(height, number, box[4:6])
+    _extent(distance, number, box[6:8])
+    most = 0.0
+    for i in range(number):
+        most = seen[i] if seen[i] > most else most
+    if most <= 0.0:
+        box[6] = np.inf
+
+
+@njit(cache=True, error_model='numpy')
+def _products(a, b, number, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    for i in range(number):
+        out[i] = a[i] * b[i]
+
+
+@njit(cache=True, error_model='numpy')
+def _norms(x, y, z, number, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    for i in range(number):
+        out[i] = math.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _associate_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk,
     last_chunk,
     particles,
-    denominator_weights,
+    weights,
+    kind,
+    parameters,
+    cos_yaw,
+    sin_yaw,
     probability,
     sensor_position,
     values,
     cartesian,
     centres,
     information,
+    gates,
     likelihood,
+    active,
     all_smallest,
     all_sums,
 ):
-    """Fill likelihoods (m, n), pi exp(-(q - smallest) / 2), of chunks, and weighted sums."""
-    d = particles.shape[1]
+    """Fill likelihoods (m, n), pi exp(-(q - smallest) / 2), of chunks, and weighted sums.
+
+    Neighbours among the particles are mostly neighbours in space. A tile of them that a bound
+    shows to be beyond the gate is not worked out: `active` (m, tiles) tells which were.
+    """
+    solid = particles.shape[1] == 3
     number = values.shape[0]
-    polar = not cartesian.all()
-    # Coordinates apart, and loops without branches: they become vector instructions.
-    x = np.empty(CHUNK)
-    y = np.empty(CHUNK)
-    height = np.zeros(CHUNK)
-    distance = np.empty(CHUNK)
-    bearing = np.empty(CHUNK)
-    elevation = np.zeros(CHUNK)
+    # Coordinates apart, and short loops without branches: they become vector instructions.
+    x = np.empty((TILES, TILE))
+    y = np.empty((TILES, TILE))
+    height = np.empty((TILES, TILE))
+    distance = np.empty((TILES, TILE))
+    bearing = np.empty((TILES, TILE))
+    elevation = np.zeros((TILES, TILE))
+    seen = np.empty((TILES, TILE))
+    scratch = np.empty(TILE)
+    bits = scratch.view(np.int64)
+    box = np.empty((TILES, 8))
+    least_here = np.empty(TILES)
+    lower = np.empty(TILES)
+    turned = np.empty(TILES, np.bool_)
     for chunk in range(first_chunk, last_chunk):
-        start = chunk * CHUNK
-        size = min(particles.shape[0], start + CHUNK) - start
-        for i in range(size):
-            x[i] = particles[start + i, 0] - sensor_position[0]
-            y[i] = particles[start + i, 1] - sensor_position[1]
-        if d == 3:
-            for i in range(size):
-                height[i] = particles[start + i, 2] - sensor_position[2]
-        if polar:
-            for i in range(size):
-                bearing[i] = arctan2(y[i], x[i])
-                distance[i] = math.sqrt(x[i] * x[i] + y[i] * y[i])
-            if d == 3:
-                for i in range(size):
-                    elevation[i] = arctan2(height[i], distance[i])
-                    distance[i] = math.sqrt(distance[i] * distance[i] + height[i] * height[i])
+        first = chunk * CHUNK
+        stop = min(particles.shape[0], first + CHUNK)
+        tiles = (stop - first + TILE - 1) // TILE
+        for tile in range(tiles):
+            start = first + tile * TILE
+            size = min(TILE, stop - start)
+            chance = probability[start : start + size]
+            mine = weights[start : start + size]
+            turned[tile] = False
+            offsets(particles, start, size, sensor_position, x[tile], y[tile], height[tile])
+            if kind != GIVEN:
+                fill_probabilities(
+                    kind,
+                    parameters,
+                    x[tile],
+                    y[tile],
+                    height[tile],
+                    size,
+                    cos_yaw,
+                    sin_yaw,
+                    chance,
+                    scratch,
+                    bits,
+                )
+            _products(chance, mine, size, seen[tile])
+            _norms(x[tile], y[tile], height[tile], size, distance[tile])
+            _bounding_box(
+                x[tile], y[tile], height[tile], distance[tile], seen[tile], size, box[tile]
+            )
         for m in range(number):
-            row = likelihood[m, start : start + size]
-            i00 = information[m, 0, 0]
-            i11 = information[m, 1, 1]
-            i01 = 2.0 * information[m, 0, 1]
-            i22 = 0.0
-            i02 = 0.0
-            i12 = 0.0
-            z2 = 0.0
-            if d == 3:
-                i22 = information[m, 2, 2]
-                i02 = 2.0 * information[m, 0, 2]
-                i12 = 2.0 * information[m, 1, 2]
-            if cartesian[m]:
-                z0 = centres[m, 0] - sensor_position[0]
-                z1 = centres[m, 1] - sensor_position[1]
-                if d == 3:
-                    z2 = centres[m, 2] - sensor_position[2]
-                for i in range(size):
-                    e0 = z0 - x[i]
-                    e1 = z1 - y[i]
-                    e2 = z2 - height[i]
-                    row[i] = (
-                        e0 * (e0 * i00 + e1 * i01 + e2 * i02)
-                        + e1 * (e1 * i11 + e2 * i12)
-                        + e2 * e2 * i22
-                    )
-            else:
-                z0 = values[m, 0]
-                z1 = wrap(values[m, 1])
-                if d == 3:
-                    z2 = values[m, 2]
-                for i in range(size):
-                    e0 = z0 - distance[i]
-                    e1 = z1 - bearing[i]
-                    e1 = e1 - TWO_PI if e1 >= math.pi else e1
-                    e1 = e1 + TWO_PI if e1 < -math.pi else e1
-                    e2 = z2 - elevation[i]
-                    row[i] = (
-                        e0 * (e0 * i00 + e1 * i01 + e2 * i02)
-                        + e1 * (e1 * i11 + e2 * i12)
-                        + e2 * e2 * i22
-                    )
+            c0 = centres[m, 0] - sensor_position[0]
+            c1 = centres[m, 1] - sensor_position[1]
+            c2 = centres[m, 2] - sensor_position[2] if solid else 0.0
+            best = 0
+            for tile in range(tiles):
+                lower[tile] = _least_square(
+                    box[tile], c0, c1, c2, values[m, 0], cartesian[m], gates[m]
+                )
+                if lower[tile] < lower[best]:
+                    best = tile
             least = np.inf
-            for i in range(size):
-                if row[i] < least and probability[start + i] * denominator_weights[start + i] > 0.0:
-                    least = row[i]
-            total = 0.0
-            largest = least + RELATIVE_GATE
-            for i in range(size):
-                if row[i] < largest and probability[start + i] * denominator_weights[start + i] > 0:
-                    value = probability[start + i] * math.exp(-0.5 * (row[i] - least))
-                    row[i] = value
-                    total += value * denominator_weights[start + i]
+            for turn in range(tiles):
+                # The most promising tile first: its likelihoods rule out most others.
+                tile = best if turn == 0 else (turn - 1 if turn <= best else turn)
+                least_here[tile] = np.inf
+                if lower[tile] == np.inf or lower[tile] > least + 1.01 * RELATIVE_GATE:
+                    continue
+                start = first + tile * TILE
+                size = min(TILE, stop - start)
+                row = likelihood[m, start : start + size]
+                if cartesian[m]:
+                    _cartesian_squares(
+                        c0, c1, c2, information[m], x[tile], y[tile], height[tile], size, row
+                    )
                 else:
-                    row[i] = 0.0
+                    if not turned[tile]:
+                        turned[tile] = True
+                        _angles(
+                            x[tile],
+                            y[tile],
+                            height[tile],
+                            solid,
+                            size,
+                            bearing[tile],
+                            elevation[tile],
+                        )
+                    _polar_squares(
+                        values[m],
+                        information[m],
+                        distance[tile],
+                        bearing[tile],
+                        elevation[tile],
+                        size,
+                        row,
+                    )
+                least_here[tile] = _smallest(row, seen[tile], size)
+                least = min(least, least_here[tile])
+            total = 0.0
+            for tile in range(tiles):
+                here = least_here[tile] < least + RELATIVE_GATE
+                active[m, chunk * TILES + tile] = here
+                if here:
+                    start = first + tile * TILE
+                    size = min(TILE, stop - start)
+                    total += _likelihoods(
+                        likelihood[m, start : start + size],
+                        least,
+                        seen[tile],
+                        probability[start : start + size],
+                        size,
+                        scratch,
+                        bits,
+                    )
             all_smallest[chunk, m] = least
             all_sums[chunk, m] = total
 
 
 @njit(cache=True, error_model='numpy')
+def _log_sums(smallest, sums, log_norm, log_own):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the logarithm of the particles' part of C(z)."""
+    for m in range(smallest.shape[1]):
+        least = np.inf
+        for chunk in range(smallest.shape[0]):
+            least = min(least, smallest[chunk, m])
+        total = 0.0
+        for chunk in range(smallest.shape[0]):
+            if smallest[chunk, m] < np.inf:
+                total += sums[chunk, m] * math.exp(-0.5 * (smallest[chunk, m] - least))
+        log_own[m] = log_norm[m] - 0.5 * least + math.log(total) if total > 0.0 else -np.inf
+
+
+@njit(cache=True, error_model='numpy')
 def _normalise(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    smallest, sums, log_norm, other, log_normaliser, own_mass, other_scale, scale
+    smallest, sums, log_own, other, log_normaliser, own_mass, other_scale, scale
 ):
     """Fill log C(z), the particles' share of it, 1 / C(z), and the factor of each chunk."""
     chunks, number = smallest.shape
@@ -434,31 +705,79 @@ def _normalise(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
         for chunk in range(chunks):
             least = min(least, smallest[chunk, m])
         total = 0.0
-        if least < np.inf:
-            for chunk in range(chunks):
-                if smallest[chunk, m] < np.inf:
-                    total += sums[chunk, m] * math.exp(-0.5 * (smallest[chunk, m] - least))
-        log_other = math.log(other[m]) if other[m] > 0.0 else -np.inf
-        # Everything in units of the largest likelihood: exact however small that is.
-        log_peak = log_norm[m] - 0.5 * least if total > 0.0 else -np.inf
-        own_mass[m] = 0.0
-        other_scale[m] = 0.0
         for chunk in range(chunks):
             scale[chunk, m] = 0.0
-        log_sum = log_other
+            if smallest[chunk, m] < np.inf:
+                scale[chunk, m] = math.exp(-0.5 * (smallest[chunk, m] - least))
+                total += sums[chunk, m] * scale[chunk, m]
+        log_sum = math.log(other[m]) if other[m] > 0.0 else -np.inf
+        own_mass[m] = 0.0
+        other_scale[m] = 0.0
+        share = 0.0
         # Where something else explains it e^600 times better, the particles' share is nothing.
-        if total > 0.0 and log_other - log_peak < 600.0:
-            relative = math.exp(log_other - log_peak)
-            own_mass[m] = total / (total + relative)
-            log_sum = log_peak + math.log(total + relative)
-            for chunk in range(chunks):
-                if smallest[chunk, m] < np.inf:
-                    part = math.exp(-0.5 * (smallest[chunk, m] - least))
-                    scale[chunk, m] = part / (total + relative)
+        if log_own[m] > -np.inf and log_sum - log_own[m] < 600.0:
+            # In units of what the particles explain: exact however small that is.
+            relative = math.exp(log_sum - log_own[m])
+            own_mass[m] = 1.0 / (1.0 + relative)
+            share = own_mass[m] / total
+            log_sum = log_own[m] + math.log(1.0 + relative)
+        for chunk in range(chunks):
+            scale[chunk, m] *= share
         if log_sum > -np.inf:
             # Next to nothing may still be divided by; what is multiplied with it is as small.
             other_scale[m] = math.exp(min(-log_sum, 700.0))
         log_normaliser[m] = log_sum
+
+
+@njit(cache=True, error_model='numpy')
+def _begin(probability, factor, share, component, number):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(number):
+        factor[i] = 1.0 - probability[i]
+    for i in range(number):
+        share[i] = 0.0
+    for i in range(number):
+        component[i] = -1
+
+
+@njit(cache=True, error_model='numpy')
+def _shares(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    row, multiple, weights, detection, number, held, factor, share, component
+):
+    """Fill W_i(z) of a detection, and what it changes in `factor`, `share` and `component`."""
+    for i in range(number):
+        held[i] = row[i] * multiple
+    for i in range(number):
+        factor[i] += held[i]
+    for i in range(number):
+        held[i] *= weights[i]
+    for i in range(number):
+        component[i] = detection if held[i] > share[i] else component[i]
+    for i in range(number):
+        share[i] = held[i] if held[i] > share[i] else share[i]
+
+
+@njit(cache=True, error_model='numpy')
+def _one_group(group, number):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    different = np.int64(0)
+    first = group[0]
+    for i in range(number):
+        different |= group[i] ^ first
+    return different == 0
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _finish(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    weights, factor, share, component, group, groups, number, updated, owner
+):
+    """Fill updated weights and the group each particle would join; return the sum."""
+    total = 0.0
+    for i in range(number):
+        updated[i] = weights[i] * factor[i]
+    for i in range(number):
+        total += updated[i]
+    for i in range(number):
+        owner[i] = groups + component[i] if share[i] > 0.5 * updated[i] else group[i]
+    return total
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -466,126 +785,123 @@ def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
     first_chunk,
     last_chunk,
     particles,
-    weights,
-    first,
+    all_weights,
+    all_probability,
     likelihood,
+    active,
     scale,
     centres,
-    factor,
-    share,
-    component,
+    all_factor,
+    all_share,
+    all_component,
     all_moments,
-    group,
+    all_group,
     group_share,
+    group_mass,
+    first_detection,
+    finish,
+    all_updated,
+    all_owner,
 ):
     """Add psi_z / C(z) to `factor`, and sum moments of W_i(z) = psi_z(x_i) w_i / C(z).
 
     `share` and `component` keep the largest W_i(z) of each particle, and its z. `moments`
-    (m, 1 + d + d (d + 1) / 2) are taken about `centres`.
+    (m, 1 + d + d (d + 1) / 2) are taken about `centres`. With the last detections the updated
+    weights are filled, and the group that each particle would join by itself.
     """
-    d = particles.shape[1]
+    n, d = particles.shape
     number = likelihood.shape[0]
+    groups = group_mass.shape[1]
+    held = np.empty(TILE)
+    x = np.empty(TILE)
+    y = np.empty(TILE)
+    z = np.empty(TILE)
+    before = np.empty(TILE, np.int64)
+    origin = np.zeros(3)
     for chunk in range(first_chunk, last_chunk):
-        start = chunk * CHUNK
-        stop = min(particles.shape[0], start + CHUNK)
-        for m in range(number):
-            row = likelihood[m]
-            multiple = scale[chunk, m]
-            c0 = centres[m, 0]
-            c1 = centres[m, 1]
-            c2 = centres[m, 2] if d == 3 else 0.0
-            t0 = 0.0
-            tx = 0.0
-            ty = 0.0
-            tz = 0.0
-            txx = 0.0
-            txy = 0.0
-            tyy = 0.0
-            txz = 0.0
-            tyz = 0.0
-            tzz = 0.0
-            # Particles of a group lie together, so its sum is kept apart until another comes.
-            current = np.int64(0)
-            held = 0.0
-            for i in range(start, stop):
-                value = row[i]
-                if value == 0.0:
+        all_moments[chunk] = 0.0
+        for tile in range(chunk * TILES, (chunk + 1) * TILES):
+            start = tile * TILE
+            stop = min(n, start + TILE)
+            size = stop - start
+            if size <= 0:
+                break
+            weights = all_weights[start:stop]
+            factor = all_factor[start:stop]
+            share = all_share[start:stop]
+            component = all_component[start:stop]
+            for i in range(size):
+                before[i] = all_group[start + i]
+            single = _one_group(before, size)
+            offsets(particles, start, size, origin, x, y, z)
+            if first_detection == 0:
+                _begin(all_probability[start:stop], factor, share, component, size)
+            for m in range(number):
+                if not active[m, tile] or scale[chunk, m] == 0.0:
                     continue
-                ratio = value * multiple
-                factor[i] += ratio
-                value = ratio * weights[i]
-                if value <= 0.0:
-                    continue
-                if value > share[i]:
-                    share[i] = value
-                    component[i] = first + m
-                if group[i] != current:
-                    group_share[chunk, current, m] += held
-                    held = 0.0
-                    current = group[i]
-                held += value
-                x = particles[i, 0] - c0
-                y = particles[i, 1] - c1
-                t0 += value
-                tx += value * x
-                ty += value * y
-                txx += value * x * x
-                txy += value * x * y
-                tyy += value * y * y
-                if d == 3:
-                    z = particles[i, 2] - c2
-                    tz += value * z
-                    txz += value * x * z
-                    tyz += value * y * z
-                    tzz += value * z * z
-            if held > 0.0:
-                group_share[chunk, current, m] += held
-            moments = all_moments[chunk, m]
-            moments[0] = t0
-            moments[1] = tx
-            moments[2] = ty
-            if d == 2:
-                moments[3] = txx
-                moments[4] = txy
-                moments[5] = tyy
-            else:
-                moments[3] = tz
-                moments[4] = txx
-                moments[5] = txy
-                moments[6] = tyy
-                moments[7] = txz
-                moments[8] = tyz
-                moments[9] = tzz
+                _shares(
+                    likelihood[m, start:stop],
+                    scale[chunk, m],
+                    weights,
+                    first_detection + m,
+                    size,
+                    held,
+                    factor,
+                    share,
+                    component,
+                )
+                total = add_moments(held, x, y, z, size, centres[m], d == 3, all_moments[chunk, m])
+                if single:
+                    group_share[chunk, before[0], m] += total
+                else:
+                    for i in range(size):
+                        group_share[chunk, before[i], m] += held[i]
+            if finish:
+                updated = all_updated[start:stop]
+                total = _finish(
+                    weights,
+                    factor,
+                    share,
+                    component,
+                    before,
+                    groups,
+                    size,
+                    updated,
+                    all_owner[start:stop],
+                )
+                if single:
+                    group_mass[chunk, before[0]] += total
+                else:
+                    for i in range(size):
+                        group_mass[chunk, before[i]] += updated[i]
 
 
-@njit(cache=True, error_model='numpy')
-def regroup(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    weights, factor, share, component, group, group_share, updated, regrouped
-):
-    """Fill the updated weights, and the groups of particles after one robot's detections.
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _taken(group_mass, group_share, taken):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fill for each group (g,) the detection's group that what is left of it belongs to.
 
-    A particle belongs to the detection that explains most of its weight, if one does. What a
-    detection leaves of a group that it mostly took belongs to it too. Groups of detections are
-    numbered behind the ones there are.
+    A detection that mostly took a group takes the rest of it too.
     """
     groups, number = group_share.shape
-    mass = np.zeros(groups)
-    for i in range(weights.shape[0]):
-        updated[i] = weights[i] * factor[i]
-        mass[group[i]] += updated[i]
-    taken = np.empty(groups, np.int64)
     for g in range(groups):
+        mass = 0.0
+        for chunk in range(group_mass.shape[0]):
+            mass += group_mass[chunk, g]
         taken[g] = g
-        best = 0.5 * mass[g]
+        best = 0.5 * mass
         for m in range(number):
             if group_share[g, m] > best:
                 best = group_share[g, m]
                 taken[g] = groups + m
-    for i in range(weights.shape[0]):
-        if share[i] > 0.5 * updated[i]:
-            regrouped[i] = groups + component[i]
-        else:
-            regrouped[i] = taken[group[i]]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _regroup_chunks(first_chunk, last_chunk, taken, owner):  # type: ignore[no-untyped-def]  # pragma: no cover
+    groups = taken.shape[0]
+    part = owner[first_chunk * CHUNK : last_chunk * CHUNK]
+    for i in range(len(part)):
+        g = part[i]
+        part[i] = taken[g] if g < groups else g
 
 
 @njit(cache=True, error_model='numpy')
@@ -628,12 +944,46 @@ def run_chunks(
     Every chunk writes to places of its own, so that the result does not depend on the threads.
     """
     count = max(1, -(-number // CHUNK))
-    if pool is None or count < 4:
+    if pool is None or count < 8:
         function(0, count)
         return
-    futures = [pool.submit(function, chunk, chunk + 1) for chunk in range(count)]
+    part = max(4, -(-count // RANGES))
+    futures = [
+        pool.submit(function, first, min(first + part, count)) for first in range(0, count, part)
+    ]
     for future in futures:
         future.result()
+
+
+class Workspace:
+    """Arrays that are used again and again: fresh memory costs more than what is done in it."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
+        """Return an array whose content is arbitrary; the one taken before by that name is void."""
+        size = math.prod(shape)
+        array = self._arrays.get(name)
+        if array is None or array.size < size:
+            array = np.empty(size + size // 4, dtype)
+            self._arrays[name] = array
+        return array[:size].reshape(shape)
+
+    def released(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Return an array that later takes leave alone: a copy if it is one that was taken."""
+        taken = any(array.base is own for own in self._arrays.values())
+        return array.copy() if taken else array
+
+    def extended(self, name: str, array: NDArray[Any], more: NDArray[Any]) -> NDArray[Any]:
+        """Return an array with rows appended; in place where it is the one taken by that name."""
+        before = self._arrays.get(name)
+        shape = (len(array) + len(more), *array.shape[1:])
+        out = self.take(name, shape, array.dtype)
+        if array.base is None or array.base is not before or out.base is not before:
+            out[: len(array)] = array
+        out[len(array) :] = more
+        return out
 
 
 @dataclass
@@ -644,6 +994,8 @@ class Association:
     ----------
     factor : (n,) array
         What each weight is multiplied with: 1 - pi + sum over z of psi_z / C(z).
+    weights : (n,) array
+        The updated ones.
     log_normaliser : (m,) array
         Logarithm of C(z), -inf where nothing explains a detection.
     own_mass : (m,) array
@@ -658,9 +1010,14 @@ class Association:
         Of the particles weighted with W_i(z), metres; covariance 0 where there is no mass.
     group_share : (g, m) array
         W_i(z) summed over the particles of each group.
+    group : (n,) array
+        Groups after the update. A particle belongs to the detection that explains most of its
+        weight, if one does; what a detection leaves of a group that it mostly took belongs to it
+        too. The group of a detection is its number behind the groups there were.
     """
 
     factor: FloatArray
+    weights: FloatArray
     log_normaliser: FloatArray
     own_mass: FloatArray
     other_scale: FloatArray
@@ -669,19 +1026,65 @@ class Association:
     means: FloatArray
     covariances: FloatArray
     group_share: FloatArray
+    group: IntArray
+
+
+def _explain(
+    particles: FloatArray,
+    denominator: FloatArray,
+    kernel: tuple[int, FloatArray],
+    probability: FloatArray,
+    measurements: MeasurementSet,
+    block: slice,
+    pose: Pose,
+    workspace: Workspace,
+    pool: ThreadPoolExecutor | None,
+) -> tuple[FloatArray, NDArray[np.bool_], FloatArray, FloatArray, FloatArray]:
+    """Return likelihoods, active tiles, smallest squares, sums, and log of the particles' C(z)."""
+    n = len(particles)
+    chunks = max(1, -(-n // CHUNK))
+    width = block.stop - block.start
+    likelihood = workspace.take('likelihood', (width, n))
+    active = workspace.take('active', (width, chunks * TILES), np.bool_)
+    smallest = np.empty((chunks, width))
+    sums = np.empty((chunks, width))
+    yaw = pose.yaw
+    work = (
+        particles,
+        denominator,
+        *kernel,
+        math.cos(yaw),
+        math.sin(yaw),
+        probability,
+        pose.position,
+        measurements.values[block],
+        measurements.cartesian[block],
+        measurements.centres[block],
+        measurements.information[block],
+        measurements.gates[block],
+        likelihood,
+        active,
+        smallest,
+        sums,
+    )
+    run_chunks(lambda c, e: _explain_chunks(c, e, *work), n, pool)
+    log_own = np.empty(width)
+    _log_sums(smallest, sums, measurements.log_norm[block], log_own)
+    return likelihood, active, smallest, sums, log_own
 
 
 def associate(
     particles: FloatArray,
     weights: FloatArray,
-    probability: FloatArray,
+    probability: FloatArray | tuple[int, FloatArray],
     measurements: MeasurementSet,
     pose: Pose,
-    other: FloatArray,
+    other: FloatArray | Callable[[FloatArray], FloatArray],
     denominator_weights: FloatArray | None = None,
     group: IntArray | None = None,
     groups: int = 1,
     pool: ThreadPoolExecutor | None = None,
+    workspace: Workspace | None = None,
 ) -> Association:
     """Return the update of particle weights by one robot's detections (000, eq. (13), (16)).
 
@@ -691,15 +1094,16 @@ def associate(
         Metres, frame `map`.
     weights : (n,) array
         Of the running intensity.
-    probability : (n,) array
+    probability : (n,) array, or a detection model's kernel
         pi at the particles.
     measurements : MeasurementSet
         m detections; with none the factor is 1 - pi.
     pose : Pose
         Of the sensor.
-    other : (m,) array
+    other : (m,) array or callable
         What else explains each detection: intensity of clutter, found targets and births, per
-        unit of measurement space. Added to C(z).
+        unit of measurement space. Added to C(z). A callable gets the logarithm of what the
+        particles add to C(z), (m,).
     denominator_weights : (n,) array, optional
         Weights in C(z) where they are not the running ones: 002, eq. (9) has the predicted ones.
     group : (n,) int array, optional
@@ -708,14 +1112,32 @@ def associate(
         Number of groups.
     pool : ThreadPoolExecutor, optional
         For large sets; the result is the same.
+    workspace : Workspace, optional
+        The arrays of n in the result are its own: the next update with it overwrites them.
     """
     n, d = particles.shape
     number = len(measurements)
+    workspace = Workspace() if workspace is None else workspace
     denominator = weights if denominator_weights is None else denominator_weights
     group = np.zeros(n, np.int64) if group is None else group
-    factor = 1.0 - probability
-    share = np.zeros(n)
-    component = np.full(n, -1, np.int64)
+    kernel = (GIVEN, np.empty(PARAMETERS))
+    if isinstance(probability, tuple):
+        kernel = probability
+        probability = workspace.take('probability', (n,))
+    blocks = [slice(first, min(number, first + BLOCK)) for first in range(0, number, BLOCK)]
+    blocks = blocks or [slice(0, 0)]
+    parts = (particles, denominator, kernel, probability, measurements)
+    explained = _explain(*parts, blocks[0], pose, workspace, pool)
+    if callable(other):
+        own = [explained[4]]
+        for block in blocks[1:]:
+            own.append(_explain(*parts, block, pose, workspace, pool)[4])
+        other = other(np.concatenate(own))
+    factor = workspace.take('factor', (n,))
+    share = workspace.take('share', (n,))
+    component = workspace.take('component', (n,), np.int64)
+    updated = workspace.take('weights', (n,))
+    owner = workspace.take('group', (n,), np.int64)
     log_normaliser = np.empty(number)
     own_mass = np.empty(number)
     other_scale = np.empty(number)
@@ -724,31 +1146,18 @@ def associate(
     covariances = np.empty((number, d, d))
     group_share = np.zeros((groups, number))
     chunks = max(1, -(-n // CHUNK))
-    for first in range(0, number, BLOCK):
-        block = slice(first, min(number, first + BLOCK))
-        width = block.stop - first
-        likelihood = np.empty((width, n))
-        smallest = np.empty((chunks, width))
-        sums = np.empty((chunks, width))
-        before = (
-            particles,
-            denominator,
-            probability,
-            pose.position,
-            measurements.values[block],
-            measurements.cartesian[block],
-            measurements.centres[block],
-            measurements.information[block],
-            likelihood,
-            smallest,
-            sums,
-        )
-        run_chunks(lambda c, e, work=before: _associate_chunks(c, e, *work), n, pool)  # type: ignore[misc]
+    group_mass = np.zeros((chunks, groups))
+    for block in blocks:
+        width = block.stop - block.start
+        # One block is the usual; of several the last one explained is not the first.
+        if len(blocks) > 1:
+            explained = _explain(*parts, block, pose, workspace, pool)
+        likelihood, active, smallest, sums, log_own = explained
         scale = np.empty((chunks, width))
         _normalise(
             smallest,
             sums,
-            measurements.log_norm[block],
+            log_own,
             other[block],
             log_normaliser[block],
             own_mass[block],
@@ -757,11 +1166,12 @@ def associate(
         )
         moments = np.empty((chunks, width, 1 + d + d * (d + 1) // 2))
         shares = np.zeros((chunks, groups, width))
-        after = (
+        work = (
             particles,
             weights,
-            first,
+            probability,
             likelihood,
+            active,
             scale,
             measurements.centres[block],
             factor,
@@ -770,15 +1180,24 @@ def associate(
             moments,
             group,
             shares,
+            group_mass,
+            block.start,
+            block is blocks[-1],
+            updated,
+            owner,
         )
-        run_chunks(lambda c, e, work=after: _apply_chunks(c, e, *work), n, pool)  # type: ignore[misc]
+        run_chunks(lambda c, e, work=work: _apply_chunks(c, e, *work), n, pool)  # type: ignore[misc]
         finish_moments(
             moments, measurements.centres[block], mass[block], means[block], covariances[block]
         )
         for chunk in range(chunks):
             group_share[:, block] += shares[chunk]
+    taken = np.empty(groups, np.int64)
+    _taken(group_mass, group_share, taken)
+    run_chunks(lambda c, e: _regroup_chunks(c, e, taken, owner), n, pool)
     return Association(
         factor,
+        updated,
         log_normaliser,
         own_mass,
         other_scale,
@@ -787,4 +1206,5 @@ def associate(
         means,
         covariances,
         group_share,
+        owner,
     )

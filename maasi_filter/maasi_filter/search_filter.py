@@ -23,23 +23,24 @@ from maasi_filter.detection_model import (
 from maasi_filter.exploration import Exploration, check_bounds
 from maasi_filter.found_targets import (
     FoundTarget,
-    bounded_below,
     detection_information,
     exclusive,
     found_intensity,
     missing_spread,
+    narrow_clouds,
     refine,
     remove_measurements,
 )
-from maasi_filter.particles import gather, group_moments, jitter, resample, total_weight
-from maasi_filter.phd import (
-    CHUNK,
-    MeasurementSet,
-    associate,
-    prepare_measurements,
-    regroup,
-    run_chunks,
+from maasi_filter.particles import (
+    clear,
+    gather,
+    group_moments,
+    groups_of,
+    jitter,
+    resample,
+    total_weight,
 )
+from maasi_filter.phd import MeasurementSet, Workspace, associate, prepare_measurements
 from maasi_filter.pose import Pose
 from maasi_filter.sensor import Sensor, is_covariance
 from maasi_filter.settings import (
@@ -76,6 +77,8 @@ LEAST_CLUSTER_MASS = 0.1
 SAME_TARGET = 16.0
 # Particles of a birth when there are more detections than there are particles for.
 LEAST_BIRTHS = 20
+# Draws of a birth where particles explain the detection.
+LEAST_DRAWS = 32
 UNLIMITED_INFORMATION = 1e12
 # Births that explain less of a detection than this are not worth their particles.
 LEAST_BIRTH_MASS = 1e-3
@@ -211,6 +214,8 @@ class SearchFilter:
         self._predicted: FloatArray | None = None
         self._birth_budget = 0
         self._moments: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._expected: float | None = None
+        self._workspace = Workspace()
         self._pool: ThreadPoolExecutor | None = None
 
     @property
@@ -399,6 +404,7 @@ class SearchFilter:
         if not math.isfinite(time):
             raise ValueError(f'time: got {time}, allowed are finite numbers')
         self._moments = None
+        self._expected = None
         members = [self._checked(m) for m in sorted(measurements, key=lambda m: m.robot)]
         names = [member.robot for member in members]
         if len(set(names)) != len(names):
@@ -426,6 +432,11 @@ class SearchFilter:
         self._predicted = None
         if detections:
             self._resample(members)
+        else:
+            # What the workspace holds is overwritten by the next step.
+            self.particles = self._workspace.released(self.particles)
+            self.weights = self._workspace.released(self.weights)
+            self._group = self._workspace.released(self._group)
         if numbers.extraction == 'kmeans':
             self._extract_kmeans(members, newly_found, time)
         else:
@@ -434,7 +445,7 @@ class SearchFilter:
             clusters=list(self.clusters),
             newly_found=newly_found,
             found_changed=moved or bool(newly_found),
-            expected_number=self.expected_number,
+            expected_number=self.expected_number if self._expected is None else self._expected,
             dropped=dropped,
         )
 
@@ -532,9 +543,10 @@ class SearchFilter:
     def _append(
         self, particles: FloatArray, weights: FloatArray, group: IntArray, groups: int
     ) -> None:
-        self.particles = np.concatenate([self.particles, particles])
-        self.weights = np.concatenate([self.weights, weights])
-        self._group = np.concatenate([self._group, group])
+        space = self._workspace
+        self.particles = space.extended('particles', self.particles, particles)
+        self.weights = space.extended('weights', self.weights, weights)
+        self._group = space.extended('group', self._group, group)
         if self._predicted is not None:
             # For the robots after this one, what is born by then is part of the prediction.
             self._predicted = np.concatenate([self._predicted, weights])
@@ -547,7 +559,7 @@ class SearchFilter:
         mass = born.totals * scale
         per_target = self._numbers.particles_per_target
         assert per_target is not None
-        number = np.minimum(np.ceil(per_target * mass), born.intensity.shape[1])
+        number = np.minimum(np.ceil(per_target * mass), np.diff(born.starts))
         number[mass <= LEAST_BIRTH_MASS] = 0.0
         if not number.any():
             return
@@ -576,21 +588,6 @@ class SearchFilter:
             self._pool = ThreadPoolExecutor(threads)
         return self._pool
 
-    def _probability(
-        self, detection: DetectionModel, pose: Pose, pool: ThreadPoolExecutor | None
-    ) -> FloatArray:
-        """Return pi at the particles; a user's own function is called once, in this thread."""
-        if pool is None or detection.kernel() is None:
-            return detection.probability(self.particles, pose)
-        out = np.empty(len(self.particles))
-
-        def fill(first: int, last: int) -> None:
-            part = slice(first * CHUNK, last * CHUNK)
-            out[part] = detection.probability(self.particles[part], pose)
-
-        run_chunks(fill, len(out), pool)
-        return out
-
     def _correct(
         self,
         member: _Member,
@@ -610,63 +607,47 @@ class SearchFilter:
             _count(dropped, 'range', int((~reach).sum()))
             member = member.only(reach)
         count = len(member.values)
-        pool = self._threads()
-        probability = self._probability(detection, member.pose, pool)
         if count == 0:
-            self.weights = self.weights * (1.0 - probability)
+            missed = 1.0 - detection.probability(self.particles, member.pose)
+            self.weights = self.weights * missed
             self.exploration.update(detection, member.pose)
             return 0, False
         prepared = self._prepared(member)
-        other = np.full(count, sensor.clutter)
         born = None
         kappa = np.zeros((0, count))
-        if numbers.births == 'measurement':
-            assert numbers.birth_particles is not None and numbers.expected_targets is not None
-            each = max(LEAST_BIRTHS, min(numbers.birth_particles, self._birth_budget))
-            born = birth_models.measurement_births(
-                prepared,
-                member.pose,
-                detection,
-                self.exploration,
-                numbers.expected_targets,
-                each,
-                self.generator,
-                unexplored=numbers.birth_prior == 'unexplored',
-            )
-            other = other + born.totals
-        if numbers.removal == 'soft' and self.found_targets:
-            kappa = self._found_intensity(member, detection, prepared, other)
-            other = other + kappa.sum(axis=0)
+
+        def other(log_own: FloatArray) -> FloatArray:
+            """Return what else explains each detection, once it is known what particles do."""
+            nonlocal born, kappa
+            intensity = np.full(count, sensor.clutter)
+            if numbers.births == 'measurement':
+                born = self._births(member, detection, prepared, log_own)
+                intensity += born.totals
+            if numbers.removal == 'soft' and self.found_targets:
+                kappa = self._found_intensity(member, detection, prepared, intensity)
+                intensity += kappa.sum(axis=0)
+            return intensity
+
+        kernel = detection.kernel()
         update = associate(
             self.particles,
             self.weights,
-            probability,
+            detection.probability(self.particles, member.pose) if kernel is None else kernel,
             prepared,
             member.pose,
             other,
             denominator_weights=self._predicted,
             group=self._group,
             groups=self._groups,
-            pool=pool,
+            pool=self._threads(),
+            workspace=self._workspace,
         )
         explained = np.isfinite(update.log_normaliser)
         if not explained.all():
             self._count_unexplained(prepared, ~explained, dropped)
         groups = self._groups
-        updated = np.empty_like(self.weights)
-        group = np.empty_like(self._group)
-        regroup(
-            self.weights,
-            update.factor,
-            update.share,
-            update.component,
-            self._group,
-            update.group_share,
-            updated,
-            group,
-        )
-        self.weights = updated
-        self._group = group
+        self.weights = update.weights
+        self._group = update.group
         self._groups = groups + count
         information = detection_information(update.means, prepared, member.pose)
         if groups:
@@ -693,6 +674,36 @@ class SearchFilter:
             )
         self.exploration.update(detection, member.pose)
         return int(explained.sum()), moved
+
+    def _births(
+        self,
+        member: _Member,
+        detection: DetectionModel,
+        prepared: MeasurementSet,
+        log_own: FloatArray,
+    ) -> birth_models.MeasurementBirths:
+        numbers = self._numbers
+        assert numbers.birth_particles is not None and numbers.expected_targets is not None
+        assert numbers.particles_per_target is not None
+        number = birth_models.births_worth_drawing(
+            prepared,
+            log_own,
+            numbers.expected_targets,
+            self.volume,
+            numbers.particles_per_target,
+            LEAST_DRAWS,
+            max(LEAST_BIRTHS, min(numbers.birth_particles, self._birth_budget)),
+        )
+        return birth_models.measurement_births(
+            prepared,
+            member.pose,
+            detection,
+            self.exploration,
+            numbers.expected_targets,
+            number,
+            self.generator,
+            unexplored=numbers.birth_prior == 'unexplored',
+        )
 
     def _count_unexplained(
         self,
@@ -767,19 +778,17 @@ class SearchFilter:
         radius = self._found_radius(member.sensor)
         own = self._pose_error(member.sensor) ** 2 * np.eye(self.dimension)
         known = len(claims)
-        for m in range(len(own_mass)):
-            if own_mass[m] <= numbers.found_mass:
-                continue
-            spread = math.sqrt(max(float(np.trace(covariances[m])), 0.0))
-            if spread > radius:
-                continue
-            covariance = covariances[m]
-            covariance = bounded_below(
-                covariance, self._information[groups + m] + self._prior_information
-            )
+        candidates, bounded = narrow_clouds(
+            own_mass,
+            covariances,
+            self._information[groups : groups + len(own_mass)],
+            self._prior_information,
+            numbers.found_mass,
+            radius,
+        )
+        for m in candidates.tolist():
+            covariance = bounded[m]
             spread = math.sqrt(float(np.trace(covariance)))
-            if spread > radius:
-                continue
             if self._is_known(means[m], covariance, claims, known, m):
                 continue
             target = FoundTarget(
@@ -793,11 +802,17 @@ class SearchFilter:
             self.found_targets.append(target)
             self._covariances.append(covariance)
             newly_found.append(target)
-            offset = self.particles - means[m]
-            near = np.sqrt((offset * offset).sum(axis=1)) <= 3.0 * spread
-            here = self._group == groups + m
-            elsewhere = (self._group >= groups) & ~here
-            self.weights = np.where(here | (near & ~elsewhere), 0.0, self.weights)
+            # What another detection explains is another target's, however near.
+            clear(
+                self.particles,
+                self.weights,
+                self._group,
+                means[m],
+                3.0 * spread,
+                groups + m,
+                groups,
+                self._threads(),
+            )
 
     def _is_known(
         self,
@@ -826,21 +841,25 @@ class SearchFilter:
     def _resample(self, members: Sequence[_Member]) -> None:
         numbers = self._numbers
         pool = self._threads()
-        expected = total_weight(self.weights)
+        expected = total_weight(self.weights, pool)
         if not expected > 1e-12:
             self.particles = np.empty((0, self.dimension))
             self.weights = np.empty(0)
             self._group = np.empty(0, np.int64)
             self._groups = 0
             self._information = np.empty((0, self.dimension, self.dimension))
+            self._expected = 0.0
             return
         assert numbers.particles_per_target is not None and numbers.particles_minimum is not None
         wanted = max(numbers.particles_minimum, math.ceil(numbers.particles_per_target * expected))
         number = min(max(wanted, 1), numbers.particles)
         assert numbers.resampling is not None
         index = resample(self.weights, number, numbers.resampling, self.generator, pool)
-        particles, group, present = gather(index, self.particles, self._group, self._groups, pool)
-        self._groups = int(present.sum())
+        particles, copy, starts, present = gather(
+            index, self.particles, self._group, self._groups, pool, self._workspace
+        )
+        group = groups_of(starts, pool)
+        self._groups = len(starts) - 1
         self._information = self._information[present]
         weights = np.full(number, expected / number)
         mass, means, covariances = group_moments(particles, weights, group, self._groups, pool)
@@ -853,10 +872,10 @@ class SearchFilter:
         known = self._information[:, 0, 0] > 0.0
         deviation = max((self._jitter_deviation(member.sensor) for member in members), default=0.0)
         if numbers.jitter_differential > 0.0 or deviation > 0.0:
-            particles = jitter(
+            self.particles = jitter(
                 particles,
-                index,
-                group,
+                copy,
+                starts,
                 means,
                 np.where(known, numbers.jitter_differential, 0.0),
                 deviation,
@@ -865,11 +884,13 @@ class SearchFilter:
                 fill=fill,
                 pool=pool,
             )
-        self.particles = particles
+        else:
+            self.particles = particles.copy()
         self.weights = weights
+        self._expected = expected
         self._group = group
         if fill is not None:
-            covariances = covariances + np.einsum('gij,gkj->gik', fill, fill)
+            covariances = covariances + fill @ fill.transpose(0, 2, 1)
         self._moments = mass, means, covariances
 
     def _extract_groups(self, members: Sequence[_Member]) -> None:

@@ -22,7 +22,7 @@ from maasi_planner.obstacles import Obstacles
 from maasi_planner.team import Decision
 from maasi_sim.scenario import Scenario, steps_of
 from maasi_sim.scoring import score, scoring_radius
-from maasi_sim.simulation import simulated_robot
+from maasi_sim.simulation import simulated_robot, step_of_event
 from maasi_sim.world import World
 
 FloatArray = NDArray[np.float64]
@@ -194,17 +194,34 @@ def planner_settings(scenario: Scenario, common: NodeSettings) -> PlannerNodeSet
     )
 
 
+def leaving(scenario: Scenario) -> dict[int, list[str]]:
+    """Return which robots leave at which step, as the simulation plays it."""
+    steps: dict[int, list[str]] = {}
+    for event in scenario.events:
+        if event.do != 'leave':
+            raise ValueError(
+                f"events: read '{event.do}' of {event.robot}, in one process robots only leave"
+            )
+        steps.setdefault(step_of_event(event.at, scenario.step), []).append(event.robot)
+    return steps
+
+
 def search(scenario: Scenario, seed: int, most_measurements: int | None = None) -> SearchResult:
-    """Run a scenario in this process, step by step as in lockstep; events are not played.
+    """Run a scenario in this process, step by step as in lockstep.
 
     Parameters
     ----------
     scenario : Scenario
-        What to search, by whom.
+        What to search, by whom. Of its events, robots that leave are played.
     seed : int
         Of all random numbers.
     most_measurements : int, optional
         End after so many measurements of all robots.
+
+    Raises
+    ------
+    ValueError
+        If a robot is to come back.
     """
     world = scenario.world(seed)
     robots = {name: _Robot(name, scenario, seed, world) for name in scenario.names()}
@@ -214,6 +231,8 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
     search_filter = SearchFilter(
         scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
     )
+    departures = leaving(scenario)
+    away: set[str] = set()
     truth = np.asarray(world.targets, dtype=float)
     radius = scoring_radius(scenario, truth)
     counts = dict.fromkeys(robots, 0)
@@ -226,10 +245,14 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
     step = -1
     for step in range(steps_of(scenario.limits.time, scenario.step)):
         time = step * scenario.step
-        for robot in robots.values():
+        for name in departures.get(step, []):
+            away.add(name)
+            coordinator.leave(name)
+        here = {name: robot for name, robot in robots.items() if name not in away}
+        for robot in here.values():
             robot.observe(round(time * 1e9))
         commands = {
-            name: robot.follower.update(robot.state, step)[0] for name, robot in robots.items()
+            name: robot.follower.update(robot.state, step)[0] for name, robot in here.items()
         }
         present = {
             name: PresentRobot(
@@ -241,7 +264,7 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
                     and robot.follower.status != GoalStatus.MOVING
                 ),
             )
-            for name, robot in robots.items()
+            for name, robot in here.items()
         }
         begin = perf_counter()
         decision = coordinator.plan(step, present)
@@ -252,7 +275,7 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
                 if not chosen.stays:
                     number = coordinator.decision_index(name) + 1
                     robots[name].follower.take(Goal(number, step, chosen.waypoint))
-        able = {name for name, robot in robots.items() if step % robot.imaging_steps == 0}
+        able = {name for name, robot in here.items() if step % robot.imaging_steps == 0}
         members = coordinator.measuring(step, present, able)
         if members:
             measurements = [
@@ -289,7 +312,7 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
         if most_measurements is not None and sum(counts.values()) >= most_measurements:
             end_reason = 'measurement_limit'
             break
-        for name, robot in robots.items():
+        for name, robot in here.items():
             before = robot.body.state.pose.position
             robot.body.command(commands[name])
             robot.body.step(step + 1, scenario.step)

@@ -59,7 +59,7 @@ class Simulation:
         }
         self._events: dict[int, list[tuple[str, str]]] = {}
         for event in sorted(scenario.events, key=lambda event: event.at):
-            step = math.ceil(event.at / scenario.step - _TOLERANCE)
+            step = step_of_event(event.at, scenario.step)
             self._events.setdefault(step, []).append((event.robot, event.do))
         self._apply_events()
 
@@ -123,6 +123,11 @@ class Simulation:
                 self.away.add(name)
             else:
                 self.away.discard(name)
+
+
+def step_of_event(time: float, step: float) -> int:
+    """Return the first step at or after a time [s]."""
+    return math.ceil(time / step - _TOLERANCE)
 
 
 def simulated_robot(name: str, scenario: Scenario, world: World, seed: int) -> SimulatedRobot:

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from maasi_filter.particles import gather, group_moments, jitter, resample, total_weight
+from maasi_filter.particles import (
+    clear,
+    gather,
+    group_moments,
+    groups_of,
+    jitter,
+    resample,
+    total_weight,
+)
 
 SCHEMES = ['systematic', 'stratified', 'multinomial']
 BOUNDS = np.array([[-100.0, 100.0]] * 3)
@@ -94,27 +102,50 @@ def test_group_moments_are_the_weighted_ones(dimension):
 def test_gather_renumbers_the_groups_that_are_left():
     particles = np.arange(12.0).reshape(6, 2)
     group = np.array([0, 0, 3, 3, 5, 5])
-    out, groups, present = gather(np.array([1, 4, 4]), particles, group, 6)
+    out, copy, starts, present = gather(np.array([1, 4, 4]), particles, group, 6)
     np.testing.assert_array_equal(out, particles[[1, 4, 4]])
-    assert groups.tolist() == [0, 1, 1]
+    assert copy.tolist() == [False, False, True]
+    assert groups_of(starts).tolist() == [0, 1, 1]
     assert np.nonzero(present)[0].tolist() == [0, 5]
 
 
+def test_gather_puts_groups_together_in_order_and_threads_change_nothing():
+    generator = np.random.default_rng(2)
+    particles = generator.normal(size=(30_000, 3))
+    group = generator.integers(0, 7, 30_000)
+    index = np.sort(generator.integers(0, 30_000, 50_000))
+    expected = index[np.argsort(group[index], kind='stable')]
+    with ThreadPoolExecutor(3) as pool:
+        for threads in (None, pool):
+            out, copy, starts, _ = gather(index, particles, group, 7, threads)
+            np.testing.assert_array_equal(out, particles[expected])
+            np.testing.assert_array_equal(copy[1:], expected[1:] == expected[:-1])
+            np.testing.assert_array_equal(groups_of(starts, threads), group[expected])
+
+
+def test_clearing_takes_a_group_and_what_is_around_but_not_other_detections():
+    particles = np.array([[0.0, 0.0], [9.0, 0.0], [0.5, 0.0], [0.5, 0.0], [5.0, 0.0]])
+    weights = np.ones(5)
+    clear(particles, weights, np.array([0, 3, 1, 2, 1]), np.zeros(2), 1.0, 3, 2)
+    assert weights.tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]
+
+
 def resampled_cloud(seed=0, number=20_000):
-    """Return a resampled cloud: half of the particles are duplicates."""
+    """Return a resampled cloud of one group, and which particles are duplicates."""
     generator = np.random.default_rng(seed)
     source = generator.multivariate_normal([1, 2, 3], [[4, 1, 0], [1, 2, 0], [0, 0, 1]], number)
     index = np.sort(generator.integers(0, number, number))
-    return source[index], index, generator
+    copy = np.append(False, index[1:] == index[:-1])
+    return source[index], copy, np.array([0, number]), generator
 
 
 def test_jitter_keeps_mean_and_covariance():
-    particles, index, generator = resampled_cloud()
-    group = np.zeros(len(index), np.int64)
-    _, means, before = group_moments(particles, np.ones(len(index)), group, 1)
+    particles, copy, starts, generator = resampled_cloud()
+    group = np.zeros(len(copy), np.int64)
+    _, means, before = group_moments(particles, np.ones(len(copy)), group, 1)
     for _ in range(20):
-        particles = jitter(particles, index, group, means, np.full(1, 0.3), 0.0, BOUNDS, generator)
-    _, after_means, after = group_moments(particles, np.ones(len(index)), group, 1)
+        particles = jitter(particles, copy, starts, means, np.full(1, 0.3), 0.0, BOUNDS, generator)
+    _, after_means, after = group_moments(particles, np.ones(len(copy)), group, 1)
     np.testing.assert_allclose(after_means, means, atol=0.05)
     np.testing.assert_allclose(after[0], before[0], rtol=0.05, atol=0.08)
     assert len(np.unique(particles[:, 0])) == len(particles)
@@ -122,12 +153,10 @@ def test_jitter_keeps_mean_and_covariance():
 
 def test_jitter_leaves_single_particles_of_a_group_without_duplicates_alone():
     particles = np.random.default_rng(0).normal(size=(100, 2))
-    group = np.zeros(100, np.int64)
-    index = np.arange(100)
     moved = jitter(
         particles,
-        index,
-        group,
+        np.zeros(100, np.bool_),
+        np.array([0, 100]),
         particles.mean(axis=0)[None],
         np.full(1, 0.3),
         0.1,
@@ -143,8 +172,8 @@ def test_fill_adds_the_covariance_that_is_asked_for():
     root = np.array([[0.5, 0.0], [0.2, 0.1]])
     moved = jitter(
         particles,
-        np.arange(number),
-        np.zeros(number, np.int64),
+        np.zeros(number, np.bool_),
+        np.array([0, number]),
         particles[:1],
         np.zeros(1),
         0.0,
@@ -157,10 +186,9 @@ def test_fill_adds_the_covariance_that_is_asked_for():
 
 
 def test_jitter_stays_inside_the_bounds_and_does_not_depend_on_threads():
-    particles, index, _ = resampled_cloud(number=40_000)
-    group = np.zeros(len(index), np.int64)
+    particles, copy, starts, _ = resampled_cloud(number=40_000)
     bounds = np.array([[particles[:, a].min(), particles[:, a].max()] for a in range(3)])
-    arguments = (particles, index, group, particles.mean(axis=0)[None], np.full(1, 0.5), 0.2)
+    arguments = (particles, copy, starts, particles.mean(axis=0)[None], np.full(1, 0.5), 0.2)
     alone = jitter(*arguments, bounds, np.random.default_rng(2))
     with ThreadPoolExecutor(3) as pool:
         together = jitter(*arguments, bounds, np.random.default_rng(2), pool=pool)

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 
 from maasi_filter import ExponentialDetection, Pose, RangeBearing, RangeBearingElevation
-from maasi_filter.phd import arctan2, associate, position_measurements, prepare_measurements
+from maasi_filter.elementary import arctan2, exponentials
+from maasi_filter.phd import associate, position_measurements, prepare_measurements
 
 ORIGIN = Pose([0.0, 0.0, 0.0])
 MODELS = {2: RangeBearing(), 3: RangeBearingElevation()}
@@ -291,6 +292,18 @@ def test_own_arctangent_is_the_librarys():
     assert arctan2(0.0, 0.0) == 0.0
     assert arctan2(0.0, -1.0) == np.pi
     assert arctan2(1.0, 0.0) == np.pi / 2
+
+
+def test_own_exponential_is_the_librarys_and_becomes_zero():
+    x = np.concatenate(
+        [np.random.default_rng(0).uniform(-708.0, 50.0, 20_000), [0.0, -709.0, -1e9]]
+    )
+    ours = x.copy()
+    scratch = np.empty_like(x)
+    exponentials(ours, len(x), scratch, scratch.view(np.int64))
+    np.testing.assert_allclose(ours[:-2], np.exp(x[:-2]), rtol=4e-16, atol=0.0)
+    assert ours[-3] == 1.0
+    assert ours[-2:].tolist() == [0.0, 0.0]
 
 
 def test_an_error_of_the_robots_position_widens_the_noise_as_it_is_seen():

@@ -1,0 +1,97 @@
+"""Segments images and sends what it sees as a measurement feed: what runs on board of a robot."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import socket
+import sys
+import threading
+import time
+
+from pydantic import ValidationError
+
+from maasi_drivers.camera_settings import SegmentationSettings
+from maasi_drivers.image_source import ImageSourceError, VideoSource
+from maasi_drivers.measurement_feed import MOST, FeedPacket, encode
+from maasi_drivers.segmentation import segment
+
+_ROUND = 0.002
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='measurement_feed_sender',
+        description='Segment the images of a camera, and send the blobs to a driver with '
+        'image_source: feed. Ends with the video, or with Ctrl-C.',
+    )
+    parser.add_argument(
+        'video', help='address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it'
+    )
+    parser.add_argument('to', metavar='HOST:PORT', help='of the driver')
+    parser.add_argument(
+        '--rule', default='robust', help='segmentation rule: robust or paper (default: robust)'
+    )
+    parser.add_argument(
+        '--exposure-age',
+        type=float,
+        default=0.0,
+        metavar='S',
+        help='from the middle of the exposure until OpenCV has the image [s] (default: 0)',
+    )
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the sender and return its exit code."""
+    options = build_parser().parse_args(arguments)
+    host, _, port = options.to.rpartition(':')
+    try:
+        if not host or not 0 < int(port) < 65536:
+            raise ValueError
+    except ValueError:
+        print(f'error: read {options.to!r}, allowed is HOST:PORT', file=sys.stderr)
+        return 2
+    if not 0.0 <= options.exposure_age <= 1.0:
+        print(
+            f'error: --exposure-age: read {options.exposure_age}, allowed is 0 to 1 s',
+            file=sys.stderr,
+        )
+        return 2
+    try:
+        settings = SegmentationSettings.model_validate({'rule': options.rule})
+        source = VideoSource(options.video)
+    except (ImageSourceError, ValidationError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    sent, said = 0, ''
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as output:
+        while not ended.wait(_ROUND):
+            done = source.ended
+            if source.error != said:
+                said = source.error
+                print(said or 'video: frames come', file=sys.stderr)
+            frame = source.take()
+            if frame is None:
+                if done:
+                    break
+                continue
+            blobs = segment(frame.image, settings)
+            if len(blobs) > MOST:
+                continue
+            height, width = frame.image.shape[:2]
+            age = time.monotonic() - frame.received + options.exposure_age
+            packet = FeedPacket(frame.number, age, width, height, blobs)
+            output.sendto(encode(packet), (host, int(port)))
+            sent += 1
+    source.close()
+    print(f'{sent} images sent to {options.to}')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

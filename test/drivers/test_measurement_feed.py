@@ -1,0 +1,269 @@
+"""The measurement feed: its layout, what is refused, and the reference sender over the network."""
+
+import socket
+import struct
+import subprocess
+import sys
+import time
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from maasi_drivers.camera_settings import SegmentationSettings
+from maasi_drivers.image_source import ImageSourceError, VideoSource
+from maasi_drivers.measurement_feed import FeedError, FeedPacket, FeedReceiver, decode, encode
+from maasi_drivers.measurement_feed_sender import main
+from maasi_drivers.segmentation import Blobs, segment
+
+# Longest wait for anything; the machine may be busy.
+LIMIT = 30.0
+
+
+def blobs(number, seed=1):
+    generator = np.random.default_rng(seed)
+    roots = generator.normal(0.0, 0.3, (number, 2, 2))
+    return Blobs(
+        centroids=generator.uniform([0.0, 0.0], [159.0, 119.0], (number, 2)),
+        areas=generator.uniform(10.0, 60.0, number),
+        extents=generator.uniform(4.0, 9.0, (number, 2)),
+        border_cut=generator.random(number) < 0.5,
+        covariances=roots @ np.swapaxes(roots, 1, 2),
+    )
+
+
+def packet(number=3, sequence=7, age=0.012):
+    return FeedPacket(sequence, age, 160, 120, blobs(number))
+
+
+def sealed(data):
+    """Return bytes with the checksum that belongs to them instead of their last four."""
+    return data[:-4] + struct.pack('<I', zlib.crc32(data[:-4]))
+
+
+@pytest.mark.parametrize('number', [0, 1, 5, 256])
+def test_what_is_sent_is_what_is_read(number):
+    sent = packet(number)
+    read = decode(encode(sent))
+    assert (read.sequence, read.width, read.height) == (7, 160, 120)
+    assert_allclose(read.age, 0.012, atol=1e-6)
+    for name in ('centroids', 'areas', 'extents', 'covariances'):
+        assert_allclose(getattr(read.blobs, name), getattr(sent.blobs, name), rtol=1e-6, atol=1e-6)
+    assert_array_equal(read.blobs.border_cut, sent.blobs.border_cut)
+
+
+def test_the_bytes_are_those_of_the_document():
+    one = Blobs(
+        centroids=np.array([[80.5, 59.25]]),
+        areas=np.array([33.0]),
+        extents=np.array([[7.0, 6.0]]),
+        border_cut=np.array([True]),
+        covariances=np.array([[[0.25, 0.125], [0.125, 0.5]]]),
+    )
+    data = encode(FeedPacket(0x01020304, 0.005, 160, 120, one))
+    assert data[:20].hex() == '4d534d4601000100a00078000403020188130000'
+    assert_array_equal(
+        np.frombuffer(data[20:52], '<f4'), [80.5, 59.25, 0.25, 0.125, 0.5, 33.0, 7.0, 6.0]
+    )
+    assert data[52:56] == b'\1\0\0\0'
+    assert data[56:] == struct.pack('<I', zlib.crc32(data[:56]))
+
+
+def test_no_damage_goes_unnoticed():
+    data = encode(packet(2))
+    for index in range(len(data)):
+        for bit in (0, 3, 7):
+            damaged = bytearray(data)
+            damaged[index] ^= 1 << bit
+            with pytest.raises(FeedError):
+                decode(bytes(damaged))
+    for size in range(len(data)):
+        with pytest.raises(FeedError):
+            decode(data[:size])
+    with pytest.raises(FeedError):
+        decode(data + b'\0')
+
+
+@given(st.binary(max_size=200))
+def test_anything_else_is_refused(data):
+    for content in (data, b'MSMF' + data, sealed(b'MSMF\1\0' + data + b'1234')):
+        try:
+            read = decode(content)
+        except FeedError:
+            continue
+        assert np.isfinite(read.blobs.centroids).all()
+
+
+@pytest.mark.parametrize(
+    ('offset', 'layout', 'value', 'said'),
+    [
+        (4, '<B', 2, 'version: read 2, allowed is 1'),
+        (5, '<B', 1, 'flags: read 1'),
+        (8, '<H', 0, 'width, height: read 0 x 120'),
+        (16, '<I', 10_000_001, 'age: read 10000001 us'),
+        (20, '<f', float('nan'), 'blob 0: .*finite'),
+        (24, '<f', 119.6, 'inside 160 x 120 px'),
+        (28, '<f', -1.0, 'semidefinite'),
+        (32, '<f', 50.0, 'semidefinite'),
+        (40, '<f', -1.0, 'area and extents from 0'),
+        (44, '<f', float('inf'), 'blob 0: .*finite'),
+        (52, '<I', 2, 'marks 0 or 1'),
+    ],
+)
+def test_a_field_that_cannot_be_is_named(offset, layout, value, said):
+    data = bytearray(encode(packet(1)))
+    struct.pack_into(layout, data, offset, value)
+    with pytest.raises(FeedError, match=said):
+        decode(sealed(bytes(data)))
+
+
+def test_what_cannot_be_sent_is_refused():
+    with pytest.raises(FeedError, match='at most 256'):
+        encode(packet(257))
+    with pytest.raises(FeedError, match='age'):
+        encode(packet(age=float('nan')))
+    bad = packet(1)
+    bad.blobs.centroids[0, 0] = np.nan
+    with pytest.raises(FeedError, match='finite'):
+        encode(bad)
+
+
+def received(receiver, number):
+    end, packets = time.monotonic() + LIMIT, []
+    while len(packets) < number:
+        assert time.monotonic() < end, (len(packets), receiver.counts)
+        packets += receiver.take()
+        time.sleep(0.005)
+    return packets
+
+
+@pytest.fixture
+def feed():
+    """Return a receiver, and what sends to it."""
+    receiver = FeedReceiver(0, '127.0.0.1')
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as output:
+        yield receiver, lambda data: output.sendto(data, ('127.0.0.1', receiver.port))
+    receiver.close()
+
+
+def test_a_packet_over_the_network_has_the_time_of_its_image(feed):
+    receiver, send = feed
+    before = time.monotonic()
+    send(encode(packet(age=0.5)))
+    (found,) = received(receiver, 1)
+    assert before - 0.5 - 1e-6 <= found.taken <= time.monotonic() - 0.5
+    assert len(found.packet.blobs) == 3
+
+
+def test_lost_old_and_damaged_packets_are_counted(feed):
+    receiver, send = feed
+    for sequence in (2**32 - 2, 2**32 - 1, 0, 0, 2**32 - 1, 3):
+        send(encode(packet(sequence=sequence)))
+    send(b'hello')
+    send(encode(packet(sequence=4)))
+    packets = received(receiver, 5)
+    assert [item.packet.sequence for item in packets] == [2**32 - 2, 2**32 - 1, 0, 3, 4]
+    assert receiver.counts['lost packet'] == 2
+    assert receiver.counts['old packet'] == 2
+    assert receiver.counts['bad packet'] == 1
+    assert 'length: read 5 bytes' in receiver.problem
+
+
+def test_a_sender_that_was_started_again_is_heard(feed):
+    receiver, send = feed
+    for sequence in (5000, 1, 2):
+        send(encode(packet(sequence=sequence)))
+    assert [item.packet.sequence for item in received(receiver, 3)] == [5000, 1, 2]
+
+
+def test_a_port_that_is_taken_is_said(feed):
+    receiver, _ = feed
+    with pytest.raises(OSError, match='in use'):
+        FeedReceiver(receiver.port, '127.0.0.1')
+
+
+# ---- videos ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope='module')
+def video(tmp_path_factory):
+    """Return a video of one second with a blue disc that moves to the right."""
+    path = tmp_path_factory.mktemp('video') / 'flight.avi'
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 20.0, (160, 120))
+    assert writer.isOpened()
+    for step in range(20):
+        image = np.full((120, 160, 3), 130, np.uint8)
+        # B, G, R.
+        cv2.circle(image, (30 + 5 * step, 60), 5, (200, 70, 50), -1, cv2.LINE_AA)
+        writer.write(image)
+    writer.release()
+    return path
+
+
+def test_a_video_is_played_at_its_rate_in_rgb(video):
+    source = VideoSource(str(video))
+    frames, end = [], time.monotonic() + LIMIT
+    while not source.ended:
+        assert time.monotonic() < end
+        frame = source.take()
+        if frame is not None:
+            frames.append(frame)
+        time.sleep(0.001)
+    source.close()
+    assert 5 <= len(frames) <= 20
+    assert [frame.number for frame in frames] == sorted({frame.number for frame in frames})
+    times = np.array([[frame.number, frame.received] for frame in frames])
+    # Not before its time.
+    assert np.all(times[:, 1] - times[0, 1] >= (times[:, 0] - times[0, 0]) / 20.0 - 0.2)
+    for frame in frames:
+        found = segment(frame.image, SegmentationSettings(rule='paper'))
+        assert_allclose(found.centroids, [[30.0 + 5.0 * (frame.number - 1), 60.0]], atol=0.5)
+
+
+def test_a_source_that_is_not_there_is_said(tmp_path):
+    with pytest.raises(ImageSourceError, match='OpenCV cannot open it'):
+        VideoSource(str(tmp_path / 'none.avi'))
+    with pytest.raises(ImageSourceError, match='allowed are'):
+        VideoSource('')
+
+
+def test_a_device_that_is_not_there_is_tried_again():
+    source = VideoSource('/dev/video77')
+    end = time.monotonic() + LIMIT
+    while not source.error:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert 'cannot open' in source.error
+    assert source.take() is None and not source.ended
+    source.close()
+
+
+def test_the_reference_sender_sends_what_it_sees(feed, video):
+    receiver, _ = feed
+    sender = subprocess.Popen(
+        [
+            *(sys.executable, '-m', 'maasi_drivers.measurement_feed_sender'),
+            *(str(video), f'127.0.0.1:{receiver.port}', '--rule', 'paper'),
+            *('--exposure-age', '0.03'),
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    packets = received(receiver, 5)
+    output, _ = sender.communicate(timeout=LIMIT)
+    assert sender.returncode == 0 and 'images sent' in output
+    packets += receiver.take()
+    for item in packets:
+        assert item.packet.age >= 0.03
+        column = 30.0 + 5.0 * (item.packet.sequence - 1)
+        assert_allclose(item.packet.blobs.centroids, [[column, 60.0]], atol=0.5)
+
+
+@pytest.mark.parametrize('to', ['127.0.0.1', 'host:0', ':99', '127.0.0.1:port'])
+def test_a_wrong_address_is_said(video, to, capsys):
+    assert main([str(video), to]) == 2
+    assert 'allowed is HOST:PORT' in capsys.readouterr().err
