@@ -123,6 +123,18 @@ def found_target_to_ros(target: FoundTarget, batch: int) -> FoundTargetMessage:
     )
 
 
+def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundTarget:
+    """Return a found target."""
+    return FoundTarget(
+        id=int(message.id),
+        position=point_from_ros(message.position)[:dimension],
+        covariance=covariance_from_ros(message.covariance, dimension),
+        robot=message.robot,
+        measurement=int(message.measurement),
+        time=stamp_from_ros(message.stamp) * 1e-9,
+    )
+
+
 def detections_to_ros(values: FloatArray, covariances: FloatArray | None) -> list[Detection]:
     """Return detections.
 

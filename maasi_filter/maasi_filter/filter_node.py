@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rclpy.duration import Duration
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -18,6 +20,7 @@ from maasi_filter import warm_up
 from maasi_filter.conversions import (
     cluster_to_ros,
     filter_markers,
+    found_target_from_ros,
     found_target_to_ros,
     measurement_from_ros,
     particles_to_ros,
@@ -25,7 +28,7 @@ from maasi_filter.conversions import (
     stamp_to_ros,
 )
 from maasi_filter.node_settings import FilterNodeSettings
-from maasi_filter.qos import LATCHED, RELIABLE, UPDATES
+from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
 from maasi_filter.search_filter import AgentMeasurement, SearchFilter
 from maasi_filter.search_node import SearchNode, run
 from maasi_msgs.msg import (
@@ -38,6 +41,8 @@ from maasi_msgs.msg import (
 )
 
 _TIMEOUT_PERIOD = 0.05
+# Longest wait until the filters of other robots have what was found [s].
+_SHARING_PATIENCE = 0.5
 
 
 @dataclass
@@ -66,10 +71,15 @@ class PendingBatch:
 class FilterNode(SearchNode[FilterNodeSettings]):
     """The particle PHD filter of the team (000, sections 3.1 to 3.3).
 
+    In the namespace of its only robot it is that robot's own: beside others of the kind that tell
+    each other what they have found (002, section 4, independent planner). What another one found
+    counts for the batches with a later stamp.
+
     Subscribes
     ----------
     `measurement_batch` (maasi_msgs/MeasurementBatch): who measures;
-    `<robot>/detections` (maasi_msgs/DetectionArray): what they see
+    `<robot>/detections` (maasi_msgs/DetectionArray): what they see;
+    `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with filters of their own
 
     Publishes
     ---------
@@ -103,6 +113,9 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         self._settled_by: dict[int, int] = {}
         self._found_published = False
         self._shown_clusters = 0
+        self._shared: dict[str, deque[FoundTargetArray]] = {
+            name: deque() for name in sorted(settings.share_with)
+        }
         self._particles_at = self._markers_at = -math.inf
         self._latency = 0.0
 
@@ -125,10 +138,20 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         for name in self._sensors:
             self.create_subscription(
                 DetectionArray,
-                f'{name}/detections',
+                self.team_topic(f'{name}/detections'),
                 partial(self._on_detections, name),
                 RELIABLE,
             )
+        self._sharing = []
+        for name in self._shared:
+            topic = self.team_topic(f'{name}/found_targets')
+            self._sharing.append(
+                self.create_subscription(
+                    FoundTargetArray, topic, partial(self._on_shared, name), LATCHED_ALL
+                )
+            )
+            self.expect_publisher(topic)
+        self.expect_subscribers(self._found_publisher, len(self._shared))
         if not settings.lockstep:
             self.create_wall_timer(_TIMEOUT_PERIOD, self._look_at_waiting)
         if settings.save_file and settings.save_period > 0.0:
@@ -274,6 +297,41 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         )
         self._process(late)
 
+    def _on_shared(self, name: str, message: FoundTargetArray) -> None:
+        if not self.active:
+            return
+        if message.header.frame_id != self.settings.frame:
+            self.drop(
+                'bad found targets',
+                f'{name}/found_targets.header.frame_id: read {message.header.frame_id!r}, allowed '
+                f'is {self.settings.frame!r}',
+            )
+            return
+        self._shared[name].append(message)
+
+    def _take_over(self, stamp: int) -> bool:
+        """Take over what others found before a batch; return whether anything changed."""
+        for subscription in self._sharing:
+            # The others go on once this has come, which does not mean that it has been read.
+            while (taken := subscription.handle.take_message(FoundTargetArray, False)) is not None:
+                subscription.callback(taken[0])
+        changed = False
+        for name, waiting in self._shared.items():
+            last = None
+            while waiting and stamp_from_ros(waiting[0].header.stamp) < stamp:
+                last = waiting.popleft()
+            if last is None:
+                continue
+            # What it took over itself comes from whoever found it.
+            targets = [item for item in last.targets if item.robot == name]
+            try:
+                changed |= self.filter.take_over(
+                    name, [found_target_from_ros(item, self._dimension) for item in targets]
+                )
+            except ValueError as error:
+                self.drop('bad found targets', f'{name}/found_targets: {error}')
+        return changed
+
     def _look_at_waiting(self) -> None:
         if not self._pending:
             return
@@ -307,6 +365,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         self._last_step = batch.step
         members = [item for item in batch.members if item.robot in batch.measurements]
         now = batch.stamp * 1e-9
+        changed = self._take_over(batch.stamp)
         try:
             result = self.filter.step(
                 [batch.measurements[item.robot] for item in members], steps, now
@@ -325,7 +384,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
             self._settled_by[target.id] = batch.id
         clusters = [cluster_to_ros(cluster) for cluster in result.clusters]
         # Found targets first, so that they are there for whoever hears of the update.
-        if result.found_changed or not self._found_published:
+        if changed or result.found_changed or not self._found_published:
             self._found_published = True
             self._found_publisher.publish(
                 FoundTargetArray(
@@ -337,6 +396,9 @@ class FilterNode(SearchNode[FilterNodeSettings]):
                     ],
                 )
             )
+            if self._shared:
+                # With everybody before the step ends, so that it counts from the next one on.
+                self._found_publisher.wait_for_all_acked(Duration(seconds=_SHARING_PATIENCE))
         self._update_publisher.publish(
             FilterUpdate(
                 header=header,

@@ -45,6 +45,9 @@ class FoundTarget:
         That robot's measurement index then.
     time : float
         Seconds.
+    origin : int
+        Its number in the filter of another robot that it was taken over from; 0 for the filter's
+        own.
     """
 
     id: int
@@ -53,6 +56,7 @@ class FoundTarget:
     robot: str
     measurement: int
     time: float
+    origin: int = 0
 
 
 @njit(cache=True, error_model='numpy')

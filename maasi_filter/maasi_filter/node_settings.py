@@ -35,6 +35,11 @@ class FilterNodeSettings(NodeSettings):
     environment: EnvironmentSettings = Field(description='Where the targets are')
     filter: FilterSettings = Field(default_factory=FilterSettings, description='The filter')
     robots: dict[str, SensorOfRobot] = Field(min_length=1, description='Robots, by name')
+    share_with: list[str] = Field(
+        default=[],
+        description='Robots with filters of their own in their namespaces: what they find is taken '
+        'over, and they take over what this one finds',
+    )
     batch_timeout: float = Field(
         default=1.0,
         gt=0.0,

@@ -59,7 +59,8 @@ def flatten(settings: BaseModel, prefix: str = '') -> dict[str, ParameterValue]:
         if isinstance(value, BaseModel):
             flat.update(flatten(value, f'{key}.'))
         elif _model_by_name(info.annotation) is not None:
-            flat[key] = sorted(value)
+            if value:
+                flat[key] = sorted(value)
             for item in sorted(value):
                 flat.update(flatten(value[item], f'{prefix}{_singular(name)}.{item}.'))
         elif not isinstance(value, (list, tuple)):
@@ -100,7 +101,7 @@ def parameter_fields(
         by_name = _model_by_name(info.annotation)
         nested = _nested(info.annotation)
         if by_name is not None:
-            yield ParameterField(key, [], info.description or '', '')
+            yield ParameterField(key, None, info.description or '', '')
             for item in given.get(key) or []:
                 yield from parameter_fields(by_name, given, f'{prefix}{_singular(name)}.{item}.')
         elif nested is not None:

@@ -287,6 +287,7 @@ class SearchFilter:
             'robots': text(json.dumps([target.robot for target in targets])),
             'found_ids': np.array([target.id for target in targets], np.int64),
             'found_measurements': np.array([target.measurement for target in targets], np.int64),
+            'found_origins': np.array([target.origin for target in targets], np.int64),
             'found_times': np.array([target.time for target in targets], float),
             'found_positions': np.array([t.position for t in targets]).reshape(-1, d),
             'found_covariances': np.array([t.covariance for t in targets]).reshape(-1, d, d),
@@ -326,14 +327,17 @@ class SearchFilter:
             search._centres = state['centres'] if len(state['centres']) else None
             search._covariances = list(state['own_covariances'])
             search.found_targets = [
-                FoundTarget(int(number), position, covariance, robot, int(index), float(time))
-                for number, position, covariance, robot, index, time in zip(
+                FoundTarget(
+                    int(number), position, covariance, robot, int(index), float(time), int(origin)
+                )
+                for number, position, covariance, robot, index, time, origin in zip(
                     state['found_ids'],
                     state['found_positions'],
                     state['found_covariances'],
                     json.loads(untext(state['robots'])),
                     state['found_measurements'],
                     state['found_times'],
+                    state['found_origins'],
                 )
             ]
             search.clusters = [
@@ -448,6 +452,111 @@ class SearchFilter:
             expected_number=self.expected_number if self._expected is None else self._expected,
             dropped=dropped,
         )
+
+    # What the filters of other robots have found.
+
+    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
+        """Take over what the filter of another robot has found; return whether anything changed.
+
+        The independent robots of 002, section 4, share their found targets: detections of them
+        are no news to anybody any more. A target that two robots found belongs to the one that
+        was first, at the same time to the first by name, and follows that one's estimate.
+
+        Parameters
+        ----------
+        robot : str
+            Whose filter.
+        targets : sequence of FoundTarget
+            All that its filter found itself, as they stand there; taken before `step`.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite, or dimensions do not fit. Nothing has changed then.
+        """
+        d = self.dimension
+        for target in targets:
+            if target.position.shape != (d,) or target.covariance.shape != (d, d):
+                raise ValueError(
+                    f'{robot}: target {target.id}: got {len(target.position)} dimensions, allowed '
+                    f'is {d}'
+                )
+            if not (np.isfinite(target.position).all() and is_covariance(target.covariance)):
+                raise ValueError(
+                    f'{robot}: target {target.id}: got position {target.position.tolist()} with '
+                    f'covariance {target.covariance.tolist()}, allowed are finite numbers and a '
+                    'positive definite matrix'
+                )
+        places = {(item.robot, item.origin): f for f, item in enumerate(self.found_targets)}
+        changed = False
+        for target in targets:
+            f = places.get((robot, target.id), -1)
+            if f < 0:
+                f = self._known_as(target)
+                if f >= 0:
+                    known = self.found_targets[f]
+                    if (known.time, known.robot) <= (target.time, robot):
+                        continue
+            number = self.found_targets[f].id if f >= 0 else len(self.found_targets) + 1
+            taken = FoundTarget(
+                number,
+                target.position.copy(),
+                target.covariance.copy(),
+                robot,
+                target.measurement,
+                target.time,
+                target.id,
+            )
+            if f < 0:
+                self.found_targets.append(taken)
+                self._covariances.append(taken.covariance)
+                self._forget(taken)
+            elif _same_estimate(taken, self.found_targets[f]):
+                continue
+            else:
+                self.found_targets[f] = taken
+                self._covariances[f] = taken.covariance
+            changed = True
+        return changed
+
+    def own_found_targets(self) -> list[FoundTarget]:
+        """Return the found targets that this filter found itself."""
+        return [target for target in self.found_targets if not target.origin]
+
+    def _known_as(self, target: FoundTarget) -> int:
+        """Return the nearest found target that may be the same, or -1."""
+        best, nearest = -1, SAME_TARGET
+        for f, known in enumerate(self.found_targets):
+            offset = target.position - known.position
+            total = target.covariance + known.covariance
+            distance = float(offset @ np.linalg.solve(total, offset))
+            if distance < nearest:
+                best, nearest = f, distance
+        return best
+
+    def _forget(self, target: FoundTarget) -> None:
+        """Delete the particles that a target explains: the nearest group, if it may be it."""
+        if not len(self.weights):
+            return
+        mass, means, covariances = group_moments(
+            self.particles, self.weights, self._group, self._groups, self._threads()
+        )
+        best, nearest = -1, SAME_TARGET
+        for g in np.flatnonzero(mass > 0.0).tolist():
+            offset = means[g] - target.position
+            total = covariances[g] + target.covariance
+            distance = float(offset @ np.linalg.solve(total, offset))
+            if distance < nearest:
+                best, nearest = g, distance
+        offset = self.particles - target.position
+        spread = math.sqrt(float(np.trace(target.covariance)))
+        keep = (np.sqrt((offset * offset).sum(axis=1)) > 3.0 * spread) & (self._group != best)
+        present, group = np.unique(self._group[keep], return_inverse=True)
+        self.particles = self.particles[keep]
+        self.weights = self.weights[keep]
+        self._group = group.astype(np.int64).reshape(-1)
+        self._groups = len(present)
+        self._information = self._information[present]
 
     def _checked(self, measurement: AgentMeasurement) -> _Member:
         """Return a measurement whose arrays fit, its detections in a fixed order."""
@@ -741,7 +850,8 @@ class SearchFilter:
         own = self._pose_error(member.sensor) ** 2 * np.eye(self.dimension)
         best = claims.argmax(axis=1)
         for f, target in enumerate(self.found_targets):
-            if claims[f, best[f]] <= 0.5:
+            # What another robot found is its to refine.
+            if target.origin or claims[f, best[f]] <= 0.5:
                 continue
             position, covariance = refine(
                 target.position, self._covariances[f], prepared, int(best[f]), member.pose
@@ -956,6 +1066,15 @@ class SearchFilter:
             self._group = self._group[alive]
         self._centres = np.array(kept) if kept else None
         self.clusters = sorted(remaining, key=lambda cluster: -cluster.mass)
+
+
+def _same_estimate(one: FoundTarget, other: FoundTarget) -> bool:
+    return (
+        one.origin == other.origin
+        and one.robot == other.robot
+        and np.array_equal(one.position, other.position)
+        and np.array_equal(one.covariance, other.covariance)
+    )
 
 
 def _count(dropped: dict[str, int], reason: str, number: int) -> None:

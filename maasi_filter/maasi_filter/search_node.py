@@ -82,6 +82,10 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         self._in_robot = in_robot
         self._lockstep_member = lockstep_member
         self.settings: SettingsT = self._read_settings(settings)
+        robots = getattr(self.settings, 'robots', None)
+        if robots is not None:
+            # One that works for a single robot, in its namespace, belongs to that robot.
+            self._in_robot = list(robots) == [self.get_namespace().rpartition('/')[2]]
         self.dropped: Counter[str] = Counter()
         self.active = False
         self.step = -1
@@ -214,6 +218,10 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
     def expect_subscribers(self, publisher: Publisher, number: int = 1) -> None:
         """Count as ready only with so many subscriptions to a publisher."""
         self.expect(lambda: publisher.get_subscription_count() >= number)
+
+    def expect_publisher(self, topic: str) -> None:
+        """Count as ready only with a publisher of a topic."""
+        self.expect(lambda: self.count_publishers(topic) > 0)
 
     def _look_for_peers(self) -> None:
         if not self.active or not all(condition() for condition in self._peers):

@@ -1,0 +1,116 @@
+"""Filters of several robots that share their found targets (002, section 4)."""
+
+import numpy as np
+import pytest
+from searches import FLOOR, floor_sensor
+
+from maasi_filter import AgentMeasurement, FilterSettings, Pose, SearchFilter
+from maasi_filter.found_targets import FoundTarget
+
+POSE = Pose([1.0, 1.0, 1.0])
+VALUES = np.array([[0.1, 0.3]])
+PLACE = np.array([1.0 + 0.1 * np.cos(0.3), 1.0 + 0.1 * np.sin(0.3)])
+
+
+def new_filter(**settings):
+    return SearchFilter(FilterSettings(particles=2000, **settings), FLOOR, np.random.default_rng(1))
+
+
+def look(search, robot, times, begin=0, values=VALUES):
+    """Let a robot look at one target again and again; return the last result."""
+    for number in range(begin, begin + times):
+        measurement = AgentMeasurement(robot, POSE, floor_sensor(), values, index=number)
+        result = search.step([measurement], 1, float(number))
+    return result
+
+
+def target(position=PLACE, time=3.0, number=1, deviation=0.01):
+    return FoundTarget(number, np.array(position), np.diag([deviation**2] * 2), 'other', 5, time)
+
+
+# The lengths of 002 are those of a much larger environment.
+LENGTHS = {'found_radius': 0.05, 'removal_distance': 0.1, 'jitter_deviation': 0.003}
+
+
+@pytest.mark.parametrize('preset, lengths', [('recommended', {}), ('paper_002', LENGTHS)])
+def test_what_another_one_found_is_not_found_again(preset, lengths):
+    alone = new_filter(preset=preset, **lengths)
+    look(alone, 'own', 12)
+    assert len(alone.found_targets) == 1
+    search = new_filter(preset=preset, **lengths)
+    assert search.take_over('other', [target()])
+    result = look(search, 'own', 12)
+    assert [(item.robot, item.origin) for item in search.found_targets] == [('other', 1)]
+    assert search.own_found_targets() == []
+    assert result.expected_number < 0.2
+    assert search.found_targets[0].position == pytest.approx(PLACE)
+
+
+def test_particles_of_a_target_that_another_one_found_are_deleted():
+    search = new_filter()
+    far = np.array([[0.1, 0.3], [0.15, -2.0]])
+    look(search, 'own', 1, values=far)
+    before = search.expected_number
+    assert before > 1.5
+    search.take_over('other', [target()])
+    assert search.expected_number == pytest.approx(before - 1.0, abs=0.2)
+    # The groups that are left go on as they are.
+    look(search, 'own', 6, begin=1, values=far)
+    assert len(search.own_found_targets()) == 1
+    assert search.own_found_targets()[0].position == pytest.approx(
+        [1.0 + 0.15 * np.cos(-2.0), 1.0 + 0.15 * np.sin(-2.0)], abs=0.02
+    )
+
+
+@pytest.mark.parametrize('time, owner', [(0.5, 'other'), (100.0, 'own')])
+def test_a_target_of_two_belongs_to_who_was_first(time, owner):
+    search = new_filter()
+    look(search, 'own', 12)
+    number = search.found_targets[0].id
+    changed = search.take_over('other', [target(time=time)])
+    assert changed == (owner == 'other')
+    assert [item.robot for item in search.found_targets] == [owner]
+    assert search.found_targets[0].id == number
+    assert bool(search.own_found_targets()) == (owner == 'own')
+
+
+def test_at_the_same_time_the_first_by_name_has_it():
+    search = new_filter()
+    look(search, 'own', 12)
+    time = search.found_targets[0].time
+    assert search.take_over('a', [target(time=time)])
+    assert [item.robot for item in search.found_targets] == ['a']
+    assert not search.take_over('z', [target(time=time)])
+
+
+def test_the_estimate_is_that_of_its_owner():
+    search = new_filter()
+    search.take_over('other', [target()])
+    assert not search.take_over('other', [target()])
+    moved = PLACE + 0.004
+    assert search.take_over('other', [target(moved), target([0.0, 2.0], number=2)])
+    assert len(search.found_targets) == 2
+    assert search.found_targets[0].position == pytest.approx(moved)
+    look(search, 'own', 5)
+    assert search.found_targets[0].position == pytest.approx(moved)
+
+
+def test_bad_targets_are_refused_and_change_nothing():
+    search = new_filter()
+    wrong = [target([np.nan, 1.0]), target(deviation=np.inf), target(deviation=0.0)]
+    for item in wrong:
+        with pytest.raises(ValueError, match='other: target 1'):
+            search.take_over('other', [target([0.0, 0.0], number=2), item])
+    with pytest.raises(ValueError, match='dimensions'):
+        search.take_over('other', [target([1.0, 1.0, 1.0])])
+    assert search.found_targets == []
+
+
+def test_a_saved_filter_knows_what_it_took_over(tmp_path):
+    search = new_filter()
+    search.take_over('other', [target()])
+    look(search, 'own', 2)
+    search.save(tmp_path / 'state')
+    loaded = SearchFilter.load(tmp_path / 'state')
+    assert [(item.robot, item.origin) for item in loaded.found_targets] == [('other', 1)]
+    assert not loaded.take_over('other', [target()])
