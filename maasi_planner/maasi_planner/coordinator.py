@@ -131,6 +131,13 @@ class Coordinator:
         """Return a robot's predicted trajectory, (K + 1, 3) [m]."""
         return self._plans[name].positions
 
+    def destination(self, name: str, state: RobotState) -> FloatArray:
+        """Return where a robot at `state` will stand when its plan is done, (3,) [m]."""
+        plan = self._plans[name]
+        if plan.staying or not len(plan.positions):
+            return np.array(state.pose.position)
+        return plan.positions[-1].copy()
+
     def is_idle(self, name: str) -> bool:
         """Return whether a robot has no goal of its plan: it never had one, or was told to stay."""
         return self._plans[name].staying
@@ -171,7 +178,12 @@ class Coordinator:
                 chosen.append(name)
         return chosen
 
-    def plan(self, step: int, robots: Mapping[str, PresentRobot]) -> Decision | None:
+    def plan(
+        self,
+        step: int,
+        robots: Mapping[str, PresentRobot],
+        taken: Sequence[tuple[FloatArray, float]] = (),
+    ) -> Decision | None:
         """Return the joint decision of the robots that plan at a step, None where nobody does.
 
         Parameters
@@ -180,11 +192,13 @@ class Coordinator:
             k.
         robots : mapping
             The robots that take part, by name.
+        taken : sequence of (3,) array and float
+            Where robots that others plan for will stand [m], and their radii.
         """
         planning = self.planning(step, robots)
         if not planning:
             return None
-        team = self._team(step, robots, planning)
+        team = self._team(step, robots, planning, taken)
         self.finished = self.planner.finished(team)
         if self.finished is not None:
             for name in planning:
@@ -211,7 +225,11 @@ class Coordinator:
         return decision
 
     def _team(
-        self, step: int, robots: Mapping[str, PresentRobot], planning: Sequence[str]
+        self,
+        step: int,
+        robots: Mapping[str, PresentRobot],
+        planning: Sequence[str],
+        taken: Sequence[tuple[FloatArray, float]],
     ) -> TeamView:
         views = {}
         for name in sorted(robots):
@@ -241,6 +259,7 @@ class Coordinator:
             clusters=self.clusters,
             exploration=self.exploration,
             obstacles=self.obstacles,
+            taken=taken,
         )
 
     def measuring(
@@ -267,7 +286,8 @@ class Coordinator:
             if plan.decided_at is None:
                 continue
             gone = step - plan.decided_at
-            if gone % plan.period == 0:
+            # The decision itself is taken at the last waypoint.
+            if gone == 0 or (self.planner.measures_underway and gone % plan.period == 0):
                 plan.due = plan.due or self.trigger.measures(
                     name,
                     gone // plan.period,

@@ -10,7 +10,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import OccupancyGrid, Path
+from numpy.typing import NDArray
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
@@ -50,6 +52,8 @@ from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
 
+FloatArray = NDArray[np.float64]
+
 _ENDED = (AgentState.IDLE, AgentState.REACHED, AgentState.CANCELED, AgentState.ABORTED)
 _LOOK_PERIOD = 0.1
 # Poses of measurements that are kept for updates that come late.
@@ -69,19 +73,25 @@ class HeardState:
 
 
 class PlannerNode(SearchNode[PlannerNodeSettings]):
-    """Plans for the whole team (000, algorithms 1 and 2).
+    """Plans for the whole team (000, algorithms 1 and 2), or for one robot of several by itself.
+
+    In the namespace of its only robot it is that robot's own (002, section 4, independent
+    planner): beside others of the kind that tell each other where their robots go. Who comes
+    later by name knows where those before go at the same step.
 
     Subscribes
     ----------
     `<robot>/state` (maasi_msgs/AgentState), `<robot>/detections` (maasi_msgs/DetectionArray),
-    `filter_update` (maasi_msgs/FilterUpdate)
+    `filter_update` (maasi_msgs/FilterUpdate);
+    `<robot>/destination` (geometry_msgs/PointStamped) of robots that plan for themselves
 
     Publishes
     ---------
     `measurement_batch` (maasi_msgs/MeasurementBatch): M_k;
     `decisions` (maasi_msgs/PlanDecision): every candidate with its terms;
     `<robot>/plan` (nav_msgs/Path); `exploration` (2D: nav_msgs/OccupancyGrid, 3D:
-    sensor_msgs/PointCloud2); `markers` (visualization_msgs/MarkerArray)
+    sensor_msgs/PointCloud2); `markers` (visualization_msgs/MarkerArray);
+    `<robot>/destination` (geometry_msgs/PointStamped), each step, where others plan for themselves
 
     Actions
     -------
@@ -118,6 +128,13 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self._decisions = 0
         self._views_at = -math.inf
         self._planning_time = 0.0
+        others = self.settings.others
+        # Where they will stand, by step: the last two that were heard of.
+        self._destinations: dict[str, dict[int, FloatArray]] = {
+            name: {-1: np.array(others[name].start)} for name in sorted(others)
+        }
+        self._others_at: dict[str, float] = {}
+        self._others_before: set[str] = set()
 
     # ---- life cycle --------------------------------------------------------------------------
 
@@ -134,24 +151,39 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         kind = OccupancyGrid if self._dimension == 2 else PointCloud2
         self._exploration_publisher = self.create_publisher(kind, 'exploration', 2)
         self._path_publishers = {}
+        self._destination_publishers = {}
         self._go_to: dict[str, ActionClient] = {}
         for name in names:
-            self._path_publishers[name] = self.create_publisher(Path, f'{name}/plan', 10)
-            client = ActionClient(self, GoToWaypoint, f'{name}/go_to')
+            self._path_publishers[name] = self.create_publisher(
+                Path, self.team_topic(f'{name}/plan'), 10
+            )
+            client = ActionClient(self, GoToWaypoint, self.team_topic(f'{name}/go_to'))
             self._go_to[name] = client
             self.expect(client.server_is_ready)
             self.create_subscription(
                 AgentState,
-                f'{name}/state',
+                self.team_topic(f'{name}/state'),
                 partial(self._on_state, name),
                 RELIABLE,
             )
             self.create_subscription(
                 DetectionArray,
-                f'{name}/detections',
+                self.team_topic(f'{name}/detections'),
                 partial(self._on_detections, name),
                 RELIABLE,
             )
+            if self.settings.others:
+                publisher = self.create_publisher(
+                    PointStamped, self.team_topic(f'{name}/destination'), RELIABLE
+                )
+                self.expect_subscribers(publisher, len(self.settings.others))
+                self._destination_publishers[name] = publisher
+        for name in sorted(self.settings.others):
+            topic = self.team_topic(f'{name}/destination')
+            self.create_subscription(
+                PointStamped, topic, partial(self._on_destination, name), RELIABLE
+            )
+            self.expect_publisher(topic)
         self.create_subscription(FilterUpdate, 'filter_update', self._on_update, UPDATES)
         self._search_server = ActionServer(
             self,
@@ -260,6 +292,59 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self._poses[key] = pose
         self._take_updates()
 
+    def _on_destination(self, name: str, message: PointStamped) -> None:
+        if not self.active:
+            return
+        point = np.array([message.point.x, message.point.y, message.point.z])
+        frame = message.header.frame_id
+        if frame != self.settings.frame or not np.isfinite(point).all():
+            self.drop(
+                'bad destination',
+                f'{name}/destination: read {point.tolist()} in {frame!r}, allowed are finite '
+                f'numbers in {self.settings.frame!r}',
+            )
+            return
+        known = self._destinations[name]
+        known[round(stamp_from_ros(message.header.stamp) * 1e-9 / self.settings.step)] = point
+        while len(known) > 2:
+            del known[min(known)]
+        self._others_at[name] = time.monotonic()
+        if self.settings.lockstep:
+            self._try_step()
+
+    def _unheard(self, step: int, robots: list[str]) -> bool:
+        """Return whether another planner has still to say where its robot goes.
+
+        One with a name before says so for this step first, one after for the step before.
+        """
+        own = self.coordinator.names[0]
+        for name, known in self._destinations.items():
+            if name not in robots:
+                continue
+            if name < own:
+                if max(known) < step:
+                    return True
+            elif name in self._others_before and max(known) < step - 1:
+                return True
+        return False
+
+    def _taken(self, step: int, robots: list[str] | None) -> list[tuple[FloatArray, float]]:
+        """Return where robots that plan for themselves will stand, as far as it is known."""
+        own = self.coordinator.names[0]
+        now = time.monotonic()
+        taken = []
+        for name, known in self._destinations.items():
+            if robots is None:
+                heard = self._others_at.get(name)
+                there = heard is None or now - heard <= self.settings.state_timeout
+                last = max(known)
+            else:
+                there = name in robots
+                last = max((k for k in known if k < step or name < own), default=max(known))
+            if there:
+                taken.append((known[last], self.settings.others[name].radius))
+        return taken
+
     def _on_update(self, message: FilterUpdate) -> None:
         if not self.active:
             return
@@ -335,13 +420,21 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         names = [name for name in expected.robots if name in self.coordinator.names]
         if any(name not in self._heard or self._heard[name].step != step for name in names):
             return
+        if self._destinations and names and self._unheard(step, expected.robots):
+            return
         self._expected = None
         for name in self.coordinator.names:
             if name not in names:
                 self._leave(name, 'it left')
         for name in names:
             self._join_or_leave(name, self._heard[name].status, self._heard[name].reason)
-        self._plan_step(step, stamp_from_ros(expected.stamp), set(expected.imaging))
+        self._plan_step(
+            step,
+            stamp_from_ros(expected.stamp),
+            set(expected.imaging),
+            self._taken(step, expected.robots),
+        )
+        self._others_before = set(expected.robots)
         self._try_done()
 
     def _try_free_step(self) -> None:
@@ -351,13 +444,19 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             return
         step = min(self._heard[name].step for name in present)
         if step > self._taken_step:
-            self._plan_step(step, stamp_of_step(step, self.settings.step), None)
+            self._plan_step(
+                step, stamp_of_step(step, self.settings.step), None, self._taken(step, None)
+            )
 
-    def _plan_step(self, step: int, stamp: int, imaging: set[str] | None) -> None:
+    def _plan_step(
+        self,
+        step: int,
+        stamp: int,
+        imaging: set[str] | None,
+        taken: list[tuple[FloatArray, float]],
+    ) -> None:
         self._taken_step = step
         self.step = step
-        if not self.searching:
-            return
         robots = {}
         for name in self.coordinator.names:
             if name in self._away:
@@ -369,10 +468,15 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             )
             robots[name] = PresentRobot(heard.state, free or self.coordinator.is_idle(name))
         header = Header(stamp=stamp_to_ros(stamp), frame_id=self.settings.frame)
+        if not self.searching:
+            self._publish_destinations(header, robots)
+            return
         begin = time.perf_counter()
-        decision = self.coordinator.plan(step, robots)
+        decision = self.coordinator.plan(step, robots, taken)
         if decision is not None:
             self._planning_time = time.perf_counter() - begin
+        self._publish_destinations(header, robots)
+        if decision is not None:
             self._announce(decision, header)
         members = self.coordinator.measuring(step, robots, imaging)
         if members:
@@ -392,6 +496,12 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                 )
             )
         self._publish_views(header, stamp * 1e-9, robots)
+
+    def _publish_destinations(self, header: Header, robots: dict[str, PresentRobot]) -> None:
+        for name, publisher in self._destination_publishers.items():
+            if name in robots:
+                point = point_to_ros(self.coordinator.destination(name, robots[name].state))
+                publisher.publish(PointStamped(header=header, point=point))
 
     def _announce(self, decision: Any, header: Header) -> None:
         """Publish a decision and send the robots on their way."""

@@ -231,7 +231,9 @@ class PlannerSettings(Settings):
         default='centres', description='maas: T by centre probabilities or by mutual information'
     )
     coordination: Literal['centralized', 'independent'] = Field(
-        default='centralized', description='maas: joint choice, or each robot for itself'
+        default='centralized',
+        description='All robots with one filter and joint choices, or each for itself with a '
+        'filter of its own, sharing only what is found',
     )
     lane_spacing: float | None = Field(
         default=None, gt=0.0, description='lawnmower: distance of lanes; none: size of the view [m]'
@@ -244,3 +246,12 @@ class PlannerSettings(Settings):
         ge=0.0,
         description='lawnmower: distance of the outer lanes from the bounds; none: half a lane [m]',
     )
+
+    @model_validator(mode='after')
+    def _lanes_are_shared_out(self) -> PlannerSettings:
+        if self.name == 'lawnmower' and self.coordination == 'independent':
+            raise ValueError(
+                "coordination: got 'independent', allowed with lawnmower is 'centralized': its "
+                'robots share the lanes'
+            )
+        return self

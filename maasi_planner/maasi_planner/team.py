@@ -50,10 +50,6 @@ class RobotView:
         that plans measures now.)
     radius : float
         Of a circle around the robot, metres; keeps waypoints apart.
-    clusters : list of Cluster, optional
-    exploration : Exploration, optional
-        What this robot alone believes, for independent planning with a filter of its own; None:
-        what the team believes.
     """
 
     state: RobotState
@@ -66,8 +62,6 @@ class RobotView:
     tail_yaws: FloatArray | None = None
     phase: int = 0
     radius: float = 0.0
-    clusters: list[Cluster] | None = None
-    exploration: Exploration | None = None
 
 
 @dataclass
@@ -92,6 +86,8 @@ class TeamView:
         In their own size, not inflated.
     particles, weights : (n, d), (n,) arrays, optional
         The intensity, for mutual information; without them the clusters stand for it.
+    taken : sequence of (3,) array and float
+        Where robots stand or will stand that are none of this team's, metres, and their radii.
     """
 
     step: int
@@ -103,6 +99,7 @@ class TeamView:
     obstacles: Obstacles | None = None
     particles: FloatArray | None = None
     weights: FloatArray | None = None
+    taken: Sequence[tuple[FloatArray, float]] = ()
 
     @property
     def bounds(self) -> FloatArray:

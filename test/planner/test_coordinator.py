@@ -125,3 +125,28 @@ def test_a_refused_goal_is_planned_anew_at_the_next_period():
     assert coordinator.is_idle('a')
     assert coordinator.plan(2, robots) is None
     assert list(coordinator.plan(4, robots).robots) == ['a']
+
+
+def test_places_of_robots_that_plan_for_themselves_are_kept_clear():
+    coordinator = make(name='nearest_widest')
+    robots = there(a=(1.0, 1.0))
+    free = coordinator.plan(0, robots).robots['a'].waypoint
+    again = make(name='nearest_widest')
+    other = again.plan(0, robots, taken=[(free, 0.1)]).robots['a'].waypoint
+    assert np.linalg.norm(other - free) >= 0.2
+    assert again.destination('a', robots['a'].state) == pytest.approx(other, abs=0.1)
+    again.refuse('a')
+    assert again.destination('a', robots['a'].state) == pytest.approx([1.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize('name', ['maas', 'mutual_information'])
+def test_active_search_measures_at_its_waypoints_only(name):
+    coordinator = make(name=name)
+    robots = there(a=(1.0, 1.0))
+    coordinator.plan(0, robots)
+    assert len(coordinator.measuring(0, robots)) == 1
+    for step in (4, 8, 12):
+        assert coordinator.measuring(step, there(free=False, a=(2.0, 1.0))) == []
+    arrived = there(a=(2.0, 2.0))
+    assert coordinator.plan(14, arrived) is not None
+    assert len(coordinator.measuring(14, arrived)) == 1

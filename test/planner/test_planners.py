@@ -217,27 +217,6 @@ def test_active_search_is_brute_force(planning, horizon):
             assert robot.objective[robot.chosen] == pytest.approx(decision.objective, rel=1e-9)
 
 
-def test_independent_robots_do_not_see_each_other():
-    """Each robot's choice is the one it would make alone, with a filter of its own too."""
-    settings = PlannerSettings(name='maas', alpha=0.8, coordination='independent')
-    team = ring_team(np.random.default_rng(5), 2)
-    names = team.planning()
-    own = team.exploration.copy()
-    own.values[...] = np.random.default_rng(6).uniform(size=own.values.shape)
-    team.robots[names[1]].exploration = own
-    team.robots[names[1]].clusters = [Cluster(np.array([0.2, 0.2]), np.eye(2) * 0.01, 0.1, 1.0)]
-    both = make_planner('maas', settings).decide(team)
-    for name in names:
-        view = team.robots[name]
-        alone = ring_team(np.random.default_rng(5), 2)
-        alone.robots = {name: view}
-        if view.exploration is not None:
-            alone.exploration = view.exploration
-            alone.clusters = view.clusters
-        decision = make_planner('maas', settings).decide(alone)
-        assert decision.robots[name].chosen == both.robots[name].chosen
-
-
 def test_active_search_with_mutual_information():
     settings = PlannerSettings(name='as', alpha=0.0, refinement='mutual_information')
     team = ring_team(np.random.default_rng(9), 1)

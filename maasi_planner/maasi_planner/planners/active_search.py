@@ -2,9 +2,9 @@
 
 Single robot, 001, eq. (9) to (13): sequences of `horizon` position changes, scored by
 T + alpha E with E the sum of e at the positions and T either the sum of pi at the cluster centres
-or the mutual information with the empty measurement set. Several robots, 002, section 4: each for
-itself (10), or jointly with the sum of T and the product of e (14) to (16). e and the clusters
-stay as they are at the decision.
+or the mutual information with the empty measurement set. Several robots, 002, section 4: jointly
+with the sum of T and the product of e (14) to (16), or each for itself (10), which is this planner
+once for each robot with a filter of its own. e and the clusters stay as they are at the decision.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.clusters import Cluster
 from maasi_filter.pose import Pose
 from maasi_planner.planners.base import (
     Options,
@@ -53,8 +52,6 @@ class Sequences:
     def __init__(
         self, team: TeamView, view: RobotView, option: Options, horizon: int, informed: bool
     ) -> None:
-        clusters = team.clusters if view.clusters is None else view.clusters
-        exploration = team.exploration if view.exploration is None else view.exploration
         here = np.array(view.state.pose.position)
         steps = np.asarray(view.candidates, dtype=float) - here
         kept: list[tuple[int, list[FloatArray]]] = [
@@ -78,31 +75,25 @@ class Sequences:
         positions = np.array([sequence for _, sequence in kept]).reshape(len(kept), horizon, 3)
         self.places = positions
         flat = positions.reshape(-1, 3)
-        self.explored = exploration.at(flat).reshape(len(kept), horizon)
+        self.explored = team.exploration.at(flat).reshape(len(kept), horizon)
         before = np.concatenate(
             [np.broadcast_to(here, (len(kept), 1, 3)), positions[:, :-1]], axis=1
         )
-        self.refinement = self._refinement(team, view, clusters, positions, before, informed)
+        self.refinement = self._refinement(team, view, positions, before, informed)
 
     def _refinement(
         self,
         team: TeamView,
         view: RobotView,
-        clusters: list[Cluster],
         places: FloatArray,
         before: FloatArray,
         informed: bool,
     ) -> FloatArray:
         number, horizon, _ = places.shape
         if informed:
-            own = team
-            if view.clusters is not None:
-                own = TeamView(
-                    team.step, team.step_time, team.robots, view.clusters, team.exploration
-                )
-            points, weights = intensity(own)
+            points, weights = intensity(team)
         else:
-            points = np.array([cluster.position[: team.dimension] for cluster in clusters])
+            points = np.array([cluster.position[: team.dimension] for cluster in team.clusters])
         out = np.zeros(number)
         if not len(points):
             return out
@@ -131,6 +122,8 @@ class ActiveSearch(Planner):
     first waypoint is used, and then all is planned again.
     """
 
+    measures_underway = False
+
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
         check_team(team)
@@ -148,10 +141,7 @@ class ActiveSearch(Planner):
             options[name] = found
             sequences[name] = Sequences(team, team.robots[name], found, settings.horizon, informed)
         names = list(options)
-        if settings.coordination == 'independent':
-            chosen = self._independent(team, options, sequences)
-        else:
-            chosen, decision.exact, decision.evaluated = self._centralized(team, options, sequences)
+        chosen, decision.exact, decision.evaluated = self._search(team, options, sequences)
         decision.objective = self._value(sequences, chosen)
         for name in names:
             view, option = team.robots[name], options[name]
@@ -162,38 +152,16 @@ class ActiveSearch(Planner):
         return explain(decision)
 
     def _value(self, sequences: dict[str, Sequences], chosen: dict[str, int]) -> float:
-        """Return the joint objective (002, eq. (14)), or the sum of single ones."""
+        """Return the joint objective (002, eq. (14))."""
         going = [name for name in chosen if chosen[name] >= 0]
         if not going:
             return 0.0
         refinement = 0.0
-        single = 0.0
         product = np.ones(self.settings.horizon)
         for name in going:
             refinement += float(sequences[name].refinement[chosen[name]])
-            explored = sequences[name].explored[chosen[name]]
-            product = product * explored
-            single += float(sum(explored.tolist()))
-        if self.settings.coordination == 'centralized':
-            single = float(sum(product.tolist()))
-        return refinement + self.settings.alpha * single
-
-    def _independent(
-        self, team: TeamView, options: dict[str, Options], sequences: dict[str, Sequences]
-    ) -> dict[str, int]:
-        chosen: dict[str, int] = {}
-        taken: list[tuple[FloatArray, float]] = []
-        for name, mine in sequences.items():
-            radius = team.robots[name].radius
-            values = mine.refinement + self.settings.alpha * mine.explored.sum(axis=1)
-            chosen[name] = -1
-            for row in np.argsort(-values, kind='stable').tolist():
-                point = options[name].points[mine.first[row]]
-                if apart(point, radius, taken):
-                    chosen[name] = row
-                    taken.append((point, radius))
-                    break
-        return chosen
+            product = product * sequences[name].explored[chosen[name]]
+        return refinement + self.settings.alpha * float(sum(product.tolist()))
 
     def _fits(
         self,
@@ -213,7 +181,7 @@ class ActiveSearch(Planner):
             taken.append((point, radius))
         return True
 
-    def _centralized(
+    def _search(
         self, team: TeamView, options: dict[str, Options], sequences: dict[str, Sequences]
     ) -> tuple[dict[str, int], bool, int]:
         names = list(sequences)

@@ -24,7 +24,14 @@ class Planner(ABC):
     ----------
     settings : PlannerSettings
         Which planner, and its numbers.
+
+    Attributes
+    ----------
+    measures_underway : bool
+        Whether robots measure on their way, or only at their waypoints.
     """
+
+    measures_underway = True
 
     def __init__(self, settings: PlannerSettings) -> None:
         self.settings = settings
@@ -103,6 +110,12 @@ def check_team(team: TeamView) -> None:
             or not np.isfinite(view.tail_yaws).all()
         ):
             raise ValueError(f'{name}: tail_yaws: allowed is one finite heading per tail position')
+    for place, radius in team.taken:
+        if not (np.isfinite(place).all() and math.isfinite(radius) and radius >= 0.0):
+            raise ValueError(
+                f'taken: got {np.asarray(place).tolist()} with radius {radius}, allowed are finite '
+                'numbers, the radius from 0 [m]'
+            )
     for index, cluster in enumerate(team.clusters):
         if not (
             np.isfinite(cluster.position).all()
@@ -175,7 +188,7 @@ def usable_candidates(
 
 def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
     """Return where robots that do not plan will stand, with their radii."""
-    places = []
+    places = list(team.taken)
     for name in team.names():
         view = team.robots[name]
         if view.planning:

@@ -149,6 +149,8 @@ class MutualInformation(Planner):
     Each robot measures at its waypoint. Where no waypoint tells anything, robots go straight on.
     """
 
+    measures_underway = False
+
     def __init__(self, settings: PlannerSettings) -> None:
         super().__init__(settings)
         self._headings: dict[str, FloatArray] = {}

@@ -50,9 +50,7 @@ class NearestWidest(Planner):
     ) -> RobotDecision:
         view = team.robots[name]
         clusters = [
-            cluster
-            for cluster in (team.clusters if view.clusters is None else view.clusters)
-            if cluster.mass >= self.settings.mass_threshold
+            cluster for cluster in team.clusters if cluster.mass >= self.settings.mass_threshold
         ]
         centres = np.zeros((len(clusters), 3))
         centres[:, 2] = view.candidates[0, 2] if len(view.candidates) else 0.0
@@ -75,8 +73,7 @@ class NearestWidest(Planner):
                 self._turns[name] = (kind + 1) % 2
                 word = ('nearest', 'widest')[kind % 2]
                 return single_choice(point[None, :], prediction, 0, f'{word} cluster')
-        exploration = team.exploration if view.exploration is None else view.exploration
-        explored = exploration.at(found.points)
+        explored = team.exploration.at(found.points)
         gaps = ((found.points - here) ** 2).sum(axis=1)
         order = sorted(
             np.flatnonzero(found.allowed).tolist(),
