@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from maasi_sim.observer import BATCH, DECISIONS, FOUND, STEP, UPDATE
-from maasi_sim.scenario import RobotSettings, Scenario
+from maasi_sim.observer import BATCH, DECISIONS, FOUND, STEP, UPDATE, within
+from maasi_sim.scenario import RobotSettings, Scenario, planner_settings
 
 CLOCK = '/clock'
 # The time is that of the sim.
@@ -37,6 +37,8 @@ class NodePlan:
         Whether it takes part in lockstep.
     is_clock : bool
         Whether the time is its.
+    remaps : dict
+        Names of topics that are called otherwise.
     """
 
     package: str
@@ -48,6 +50,7 @@ class NodePlan:
     says_ready: bool = True
     says_done: bool = True
     is_clock: bool = False
+    remaps: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def full_name(self) -> str:
@@ -74,6 +77,11 @@ class NodePlan:
             f'__node:={self.name}',
             '--remap',
             f'__ns:=/{self.namespace}',
+            *(
+                word
+                for before, after in self.remaps.items()
+                for word in ('--remap', f'{before}:={after}')
+            ),
             '--params-file',
             str(parameter_file),
         ]
@@ -105,37 +113,7 @@ def plan_nodes(
     file : Path
         Scenario file with all layers, for the sim.
     """
-    from maasi_filter.node_settings import FilterNodeSettings
-    from maasi_filter.parameters import flatten
-    from maasi_planner.node_settings import PlannerNodeSettings
-
     common = {'step': scenario.step, 'seed': seed, 'lockstep': lockstep}
-    filter_settings = FilterNodeSettings.model_validate(
-        {
-            **common,
-            'environment': scenario.environment,
-            'filter': scenario.filter,
-            'robots': {name: {'sensor': robot.sensor} for name, robot in scenario.robots.items()},
-        }
-    )
-    planner_settings = PlannerNodeSettings.model_validate(
-        {
-            **common,
-            'environment': scenario.environment,
-            'planner': scenario.planner,
-            'exploration_spacing': scenario.filter.exploration_spacing,
-            'robots': {
-                name: {
-                    'candidates': robot.candidates,
-                    'motion': robot.motion,
-                    'sensor': robot.sensor,
-                    'radius': robot.radius,
-                    'start': robot.start,
-                }
-                for name, robot in scenario.robots.items()
-            },
-        }
-    )
     simulation: dict[str, Any] = {
         'scenario': str(file),
         'seed': seed,
@@ -157,25 +135,46 @@ def plan_nodes(
     ]
     for name in scenario.names():
         plans += _robot_plans(name, scenario.robots[name], scenario, common)
-    plans.append(
+    for namespace, names in scenario.namespaces().items():
+        plans += _team_plans(namespace, names, scenario, common)
+    return plans
+
+
+def _team_plans(
+    namespace: str, names: list[str], scenario: Scenario, common: dict[str, Any]
+) -> list[NodePlan]:
+    """Return filter and planner of robots that share them."""
+    from maasi_filter.node_settings import FilterNodeSettings
+    from maasi_filter.parameters import flatten
+
+    others = [name for name in scenario.names() if name not in names]
+    filter_settings = FilterNodeSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment,
+            'filter': scenario.filter,
+            'robots': {name: {'sensor': scenario.robots[name].sensor} for name in names},
+            'share_with': others,
+        }
+    )
+    return [
         NodePlan(
             'maasi_filter',
             'filter_node',
             'filter_node',
-            parameters={**flatten(filter_settings), **_SIMULATED},
-            topics=(UPDATE, FOUND),
-        )
-    )
-    plans.append(
+            namespace,
+            {**flatten(filter_settings), **_SIMULATED},
+            topics=(within(namespace, UPDATE), within(namespace, FOUND)),
+        ),
         NodePlan(
             'maasi_planner',
             'planner_node',
             'planner_node',
-            parameters={**flatten(planner_settings), **_SIMULATED},
-            topics=(DECISIONS, BATCH),
-        )
-    )
-    return plans
+            namespace,
+            {**flatten(planner_settings(scenario, names, common)), **_SIMULATED},
+            topics=(within(namespace, DECISIONS), within(namespace, BATCH)),
+        ),
+    ]
 
 
 def _robot_plans(
@@ -197,6 +196,7 @@ def _robot_plans(
             'camera': robot.camera,
         }
     )
+    own = name in scenario.namespaces()
     plans = [
         NodePlan(
             'maasi_drivers',
@@ -204,6 +204,8 @@ def _robot_plans(
             'driver',
             name,
             {**flatten(settings), **_SIMULATED},
+            # Its batches are those of its own planner, if it has one.
+            remaps={BATCH: within(name, BATCH)} if own else {},
             topics=tuple(f'/{name}/{topic}' for topic in ('state', 'detections', 'cmd_vel')),
         )
     ]

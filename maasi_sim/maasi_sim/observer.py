@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,11 @@ UPDATE, FOUND, DECISIONS = '/filter_update', '/found_targets', '/decisions'
 BATCH = '/measurement_batch'
 STEP = '/lockstep/step'
 UNAVAILABLE = 5
+
+
+def within(namespace: str, topic: str) -> str:
+    """Return the full name of a topic in a namespace; an empty one is the root."""
+    return f'/{namespace}{topic}' if namespace else topic
 
 
 def seconds(stamp: Any) -> float:
@@ -119,6 +124,102 @@ class RunRecord:
         return score(positions, self.truth, self.radius, self.scenario.scoring.order)
 
 
+@dataclass
+class _Update:
+    """An update of a filter, in a namespace, with the found targets as they were changed by it."""
+
+    namespace: str
+    message: Any
+    arrays: list[Any]
+
+
+class _Tally:
+    """Counts what the filters have found, update by update."""
+
+    def __init__(self, scenario: Scenario, truth: FloatArray) -> None:
+        self.scenario = scenario
+        self.truth = truth
+        self.radius = scoring_radius(scenario, truth)
+        self.measurements = dict.fromkeys(scenario.names(), 0)
+        self.progress: list[Progress] = []
+        self.completed: Progress | None = None
+        self.expected_number = 0.0
+        self._shared = len(scenario.namespaces()) > 1
+        # By the namespace of the filter.
+        self._found: dict[str, dict[int, Found]] = {name: {} for name in scenario.namespaces()}
+        self._expected: dict[str, float] = {}
+        self._last_scores: Scores | None = None
+
+    @property
+    def found(self) -> list[Found]:
+        """Targets found so far; those of several filters are numbered in their order."""
+        if not self._shared:
+            (found,) = self._found.values()
+            return [found[key] for key in sorted(found)]
+        every = [item for found in self._found.values() for item in found.values()]
+        every.sort(key=lambda item: (item.time, item.agent, item.id))
+        return [replace(item, id=number) for number, item in enumerate(every, start=1)]
+
+    def take(self, update: _Update) -> bool:
+        """Take an update; return whether the number of found targets is another one."""
+        message = update.message
+        before = self._found[update.namespace]
+        changed = bool(update.arrays)
+        for array in update.arrays:
+            before = {int(item.id): self._target(item) for item in self._own(update, array.targets)}
+        for item in self._own(update, message.newly_found):
+            if int(item.id) not in before:
+                before[int(item.id)] = self._target(item)
+                changed = True
+        self._found[update.namespace] = before
+        for member in message.members:
+            self.measurements[member.robot] = self.measurements.get(member.robot, 0) + 1
+        # All filters believe in the same targets.
+        self._expected[update.namespace] = float(message.expected_number)
+        self.expected_number = max(self._expected.values())
+        if changed or self._last_scores is None:
+            self._last_scores = self._scores()
+        now = Progress(
+            seconds(message.header.stamp),
+            int(message.step),
+            int(message.batch_id),
+            sum(self.measurements.values()),
+            sum(len(found) for found in self._found.values()),
+            self._last_scores.match.true_found,
+        )
+        news = not self.progress or self.progress[-1].found != now.found
+        self.progress.append(now)
+        if (
+            self.completed is None
+            and len(self.truth)
+            and self._last_scores.complete
+            and self.scenario.stop == 'all_found'
+        ):
+            self.completed = now
+        return news
+
+    def _own(self, update: _Update, targets: Any) -> list[Any]:
+        """Return the targets that the filter found itself."""
+        if not self._shared:
+            return list(targets)
+        return [item for item in targets if item.robot == update.namespace]
+
+    def _scores(self) -> Scores:
+        positions = [item.position for item in self.found]
+        return score(positions, self.truth, self.radius, self.scenario.scoring.order)
+
+    def _target(self, item: Any) -> Found:
+        size = self.scenario.dimension
+        return Found(
+            int(item.id),
+            np.array([item.position.x, item.position.y, item.position.z])[:size],
+            np.array(item.covariance, dtype=float).reshape(3, 3)[:size, :size],
+            item.robot,
+            int(item.measurement),
+            seconds(item.stamp),
+        )
+
+
 class RunObserver:
     """Gather what a report needs from serialised messages, in the order in which they come.
 
@@ -142,45 +243,76 @@ class RunObserver:
         self.scenario = scenario
         self.seed = seed
         self.truth = np.asarray(scenario.world(seed).targets, dtype=float)
-        self.radius = scoring_radius(scenario, self.truth)
         self._types = types
-        self._dimension = scenario.dimension
+        spaces = list(scenario.namespaces())
+        self._update_topics = {within(space, UPDATE): space for space in spaces}
+        self._found_topics = {within(space, FOUND): space for space in spaces}
+        self._decision_topics = {within(space, DECISIONS): space for space in spaces}
         self._state_topics = {f'/{name}/state': name for name in scenario.names()}
         self._detection_topics = {f'/{name}/detections': name for name in scenario.names()}
         self._kept: dict[str, list[bytes]] = {
-            topic: [] for topic in (DECISIONS, *self._state_topics, *self._detection_topics)
+            topic: []
+            for topic in (*self._decision_topics, *self._state_topics, *self._detection_topics)
         }
-        self._found: dict[int, Found] = {}
-        self._updates: list[Any] = []
-        self._arrays: list[Any] = []
-        self._last_scores: Scores | None = None
+        self._tally = _Tally(scenario, self.truth)
+        self._updates: list[tuple[str, Any]] = []
+        self._arrays: dict[str, list[Any]] = {space: [] for space in spaces}
+        self._history: list[_Update] = []
         self._team: list[str] | None = None
-        self.progress: list[Progress] = []
-        self.measurements = dict.fromkeys(scenario.names(), 0)
         self.events: list[dict[str, Any]] = []
-        self.completed: Progress | None = None
-        self.settled: str | None = None
-        self._settled_step: int | None = None
-        self._explored = 0.0
+        # Why the planners think that nothing is left, and since which step.
+        self._settled: dict[str, tuple[int, str]] = {}
+        self._explored: dict[str, float] = {}
         self.news = False
-        self.expected_number = 0.0
+
+    @property
+    def update_topics(self) -> list[str]:
+        """Topics of the filters' updates."""
+        return list(self._update_topics)
+
+    @property
+    def result_topics(self) -> list[str]:
+        """Topics of the filters' updates and found targets."""
+        return [*self._update_topics, *self._found_topics]
 
     @property
     def topics(self) -> list[str]:
         """Topics that it wants."""
-        return [UPDATE, FOUND, STEP, *self._kept]
+        return [*self.result_topics, STEP, *self._kept]
+
+    @property
+    def progress(self) -> list[Progress]:
+        """Where the run stood after each filter update."""
+        return self._tally.progress
+
+    @property
+    def completed(self) -> Progress | None:
+        """Where the run stood when all was found."""
+        return self._tally.completed
+
+    @property
+    def settled(self) -> str | None:
+        """Why nothing is left to gain, once every planner says so."""
+        if len(self._settled) < len(self._decision_topics):
+            return None
+        return max(self._settled.values())[1]
 
     @property
     def end_step(self) -> int | None:
         """Step at which the run came to its end by itself, if it has."""
         if self.completed is not None:
             return self.completed.step
-        return self._settled_step
+        return max(self._settled.values())[0] if self.settled is not None else None
 
     @property
     def found(self) -> int:
         """Number of targets found so far."""
-        return len(self._found)
+        return self.progress[-1].found if self.progress else 0
+
+    @property
+    def measurements(self) -> dict[str, int]:
+        """Number of measurements so far, by robot."""
+        return self._tally.measurements
 
     @property
     def total_measurements(self) -> int:
@@ -189,22 +321,25 @@ class RunObserver:
 
     @property
     def explored(self) -> float:
-        """Share of the environment explored, as of the last decision."""
-        return self._explored
+        """Share of the environment explored, as of the last decisions; the largest of several."""
+        return max(self._explored.values(), default=0.0)
+
+    @property
+    def expected_number(self) -> float:
+        """Targets believed not yet found; the most that any filter believes."""
+        return self._tally.expected_number
 
     def add(self, topic: str, data: bytes) -> None:
         """Take a serialised message; what is not in `topics` is left alone."""
         if topic in self._kept:
             self._kept[topic].append(data)
-            if topic == DECISIONS:
-                self._note_decision(self._decode(data, 'PlanDecision'))
-        elif self.completed is not None:
-            return
-        elif topic == UPDATE:
-            self._updates.append(self._decode(data, 'FilterUpdate'))
-        elif topic == FOUND:
-            self._arrays.append(self._decode(data, 'FoundTargetArray'))
-        elif topic == STEP:
+            if topic in self._decision_topics:
+                self._note_decision(topic, self._decode(data, 'PlanDecision'))
+        elif topic in self._update_topics:
+            self._updates.append((self._update_topics[topic], self._decode(data, 'FilterUpdate')))
+        elif topic in self._found_topics:
+            self._arrays[self._found_topics[topic]].append(self._decode(data, 'FoundTargetArray'))
+        elif topic == STEP and self.completed is None:
             self._note_team(self._decode(data, 'LockstepStep'))
 
     def settle(self) -> None:
@@ -213,65 +348,39 @@ class RunObserver:
         The filter publishes found targets before the update that they belong to, so both are there.
         """
         updates, self._updates = self._updates, []
-        for update in updates:
-            if self.completed is None:
-                self._take(update)
+        for namespace, message in updates:
+            # Of several filters the others may still have to say what they found at that step.
+            if self.completed is not None and (
+                len(self._update_topics) == 1 or message.step > self.completed.step
+            ):
+                continue
+            arrays, waiting = [], self._arrays[namespace]
+            while waiting and waiting[0].batch_id <= message.batch_id:
+                arrays.append(waiting.pop(0))
+            update = _Update(namespace, message, arrays)
+            if len(self._update_topics) > 1:
+                self._history.append(update)
+            self.news = self._tally.take(update) or self.news
 
-    def _take(self, update: Any) -> None:
-        changed = self._apply_arrays(int(update.batch_id))
-        for item in update.newly_found:
-            if int(item.id) not in self._found:
-                self._found[int(item.id)] = self._target(item)
-                changed = True
-        for member in update.members:
-            self.measurements[member.robot] = self.measurements.get(member.robot, 0) + 1
-        self.expected_number = float(update.expected_number)
-        if changed or self._last_scores is None:
-            self._last_scores = self._scores()
-        scores = self._last_scores
-        now = Progress(
-            seconds(update.header.stamp),
-            int(update.step),
-            int(update.batch_id),
-            self.total_measurements,
-            len(self._found),
-            scores.match.true_found,
-        )
-        self.news = self.news or not self.progress or self.progress[-1].found != now.found
-        self.progress.append(now)
-        if len(self.truth) and scores.complete and self.scenario.stop == 'all_found':
-            self.completed = now
+    def _final_tally(self) -> _Tally:
+        """Return the tally with the updates of several filters in the order of steps and names."""
+        if not self._history:
+            return self._tally
+        tally = _Tally(self.scenario, self.truth)
+        for update in sorted(
+            self._history,
+            key=lambda item: (item.message.step, item.namespace, item.message.batch_id),
+        ):
+            if tally.completed is not None and update.message.step > tally.completed.step:
+                break
+            tally.take(update)
+        return tally
 
-    def _apply_arrays(self, batch: int) -> bool:
-        """Take the found targets as they stood after a batch; return whether any came."""
-        changed = False
-        while self._arrays and self._arrays[0].batch_id <= batch:
-            targets = self._arrays.pop(0).targets
-            self._found = {int(item.id): self._target(item) for item in targets}
-            changed = True
-        return changed
-
-    def _scores(self) -> Scores:
-        positions = [self._found[key].position for key in sorted(self._found)]
-        return score(positions, self.truth, self.radius, self.scenario.scoring.order)
-
-    def _target(self, item: Any) -> Found:
-        size = self._dimension
-        return Found(
-            int(item.id),
-            np.array([item.position.x, item.position.y, item.position.z])[:size],
-            np.array(item.covariance, dtype=float).reshape(3, 3)[:size, :size],
-            item.robot,
-            int(item.measurement),
-            seconds(item.stamp),
-        )
-
-    def _note_decision(self, decision: Any) -> None:
-        """Note when the planner says that nothing is left to gain: a reason, and no robots."""
-        self._explored = float(decision.explored)
-        if decision.reason and not decision.robots and self.settled is None:
-            self.settled = decision.reason
-            self._settled_step = int(decision.step)
+    def _note_decision(self, topic: str, decision: Any) -> None:
+        """Note when a planner says that nothing is left to gain: a reason, and no robots."""
+        self._explored[topic] = float(decision.explored)
+        if decision.reason and not decision.robots:
+            self._settled.setdefault(topic, (int(decision.step), decision.reason))
 
     def _note_team(self, step: Any) -> None:
         team = list(step.robots)
@@ -312,21 +421,22 @@ class RunObserver:
         events : list of dict, optional
             Of nodes: restarted, dead.
         """
+        tally = self._final_tally()
         last_step = None
-        if self.completed is not None:
-            end_time, last_step = self.completed.time, self.completed.step
+        if tally.completed is not None:
+            end_time, last_step = tally.completed.time, tally.completed.step
         record = RunRecord(
             self.name,
             self.scenario,
             self.seed,
             self.truth,
-            found=[self._found[key] for key in sorted(self._found)],
-            progress=list(self.progress),
-            measurements={name: self.measurements[name] for name in sorted(self.measurements)},
+            found=tally.found,
+            progress=list(tally.progress),
+            measurements={name: tally.measurements[name] for name in sorted(tally.measurements)},
             end_reason=end_reason,
             end_time=end_time,
             wall_time=wall_time,
-            expected_number=self.expected_number,
+            expected_number=tally.expected_number,
         )
         self._add_decisions(record, last_step)
         lost: list[dict[str, Any]] = []
@@ -357,15 +467,18 @@ class RunObserver:
         waypoints: dict[str, list[tuple[float, float, float]]] = {
             name: [] for name in self.scenario.names()
         }
-        for data in self._kept[DECISIONS]:
-            decision = self._decode(data, 'PlanDecision')
-            if last_step is not None and decision.step > last_step:
-                break
-            record.explored = float(decision.explored)
-            for robot in decision.robots:
-                if robot.chosen >= 0:
-                    record.decisions += 1
-                    waypoints.setdefault(robot.robot, []).append(_point(robot.waypoint))
+        for topic in self._decision_topics:
+            explored = 0.0
+            for data in self._kept[topic]:
+                decision = self._decode(data, 'PlanDecision')
+                if last_step is not None and decision.step > last_step:
+                    break
+                explored = float(decision.explored)
+                for robot in decision.robots:
+                    if robot.chosen >= 0:
+                        record.decisions += 1
+                        waypoints.setdefault(robot.robot, []).append(_point(robot.waypoint))
+            record.explored = max(record.explored, explored)
         record.waypoints = {name: _rows(points, 3) for name, points in waypoints.items()}
 
 
@@ -374,7 +487,7 @@ def observe_bag(bag: Bag, name: str, scenario: Scenario, seed: int) -> RunObserv
     observer = RunObserver(name, scenario, seed, bag.store)
     for topic, _, _, data in bag.raw(observer.topics):
         observer.add(topic, data)
-        if topic == UPDATE:
+        if topic in observer.update_topics:
             observer.settle()
     return observer
 

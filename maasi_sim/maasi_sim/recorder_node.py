@@ -22,17 +22,15 @@ from rclpy.subscription import Subscription
 from maasi_filter.conversions import stamp_of_step
 from maasi_msgs.msg import (
     AgentState,
-    ClusterArray,
     DetectionArray,
     FilterUpdate,
-    FoundTargetArray,
     LockstepDone,
     LockstepStep,
     MeasurementBatch,
     PlanDecision,
 )
 from maasi_sim.bag import BagError, BagWriter, TopicQos
-from maasi_sim.observer import STEP, UPDATE, RunObserver
+from maasi_sim.observer import STEP, RunObserver
 
 NAME = '/recorder'
 CLOCK, READY, DONE = '/clock', '/lockstep/ready', '/lockstep/done'
@@ -49,7 +47,6 @@ _WITH_STEP = (
     MeasurementBatch,
     PlanDecision,
 )
-_WITH_BATCH = (ClusterArray, FoundTargetArray)
 _READY_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -219,7 +216,11 @@ class Recorder:
         # Left where they are they would end each wait at once.
         self.take_ready()
         # What belongs to an update was published before it: take updates first, read them last.
-        updates = self._take_from(UPDATE)
+        updates = [
+            (topic, data)
+            for topic in self.observer.update_topics
+            for data in self._take_from(topic)
+        ]
         steps = self._take_from(STEP)
         for data in steps:
             self.step = struct.unpack_from('<Q', data, 4)[0]
@@ -228,9 +229,9 @@ class Recorder:
         for _, data in taken:
             self._set_time(data, 4)
         for topic, subscription in self._subscriptions.items():
-            if topic not in (UPDATE, STEP, CLOCK):
+            if topic not in (*self.observer.update_topics, STEP, CLOCK):
                 taken += [(topic, data) for data in _take(subscription)]
-        taken += [(UPDATE, data) for data in updates]
+        taken += updates
         taken += [(STEP, data) for data in steps]
         if self._finished:
             taken = self._until(taken, self._last_step)
@@ -242,7 +243,7 @@ class Recorder:
             self.last_seen[topic] = now
             if topic == DONE:
                 self._last_done.append(data)
-            if not self._finished:
+            if not self._finished or topic in self.observer.result_topics:
                 self.observer.add(topic, data)
         self.observer.settle()
         if self.observer.end_step is not None and not self._finished:
@@ -260,8 +261,6 @@ class Recorder:
 
     def _until(self, taken: list[tuple[str, bytes]], step: int) -> list[tuple[str, bytes]]:
         """Return the messages up to a step, as far as they say to which they belong."""
-        progress = self.observer.progress
-        batch = progress[-1].batch if progress else 0
         end = stamp_of_step(step, self.observer.scenario.step)
         kept = []
         for topic, data in taken:
@@ -274,8 +273,6 @@ class Recorder:
                 if seconds * 10**9 + nanoseconds > end:
                     continue
             if kind in _WITH_STEP and deserialize_message(data, kind).step > step:
-                continue
-            if kind in _WITH_BATCH and deserialize_message(data, kind).batch_id > batch:
                 continue
             kept.append((topic, data))
         return kept

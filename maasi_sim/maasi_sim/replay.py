@@ -12,10 +12,10 @@ from typing import Any
 
 from maasi_sim.bag import Bag, BagError
 from maasi_sim.node_plan import NodePlan
-from maasi_sim.observer import FOUND, UPDATE
+from maasi_sim.observer import FOUND, UPDATE, within
 from maasi_sim.processes import Domain, NodeProcess, find_executable, stop
 
-FILTER = '/filter_node'
+FILTER = 'filter_node'
 EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
 # Wall time that one update may take, and the start of the node, which may have to compile [s].
 _PATIENCE = 60.0
@@ -49,6 +49,8 @@ class Batch:
         What the filter published.
     late : bool
         Whether it is what one robot sent too late for its batch, or unasked.
+    namespace : str
+        Of the filter; empty for the root.
     """
 
     id: int
@@ -58,6 +60,7 @@ class Batch:
     detections: list[bytes]
     update: Any
     late: bool = False
+    namespace: str = ''
 
 
 @dataclass
@@ -69,14 +72,22 @@ class Recording:
     facts : dict
         Scenario, seed and parameters of each node.
     batches : list of Batch
-        In order.
-    found : list of dict
-        Found targets at the end.
+        In order; those of several filters in the order of steps and names.
+    found : dict
+        By the namespace of the filter: found targets at the end, a list of dict.
+    found_batch : dict
+        By the namespace: the batch after which they stood so.
     """
 
     facts: dict[str, Any]
     batches: list[Batch] = field(default_factory=list)
-    found: list[dict[str, Any]] = field(default_factory=list)
+    found: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    found_batch: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def namespaces(self) -> list[str]:
+        """Namespaces of the filters."""
+        return list(self.found)
 
 
 def read_recording(path: Path) -> Recording:
@@ -89,7 +100,11 @@ def read_recording(path: Path) -> Recording:
     """
     with Bag(path) as bag:
         recording = Recording(bag.scenario())
-        if FILTER not in recording.facts.get('nodes', {}):
+        for name in recording.facts.get('nodes', {}):
+            namespace, _, node = name.strip('/').rpartition('/')
+            if node == FILTER:
+                recording.found[namespace] = []
+        if not recording.found:
             raise BagError(f'{path}: holds no parameters of {FILTER}')
         robots = recording.facts['scenario']['robots']
         topics = {f'/{name}/detections': name for name in robots}
@@ -98,14 +113,19 @@ def read_recording(path: Path) -> Recording:
             message = bag.decode(data, kind)
             # An index comes again only where a driver was started again: the first was used.
             detections.setdefault((topics[topic], int(message.measurement)), data)
-        last = 0
-        for item in bag.messages([UPDATE]):
-            batch = _batch(item.message, detections, path)
-            batch.late = batch.id <= last
-            last = max(last, batch.id)
-            recording.batches.append(batch)
-        for item in bag.messages([FOUND]):
-            recording.found = [plain(target) for target in item.message.targets]
+        for namespace in recording.namespaces:
+            last = 0
+            for item in bag.messages([within(namespace, UPDATE)]):
+                batch = _batch(item.message, detections, path)
+                batch.namespace = namespace
+                batch.late = batch.id <= last
+                last = max(last, batch.id)
+                recording.batches.append(batch)
+            for item in bag.messages([within(namespace, FOUND)]):
+                recording.found[namespace] = [plain(target) for target in item.message.targets]
+                recording.found_batch[namespace] = int(item.message.batch_id)
+    if len(recording.found) > 1:
+        recording.batches.sort(key=lambda batch: (batch.step, batch.namespace))
     return recording
 
 
@@ -187,35 +207,47 @@ def replay(
 
     recording = read_recording(path)
     folder = make_folder(out, '_replay')
-    facts = recording.facts['nodes'][FILTER]
+    with Domain(domain_id) as domain:
+        os.environ.update(domain.environment())
+        processes = [
+            _process(recording.facts, namespace, folder) for namespace in recording.namespaces
+        ]
+        try:
+            for process in processes:
+                process.start()
+            from maasi_sim.replay_node import ReplayNode
+
+            robots = sorted(recording.facts['scenario']['robots'])
+            node = ReplayNode(domain.number, robots, recording.namespaces)
+            try:
+                return _feed(node, recording, processes, interrupted)
+            finally:
+                node.close()
+        finally:
+            stop(processes)
+
+
+def _process(facts: dict[str, Any], namespace: str, folder: Path) -> NodeProcess:
+    recorded = facts['nodes'][within(namespace, f'/{FILTER}')]
     plan = NodePlan(
-        facts['package'],
-        facts['executable'],
-        FILTER.strip('/'),
-        parameters={**facts['parameters'], **_REPLAYED},
+        recorded['package'],
+        recorded['executable'],
+        FILTER,
+        namespace,
+        {**recorded['parameters'], **_REPLAYED},
     )
     parameters = folder / f'{plan.file_name}.yaml'
     parameters.write_text(plan.parameter_text(), encoding='utf-8')
     executable = find_executable(plan.package, plan.executable)
     log = folder / f'{plan.file_name}.log'
-    with Domain(domain_id) as domain:
-        os.environ.update(domain.environment())
-        process = NodeProcess(plan.full_name, plan.command(executable, parameters), log)
-        process.start()
-        try:
-            from maasi_sim.replay_node import ReplayNode
-
-            node = ReplayNode(domain.number, sorted(recording.facts['scenario']['robots']))
-            try:
-                return _feed(node, recording, process, interrupted)
-            finally:
-                node.close()
-        finally:
-            stop([process])
+    return NodeProcess(plan.full_name, plan.command(executable, parameters), log)
 
 
 def _feed(
-    node: Any, recording: Recording, process: NodeProcess, interrupted: Callable[[], bool]
+    node: Any,
+    recording: Recording,
+    processes: list[NodeProcess],
+    interrupted: Callable[[], bool],
 ) -> int:
     first_difference = None
 
@@ -226,35 +258,42 @@ def _feed(
         while not condition():
             if interrupted():
                 return INTERRUPTED
-            if not process.running:
-                return _failed(f'{process.name} {process.how_it_ended()}', process)
+            for process in processes:
+                if not process.running:
+                    return _failed(f'{process.name} {process.how_it_ended()}', process)
             if time.monotonic() > deadline:
-                return _failed(f'{process.name}: {what} for {patience:g} s', process)
+                return _failed(f'{what} for {patience:g} s', processes[0])
             node.spin()
         return None
 
-    code = wait_for(lambda: node.ready, 'was not ready', _START_PATIENCE)
+    code = wait_for(lambda: node.ready, 'the filter was not ready', _START_PATIENCE)
     if code is not None:
         return code
     for index, batch in enumerate(recording.batches):
         node.publish(batch)
         code = wait_for(
             lambda number=index + 1: len(node.updates) >= number,  # type: ignore[misc]
-            f'did not answer batch {batch.id}',
+            f'the filter did not answer batch {batch.id}',
         )
         if code is not None:
             return code
         if first_difference is None and not _same(plain(node.updates[-1]), batch.update):
             first_difference = batch
-    code = wait_for(lambda: node.found_batch >= node.changed_batch, 'published no found targets')
+    code = wait_for(
+        lambda: all(node.found_batch[key] >= last for key, last in recording.found_batch.items()),
+        'the filter published no found targets',
+    )
     if code is not None:
         return code
-    lines = differences(recording.found, [plain(target) for target in node.found])
+    lines = []
+    for namespace, found in recording.found.items():
+        now = [plain(target) for target in node.found[namespace]]
+        lines += [within(namespace, f' {line}').strip() for line in differences(found, now)]
     for line in lines:
         print(line)
     if first_difference is not None:
         print(f'the first update that differs is that of batch {first_difference.id}')
-    number = len(recording.found)
+    number = sum(len(found) for found in recording.found.values())
     if lines:
         print(f'{len(recording.batches)} batches replayed: the found targets are NOT equal')
         return DIFFERENT

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -19,7 +22,7 @@ from maasi_msgs.msg import (
     LockstepDone,
     MeasurementBatch,
 )
-from maasi_sim.observer import BATCH, FOUND, UPDATE
+from maasi_sim.observer import BATCH, FOUND, UPDATE, within
 from maasi_sim.replay import FILTER, Batch
 
 _ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE)
@@ -32,7 +35,7 @@ _LATCHED = QoSProfile(
 
 class ReplayNode:
     """
-    The other end of the filter node.
+    The other end of the filter node, or of several.
 
     Publishes
     ---------
@@ -50,9 +53,13 @@ class ReplayNode:
         ROS domain.
     robots : list of str
         Names.
+    namespaces : list of str
+        Of the filters; an empty one is the root.
     """
 
-    def __init__(self, domain: int, robots: list[str]) -> None:
+    def __init__(
+        self, domain: int, robots: Sequence[str], namespaces: Sequence[str] = ('',)
+    ) -> None:
         self.context = Context()
         rclpy.init(
             context=self.context,
@@ -61,26 +68,33 @@ class ReplayNode:
         )
         self.node = Node('replay', context=self.context, use_global_arguments=False)
         self.updates: list[FilterUpdate] = []
-        self.found: list[FoundTarget] = []
-        self.found_batch = 0
-        self.changed_batch = 0
-        self._announced = False
-        self._batch = self.node.create_publisher(MeasurementBatch, BATCH, _ALL)
+        self.found: dict[str, list[FoundTarget]] = {name: [] for name in namespaces}
+        self.found_batch = dict.fromkeys(namespaces, 0)
+        self._awaited = {within(name, f'/{FILTER}') for name in namespaces}
+        self._batches = {
+            name: self.node.create_publisher(MeasurementBatch, within(name, BATCH), _ALL)
+            for name in namespaces
+        }
         self._detections = {
             name: self.node.create_publisher(DetectionArray, f'/{name}/detections', _ALL)
             for name in robots
         }
-        self.node.create_subscription(FilterUpdate, UPDATE, self._on_update, _ALL)
-        self.node.create_subscription(FoundTargetArray, FOUND, self._on_found, _LATCHED)
+        for name in namespaces:
+            self.node.create_subscription(
+                FilterUpdate, within(name, UPDATE), self.updates.append, _ALL
+            )
+            self.node.create_subscription(
+                FoundTargetArray, within(name, FOUND), partial(self._on_found, name), _LATCHED
+            )
         self.node.create_subscription(LockstepDone, '/lockstep/ready', self._on_ready, _LATCHED)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
 
     @property
     def ready(self) -> bool:
-        """Whether the filter is, and hears all that will be published."""
-        publishers = [self._batch, *self._detections.values()]
-        return self._announced and all(item.get_subscription_count() for item in publishers)
+        """Whether the filters are, and hear all that will be published."""
+        publishers = [*self._batches.values(), *self._detections.values()]
+        return not self._awaited and all(item.get_subscription_count() for item in publishers)
 
     def spin(self, timeout: float = 0.05) -> None:
         """Take what comes within a time [s]."""
@@ -100,19 +114,14 @@ class ReplayNode:
             BatchMember(robot=robot, decision=decision, measurement=measurement)
             for robot, decision, measurement in batch.members
         ]
-        self._batch.publish(message)
+        self._batches[batch.namespace].publish(message)
 
-    def _on_update(self, message: FilterUpdate) -> None:
-        self.updates.append(message)
-        if message.newly_found:
-            self.changed_batch = message.batch_id
-
-    def _on_found(self, message: FoundTargetArray) -> None:
-        self.found = list(message.targets)
-        self.found_batch = message.batch_id
+    def _on_found(self, namespace: str, message: FoundTargetArray) -> None:
+        self.found[namespace] = list(message.targets)
+        self.found_batch[namespace] = message.batch_id
 
     def _on_ready(self, message: LockstepDone) -> None:
-        self._announced = self._announced or message.node == FILTER
+        self._awaited.discard(message.node)
 
     def close(self) -> None:
         """Leave the graph."""

@@ -490,7 +490,7 @@ class ScenarioRun:
         from maasi_sim.processes import stop
 
         recorder.finish()
-        drivers = [name for name in self.processes if self._robot_of(name) is not None]
+        drivers = [plan.full_name for plan in self.plans if plan.package == 'maasi_drivers']
         others = [name for name in self.processes if name not in drivers]
         if ending.reason == 'node_hung':
             for name in self.scenario.names():

@@ -22,6 +22,7 @@ from maasi_filter.settings import (
     Settings,
 )
 from maasi_planner.candidates import CandidateSet, Viewer, unseen_parts
+from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 from maasi_sim.camera import RenderSettings
 from maasi_sim.laser_scan import LaserSettings
@@ -169,6 +170,15 @@ class Scenario(Settings):
     def names(self) -> list[str]:
         """Return the robots' names in order."""
         return sorted(self.robots)
+
+    def namespaces(self) -> dict[str, list[str]]:
+        """Return the robots that share filter and planner, by the namespace of those nodes.
+
+        The empty one stands for the root: all robots together.
+        """
+        if self.planner.coordination == 'independent':
+            return {name: [name] for name in self.names()}
+        return {'': self.names()}
 
     def removal_distance(self) -> float:
         """Return T_z [m]: the filter's, or four deviations of the coarsest range without."""
@@ -493,6 +503,46 @@ def _inside(position: Sequence[float] | np.ndarray, bounds: np.ndarray) -> bool:
 def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> CandidateSet:
     """Return a robot's candidate waypoints; in 2D at the height of its start."""
     return CandidateSet(robot.candidates, environment.array(), height=robot.start[2])
+
+
+def planner_settings(
+    scenario: Scenario, names: Sequence[str], common: Mapping[str, Any]
+) -> PlannerNodeSettings:
+    """Return the settings of the planner of some robots; the others plan for themselves.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With all layers.
+    names : sequence of str
+        Its robots.
+    common : mapping
+        Settings that all nodes share.
+    """
+    return PlannerNodeSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment,
+            'planner': scenario.planner,
+            # As the filter has it.
+            'exploration_spacing': scenario.filter.exploration_spacing,
+            'robots': {
+                name: {
+                    'candidates': scenario.robots[name].candidates,
+                    'motion': scenario.robots[name].motion,
+                    'sensor': scenario.robots[name].sensor,
+                    'radius': scenario.robots[name].radius,
+                    'start': scenario.robots[name].start,
+                }
+                for name in names
+            },
+            'others': {
+                name: {'radius': robot.radius, 'start': robot.start}
+                for name, robot in scenario.robots.items()
+                if name not in names
+            },
+        }
+    )
 
 
 def never_seen(scenario: Scenario) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
@@ -12,15 +14,13 @@ from maasi_drivers.marker_detector import MarkerDetector
 from maasi_drivers.odometry import MapOdometry, StampedPose
 from maasi_drivers.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_filter.found_targets import FoundTarget
-from maasi_filter.node_settings import NodeSettings
 from maasi_filter.pose import Pose
 from maasi_filter.search_filter import AgentMeasurement, SearchFilter
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState, make_motion
-from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.team import Decision
-from maasi_sim.scenario import Scenario, steps_of
+from maasi_sim.scenario import Scenario, planner_settings, steps_of
 from maasi_sim.scoring import score, scoring_radius
 from maasi_sim.simulation import simulated_robot, step_of_event
 from maasi_sim.world import World
@@ -148,6 +148,15 @@ class _Robot:
         )
         self.state = RobotState(self.pose.pose, self.pose.velocity, self.pose.angular_velocity)
 
+    def has_ended(self, goal: int) -> bool:
+        """Return whether the goal of this number is over."""
+        follower = self.follower
+        return (
+            follower.goal is not None
+            and follower.goal.id == goal
+            and follower.status != GoalStatus.MOVING
+        )
+
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
         """Return what the robot sees at a step."""
         if self.detector is None:
@@ -171,27 +180,74 @@ class _Robot:
         )
 
 
-def planner_settings(scenario: Scenario, common: NodeSettings) -> PlannerNodeSettings:
-    """Return the planner's settings of a scenario."""
-    return PlannerNodeSettings.model_validate(
-        {
-            **common.model_dump(),
-            'environment': scenario.environment.model_dump(),
-            'planner': scenario.planner.model_dump(),
-            'robots': {
-                name: {
-                    'candidates': robot.candidates.model_dump(),
-                    'motion': robot.motion.model_dump(),
-                    'sensor': robot.sensor.model_dump(),
-                    'radius': robot.radius,
-                    'start': robot.start,
-                }
-                for name, robot in scenario.robots.items()
-            },
-            # As the filter has it.
-            'exploration_spacing': scenario.filter.exploration_spacing,
+class _Group:
+    """Robots that share filter and planner: all, or one by itself (002, section 4)."""
+
+    def __init__(self, names: list[str], scenario: Scenario, seed: int) -> None:
+        self.names = names
+        common = {'step': scenario.step, 'seed': seed, 'lockstep': True}
+        self.coordinator = Coordinator(planner_settings(scenario, names, common))
+        self.filter = SearchFilter(
+            scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
+        )
+        self.last_batch: int | None = None
+        # What the others know of: as it stood at the end of the step before.
+        self.shared: list[FoundTarget] = []
+        self.filter_times: list[float] = []
+        self.planning_times: list[float] = []
+
+    def plan(
+        self,
+        step: int,
+        robots: Mapping[str, _Robot],
+        taken: Sequence[tuple[FloatArray, float]],
+    ) -> tuple[dict[str, PresentRobot], Decision | None]:
+        """Decide where the robots go that are free, and send them there."""
+        coordinator = self.coordinator
+        present = {
+            name: PresentRobot(
+                robots[name].state,
+                coordinator.is_idle(name)
+                or robots[name].has_ended(coordinator.decision_index(name) + 1),
+            )
+            for name in self.names
+            if name in robots
         }
-    )
+        begin = perf_counter()
+        decision = coordinator.plan(step, present, taken)
+        if decision is not None:
+            self.planning_times.append(perf_counter() - begin)
+            for name, chosen in decision.robots.items():
+                if not chosen.stays:
+                    number = coordinator.decision_index(name) + 1
+                    robots[name].follower.take(Goal(number, step, chosen.waypoint))
+        return present, decision
+
+    def measure(
+        self,
+        step: int,
+        time: float,
+        robots: Mapping[str, _Robot],
+        present: Mapping[str, PresentRobot],
+        others: Sequence[_Group],
+    ) -> list[str]:
+        """Let those measure that do so now, and the filter have it; return their names."""
+        able = {name for name in present if step % robots[name].imaging_steps == 0}
+        members = self.coordinator.measuring(step, present, able)
+        if not members:
+            return []
+        measurements = [
+            robots[item.robot].measure(step, time, item.measurement) for item in members
+        ]
+        gone = 1 if self.last_batch is None else step - self.last_batch
+        self.last_batch = step
+        begin = perf_counter()
+        for other in others:
+            self.filter.take_over(other.names[0], other.shared)
+        result = self.filter.step(measurements, gone, time)
+        self.filter_times.append(perf_counter() - begin)
+        self.coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
+        return [item.robot for item in members]
 
 
 def leaving(scenario: Scenario) -> dict[int, list[str]]:
@@ -225,113 +281,107 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
     """
     world = scenario.world(seed)
     robots = {name: _Robot(name, scenario, seed, world) for name in scenario.names()}
-    coordinator = Coordinator(
-        planner_settings(scenario, NodeSettings(step=scenario.step, seed=seed, lockstep=True))
-    )
-    search_filter = SearchFilter(
-        scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
-    )
     departures = leaving(scenario)
     away: set[str] = set()
+    groups = [_Group(names, scenario, seed) for names in scenario.namespaces().values()]
+    destinations = {name: np.array(robot.start) for name, robot in scenario.robots.items()}
     truth = np.asarray(world.targets, dtype=float)
     radius = scoring_radius(scenario, truth)
     counts = dict.fromkeys(robots, 0)
     progress: list[Found] = []
     decisions: list[Decision] = []
-    filter_times: list[float] = []
-    planning_times: list[float] = []
     end_reason = 'time_limit'
-    last_batch: int | None = None
     step = -1
+
+    def found_targets() -> list[FoundTarget]:
+        return _numbered([item.filter.own_found_targets() for item in groups])
+
     for step in range(steps_of(scenario.limits.time, scenario.step)):
         time = step * scenario.step
         for name in departures.get(step, []):
             away.add(name)
-            coordinator.leave(name)
+            for group in groups:
+                if name in group.names:
+                    group.coordinator.leave(name)
         here = {name: robot for name, robot in robots.items() if name not in away}
         for robot in here.values():
             robot.observe(round(time * 1e9))
         commands = {
             name: robot.follower.update(robot.state, step)[0] for name, robot in here.items()
         }
-        present = {
-            name: PresentRobot(
-                robot.state,
-                coordinator.is_idle(name)
-                or (
-                    robot.follower.goal is not None
-                    and robot.follower.goal.id == coordinator.decision_index(name) + 1
-                    and robot.follower.status != GoalStatus.MOVING
-                ),
-            )
-            for name, robot in here.items()
-        }
-        begin = perf_counter()
-        decision = coordinator.plan(step, present)
-        if decision is not None:
-            planning_times.append(perf_counter() - begin)
-            decisions.append(decision)
-            for name, chosen in decision.robots.items():
-                if not chosen.stays:
-                    number = coordinator.decision_index(name) + 1
-                    robots[name].follower.take(Goal(number, step, chosen.waypoint))
-        able = {name for name, robot in here.items() if step % robot.imaging_steps == 0}
-        members = coordinator.measuring(step, present, able)
-        if members:
-            measurements = [
-                robots[item.robot].measure(step, time, item.measurement) for item in members
+        complete = False
+        for group in groups:
+            others = [other for other in groups if other is not group]
+            taken = [
+                (destinations[name], scenario.robots[name].radius)
+                for other in others
+                for name in other.names
+                if name in here
             ]
-            gone = 1 if last_batch is None else step - last_batch
-            last_batch = step
-            begin = perf_counter()
-            result = search_filter.step(measurements, gone, time)
-            filter_times.append(perf_counter() - begin)
-            coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
-            for item in members:
-                counts[item.robot] += 1
-            positions = [target.position for target in search_filter.found_targets]
-            scores = score(positions, truth, radius, scenario.scoring.order)
-            progress.append(
-                Found(
-                    time,
-                    sum(counts.values()),
-                    len(positions),
-                    scores.match.true_found,
-                    scores.match.rmse,
-                    step,
-                    tuple(item.robot for item in members),
-                    {name: robot.body.state.pose.position for name, robot in robots.items()},
+            present, decision = group.plan(step, here, taken)
+            for name in present:
+                destinations[name] = group.coordinator.destination(name, present[name].state)
+            if decision is not None:
+                decisions.append(decision)
+            measured = group.measure(step, time, here, present, others)
+            for name in measured:
+                counts[name] += 1
+            if measured:
+                positions = [target.position for target in found_targets()]
+                scores = score(positions, truth, radius, scenario.scoring.order)
+                complete = complete or (bool(len(truth)) and scores.complete)
+                progress.append(
+                    Found(
+                        time,
+                        sum(counts.values()),
+                        len(positions),
+                        scores.match.true_found,
+                        scores.match.rmse,
+                        step,
+                        tuple(measured),
+                        {name: robot.body.state.pose.position for name, robot in robots.items()},
+                    )
                 )
-            )
-            if len(truth) and scores.complete and scenario.stop == 'all_found':
-                end_reason = 'all_found'
-                break
-        if coordinator.finished is not None:
+        if complete and scenario.stop == 'all_found':
+            end_reason = 'all_found'
+            break
+        searching = [group for group in groups if not away.issuperset(group.names)]
+        if searching and all(group.coordinator.finished is not None for group in searching):
             end_reason = 'planner_done'
             break
         if most_measurements is not None and sum(counts.values()) >= most_measurements:
             end_reason = 'measurement_limit'
             break
+        for group in groups:
+            group.shared = group.filter.own_found_targets()
         for name, robot in here.items():
             before = robot.body.state.pose.position
             robot.body.command(commands[name])
             robot.body.step(step + 1, scenario.step)
             moved = robot.body.state.pose.position - before
             robot.distance += float(np.sqrt((moved * moved).sum()))
-    positions = [target.position for target in search_filter.found_targets]
-    scores = score(positions, truth, radius, scenario.scoring.order)
+    found = found_targets()
+    scores = score([item.position for item in found], truth, radius, scenario.scoring.order)
     return SearchResult(
         end_reason=end_reason,
-        found_targets=search_filter.found_targets,
+        found_targets=found,
         truth=truth,
         missed=len(truth) - scores.match.true_found,
-        false_found=len(positions) - scores.match.true_found,
+        false_found=len(found) - scores.match.true_found,
         rmse=scores.match.rmse,
         measurements=counts,
         distance={name: robot.distance for name, robot in robots.items()},
         steps=step + 1,
         progress=progress,
         decisions=decisions,
-        filter_times=filter_times,
-        planning_times=planning_times,
+        filter_times=[item for group in groups for item in group.filter_times],
+        planning_times=[item for group in groups for item in group.planning_times],
     )
+
+
+def _numbered(found: list[list[FoundTarget]]) -> list[FoundTarget]:
+    """Return what each filter found itself as one list, numbered in the order of being found."""
+    if len(found) == 1:
+        return found[0]
+    every = sorted(itertools.chain(*found), key=lambda item: (item.time, item.robot, item.id))
+    return [replace(item, id=number) for number, item in enumerate(every, start=1)]

@@ -284,8 +284,9 @@ class SimNode(SearchNode[SimNodeSettings]):
             self._driver_of[name]: [*step_topics, topics.odometry_topic, topics.sensor_topic]
             for name, topics in self._robots.items()
         }
-        for node in ('filter_node', 'planner_node'):
-            self._expected[self.team_topic(node)] = step_topics
+        for namespace in self.scenario.namespaces():
+            for node in ('filter_node', 'planner_node'):
+                self._expected[self.team_topic(f'{namespace}/{node}'.strip('/'))] = step_topics
         if self.settings.recorder:
             self._expected[RECORDER] = step_topics
         self._publish_truth()

@@ -51,9 +51,9 @@ def real_time_factor(folder: Path) -> float:
 def latencies(bag: Path, folder: Path) -> list[float]:
     """Return the times from detections to the update that holds them, over DDS [s]."""
     recording = read_recording(bag)
-    facts = recording.facts['nodes'][FILTER]
+    facts = recording.facts['nodes'][f'/{FILTER}']
     parameters = {**facts['parameters'], 'lockstep': True}
-    plan = NodePlan(facts['package'], facts['executable'], FILTER.strip('/'), parameters=parameters)
+    plan = NodePlan(facts['package'], facts['executable'], FILTER, parameters=parameters)
     file = folder / 'filter_node.yaml'
     file.write_text(plan.parameter_text(), encoding='utf-8')
     times = []

@@ -10,7 +10,7 @@ from maasi_filter.node_settings import FilterNodeSettings
 from maasi_filter.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.node_plan import NodePlan, plan_nodes
-from maasi_sim.scenario import config_folder, load_scenario
+from maasi_sim.scenario import ScenarioError, config_folder, load_scenario
 from maasi_sim.sim_settings import SimNodeSettings
 
 SCENARIOS = sorted(path.stem for path in (config_folder() / 'scenarios').glob('*.yaml'))
@@ -102,3 +102,28 @@ def test_a_node_without_namespace_is_at_the_root():
     plan = NodePlan('maasi_filter', 'filter_node', 'filter_node')
     assert plan.full_name == '/filter_node'
     assert '__ns:=/' in plan.command(Path('/x'), Path('/y'))
+
+
+def test_independent_robots_have_filter_and_planner_of_their_own():
+    overrides = {'planner': (('planner',), {'name': 'maas', 'coordination': 'independent'})}
+    scenario = load_scenario('mambo_turtlebot', overrides)
+    plans = plans_of(scenario)
+    assert '/filter_node' not in plans
+    assert '/planner_node' not in plans
+    for name, other in (('mambo', 'turtlebot'), ('turtlebot', 'mambo')):
+        search, _ = read_back(plans[f'/{name}/filter_node'], FilterNodeSettings)
+        assert list(search.robots) == [name]
+        assert search.share_with == [other]
+        planner, _ = read_back(plans[f'/{name}/planner_node'], PlannerNodeSettings)
+        assert list(planner.robots) == [name]
+        assert planner.planner == scenario.planner
+        assert planner.others[other].radius == scenario.robots[other].radius
+        assert planner.others[other].start == scenario.robots[other].start
+        command = plans[f'/{name}/driver'].command(Path('/x'), Path('/y'))
+        assert f'/measurement_batch:=/{name}/measurement_batch' in command
+
+
+def test_lawnmowers_share_their_lanes():
+    overrides = {'planner': (('planner',), {'name': 'lawnmower', 'coordination': 'independent'})}
+    with pytest.raises(ScenarioError, match='coordination'):
+        load_scenario('mambo_turtlebot', overrides)

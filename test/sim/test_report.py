@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from maasi_sim.bag import Bag, BagWriter, load_types
-from maasi_sim.observer import RunObserver, observe_bag
+from maasi_sim.observer import RunObserver, observe_bag, within
 from maasi_sim.report import END_REASONS, build_report, path_length, plot_report, summary
 from maasi_sim.report import write_report as write
 from maasi_sim.scenario import load_scenario
@@ -43,10 +43,11 @@ KEYS = [
 class Run:
     """Messages of a run in which everything is put in by hand."""
 
-    def __init__(self, scenario, types, sink=None):
+    def __init__(self, scenario, types, sink=None, namespace='', observer=None):
         self.types = types
         self.scenario = scenario
-        self.observer = RunObserver('hand', scenario, 7, types)
+        self.observer = observer or RunObserver('hand', scenario, 7, types)
+        self.namespace = namespace
         self.sink = sink
         self.found = []
         self.batch = 0
@@ -115,7 +116,7 @@ class Run:
             for name, waypoint in robots.items()
         ]
         self.send(
-            '/decisions',
+            within(self.namespace, '/decisions'),
             'PlanDecision',
             header=self.header(time),
             step=round(time / self.scenario.step),
@@ -150,7 +151,7 @@ class Run:
         new = [item for item in self.found if item.batch_id == self.batch]
         if latched:
             self.send(
-                '/found_targets',
+                within(self.namespace, '/found_targets'),
                 'FoundTargetArray',
                 header=self.header(time),
                 batch_id=self.batch,
@@ -158,7 +159,7 @@ class Run:
             )
         member = 'maasi_msgs/msg/BatchMember'
         self.send(
-            '/filter_update',
+            within(self.namespace, '/filter_update'),
             'FilterUpdate',
             header=self.header(time),
             batch_id=self.batch,
@@ -292,6 +293,68 @@ def test_report_of_a_complete_run(run):
     assert gospa['false'] == pytest.approx(0.5 * 0.15**2)
     assert gospa['missed'] == 0.0
     assert gospa['total'] == pytest.approx(math.sqrt(3e-4 + gospa['false']))
+
+
+@pytest.fixture
+def two_filters(types, tmp_path):
+    """Return a run of each robot, with one observer: each has a filter of its own."""
+    planner = {'name': 'maas', 'coordination': 'independent'}
+    scenario = scenario_of(tmp_path, TARGETS, planner=planner)
+    first = Run(scenario, types, namespace='mambo')
+    return first, Run(scenario, types, namespace='second', observer=first.observer)
+
+
+@pytest.mark.parametrize('turned', [False, True])
+def test_targets_of_several_filters_count_once_whoever_speaks_first(two_filters, turned):
+    one, two = two_filters
+    one.declare(0.5, TARGETS[0])
+    two.declare(0.5, TARGETS[1], 'second')
+    pair = [(one, 'mambo'), (two, 'second')]
+    for run, name in pair[::-1] if turned else pair:
+        run.update(0.5, [name])
+    # Each takes over what the other one has found; that is not found twice.
+    one.found.append(two.found[0])
+    two.found.append(one.found[0])
+    for run, name in pair[::-1] if turned else pair:
+        if name == 'mambo':
+            run.declare(0.9, TARGETS[2])
+        run.update(0.9, [name])
+    for run, name in pair:
+        run.update(0.95, [name])
+    observer = one.observer
+    assert observer.end_step == 18
+    report = build_report(observer.record('all_found', 1.0, 0.3))
+    assert [(item['id'], item['agent']) for item in report['found']] == [
+        (1, 'mambo'),
+        (2, 'second'),
+        (3, 'mambo'),
+    ]
+    assert report['true_found'] == 3
+    assert report['false_found'] == 0
+    assert report['time_to_find_all'] == pytest.approx(0.9)
+    # Both measured at the last step.
+    assert report['measurements'] == {'mambo': 2, 'second': 2}
+    assert report['measurements_to_find_all'] == 3
+
+
+def test_planners_of_several_robots_are_done_together(two_filters):
+    one, two = two_filters
+    for run, time in ((one, 1.0), (two, 1.5)):
+        assert run.observer.settled is None
+        run.send(
+            within(run.namespace, '/decisions'),
+            'PlanDecision',
+            header=run.header(time),
+            step=round(time / run.scenario.step),
+            planner='maas',
+            batch_id=1,
+            objective=0.0,
+            explored=0.99,
+            reason=f'nothing left for {run.namespace}',
+            robots=[],
+        )
+    assert one.observer.settled == 'nothing left for second'
+    assert one.observer.end_step == 30
 
 
 def test_what_comes_after_the_end_does_not_count(run):
