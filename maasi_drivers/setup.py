@@ -22,6 +22,7 @@ setup(
             'mambo_driver = maasi_drivers.mambo_driver:main',
             'turtlebot_driver = maasi_drivers.turtlebot_driver:main',
             'ranging_driver = maasi_drivers.ranging_driver:main',
+            'measurement_feed_sender = maasi_drivers.measurement_feed_sender:main',
             'guard_node = maasi_drivers.guard_node:main',
         ],
     },

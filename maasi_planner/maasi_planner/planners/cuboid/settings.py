@@ -1,0 +1,152 @@
+"""Settings of the search of buildings (004): checked models for files, parameters and code."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from maasi_filter.settings import Settings
+
+FloatArray = NDArray[np.float64]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Face = Literal['west', 'east', 'south', 'north', 'bottom', 'top']
+
+FACES: tuple[Face, ...] = ('west', 'east', 'south', 'north', 'bottom', 'top')
+LATERAL: list[Face] = ['west', 'east', 'south', 'north']
+
+
+class BoxSettings(Settings):
+    """A rectangular cuboid along the axes of the map."""
+
+    centre: list[Finite] = Field(
+        min_length=2,
+        max_length=3,
+        description='Centre x y z; of two numbers: it stands on the floor [m, map]',
+    )
+    size: list[Positive] = Field(min_length=3, max_length=3, description='Along x, y, z [m]')
+
+    def array(self, floor: float) -> FloatArray:
+        """Return its lower and upper corner, (3, 2) [m], on a floor at that height [m]."""
+        size = np.array(self.size)
+        centre = np.array([*self.centre, floor + 0.5 * size[2]])[:3]
+        return np.stack([centre - 0.5 * size, centre + 0.5 * size], axis=1)
+
+
+class ObjectSettings(BoxSettings):
+    """An object of interest."""
+
+    faces: list[Face] = Field(
+        default_factory=lambda: list(LATERAL),
+        min_length=1,
+        description='Faces to search; west is that of the smallest x, north of the largest y',
+    )
+
+
+class SearchCameraSettings(Settings):
+    """The camera of a searching robot, and how well it detects people (004, III-C)."""
+
+    angle: float = Field(
+        default=1.0471975511965976, gt=0.0, lt=3.0, description='Opening of the view [rad]'
+    )
+    least_distance: float = Field(default=17.0, gt=0.0, description='d_min of (4) [m]')
+    largest_distance: float = Field(default=90.0, gt=0.0, description='d_max of (4) [m]')
+
+    @model_validator(mode='after')
+    def _order(self) -> SearchCameraSettings:
+        if self.least_distance >= self.largest_distance:
+            raise ValueError(
+                f'least_distance: got {self.least_distance}, allowed is below largest_distance, '
+                f'{self.largest_distance} [m]'
+            )
+        return self
+
+
+class DynamicsSettings(Settings):
+    """Mass point with air resistance under bounded forces, 004, (1)."""
+
+    mass: float = Field(default=3.35, gt=0.0, description='m [kg]')
+    resistance: float = Field(default=0.2, ge=0.0, lt=1.0, description='eta, each step [1]')
+    force: float = Field(default=35.0, gt=0.0, description='Largest force on each axis [N]')
+    speed: float = Field(default=15.0, gt=0.0, description='Largest speed on each axis [m/s]')
+    gravity: float = Field(default=9.81, ge=0.0, description='g [m/s^2]')
+
+
+class HazardSettings(Settings):
+    """How batteries fail: probability at each step, 004, (3)."""
+
+    alpha: float = Field(default=100.0, gt=0.0, description='alpha_1 [steps]')
+    beta: float = Field(default=0.3, gt=0.0, description='beta_1 [1/step]')
+    recharge_steps: list[Annotated[int, Field(ge=1)]] = Field(
+        default=[5, 10],
+        min_length=2,
+        max_length=2,
+        description='T_R, least and most steps of a recharge [steps]',
+    )
+    failures: bool = Field(default=True, description='Whether batteries fail at all')
+
+    @model_validator(mode='after')
+    def _order(self) -> HazardSettings:
+        if self.recharge_steps[0] > self.recharge_steps[1]:
+            raise ValueError(
+                f'recharge_steps: got {self.recharge_steps}, allowed is the least first'
+            )
+        return self
+
+
+class CuboidSettings(Settings):
+    """The distributed model predictive control of 004 and its mission."""
+
+    objects: list[ObjectSettings] = Field(default_factory=list, description='To be searched')
+    obstacles: list[BoxSettings] = Field(default_factory=list, description='To be kept away from')
+    detection_probability: float = Field(
+        default=0.88, gt=0.0, le=1.0, description='p_d that each snapshot must have, (4) [1]'
+    )
+    coverage: Literal['paper', 'strict'] = Field(
+        default='paper',
+        description='Cells of a face: rounded as in the paper, which may leave strips of a few '
+        'percent unseen, or so many that every point is seen',
+    )
+    cuboid_size: float = Field(default=10.0, gt=0.0, description='Side of a cuboid [m]')
+    camera: SearchCameraSettings = Field(default_factory=SearchCameraSettings, description='Camera')
+    horizon: int = Field(default=10, ge=2, le=25, description='T [steps]')
+    guidance_step: int = Field(
+        default=3, ge=1, description='tau*, at most T - 1: the step that is drawn to a cuboid [1]'
+    )
+    guidance_weight: float = Field(default=1e-4, gt=0.0, description='w1 [1/m^2]')
+    smoothness_weight: float = Field(default=1e-4, gt=0.0, description='w2 [1/N^2]')
+    visit_weight: float = Field(default=0.3, ge=0.0, description='w3 [1]')
+    discount: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=1.0,
+        description='Of the reward, for each step that a visit comes later; 1 is the paper, in '
+        'which robots may hover for ever [1]',
+    )
+    around_corners: bool = Field(
+        default=True,
+        description='Whether a robot aims at the first corner of its way around obstacles '
+        'instead of at the cuboid behind them',
+    )
+    between_samples: bool = Field(
+        default=True, description='Whether obstacles are kept away from between samples, too'
+    )
+    clearance: float = Field(default=0.01, ge=0.0, description='Kept from obstacles [m]')
+    alpha: float = Field(default=2.0, gt=0.0, description='alpha_2 of (13) [1]')
+    beta: float = Field(default=0.5, gt=0.0, description='beta_2 of (13) [1]')
+    condition: Literal['low_hazard', 'printed'] = Field(
+        default='low_hazard',
+        description='When (13) holds: where p_b(t + T) is at most 0.5, or above 0.5 as printed',
+    )
+    communication_range: float = Field(default=100.0, gt=0.0, description='C_R [m]')
+    time_limit: float = Field(
+        default=0.5, gt=0.0, description='Wall time of a solve; then the best plan so far [s]'
+    )
+    node_limit: int = Field(
+        default=20000,
+        ge=1,
+        description='Nodes of a solve; then the best plan so far, the same on every machine [1]',
+    )

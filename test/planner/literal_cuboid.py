@@ -1,0 +1,330 @@
+"""P2 of 004 as it is printed, with its big-M rows and binaries, for general open solvers.
+
+The oracle of the tests and the baseline of the benchmark. What the lean problem adds on request
+(segments that keep away from obstacles, a way to brake) is added here as rows, too. HiGHS solves
+mixed-integer *linear* problems only: the squares are approximated by tangents from outside, and
+tangents are added until the gap is closed.
+"""
+
+import time
+
+import highspy
+import numpy as np
+
+BIG = 1000.0
+
+
+class LiteralProblem:
+    """Columns and rows of P2; `squares` are (weight, columns, coefficients, constant)."""
+
+    def __init__(self, dynamics, objective, problem):
+        self.dynamics, self.objective, self.problem = dynamics, objective, problem
+        self.lower, self.upper, self.integer, self.cost = [], [], [], []
+        self.rows = []
+        self.squares = []
+        self.constant = 0.0
+        self._dynamics_rows()
+        self._visit_rows()
+        self._obstacle_rows()
+        if problem.brakes:
+            self._braking_rows()
+        self._objective()
+
+    def column(self, lower, upper, integer=False, cost=0.0):
+        self.lower.append(lower)
+        self.upper.append(upper)
+        self.integer.append(integer)
+        self.cost.append(cost)
+        return len(self.cost) - 1
+
+    def row(self, columns, coefficients, lower, upper):
+        self.rows.append((list(columns), list(coefficients), lower, upper))
+
+    def _dynamics_rows(self):
+        d, T, p = self.dynamics, self.objective.horizon, self.problem
+        self.P = np.empty((T + 1, 3), dtype=int)
+        self.v = np.empty((T + 1, 3), dtype=int)
+        self.u = np.empty((T, 3), dtype=int)
+        gamma = d.step / d.mass
+        for a in range(3):
+            for k in range(T + 1):
+                low, high = (p.position[a],) * 2 if k == 0 else p.area[a]
+                if k == 1:  # given by the state
+                    low, high = -1e6, 1e6
+                self.P[k, a] = self.column(low, high)
+                low, high = (p.velocity[a],) * 2 if k == 0 else (-d.speed, d.speed)
+                self.v[k, a] = self.column(low, high)
+            for k in range(T):
+                self.u[k, a] = self.column(-d.force, d.force)
+                self.row([self.P[k + 1, a], self.P[k, a], self.v[k, a]], [1, -1, -d.step], 0, 0)
+                fall = -gamma * d.weight[a]
+                self.row(
+                    [self.v[k + 1, a], self.v[k, a], self.u[k, a]],
+                    [1, -d.retained, -gamma],
+                    fall,
+                    fall,
+                )
+
+    def _visit_rows(self):
+        T, p = self.objective.horizon, self.problem
+        self.y, self.visited = {}, {}
+        rewards = self.objective.rewards()
+        for n in np.flatnonzero(p.wanted) if not p.homing else []:
+            inside = []
+            for k in range(1, T + 1):
+                faces = []
+                for a in range(3):
+                    for sign, bound in ((-1.0, -p.cuboids[n, a, 0]), (1.0, p.cuboids[n, a, 1])):
+                        b = self.column(0, 1, True)  # b_{tau,n,l}
+                        self.row([self.P[k, a], b], [sign, BIG - bound], -np.inf, BIG)
+                        faces.append(b)
+                b_tilde = self.column(0, 1, True)
+                self.row([b_tilde, *faces], [6, *[-1] * 6], -np.inf, 0)
+                inside.append(b_tilde)
+                self.visited[k, int(n)] = b_tilde
+            b_hat = self.column(0, 1, True)
+            if self.objective.discount == 1.0:
+                self.row([b_hat, *inside], [1, *[-1] * T], -np.inf, 0)
+                y = self.column(0, 1, True, -rewards[1])
+                self.row([y, b_hat], [1, -1], -np.inf, 0)
+            else:
+                # One visit counts, with the reward of its step.
+                counted = [self.column(0, 1, True, -rewards[k]) for k in range(1, T + 1)]
+                for c, b_tilde in zip(counted, inside):
+                    self.row([c, b_tilde], [1, -1], -np.inf, 0)
+                self.row([b_hat, *counted], [-1, *[1] * T], -np.inf, 0)
+
+    def _faces(self, k, low, high):
+        """Keep to the outer side of one face; return the six z."""
+        z = [self.column(0, 1, True) for _ in range(6)]
+        self.row(z, [1] * 6, -np.inf, 5)
+        del k, low, high
+        return z
+
+    def _beyond(self, column, z, a, low, high, offset=(0.0, 0.0), more=(), factors=()):
+        below, above = z[2 * a], z[2 * a + 1]
+        self.row([column, *more, below], [1, *factors, -BIG], -np.inf, low + offset[1])
+        self.row([column, *more, above], [1, *factors, BIG], high + offset[0], np.inf)
+
+    def _obstacle_rows(self):
+        T, p = self.objective.horizon, self.problem
+        self.z = {}
+        for o, box in enumerate(p.obstacles):
+            for k in range(2, T + 1):
+                z = self._faces(k, box[:, 0], box[:, 1])
+                self.z[k, o] = z
+                for a in range(3):
+                    self._beyond(self.P[k, a], z, a, box[a, 0], box[a, 1])
+                    if p.between:
+                        self._beyond(self.P[k - 1, a], z, a, box[a, 0], box[a, 1])
+
+    def _braking_rows(self):
+        """The way to brake, each axis with full force, stays in the area and beyond a face."""
+        T, p, d = self.objective.horizon, self.problem, self.dynamics
+        for a in range(3):
+            paths = self._stops(a)
+            for factor, up, down in paths:
+                self.row([self.P[T, a], self.v[T, a]], [1, factor], p.area[a, 0] - down, np.inf)
+                self.row([self.P[T, a], self.v[T, a]], [1, factor], -np.inf, p.area[a, 1] + up)
+        for box in p.obstacles:
+            z = self._faces(T + 1, box[:, 0], box[:, 1])
+            for a in range(3):
+                self._beyond(self.P[T, a], z, a, box[a, 0], box[a, 1])
+                for factor, up, down in self._stops(a):
+                    self._beyond(
+                        self.P[T, a],
+                        z,
+                        a,
+                        box[a, 0],
+                        box[a, 1],
+                        (-down, up),
+                        [self.v[T, a]],
+                        [factor],
+                    )
+        del d
+
+    def _stops(self, a):
+        """Return way = P + factor v - up (moving up), + down (moving down), after each step."""
+        d = self.dynamics
+        result = []
+        losses = d.deceleration(a)
+        for steps in range(1, d.braking_steps() + 1):
+            factor, ways = 0.0, []
+            for loss in losses:
+                # v -> way, by simulating v = 0 and v = 1 without stopping.
+                ends = []
+                for speed in (0.0, 1.0):
+                    way = 0.0
+                    for _ in range(steps):
+                        way += d.step * speed
+                        speed = d.retained * speed - loss
+                    ends.append(way)
+                factor = ends[1] - ends[0]
+                ways.append(-ends[0])
+            result.append((factor, ways[0], ways[1]))
+        return result
+
+    def _objective(self):
+        T, p, o = self.objective.horizon, self.problem, self.objective
+        for a in range(3):
+            if p.homing:
+                raise ValueError('homing: the literal problem is that of the search')
+            self.squares.append((o.guidance, [self.P[o.guided, a]], [1.0], -float(p.target[a])))
+            for k in range(1, T):
+                self.squares.append(
+                    (o.smoothness, [self.u[k, a], self.u[k - 1, a]], [1.0, -1.0], 0.0)
+                )
+
+    def value(self, x):
+        """Return the objective of columns x."""
+        total = float(np.dot(self.cost, x))
+        for weight, columns, coefficients, constant in self.squares:
+            total += weight * (np.dot(coefficients, x[columns]) + constant) ** 2
+        return total
+
+    def check(self, plan, tolerance=2e-4):
+        """Return the objective of a lean plan, after checking all rows that do not choose."""
+        x = np.zeros(len(self.cost))
+        x[self.P], x[self.v], x[self.u] = plan.positions, plan.velocities, plan.controls
+        for columns, coefficients, lower, upper in self.rows:
+            if any(self.integer[c] for c in columns):
+                continue
+            value = np.dot(coefficients, x[columns])
+            assert lower - tolerance <= value <= upper + tolerance
+        continuous = ~np.array(self.integer)
+        assert (x[continuous] >= np.array(self.lower)[continuous] - tolerance).all()
+        assert (x[continuous] <= np.array(self.upper)[continuous] + tolerance).all()
+        total = self.value(x)
+        seen = set()
+        for step, cuboid in plan.visits:
+            assert cuboid not in seen and self.problem.wanted[cuboid]
+            seen.add(cuboid)
+            box = self.problem.cuboids[cuboid]
+            assert (plan.positions[step] >= box[:, 0] - tolerance).all()
+            assert (plan.positions[step] <= box[:, 1] + tolerance).all()
+            total -= self.objective.rewards()[step]
+        for k in range(2, self.objective.horizon + 1):
+            for box in self.problem.obstacles:
+                ends = (
+                    plan.positions[k - 1 : k + 1] if self.problem.between else plan.positions[[k]]
+                )
+                assert (
+                    (ends <= box[:, 0] + 2e-3).all(axis=0) | (ends >= box[:, 1] - 2e-3).all(axis=0)
+                ).any(), (k, ends, box)
+        return total
+
+
+def solve_with_highs(literal, gap=1e-6, limit=60.0, rounds=60):
+    """Return (lower bound, value of the best point found, seconds) by tangents from outside."""
+    begun = time.perf_counter()
+    highs = highspy.Highs()
+    highs.setOptionValue('output_flag', False)
+    highs.setOptionValue('mip_rel_gap', 0.0)
+    highs.setOptionValue('mip_abs_gap', 0.25 * gap)
+    highs.setOptionValue('mip_feasibility_tolerance', 1e-9)
+    highs.setOptionValue('threads', 1)
+    number = len(literal.cost)
+    squares = literal.squares
+    # A column for each square.
+    lower = np.array([*literal.lower, *[0.0] * len(squares)])
+    upper = np.array([*literal.upper, *[np.inf] * len(squares)])
+    cost = np.array([*literal.cost, *[square[0] for square in squares]])
+    empty = np.array([], dtype=np.int32)
+    highs.addCols(len(cost), cost, lower, upper, 0, empty, empty, np.array([]))
+    kinds = [
+        highspy.HighsVarType.kInteger if kind else highspy.HighsVarType.kContinuous
+        for kind in literal.integer
+    ]
+    highs.changeColsIntegrality(number, np.arange(number, dtype=np.int32), np.array(kinds))
+    for columns, coefficients, low, high in literal.rows:
+        highs.addRow(
+            low,
+            high,
+            len(columns),
+            np.array(columns, dtype=np.int32),
+            np.array(coefficients, dtype=float),
+        )
+    cuts = 0
+
+    def tangent(index, at):
+        nonlocal cuts
+        _, columns, coefficients, constant = squares[index]
+        highs.addRow(
+            2.0 * at * constant - at * at,
+            np.inf,
+            len(columns) + 1,
+            np.array([number + index, *columns], dtype=np.int32),
+            np.array([1.0, *(-2.0 * at * np.array(coefficients))]),
+        )
+        cuts += 1
+
+    for index in range(len(squares)):
+        for at in (-60.0, -20.0, -7.0, -2.0, 2.0, 7.0, 20.0, 60.0):
+            tangent(index, at)
+    best = np.inf
+    bound = -np.inf
+    for _ in range(rounds):
+        left = limit - (time.perf_counter() - begun)
+        if left <= 0.0:
+            break
+        highs.setOptionValue('time_limit', left)
+        highs.run()
+        status = highs.getModelStatus()
+        if status == highspy.HighsModelStatus.kInfeasible:
+            return np.inf, np.inf, time.perf_counter() - begun
+        x = np.array(highs.getSolution().col_value)
+        bound = max(bound, highs.getInfo().mip_dual_bound)
+        if status != highspy.HighsModelStatus.kOptimal:
+            break
+        best = min(best, literal.value(x[:number]))
+        if best - bound <= gap:
+            break
+        for index, (weight, columns, coefficients, constant) in enumerate(squares):
+            at = float(np.dot(coefficients, x[columns])) + constant
+            if weight * (at * at - x[number + index]) > 0.1 * gap / len(squares):
+                tangent(index, at)
+    return bound, best, time.perf_counter() - begun
+
+
+def solve_with_scip(literal, gap=1e-6, limit=60.0):
+    """Return (lower bound, value, seconds) of SCIP."""
+    import pyscipopt
+
+    begun = time.perf_counter()
+    model = pyscipopt.Model()
+    model.hideOutput()
+    model.setParam('limits/time', limit)
+    model.setParam('limits/absgap', gap)
+    model.setParam('parallel/maxnthreads', 1)
+    columns = [
+        model.addVar(
+            vtype='B' if kind else 'C',
+            lb=None if low == -np.inf else low,
+            ub=None if high == np.inf else high,
+        )
+        for low, high, kind in zip(literal.lower, literal.upper, literal.integer)
+    ]
+    for indices, coefficients, low, high in literal.rows:
+        total = pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients))
+        if low == high:
+            model.addCons(total == low)
+        else:
+            if low > -np.inf:
+                model.addCons(total >= low)
+            if high < np.inf:
+                model.addCons(total <= high)
+    top = model.addVar(vtype='C', lb=0.0, ub=None)
+    square = pyscipopt.quicksum(
+        weight
+        * (pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients)) + constant)
+        * (pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients)) + constant)
+        for weight, indices, coefficients, constant in literal.squares
+    )
+    model.addCons(square <= top)
+    linear = pyscipopt.quicksum(
+        cost * column for cost, column in zip(literal.cost, columns) if cost
+    )
+    model.setObjective(linear + top, 'minimize')
+    model.optimize()
+    value = model.getObjVal() if model.getNSols() else np.inf
+    return model.getDualbound(), value, time.perf_counter() - begun
