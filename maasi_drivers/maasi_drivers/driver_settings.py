@@ -8,12 +8,38 @@ from pydantic import Field, model_validator
 
 from maasi_drivers.camera_settings import CameraSettings
 from maasi_filter.node_settings import NodeSettings
-from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings
+from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
 from maasi_planner.settings import MotionSettings
 
 CommandType = Literal['auto', 'stamped', 'twist']
 # A driver that is silent for so long is dead to its guard [s].
 LIVELINESS_LEASE = 0.5
+
+
+class ScanSettings(Settings):
+    """How a ground robot keeps clear of what its laser scanner sees."""
+
+    position: list[Finite] = Field(
+        default_factory=lambda: [0.0, 0.0],
+        min_length=2,
+        max_length=2,
+        description="Of the scanner in the robot's frame, x and y [m]",
+    )
+    yaw: Finite = Field(default=0.0, description="Of the scanner in the robot's frame [rad]")
+    reach: float = Field(
+        default=0.7, gt=0.0, le=10.0, description='How far ahead the way has to be free [m]'
+    )
+    timeout: float = Field(
+        default=1.0,
+        gt=0.0,
+        description='Time by the odometry without a scan after which the robot is stopped [s]',
+    )
+    blocked_timeout: float = Field(
+        default=15.0,
+        gt=0.0,
+        description='Time by the odometry without getting nearer to a waypoint after which it is '
+        'given up [s]',
+    )
 
 
 class DriverSettings(NodeSettings):
@@ -35,6 +61,16 @@ class DriverSettings(NodeSettings):
         default_factory=SensorSettings, description='What it measures targets with'
     )
     camera: CameraSettings | None = Field(default=None, description='Its camera; none: it has none')
+    scan: ScanSettings | None = Field(
+        default=None,
+        description='How a ground robot uses its laser scan; none: it drives by the known '
+        'obstacles alone; not in lockstep',
+    )
+    navigation: Literal['own', 'nav2'] = Field(
+        default='own',
+        description="Who drives a ground robot to its waypoints: the driver, or Nav2's "
+        'NavigateToPose; not in lockstep',
+    )
     image_transport: Literal['raw', 'compressed'] = Field(
         default='raw',
         description='Images as camera/image_raw, or as camera/image_raw/compressed',
@@ -101,6 +137,17 @@ class DriverSettings(NodeSettings):
         if self.lockstep and self.command_type == 'twist':
             raise ValueError(
                 f'command_type: got {self.command_type!r}, allowed is stamped (or auto) in lockstep'
+            )
+        if self.lockstep and (self.scan is not None or self.navigation != 'own'):
+            name = 'navigation' if self.scan is None else 'scan'
+            raise ValueError(
+                f'{name}: got {self.navigation if self.scan is None else "settings"}, allowed in '
+                'lockstep is that the driver drives by the known obstacles alone'
+            )
+        if self.scan is not None and self.motion.model != 'unicycle':
+            raise ValueError(
+                f"scan: got settings, allowed with motion.model 'unicycle', not "
+                f'{self.motion.model!r}'
             )
         if self.lockstep and self.camera is not None and self.camera.stamp_offset > 0.0:
             raise ValueError(

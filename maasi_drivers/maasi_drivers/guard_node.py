@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import TwistStamped
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -24,7 +25,8 @@ class GuardNode(SearchNode[GuardSettings]):
     """
     Publishes zeros while no driver is alive, and nothing while one is.
 
-    Ground robots need it: the last command goes on when nothing follows.
+    Ground robots need it: the last command goes on when nothing follows. Where Nav2 drives, its
+    goals are cancelled, or it would go on too.
 
     Subscribes
     ----------
@@ -34,6 +36,10 @@ class GuardNode(SearchNode[GuardSettings]):
     ---------
     `cmd_vel` (geometry_msgs/TwistStamped or Twist), 10 times a second from the driver's death until
     it is back
+
+    Calls
+    -----
+    the cancel service of `navigate_to_pose` (action_msgs/CancelGoal), where it is there
     """
 
     def __init__(self, **options: Any) -> None:
@@ -46,6 +52,7 @@ class GuardNode(SearchNode[GuardSettings]):
         self._publisher = CommandPublisher(
             self, 'cmd_vel', self.settings.command_type, self.settings.lockstep
         )
+        self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
         self._look_timer = self.create_wall_timer(_LOOK_PERIOD, self._publisher.look)
         quality = QoSProfile(
             depth=1,
@@ -69,6 +76,7 @@ class GuardNode(SearchNode[GuardSettings]):
         self.destroy_subscription(self._subscription)
         self.destroy_timer(self._look_timer)
         self._publisher.destroy()
+        self.destroy_client(self._nav2)
 
     def halt(self) -> None:
         """Leave the robot alone."""
@@ -89,6 +97,9 @@ class GuardNode(SearchNode[GuardSettings]):
         elif self.active and self._stop_timer is None:
             self.get_logger().warning('the driver is gone: zeros on cmd_vel')
             self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._stop)
+            if self._nav2.service_is_ready():
+                # Without an id: all its goals.
+                self._nav2.call_async(CancelGoal.Request())
             self._stop()
 
     def _end_stop(self) -> None:

@@ -1,0 +1,140 @@
+"""Driving clear of what the laser scanner sees and nobody knew of."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from maasi_drivers.driver_settings import ScanSettings
+from maasi_drivers.odometry import StampedPose
+from maasi_drivers.scan_avoidance import ScanUnicycle, scan_points
+from maasi_filter.pose import Pose
+from maasi_planner.motion import RobotState
+from maasi_planner.obstacles import Obstacles
+from maasi_planner.settings import MotionSettings
+from maasi_sim.laser_scan import LaserScanner, LaserSettings
+
+RADIUS = 0.11
+STEP = 0.05
+MOTION = MotionSettings(
+    model='unicycle', speed=0.2, acceleration=0.5, yaw_rate=1.8, yaw_acceleration=4.0
+)
+BOUNDS = np.array([[-1.0, 3.0], [-1.0, 3.0]])
+
+
+def stamped(x=0.0, y=0.0, yaw=0.0, velocity=(0.0, 0.0, 0.0), turn=0.0):
+    return StampedPose(
+        0,
+        Pose.from_yaw([x, y, 0.0], yaw),
+        np.zeros((6, 6)),
+        np.array(velocity),
+        np.array([0.0, 0.0, turn]),
+    )
+
+
+def points(ranges, placed, increment=0.0, mount=(0.0, 0.0, 0.0)):
+    return scan_points(ranges, (0.0, math.pi / 2), (0.1, 3.5), increment, placed, mount)
+
+
+def test_beams_are_placed_in_the_map():
+    placed = stamped(1.0, 2.0, math.pi / 2)
+    seen = points([1.0, 2.0, math.inf, 0.5], placed, mount=(-0.1, 0.2, 0.0))
+    # The scanner sits at (0.8, 1.9) and looks along +y.
+    assert_allclose(seen, [[0.8, 2.9], [-1.2, 1.9], [1.3, 1.9]], atol=1e-12)
+    turned = points([1.0], placed, mount=(0.0, 0.0, math.pi))
+    assert_allclose(turned, [[1.0, 1.0]], atol=1e-12)
+
+
+def test_what_is_no_measurement_is_left_out():
+    seen = points([math.nan, math.inf, 0.05, 9.0], stamped())
+    assert seen.shape == (0, 2)
+
+
+def test_the_robot_moves_on_during_a_turn_of_the_scanner():
+    moving = stamped(velocity=(0.2, 0.0, 0.0), turn=1.0)
+    seen = points([1.0, 1.0], moving, increment=0.1)
+    angle = 0.1 + math.pi / 2
+    assert_allclose(seen, [[1.0, 0.0], [0.02 + math.cos(angle), math.sin(angle)]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('ranges', 'angles', 'word'),
+    [([], (0.0, 0.1), 'ranges'), ([1.0], (math.nan, 0.1), 'angle_min')],
+)
+def test_a_scan_that_makes_no_sense_is_refused(ranges, angles, word):
+    with pytest.raises(ValueError, match=f'{word}: read'):
+        scan_points(ranges, angles, (0.1, 3.5), 0.0, stamped(), [0.0, 0.0, 0.0])
+
+
+def drive(goal, centres, radii, seconds=60.0, start=(0.0, 0.0), yaw=0.0):
+    """Return whether it arrives, and the least distance kept, under scans at 5 Hz with noise."""
+    model = ScanUnicycle(MOTION, Obstacles.none(), RADIUS, ScanSettings())
+    body = model.body(RobotState.at_rest([*start, 0.0], yaw))
+    scanner = LaserScanner(LaserSettings(), BOUNDS, centres, radii, 3, 'rover')
+    goal, least = np.array([*goal, 0.0]), math.inf
+    for step in range(round(seconds / STEP)):
+        state = body.robot_state()
+        if step % 4 == 0:
+            ranges = scanner.scan(state.pose, step)
+            placed = StampedPose(
+                0, state.pose, np.zeros((6, 6)), state.velocity, state.angular_velocity
+            )
+            model.see(
+                scan_points(
+                    ranges, (0.0, 2.0 * math.pi / 360), (0.12, 3.5), 0.0, placed, [0.0, 0.0, 0.0]
+                )
+            )
+        if model.arrived(state.pose.position, goal):
+            return True, least
+        body.step(model.command(state, goal), STEP)
+        position = body.robot_state().pose.position[:2]
+        if len(centres):
+            gaps = np.hypot(*(np.asarray(centres) - position).T) - np.asarray(radii)
+            least = min(least, float(gaps.min()))
+    return False, least
+
+
+@pytest.mark.parametrize(
+    ('centres', 'radii'),
+    [
+        ([], []),
+        ([[0.9, 0.0]], [0.15]),
+        ([[0.9, 0.05], [0.9, 0.35], [0.9, -0.25]], [0.15, 0.15, 0.15]),
+        ([[0.8, 0.2], [1.2, -0.25]], [0.1, 0.2]),
+    ],
+)
+def test_a_robot_gets_around_what_it_did_not_know_of(centres, radii):
+    arrived, least = drive([1.8, 0.0], np.reshape(centres, (-1, 2)), np.array(radii))
+    assert arrived
+    assert least > RADIUS
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_robot_touches_nothing_whatever_stands_there(seed):
+    generator = np.random.default_rng(seed)
+    start, goal = np.zeros(2), np.array([2.0, 1.6])
+    centres = []
+    while len(centres) < 8:
+        place = generator.uniform(-0.5, 2.5, 2)
+        if min(np.linalg.norm(place - start), np.linalg.norm(place - goal)) > 0.5:
+            centres.append(place)
+    arrived, least = drive(goal, np.array(centres), np.full(8, 0.12), yaw=2.0)
+    assert least > RADIUS
+    assert arrived
+
+
+def test_a_waypoint_inside_of_something_is_not_driven_at():
+    arrived, least = drive([1.0, 0.0], np.array([[1.0, 0.0]]), np.array([0.2]), seconds=30.0)
+    assert not arrived
+    assert least > RADIUS
+
+
+def test_a_robot_that_touches_something_may_leave():
+    model = ScanUnicycle(MOTION, Obstacles.none(), RADIUS, ScanSettings())
+    model.see([[-0.1, 0.0]])
+    command = model.command(RobotState.at_rest([0.0, 0.0, 0.0]), [1.0, 0.0, 0.0])
+    assert command[0] > 0.0
+    model.see([[0.1, 0.0]])
+    command = model.command(RobotState.at_rest([0.0, 0.0, 0.0]), [1.0, 0.0, 0.0])
+    assert command[0] == 0.0
