@@ -189,6 +189,10 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         """Return the command (4,), and the goal that is reached; see `WaypointFollower.update`."""
         return self._follower.update(robot, step)
 
+    def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
+        """Return whether pose and images have to change; see `steer` for the command."""
+        return bool(math.hypot(*command[:3]) > _LEAST_SPEED or abs(command[3]) > _LEAST_TURN)
+
     # ---- the robot's link: topics, unless overridden -----------------------------------------
 
     def connect_robot(self) -> None:
@@ -440,9 +444,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if _FROZEN_POSE in self._troubles:
             # Nothing can be controlled by such a pose.
             command = np.zeros(4)
-        self._moving = bool(
-            math.hypot(*command[:3]) > _LEAST_SPEED or abs(command[3]) > _LEAST_TURN
-        )
+        self._moving = self.is_moving(placed, command)
         if reached is not None:
             self._finish(reached)
         self._fill_state(placed, step)

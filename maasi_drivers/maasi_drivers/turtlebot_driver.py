@@ -303,6 +303,13 @@ class TurtlebotDriver(CameraDriver):
         if goal is self._follower.current:
             self._end_goal(GoalStatus.REACHED if reached else GoalStatus.ABORTED, reason)
 
+    def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
+        """Return whether it moves: where Nav2 drives, by the odometry's velocity."""
+        if self._nav2 is None:
+            return super().is_moving(placed, command)
+        velocity = np.array([*placed.velocity, placed.angular_velocity[2]])
+        return super().is_moving(placed, velocity)
+
     def send_command(self, placed: StampedPose, command: list[float]) -> None:
         """Have the robot move, unless Nav2 does."""
         if self._nav2 is None:

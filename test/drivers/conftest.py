@@ -219,13 +219,13 @@ def process(context, tmp_path):
     """Return a function that starts a driver as a process of its own."""
     running = []
 
-    def start(**changes):
+    def start(environment=None, **changes):
         file = tmp_path / 'parameters.yaml'
         flat = flatten(DriverSettings.model_validate(TURTLEBOT | changes))
         file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
         command = [sys.executable, '-m', 'maasi_drivers.turtlebot_driver', '--ros-args']
         command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
-        running.append(subprocess.Popen(command, env=os.environ.copy()))
+        running.append(subprocess.Popen(command, env=os.environ | (environment or {})))
         return running[-1]
 
     yield start

@@ -1,0 +1,66 @@
+"""
+Plays Nav2's `navigate_to_pose`, and prints a line for each goal and what becomes of it.
+
+A goal with x below 0.5 is reached, one below 1 goes on until it is cancelled, one below 1.5 is
+given up with an error, one beyond is refused.
+"""
+
+import contextlib
+import json
+import time
+
+import rclpy
+from nav2_msgs.action import NavigateToPose
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+
+
+def say(event, pose):
+    place = pose.pose.position
+    turn = pose.pose.orientation
+    line = {'event': event, 'frame': pose.header.frame_id, 'position': [place.x, place.y, place.z]}
+    print(json.dumps(line | {'turn': [turn.z, turn.w]}), flush=True)
+
+
+def execute(handle):
+    pose = handle.request.pose
+    say('goal', pose)
+    x = pose.pose.position.x
+    while 0.5 <= x < 1.0 and not handle.is_cancel_requested:
+        time.sleep(0.02)
+    if handle.is_cancel_requested:
+        handle.canceled()
+        say('cancelled', pose)
+        return NavigateToPose.Result()
+    if x < 0.5:
+        handle.succeed()
+        return NavigateToPose.Result()
+    handle.abort()
+    return NavigateToPose.Result(error_code=208)
+
+
+def judge(goal):
+    return GoalResponse.ACCEPT if goal.pose.pose.position.x < 1.5 else GoalResponse.REJECT
+
+
+def main():
+    rclpy.init()
+    node = Node('bt_navigator', namespace='/rover')
+    ActionServer(
+        node,
+        NavigateToPose,
+        'navigate_to_pose',
+        execute,
+        goal_callback=judge,
+        cancel_callback=lambda handle: CancelResponse.ACCEPT,
+    )
+    executor = MultiThreadedExecutor(4)
+    executor.add_node(node)
+    print(json.dumps({'event': 'ready'}), flush=True)
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+        executor.spin()
+
+
+if __name__ == '__main__':
+    main()

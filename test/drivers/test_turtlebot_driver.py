@@ -1,0 +1,325 @@
+"""What only the ground robot's driver does: the laser scan, and Nav2."""
+
+import hashlib
+import json
+import math
+import os
+import queue
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from numpy.testing import assert_allclose, assert_array_equal
+from rclpy.executors import SingleThreadedExecutor
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers
+from sensor_msgs.msg import LaserScan
+
+from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.guard_node import GuardNode
+from maasi_filter.conversions import stamp_from_ros, stamp_to_ros
+from maasi_filter.qos import RELIABLE
+from maasi_filter.search_node import SettingsError
+from maasi_msgs.msg import AgentState
+from maasi_sim.laser_scan import LaserScanner, LaserSettings
+
+HERE = Path(__file__).parent
+SCANNING = {'scan': {'timeout': 1.0, 'blocked_timeout': 3.0}}
+
+
+# ---- the laser scan --------------------------------------------------------------------------
+
+
+class Scanned:
+    """A team whose robot has a scanner, among obstacles that nobody told the driver of."""
+
+    def __init__(self, team, centres=(), radii=()):
+        self.team = team
+        self.centres, self.radii = np.reshape(centres, (-1, 2)), np.array(radii, dtype=float)
+        bounds = np.array(team.settings.environment.bounds)
+        self.scanner = LaserScanner(LaserSettings(), bounds, self.centres, self.radii, 1, 'rover')
+        self.publisher = team.create_publisher(LaserScan, 'scan', RELIABLE)
+        team.until(self.publisher.get_subscription_count)
+        self.least = math.inf
+
+    def message(self):
+        team = self.team
+        ranges = self.scanner.scan(team.body.robot_state().pose, max(team.step, 0))
+        message = LaserScan(
+            angle_max=2.0 * math.pi,
+            angle_increment=2.0 * math.pi / len(ranges),
+            range_min=0.12,
+            range_max=3.5,
+            ranges=ranges.tolist(),
+        )
+        message.header.stamp = stamp_to_ros(max(team.step, 0) * NANOSECONDS)
+        return message
+
+    def move(self, scan=True):
+        self.team.move()
+        if scan and self.team.step % 4 == 0:
+            self.publisher.publish(self.message())
+        position = self.team.body.robot_state().pose.position[:2]
+        if len(self.centres):
+            gaps = np.hypot(*(self.centres - position).T) - self.radii
+            self.least = min(self.least, float(gaps.min()))
+
+
+def test_the_robot_drives_around_what_its_scan_shows(play):
+    _, team = play(**SCANNING)
+    robot = Scanned(team, [[0.9, 0.9]], [0.12])
+    robot.move()
+    _, result = team.send_accepted([1.4, 1.5, 0.0])
+    for _ in range(600):
+        robot.move()
+        if team.state.goal_status != AgentState.MOVING:
+            break
+    assert team.state.goal_status == AgentState.REACHED
+    assert robot.least > team.settings.radius
+    team.until(result.done)
+
+
+def test_without_a_scan_the_robot_is_stopped(play):
+    _, team = play(**SCANNING)
+    robot = Scanned(team)
+    robot.move()
+    _, result = team.send_accepted([1.4, 1.5, 0.0])
+    for _ in range(20):
+        robot.move()
+    assert team.state.goal_status == AgentState.MOVING
+    steps = 0
+    while team.state.goal_status != AgentState.UNAVAILABLE:
+        robot.move(scan=False)
+        steps += 1
+        assert steps * STEP <= 1.5
+    assert_array_equal(team.command, np.zeros(4))
+    team.until(result.done)
+    assert 'no scan for' in result.result().result.reason
+    assert 'no scan for' in team.state.reason
+    team.until(lambda: robot.move() or team.state.goal_status == AgentState.ABORTED)
+    assert team.send([1.4, 1.5, 0.0]).accepted
+
+
+def test_a_waypoint_that_cannot_be_reached_is_given_up(play):
+    _, team = play(**SCANNING)
+    robot = Scanned(team, [[0.9, 0.3]], [0.2])
+    robot.move()
+    _, result = team.send_accepted([0.9, 0.3, 0.0])
+    for _ in range(300):
+        robot.move()
+        if team.state.goal_status != AgentState.MOVING:
+            break
+    team.until(result.done)
+    assert result.result().status == GoalStatus.STATUS_ABORTED
+    assert 'blocked: no nearer to the waypoint for 3 s' in result.result().result.reason
+    assert robot.least > team.settings.radius
+    assert_array_equal(team.command, np.zeros(4))
+
+
+def test_a_scan_that_makes_no_sense_is_counted(play):
+    driver, team = play(**SCANNING)
+    robot = Scanned(team)
+    robot.move()
+    bad = robot.message()
+    bad.angle_increment = math.nan
+    robot.publisher.publish(bad)
+    team.until(lambda: driver.dropped['scan'] == 1)
+
+
+@pytest.mark.parametrize(
+    'changes', [SCANNING, {'navigation': 'nav2'}, {'scan': {}, 'motion': {'model': 'mambo'}}]
+)
+def test_what_scan_and_nav2_do_not_go_with_is_wrong_input(changes):
+    lockstep = 'motion' not in changes
+    with pytest.raises(ValueError, match=r'scan|navigation'):
+        DriverSettings.model_validate(TURTLEBOT | {'lockstep': lockstep} | changes)
+
+
+# ---- Nav2 ------------------------------------------------------------------------------------
+
+
+def nav2_environment(cache):
+    """Return an environment with nav2_msgs: Nav2's own, or the one beside this file, built once."""
+    probe = [sys.executable, '-c', 'from nav2_msgs.action import NavigateToPose']
+    if subprocess.run(probe, capture_output=True, check=False).returncode == 0:
+        return os.environ.copy()
+    source = HERE / 'nav2_msgs'
+    content = b''.join(path.read_bytes() for path in sorted(source.rglob('*')) if path.is_file())
+    key = hashlib.sha256(content + sys.version.encode()).hexdigest()[:12]
+    folder = cache / f'nav2_msgs_{key}'
+    install = folder / 'install'
+    if not (folder / 'built').exists():
+        command = [sys.executable, '-m', 'colcon', '--log-base', str(folder / 'log'), 'build']
+        command += ['--base-paths', str(source), '--merge-install']
+        command += ['--build-base', str(folder / 'build'), '--install-base', str(install)]
+        command += ['--cmake-args', f'-DPython3_EXECUTABLE={sys.executable}']
+        command += ['-DCMAKE_BUILD_TYPE=Debug', '-DBUILD_TESTING=OFF', '--no-warn-unused-cli']
+        built = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert built.returncode == 0, built.stdout + built.stderr
+        (folder / 'built').touch()
+    environment = os.environ.copy()
+    python = next(install.glob('lib/python*/site-packages'))
+    for name, path in (
+        ('AMENT_PREFIX_PATH', install),
+        ('LD_LIBRARY_PATH', install / 'lib'),
+        ('PYTHONPATH', python),
+    ):
+        environment[name] = f'{path}{os.pathsep}{environment.get(name, "")}'.rstrip(os.pathsep)
+    return environment
+
+
+@pytest.fixture(scope='module')
+def with_nav2(request):
+    return nav2_environment(Path(request.config.cache.mkdir('maasi_interfaces')))
+
+
+@pytest.fixture
+def nav2(context, with_nav2):
+    """Start what plays Nav2; return a queue of what it says, and its process."""
+    environment = with_nav2 | {
+        name: os.environ[name] for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')
+    }
+    process = subprocess.Popen(
+        [sys.executable, str(HERE / 'play_nav2.py')],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    said = queue.Queue()
+
+    def read():
+        for line in process.stdout:
+            said.put(json.loads(line))
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    assert said.get(timeout=60.0)['event'] == 'ready'
+    yield said, process
+    process.kill()
+    process.wait()
+    reader.join()
+
+
+@pytest.fixture
+def driven(nav2, with_nav2, process, context):
+    """Start a driver that hands its waypoints to Nav2; return the team, Nav2, and the driver."""
+    driver = process(environment=with_nav2, navigation='nav2', odometry_timeout=0.5)
+    executor = SingleThreadedExecutor(context=context)
+    team = Team(context, TURTLEBOT, executor)
+    team.connect()
+    team.awaken()
+    yield team, *nav2, driver
+    executor.shutdown()
+    team.destroy_node()
+
+
+def stand(team):
+    """Let the driver have odometry, but no motion: that is Nav2's."""
+    team.step += 1
+    team.odometry.publish(team.odometry_message())
+    team.executor_used.spin_once(timeout_sec=0.02)
+
+
+def heard(team, said, event):
+    while True:
+        team.until(lambda: stand(team) or not said.empty(), f'Nav2 never said {event}')
+        line = said.get()
+        if line['event'] == event:
+            return line
+
+
+def send(team, position):
+    """Send a goal, and have odometry come while its answer is awaited."""
+    future = team.go_to.send_goal_async(team.goal(position))
+    team.until(lambda: stand(team) or future.done())
+    return future.result()
+
+
+def test_nav2_drives_to_the_waypoints(driven):
+    team, said, nav2, _ = driven
+    # Reached.
+    result = send(team, [0.3, 0.8, 0.0]).get_result_async()
+    line = heard(team, said, 'goal')
+    assert line['frame'] == 'map'
+    assert_allclose(line['position'], [0.3, 0.8, 0.0])
+    offset = np.array([0.3, 0.8]) - team.start.position[:2]
+    heading = 2.0 * math.atan2(*line['turn'])
+    assert_allclose(heading, math.atan2(offset[1], offset[0]), atol=0.02)
+    team.until(lambda: stand(team) or result.done())
+    assert result.result().result.reached
+    # Given up by Nav2.
+    result = send(team, [1.2, 0.8, 0.0]).get_result_async()
+    team.until(lambda: stand(team) or result.done())
+    assert result.result().status == GoalStatus.STATUS_ABORTED
+    assert 'Nav2 gave it up, error 208' in result.result().result.reason
+    # Refused by Nav2.
+    result = send(team, [1.8, 0.8, 0.0]).get_result_async()
+    team.until(lambda: stand(team) or result.done())
+    assert 'Nav2 refuses' in result.result().result.reason
+    # On the way the commands are Nav2's; replaced, and cancelled, it is told so.
+    replaced = send(team, [0.7, 0.8, 0.0]).get_result_async()
+    heard(team, said, 'goal')
+    since = team.step
+    team.until(lambda: stand(team) or team.state.step > since + 10)
+    assert all(stamp_from_ros(item.header.stamp) <= since * NANOSECONDS for item in team.commands)
+    handle = send(team, [0.9, 0.8, 0.0])
+    assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.7)
+    team.until(lambda: stand(team) or replaced.done())
+    result, cancelled = handle.get_result_async(), handle.cancel_goal_async()
+    assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.9)
+    team.until(lambda: stand(team) or (cancelled.done() and result.done()))
+    assert result.result().status == GoalStatus.STATUS_CANCELED
+    assert_array_equal(team.command, np.zeros(4))
+    # A pose that hangs while the odometry's velocity says that it should not.
+    result = send(team, [0.7, 0.8, 0.0]).get_result_async()
+    heard(team, said, 'goal')
+    team.body.step([0.2, 0.0, 0.0, 0.0], 1.0)
+    assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.7)
+    team.until(lambda: stand(team) or result.done())
+    assert 'the pose has not changed for' in result.result().result.reason
+    team.body.step([0.0, 0.0, 0.0, 0.0], 2.0)
+    team.until(lambda: stand(team) or team.state.goal_status == AgentState.ABORTED)
+    # Nav2 dies on the way.
+    result = send(team, [0.7, 0.8, 0.0]).get_result_async()
+    heard(team, said, 'goal')
+    nav2.kill()
+    team.until(lambda: stand(team) or result.done())
+    assert 'Nav2 is gone' in result.result().result.reason
+    assert_array_equal(team.command, np.zeros(4))
+    assert not send(team, [0.7, 0.8, 0.0]).accepted
+
+
+def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, context):
+    team, said, _, driver = driven
+    guard = GuardNode(context=context, namespace='/rover')
+    team.executor_used.add_node(guard)
+    assert guard.trigger_configure().name == 'SUCCESS'
+    assert guard.trigger_activate().name == 'SUCCESS'
+    send(team, [0.7, 0.8, 0.0])
+    heard(team, said, 'goal')
+    # No odometry.
+    team.until(lambda: not said.empty())
+    assert said.get()['event'] == 'cancelled'
+    team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
+    team.until(lambda: stand(team) or team.state.goal_status == AgentState.ABORTED)
+    send(team, [0.9, 0.8, 0.0])
+    heard(team, said, 'goal')
+    team.until(guard._nav2.service_is_ready)
+    driver.kill()
+    driver.wait()
+    known = len(team.commands)
+    team.until(lambda: not said.empty())
+    assert said.get()['event'] == 'cancelled'
+    team.until(lambda: len(team.commands) >= known + 3)
+    assert_array_equal([numbers(item) for item in team.commands[known:]], np.zeros((3, 4)))
+    guard.destroy_node()
+
+
+def test_nav2_that_is_not_installed_is_said(play, monkeypatch):
+    # None stands for a module that cannot be imported, also where Nav2 is installed.
+    monkeypatch.setitem(sys.modules, 'nav2_msgs', None)
+    with pytest.raises(SettingsError, match='the package nav2_msgs is not installed'):
+        play(navigation='nav2')
