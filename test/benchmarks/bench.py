@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-AREAS = ('filter', 'planner', 'drivers', 'system')
+AREAS = ('filter', 'planner', 'cuboid', 'drivers', 'system')
 
 
 def load(area: str) -> ModuleType:

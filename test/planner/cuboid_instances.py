@@ -28,14 +28,14 @@ def two_buildings(**settings):
     return CuboidSettings(objects=OBJECTS, detection_probability=0.88, **settings)
 
 
-def mission_of(settings, area, starts, seed=1, failures=False, **hazard):
+def mission_of(settings, area, starts, seed=1, failures=False, scheme='distributed', **hazard):
     """Return a mission of robots that start at `starts`, by name."""
     battery = HazardSettings(failures=failures, **hazard)
     robots = {
         name: SearchRobot(np.array(place, dtype=float), hazard=battery)
         for name, place in starts.items()
     }
-    return CuboidMission(settings, area, robots, seed=seed)
+    return CuboidMission(settings, area, robots, seed=seed, scheme=scheme)
 
 
 def solver_for(horizon, discount=1.0, **limits):
@@ -53,7 +53,7 @@ def problems_of_missions(horizon, number, seed=1, **settings):
             for i in range(3)
         }
         mission = mission_of(
-            two_buildings(horizon=horizon, time_limit=1e9, **settings),
+            two_buildings(horizon=horizon, discount=1.0, time_limit=1e9, **settings),
             AREA,
             starts,
             seed=int(rng.integers(1000)),
@@ -61,6 +61,30 @@ def problems_of_missions(horizon, number, seed=1, **settings):
         for agent in mission.agents.values():
             agent.problem = _noting(agent.problem, met)
         mission.run(limit=120)
+    chosen = rng.choice(len(met), number, replace=False)
+    return solver_for(horizon), [met[i] for i in sorted(chosen)]
+
+
+def joint_problems(robots, horizon, number, seed=1):
+    """Return (solver, lists of problems): all robots' of a step, of centralized missions."""
+    rng = np.random.default_rng(seed)
+    met = []
+    while len(met) < 4 * number:
+        starts = {
+            f'robot{i}': [rng.uniform(165.0, 185.0), rng.uniform(215.0, 235.0), 5.0]
+            for i in range(robots)
+        }
+        mission = mission_of(
+            two_buildings(horizon=horizon, discount=1.0, time_limit=1e9),
+            AREA,
+            starts,
+            scheme='centralized',
+        )
+        single = []
+        for agent in mission.agents.values():
+            agent.problem = _noting(agent.problem, single)
+        mission.run(limit=60)
+        met += [single[i : i + robots] for i in range(0, len(single), robots)]
     chosen = rng.choice(len(met), number, replace=False)
     return solver_for(horizon), [met[i] for i in sorted(chosen)]
 

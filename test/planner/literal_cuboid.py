@@ -214,6 +214,84 @@ class LiteralProblem:
         return total
 
 
+class TightProblem(LiteralProblem):
+    """The same optimum with what a modeller would do for a general solver.
+
+    One binary for a visit, and only where the cuboid meets what extreme forces reach; faces of
+    obstacles only where they can matter; every big M as small as what can be reached allows.
+    """
+
+    def _reach(self):
+        d, T, p = self.dynamics, self.objective.horizon, self.problem
+        reach = np.empty((T + 1, 3, 2))
+        for side, sign in enumerate((-1.0, 1.0)):
+            place, speed = p.position.astype(float), p.velocity.astype(float)
+            for k in range(T + 1):
+                reach[k, :, side] = place
+                place, speed = d.next(place, speed, np.full(3, sign * d.force))
+                speed = np.clip(speed, -d.speed, d.speed)
+        reach[2:, :, 0] = np.maximum(reach[2:, :, 0], p.area[:, 0])
+        reach[2:, :, 1] = np.minimum(reach[2:, :, 1], p.area[:, 1])
+        return reach
+
+    def _visit_rows(self):
+        T, p = self.objective.horizon, self.problem
+        self.reach = self._reach()
+        rewards = self.objective.rewards()
+        at_step = {k: [] for k in range(1, T + 1)}
+        for n in np.flatnonzero(p.wanted):
+            visits = []
+            for k in range(1, T + 1):
+                low, high = self.reach[k].T
+                if (p.cuboids[n, :, 0] <= high).all() and (p.cuboids[n, :, 1] >= low).all():
+                    beta = self.column(0, 1, True, -rewards[k])
+                    visits.append(beta)
+                    at_step[k].append((beta, p.cuboids[n]))
+            if len(visits) > 1:
+                self.row(visits, [1] * len(visits), -np.inf, 1)
+        for k, betas in at_step.items():
+            # Cuboids may overlap: a row for each then, else one for all of a step.
+            boxes = [box for _, box in betas]
+            apart = not any(
+                ((one[:, 0] < other[:, 1]) & (other[:, 0] < one[:, 1])).all()
+                for i, one in enumerate(boxes)
+                for other in boxes[:i]
+            )
+            for group in [betas] if apart and betas else [[beta] for beta in betas]:
+                columns = [beta for beta, _ in group]
+                for a in range(3):
+                    low, high = self.reach[k, a]
+                    lifts = [max(box[a, 0] - low, 0.0) for _, box in group]
+                    drops = [max(high - box[a, 1], 0.0) for _, box in group]
+                    self.row([self.P[k, a], *columns], [1, *(-x for x in lifts)], low, np.inf)
+                    self.row([self.P[k, a], *columns], [1, *drops], -np.inf, high)
+
+    def _obstacle_rows(self):
+        T, p = self.objective.horizon, self.problem
+        for box in p.obstacles:
+            for k in range(2, T + 1):
+                steps = [k - 1, k] if p.between else [k]
+                low = np.min([self.reach[i, :, 0] for i in steps], axis=0)
+                high = np.max([self.reach[i, :, 1] for i in steps], axis=0)
+                if (high <= box[:, 0]).any() or (low >= box[:, 1]).any():
+                    continue
+                faces = []
+                for a in range(3):
+                    if box[a, 0] > p.area[a, 0] and low[a] <= box[a, 0]:
+                        z = self.column(0, 1, True)
+                        faces.append(z)
+                        for i in steps:
+                            most = max(self.reach[i, a, 1] - box[a, 0], 0.0)
+                            self.row([self.P[i, a], z], [1, -most], -np.inf, box[a, 0])
+                    if box[a, 1] < p.area[a, 1] and high[a] >= box[a, 1]:
+                        z = self.column(0, 1, True)
+                        faces.append(z)
+                        for i in steps:
+                            most = max(box[a, 1] - self.reach[i, a, 0], 0.0)
+                            self.row([self.P[i, a], z], [1, most], box[a, 1], np.inf)
+                self.row(faces, [1] * len(faces), -np.inf, len(faces) - 1)
+
+
 def solve_with_highs(literal, gap=1e-6, limit=60.0, rounds=60):
     """Return (lower bound, value of the best point found, seconds) by tangents from outside."""
     begun = time.perf_counter()
@@ -313,18 +391,19 @@ def solve_with_scip(literal, gap=1e-6, limit=60.0):
                 model.addCons(total >= low)
             if high < np.inf:
                 model.addCons(total <= high)
-    top = model.addVar(vtype='C', lb=0.0, ub=None)
-    square = pyscipopt.quicksum(
-        weight
-        * (pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients)) + constant)
-        * (pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients)) + constant)
-        for weight, indices, coefficients, constant in literal.squares
-    )
-    model.addCons(square <= top)
+    # A column for each square: as one row, its relaxation is far weaker.
+    squares = []
+    for weight, indices, coefficients, constant in literal.squares:
+        inner = model.addVar(vtype='C', lb=None, ub=None)
+        total = pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients))
+        model.addCons(inner == total + constant)
+        top = model.addVar(vtype='C', lb=0.0, ub=None)
+        model.addCons(weight * inner * inner <= top)
+        squares.append(top)
     linear = pyscipopt.quicksum(
         cost * column for cost, column in zip(literal.cost, columns) if cost
     )
-    model.setObjective(linear + top, 'minimize')
+    model.setObjective(linear + pyscipopt.quicksum(squares), 'minimize')
     model.optimize()
     value = model.getObjVal() if model.getNSols() else np.inf
     return model.getDualbound(), value, time.perf_counter() - begun

@@ -153,6 +153,14 @@ def test_start_inside_a_cuboid():
     assert literal.check(plan) == pytest.approx(plan.objective, abs=1e-6)
 
 
+def test_a_given_visit_on_a_face_counts_despite_rounding():
+    box = [[40.0, 60.0]] * 3
+    plan = solver_for(5).solve(problem_at([40 - 1e-9, 50, 50], [0, 0, 0], [50, 50, 50], [box]))
+    assert plan is not None and plan.visits == [(1, 0)]
+    plan = solver_for(5).solve(problem_at([40 - 1e-3, 50, 50], [0, 0, 0], [50, 50, 50], [box]))
+    assert plan is not None and plan.visits == [(2, 0)]
+
+
 @pytest.mark.parametrize('beyond', [0.0, 1e-6, 5e-5])
 def test_start_at_a_bound_or_a_rounding_beyond(beyond):
     solver = solver_for(5)

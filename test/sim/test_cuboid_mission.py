@@ -81,11 +81,33 @@ def test_a_wall_in_front_of_the_target_is_flown_around():
 def test_undiscounted_rewards_let_a_robot_hover_and_the_discount_frees_it():
     start = {'red': [160.0, 200.0, 5.0]}
     options = {'detection_probability': 1.0, 'guidance_step': 4}
-    hovering = make_mission(start, **options).run(200)
+    hovering = make_mission(start, discount=1.0, **options).run(200)
     assert not hovering.complete
     assert np.ptp(hovering.paths['red'][-30:], axis=0).max() < 40.0
     assert (np.diff(hovering.visited[-30:]) == 0).all()
     check_complete(make_mission(start, discount=0.95, **options).run(200))
+
+
+def test_what_is_planned_for_the_next_step_is_visited():
+    mission = make_mission(discount=1.0)
+    due, met = [], []
+
+    def noting(agent, decide):
+        def wrapped(*arguments):
+            met.extend((agent.name, n) for name, n in due if name == agent.name)
+            assert all(agent.visited[n] for name, n in due if name == agent.name)
+            due[:] = [pair for pair in due if pair[0] != agent.name]
+            choice = decide(*arguments)
+            due.extend((agent.name, n) for k, n in choice.plan.visits if k == 1)
+            return choice
+
+        return wrapped
+
+    for agent in mission.agents.values():
+        agent.decide = noting(agent, agent.decide)
+    check_complete(mission.run(200))
+    # All but the last, which ends the mission.
+    assert len(met) >= 13
 
 
 def test_robots_hear_each_other_only_in_range():

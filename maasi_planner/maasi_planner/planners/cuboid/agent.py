@@ -25,6 +25,8 @@ How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
 _ARRIVED, _ARRIVED_SPEED = 2.0, 2.0
 # How far the state may be from what the last plan said, for that plan to be flown on [m, m/s].
 _SAME_STATE = 0.5
+# Plans go this far into a cuboid: on its face, rounding would decide whether it is visited [m].
+_INTO = 1e-3
 
 
 class Activity(Enum):
@@ -193,6 +195,7 @@ class SearchAgent:
             dynamics, make_objective(settings), settings.node_limit, settings.time_limit
         )
         self.solids = inflated(mission.solids, settings.clearance)
+        self._cuboids = inflated(mission.boxes, -_INTO)
         climb = dynamics.deceleration(2)[1] / max(1.0 - dynamics.retained, 1e-9)
         self._ways = WayFinder(
             self.solids, mission.area, dynamics.speed, min(climb, dynamics.speed)
@@ -343,7 +346,7 @@ class SearchAgent:
             self.position,
             self.velocity,
             target,
-            self.mission.boxes,
+            self._cuboids,
             wanted & ~self.visited,
             self.solids,
             self.mission.area,

@@ -20,6 +20,9 @@ BoolArray = NDArray[np.bool_]
 
 # By how much bounds give way when rounding has left a state outside of them [m, m/s].
 GIVE = 1e-4
+# A given position this far outside a cuboid is inside: plans touch faces, and rounding moves them
+# [m].
+TOUCH = 1e-6
 # Nodes between two looks at the clock, and most nodes that are held at once.
 _SLICE, _ROOM = 500, 16384
 # Share of the smoothness that is kept when a robot flies home, so that its forces are unique.

@@ -120,7 +120,7 @@ class CuboidSettings(Settings):
     smoothness_weight: float = Field(default=1e-4, gt=0.0, description='w2 [1/N^2]')
     visit_weight: float = Field(default=0.3, ge=0.0, description='w3 [1]')
     discount: float = Field(
-        default=1.0,
+        default=0.95,
         gt=0.0,
         le=1.0,
         description='Of the reward, for each step that a visit comes later; 1 is the paper, in '
