@@ -106,8 +106,8 @@ def main(arguments: list[str] | None = None) -> int:
         if options.document is not None:
             from maasi_sim.experiments.document import write_document
 
-            write_document(options.document, options.out, options.seed, options.small)
-            print(f'wrote {options.document}')
+            shown = write_document(options.document, options.out, options.seed, options.small)
+            print(f'wrote {options.document} with {len(shown)} experiments')
         return code
     except (NoRoom, WorkersLost) as error:
         return _refuse(f'{error}; the runs until now are kept', STOPPED)

@@ -343,6 +343,24 @@ def test_table_compares_with_the_paper_and_in_pairs(toy, tmp_path):
     json.dumps([run.summary for run in got.runs['first']], allow_nan=False)
 
 
+def test_page_says_what_was_run_and_what_was_not(toy, tmp_path, capsys):
+    out = tmp_path / 'out'
+    arguments = ['000-toy', '--out', str(out), '--workers', '1', '--runs', '3']
+    file = tmp_path / 'docs' / 'page.md'
+    assert reproduce.main([*arguments, '--document', str(file)]) == 0
+    text = file.read_text()
+    assert '1 to 3 runs of each case, the paper has 4' in text
+    assert '30 ± 2 (table 9)' in text and 'first minus second' in text
+    picture = file.parent / 'reproduction' / '000-toy.png'
+    assert picture.read_bytes().startswith(b'\x89PNG')
+    assert f'reproduction/{picture.name}' in text
+    assert reproduce.main(['000-toy', '--out', str(out), '--workers', '1']) == 0
+    assert reproduce.main(['--document', str(file), '--out', str(out)]) == 0
+    assert 'not in full' not in file.read_text()
+    assert reproduce.main(['--document', str(file), '--out', str(tmp_path / 'nothing')]) == 0
+    assert '**not run**' in file.read_text()
+
+
 # Command line
 
 
@@ -372,9 +390,10 @@ def test_names_are_unique_and_listed(capsys):
     listed = capsys.readouterr().out
     for name, experiment in registry.experiments().items():
         assert name in listed
-        names = [case.name for case in experiment.cases(False)]
+        cases = experiment.cases(False)
+        names = [case.name for case in cases]
         assert len(names) == len(set(names))
-        assert len({case.slug for case in experiment.cases(False)}) == len(names)
+        assert len({case.slug for case in cases}) == len(names)
         known = {item.name for item in experiment.quantities}
         for item in experiment.published:
             assert item.case in names and item.quantity in known

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import os
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
 import yaml
 
-from maasi_sim.experiments import results
+from maasi_sim import reproduce
+from maasi_sim.experiments import results, searches, terrain
 from maasi_sim.experiments.campaign import Here, carry_out, plan
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.registry import experiments
@@ -48,7 +55,8 @@ def check_search(run, settings):
     scenario = settings['scenario']
     low, high = np.array(scenario['environment']['bounds'], float).T
     assert (np.diff(columns['measurements']) > 0).all()
-    assert (np.diff(columns['step']) > 0).all()
+    # Robots with filters of their own have a row each.
+    assert (np.diff(columns['step']) >= 0).all()
     assert columns['time'] == pytest.approx(columns['step'] * scenario['step'])
     assert (columns['true_found'] <= columns['found']).all()
     assert (columns['true_found'] <= summary['targets']).all()
@@ -75,6 +83,49 @@ def check_search(run, settings):
         assert 0.0 <= summary['rmse'] <= settings['scenario']['scoring']['radius']
 
 
+@contextlib.contextmanager
+def running(*arguments, folder):
+    """Run a command of Dask until the end of the block, its output in a file."""
+    with (folder / f'{arguments[0]}.log').open('w') as log:
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'dask', *map(str, arguments)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            cwd=folder,
+            start_new_session=True,
+        )
+        try:
+            yield
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def test_cluster_makes_the_same_runs(tmp_path):
+    # The documented two commands, on ports that are free.
+    address = tmp_path / 'scheduler.json'
+    scheduler = ('--host', '127.0.0.1', '--port', '0', '--no-dashboard')
+    worker = ('--nworkers', '1', '--nthreads', '1', '--no-dashboard')
+    with (
+        running('scheduler', *scheduler, '--scheduler-file', address, folder=tmp_path),
+        running('worker', '--scheduler-file', address, *worker, folder=tmp_path),
+    ):
+        deadline = time.monotonic() + 60.0
+        while not address.exists():
+            assert time.monotonic() < deadline, (tmp_path / 'scheduler.log').read_text()
+            time.sleep(0.05)
+        where = yaml.safe_load(address.read_text())['address']
+        arguments = ['000-fig7', '--small', '--out', str(tmp_path / 'there'), '--cluster', where]
+        assert reproduce.main(arguments) == 0
+    arguments = ['000-fig7', '--small', '--out', str(tmp_path / 'here'), '--workers', '1']
+    assert reproduce.main(arguments) == 0
+    steps = [(tmp_path / place / '000-fig7' / 'steps.csv') for place in ('here', 'there')]
+    assert steps[0].read_text() == steps[1].read_text()
+    assert steps[0].read_text().count('\n') > 30
+
+
 def test_maps_of_one_figure_are_those_of_its_neighbour():
     # Paths are drawn of a run of the curves, and the same drones search the same maps.
     assert KNOWN['000-fig5'].seed(0) == KNOWN['000-fig4'].seed(0)
@@ -92,3 +143,56 @@ def test_recommended_and_paper_see_the_same_maps():
     }
     truths = [outcome.details['truth'] for outcome in outcomes.values()]
     assert truths[0] == truths[1] and len(truths[0]) == 12
+
+
+def test_terrain_is_self_affine():
+    # The mean square difference grows with the distance to the power 2 H.
+    heights = terrain.self_affine_map(np.random.default_rng(4), 512)
+    assert heights.mean() == pytest.approx(0.0, abs=1e-9)
+    assert heights.std() == pytest.approx(1.0)
+    lags = np.array([2, 4, 8, 16])
+    squares = [((np.roll(heights, lag, 0) - heights) ** 2).mean() for lag in lags]
+    slope = np.polyfit(np.log(lags), np.log(squares), 1)[0]
+    assert slope == pytest.approx(2.0 * terrain.HURST, abs=0.15)
+
+
+def test_litter_lies_low_and_high():
+    generator = np.random.default_rng(5)
+    bounds = np.array([[-30.0, 250.0], [-30.0, 250.0]])
+    heights = terrain.chunk(generator, 280.0, 57)
+    targets = terrain.littered(heights, bounds, 14, 15.0, 10.0, generator)
+    assert targets.shape == (14, 2)
+    assert (targets >= -20.0).all() and (targets <= 240.0).all()
+    index = np.round((targets + 30.0) / 5.0).astype(int)
+    rank = (heights.ravel()[:, None] < heights[index[:, 0], index[:, 1]]).mean(axis=0)
+    assert rank[:7].mean() < 0.25 and rank[7:].mean() > 0.75
+
+
+def test_explored_share_is_that_of_the_planner():
+    # One measurement in the middle of a floor: pi averaged over it.
+    detection = {'kind': 'exponential', 'probability': 0.9, 'size': [0.5, 0.5]}
+    values = {
+        'version': 1,
+        'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+        'step': 1.0,
+        'targets': {'count': 0},
+        'robots': {
+            'robot': {
+                'type': 'ranging_drone',
+                'start': [1.0, 1.0, 0.0],
+                'candidates': {'points': [[1.0, 1.0]]},
+                'sensor': {'period': 1.0, 'detection': detection},
+                'odometry': searches.PERFECT_ODOMETRY,
+            }
+        },
+        'stop': 'planner_done',
+        'limits': {'time': 3.0},
+    }
+    case = searches.search_case('one', values, 1)
+    outcome = searches.add_explored_share(case.settings, searches.run_search(case.settings, 1))
+    axis = np.linspace(0.0, 2.0, 401)
+    distance = np.hypot(axis[:, None] - 1.0, axis[None, :] - 1.0)
+    expected = (0.9 * np.exp(-distance)).mean()
+    assert outcome.summary['measurements'] == 1
+    assert outcome.summary['explored'] == pytest.approx(expected, abs=0.02)
+    assert list(outcome.columns['explored']) == [outcome.summary['explored']]

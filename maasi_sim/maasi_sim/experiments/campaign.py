@@ -195,7 +195,7 @@ class Cluster:
         futures = {
             self._client.submit(execute, task, pure=False, retries=1): task for task in tasks
         }
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=self._client.loop):
             try:
                 result = future.result()
             except Exception as error:

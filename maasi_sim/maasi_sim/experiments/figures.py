@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_sim.experiments.registry import Quantity
 from maasi_sim.experiments.results import Results, Run
 from maasi_sim.experiments.statistics import mean_interval
 from maasi_sim.experiments.tables import interval, shown
@@ -137,6 +138,12 @@ def path(axes: Any, results: Results, run: Run, title: str = '') -> None:
     scenario = results.case(run.case).settings['scenario']
     bounds = np.array(scenario['environment']['bounds'], dtype=float)
     dimension = len(bounds)
+    if 'heights' in run.details:
+        heights = np.array(run.details['heights'], float)
+        sides = [
+            np.linspace(bounds[axis, 0], bounds[axis, 1], heights.shape[axis]) for axis in (0, 1)
+        ]
+        axes.contourf(*sides, heights.T, levels=12, cmap='gist_earth', alpha=0.5)
     for index, (name, robot) in enumerate(scenario['robots'].items()):
         colour = _OTHERS[index % len(_OTHERS)]
         places = np.column_stack([run.columns[f'{name}_{axis}'] for axis in 'xyz'])
@@ -207,6 +214,47 @@ def curves_and_path(
         bounds = results.case(shown_case).settings['scenario']['environment']['bounds']
         projection = '3d' if len(bounds) == 3 else None
         path(figure.add_subplot(1, 2, 2, projection=projection), results, runs[0])
+
+
+def against(
+    figure: Figure,
+    results: Results,
+    names: Mapping[str, float],
+    label: str,
+    quantities: Sequence[Quantity],
+) -> None:
+    """Draw means of quantities with their 95 % confidence against a number that cases differ in.
+
+    Parameters
+    ----------
+    figure : Figure
+        Empty.
+    results : Results
+        Of which.
+    names : mapping
+        Cases, and the number of each.
+    label : str
+        What the number is.
+    quantities : sequence of Quantity
+        One picture each, side by side.
+    """
+    figure.set_size_inches(4.6 * len(quantities), 3.8)
+    for index, quantity in enumerate(quantities):
+        axes = figure.add_subplot(1, len(quantities), index + 1)
+        found = [
+            (value, interval(results, name, quantity))
+            for name, value in names.items()
+            if results.runs.get(name)
+        ]
+        places = [value for value, _ in found]
+        means = [span.mean for _, span in found]
+        halves = np.nan_to_num([span.half_width for _, span in found])
+        axes.errorbar(places, means, yerr=halves, fmt='o-', color=_OTHERS[index], ms=4, capsize=2)
+        axes.set_xlabel(label)
+        unit = f' [{quantity.unit}]' if quantity.unit else ''
+        axes.set_ylabel(f'{quantity.label}{unit}')
+        axes.grid(color='#E6E6E6', lw=0.8)
+        axes.spines[['top', 'right']].set_visible(False)
 
 
 def table_of(

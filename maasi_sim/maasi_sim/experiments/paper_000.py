@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from maasi_sim.experiments import figures
+from maasi_sim.experiments import figures, paper_000_floor
 from maasi_sim.experiments.registry import Case, Choice, Comparison, Experiment, Published
 from maasi_sim.experiments.searches import (
     FALSE,
@@ -101,15 +101,15 @@ _GRID = {'grid': [3, 3, 3], 'spacing': 120.0, 'corner': [10.0, 10.0, 10.0]}
 _RING = {'ring': 6, 'distance': 12.0}
 
 
-def drone(start: list[float], candidates: dict[str, Any], at_waypoints: bool) -> dict[str, Any]:
-    """Return a drone that measures each second, or only at its waypoints."""
+def drone(start: list[float], candidates: dict[str, Any]) -> dict[str, Any]:
+    """Return a drone that measures each second, or at its waypoints if those are around it."""
     return {
         'type': 'ranging_drone',
         'start': start,
         'candidates': candidates,
         'motion': {'speed': 12.0, 'acceleration': None, 'tolerance': 0.01},
-        # Longer than the way to a neighbour: what is left is the measurement on arrival.
-        'sensor': {'period': 2.0 if at_waypoints else 1.0, 'noise': _DEGREES},
+        # Ready at each step where the planner measures on arrival only.
+        'sensor': {'period': 0.1 if 'ring' in candidates else 1.0, 'noise': _DEGREES},
         'odometry': PERFECT_ODOMETRY,
     }
 
@@ -118,7 +118,6 @@ def cube(
     planner: dict[str, Any],
     candidates: dict[str, Any] | None = None,
     agents: int = 1,
-    at_waypoints: bool = False,
     search_filter: dict[str, Any] | None = None,
     start: float = 1.0,
 ) -> dict[str, Any]:
@@ -130,7 +129,7 @@ def cube(
         'step': 0.1,
         'targets': {'count': 12, 'distribution': 'uniform'},
         'robots': {
-            f'drone{index + 1}': drone(place, candidates or _GRID, at_waypoints)
+            f'drone{index + 1}': drone(place, candidates or _GRID)
             for index, place in enumerate(places)
         },
         'filter': search_filter or PAPER_FILTER,
@@ -161,9 +160,9 @@ def _methods(cap: int, small: bool, recommended: bool = True) -> list[Case]:
 
     cases = [
         case('lawnmower', cube(_LAWNMOWER, start=10.0)),
-        case('MI only', cube({'name': 'mutual_information'}, _RING, at_waypoints=True)),
+        case('MI only', cube({'name': 'mutual_information'}, _RING)),
         case('Sung and Tokekar', cube({'name': 'nearest_widest'})),
-        case('AS', cube({'name': 'as', 'alpha': 5.0}, _RING, at_waypoints=True)),
+        case('AS', cube({'name': 'as', 'alpha': 5.0}, _RING)),
         case('ASI', cube(asi())),
     ]
     if recommended:
@@ -544,7 +543,7 @@ def _fig11_cases(small: bool) -> list[Case]:
 
     return [
         case('Sung and Tokekar', cube({'name': 'nearest_widest'}, agents=2)),
-        case('MAAS', cube({'name': 'maas', 'alpha': 5.0}, _RING, agents=2, at_waypoints=True)),
+        case('MAAS', cube({'name': 'maas', 'alpha': 5.0}, _RING, agents=2)),
         case('MAASI', cube(asi(0.5, 0.5, 'maasi'), agents=2)),
         case(
             'MAASI, recommended',
@@ -604,348 +603,6 @@ def _fig11() -> Experiment:
     )
 
 
-_FLOOR_FILTER = {
-    'preset': 'paper_000',
-    'particles': 10000,
-    'found_radius': 0.02,
-    'removal_distance': 0.05,
-    # As the 0.1 m in the cube: a twelfth of the deviation of the range.
-    'jitter_deviation': 0.0013,
-}
-_FLOOR_CHOICES = (
-    Choice(
-        'R = diag[0.016, 0.052]',
-        'deviations in m and rad',
-        'As variances they would be 0.13 m and 13 degrees in a field of view of 0.4 m.',
-    ),
-    Choice(
-        'a found target counts',
-        'within 0.075 m of a true one, or half the smallest distance of two targets',
-        'Half of the 0.15 m that two markers keep; the paper has an RMSE of 0.08 m.',
-    ),
-    Choice(
-        'control cost C',
-        'weight 0.01, torques only',
-        'With weight 1 the force that keeps the drone in the air outweighs T and E.',
-    ),
-    CUBE_CHOICES[4],
-    CUBE_CHOICES[6],
-)
-_HARDWARE_NOTE = (
-    'Simulated hardware: rendered camera images, segmentation, drifting odometry and the '
-    "drivers' motion, in one process. The paper flew a real drone once."
-)
-_TARGETS = {'count': 12, 'distribution': 'uniform', 'separation': 0.15, 'margin': 0.1}
-
-
-def floor(
-    bounds: list[list[float]],
-    robots: dict[str, Any],
-    planner: dict[str, Any],
-    search_filter: dict[str, Any],
-    time: float = 600.0,
-    **more: Any,
-) -> dict[str, Any]:
-    """Return a scenario on a floor with the robots of sections 5.2 and 7."""
-    return {
-        'version': 1,
-        'environment': {'bounds': bounds},
-        'step': 0.05,
-        'targets': _TARGETS,
-        'robots': robots,
-        'filter': search_filter,
-        'planner': merged(NEVER_DONE, planner),
-        'limits': {'time': time},
-        'scoring': {'radius': 0.075},
-        **more,
-    }
-
-
-# Measures where it decides, and nowhere else.
-ON_ARRIVAL = {'measurement': 'event', 'trigger': 'absolute', 'threshold': 1e9}
-_TORQUES = {'control_inputs': 'torques'}
-
-
-def _fig9_cases(small: bool) -> list[Case]:
-    bounds = [[0.0, 2.0], [0.0, 2.0]]
-
-    def robots(candidates: dict[str, Any]) -> dict[str, Any]:
-        return {
-            'mambo': {
-                'type': 'mambo',
-                'start': [0.1, 0.1, 1.0],
-                'candidates': candidates,
-                'motion': _TORQUES,
-            }
-        }
-
-    def case(
-        name: str,
-        planner: dict[str, Any],
-        candidates: dict[str, Any],
-        preset: str = 'paper',
-    ) -> Case:
-        search_filter = _FLOOR_FILTER if preset == 'paper' else RECOMMENDED_FILTER
-        values = floor(bounds, robots(candidates), planner, search_filter)
-        return search_case(name, values, 1500, preset, small)
-
-    wide = {'grid': [3, 3], 'spacing': 0.9, 'corner': [0.1, 0.1]}
-    ring = {'ring': 8, 'distance': 0.2}
-    fine = {'grid': [6, 6], 'spacing': 0.34, 'corner': [0.15, 0.15]}
-    return [
-        case('lawnmower', {'name': 'lawnmower', 'lane_spacing': 0.2, 'margin': 0.1}, wide),
-        case('AS', {'name': 'as', 'alpha': 5.0, **ON_ARRIVAL}, ring),
-        case('ASI', {**asi(), 'control_weight': 0.01}, wide),
-        case('ASI, recommended', {'name': 'asi', 'objective': 'information'}, fine, 'recommended'),
-    ]
-
-
-def _fig9() -> Experiment:
-    styles = {'lawnmower': 'lawnmower', 'AS': 'as', 'ASI': 'asi', 'ASI, recommended': 'recommended'}
-
-    def draw(figure: Figure, results: Results) -> None:
-        figures.curves_and_path(figure, results, styles, 'ASI')
-
-    return Experiment(
-        name='000-fig9',
-        title='A Mambo over a floor with 12 markers (simulated hardware)',
-        cases=_fig9_cases,
-        run=run_search,
-        quantities=(MEASUREMENTS, TIME, FOUND, FALSE, RMSE),
-        draw=draw,
-        published=(Published('ASI', RMSE.name, 0.08, runs=1, note='one flight'),),
-        comparisons=(
-            Comparison('ASI', 'AS', FOUND.name),
-            Comparison('ASI', 'lawnmower', FOUND.name),
-            Comparison('ASI, recommended', 'lawnmower', MEASUREMENTS.name),
-        ),
-        choices=(
-            *_FLOOR_CHOICES,
-            Choice(
-                'candidates: 3 x 3, spacing 0.6, from 0.1, "centred"',
-                'coordinates 0.1, 1, 1.9',
-                'From 0.1, 0.7, 1.3 the drone never sees the far edges; the recommended case '
-                'has 6 x 6, from which every place is seen.',
-            ),
-            Choice('waypoints of AS', 'the eight neighbours at 0.2 m', 'As on the floor of 001.'),
-            _AS_CHOICE,
-        ),
-        causes='With pi = 1 in the field of view, e is 0 wherever the drone has been, itself '
-        'included: E of (22) vanishes, and ASI as printed has nothing that leads it to new '
-        'places. Markers that the 3 x 3 paths never show stay unfound.',
-        seconds=3.0,
-        note=_HARDWARE_NOTE,
-    )
-
-
-_OBSTACLES = [
-    {'centre': [0.65, 1.55], 'radius': 0.08},
-    {'centre': [1.25, 0.75], 'radius': 0.1},
-    {'centre': [1.75, 1.45], 'radius': 0.12},
-    {'centre': [0.55, 0.55], 'radius': 0.06},
-]
-_FLOOR_BOUNDS = [[-0.3, 2.4], [-0.3, 2.4]]
-_WIDE = {'grid': [3, 3], 'spacing': 0.6}
-_FINE = {'grid': [8, 8], 'spacing': 0.25}
-_RING_4 = {'ring': 4, 'distance': 0.25}
-
-
-def _pair_of_fig13(ring: bool) -> dict[str, Any]:
-    def sensor(size: float, spread: tuple[float, float], period: float) -> dict[str, Any]:
-        return {
-            'period': 0.05 if ring else period,
-            'detection': {'kind': 'exponential', 'probability': 0.98, 'size': [size, size]},
-            'noise': {
-                'range': spread[0],
-                'bearing': spread[1],
-                'as': 'deviation',
-                'angles': 'radians',
-            },
-        }
-
-    return {
-        'mambo': {
-            'type': 'ranging_drone',
-            'start': [0.1, 0.1, 1.0],
-            'radius': 0.09,
-            'candidates': _RING_4 if ring else _WIDE,
-            'motion': {
-                'model': 'mambo',
-                'speed': 0.4,
-                'acceleration': None,
-                'tilt': 0.1,
-                'tolerance': 0.05,
-                'clearance': 0.12,
-                **_TORQUES,
-            },
-            'sensor': sensor(0.3, (0.016, 0.052), 0.6),
-            'odometry': PERFECT_ODOMETRY,
-        },
-        'turtlebot': {
-            'type': 'ranging_drone',
-            'start': [0.0, 0.0, 0.0],
-            'radius': 0.11,
-            'candidates': _RING_4 if ring else _FINE,
-            'motion': {
-                'model': 'unicycle',
-                'speed': 0.2,
-                'acceleration': 0.5,
-                'yaw_rate': 1.8,
-                'tolerance': 0.05,
-                'heading': 'travel',
-                'clearance': 0.12,
-            },
-            'sensor': sensor(0.15, (0.011, 0.0311), 1.2),
-            'odometry': PERFECT_ODOMETRY,
-        },
-    }
-
-
-def _fig13_cases(small: bool) -> list[Case]:
-    def case(name: str, planner: dict[str, Any], ring: bool, preset: str = 'paper') -> Case:
-        search_filter = _FLOOR_FILTER if preset == 'paper' else RECOMMENDED_FILTER
-        values = floor(_FLOOR_BOUNDS, _pair_of_fig13(ring), planner, search_filter)
-        values['environment'] = {'bounds': _FLOOR_BOUNDS, 'obstacles': _OBSTACLES}
-        return search_case(name, values, 400, preset, small)
-
-    return [
-        case('MAAS', {'name': 'maas', 'alpha': 5.0, **ON_ARRIVAL}, True),
-        case('MAASI', {**asi(0.5, 0.5, 'maasi'), 'control_weight': 0.01}, False),
-        case(
-            'MAASI, recommended',
-            {'name': 'maasi', 'objective': 'information'},
-            False,
-            'recommended',
-        ),
-    ]
-
-
-def _fig13() -> Experiment:
-    styles = {'MAAS': 'as', 'MAASI': 'asi', 'MAASI, recommended': 'recommended'}
-
-    def draw(figure: Figure, results: Results) -> None:
-        figures.curves_and_path(
-            figure, results, styles, 'MAASI', label='measurements of both robots'
-        )
-
-    return Experiment(
-        name='000-fig13',
-        title='Drone and ground robot among obstacles, in simulation',
-        cases=_fig13_cases,
-        run=run_search,
-        quantities=(MEASUREMENTS, FOUND, FALSE, RMSE),
-        draw=draw,
-        comparisons=(
-            Comparison('MAASI', 'MAAS', MEASUREMENTS.name),
-            Comparison('MAASI, recommended', 'MAASI', MEASUREMENTS.name),
-        ),
-        choices=(
-            *_FLOOR_CHOICES,
-            Choice(
-                'obstacles', 'four circles of 0.06 to 0.12 m', 'Placed by hand in the paper too.'
-            ),
-            Choice(
-                'speeds and periods',
-                '0.4 m/s and 0.6 s, 0.2 m/s and 1.2 s',
-                'Not given: 0.24 m between measurements, nearly the 0.25 m of MAAS.',
-            ),
-            Choice('grids', 'centred', 'The paper gives sizes and spacings only.'),
-            _AS_CHOICE,
-        ),
-        seconds=4.0,
-        note='Kept away from obstacles by steering around them, 0.12 m off, instead of the term of '
-        '001, (15).',
-    )
-
-
-def _fig15_cases(small: bool) -> list[Case]:
-    def robots(candidates: tuple[dict[str, Any], dict[str, Any]]) -> dict[str, Any]:
-        return {
-            'mambo': {
-                'type': 'mambo',
-                'start': [1.9, 1.9, 1.0],
-                'candidates': candidates[0],
-                'motion': _TORQUES,
-            },
-            'turtlebot': {
-                'type': 'turtlebot3_burger',
-                'start': [0.0, 0.0, 0.0],
-                'candidates': candidates[1],
-            },
-        }
-
-    def case(
-        name: str,
-        planner: dict[str, Any],
-        candidates: tuple[dict[str, Any], dict[str, Any]],
-        preset: str = 'paper',
-    ) -> Case:
-        search_filter = _FLOOR_FILTER if preset == 'paper' else RECOMMENDED_FILTER
-        leaves = [{'at': 210.0, 'robot': 'mambo', 'do': 'leave'}]
-        values = floor(
-            _FLOOR_BOUNDS, robots(candidates), planner, search_filter, 900.0, events=leaves
-        )
-        return search_case(name, values, 3000, preset, small)
-
-    lanes = {'name': 'lawnmower', 'lane_spacing': 0.25, 'margin': 0.1}
-    grids = (
-        {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
-        {'grid': [10, 10], 'spacing': 0.25, 'corner': [0.0, 0.0]},
-    )
-    return [
-        case('lawnmower', lanes, (_WIDE, _FINE)),
-        case('MAAS', {'name': 'maas', 'alpha': 5.0, **ON_ARRIVAL}, (_RING_4, _RING_4)),
-        case('MAASI', {**asi(0.5, 0.5, 'maasi'), 'control_weight': 0.01}, (_WIDE, _FINE)),
-        case(
-            'MAASI, recommended',
-            {'name': 'maasi', 'objective': 'information'},
-            grids,
-            'recommended',
-        ),
-    ]
-
-
-def _fig15() -> Experiment:
-    styles = {
-        'lawnmower': 'lawnmower',
-        'MAAS': 'as',
-        'MAASI': 'asi',
-        'MAASI, recommended': 'recommended',
-    }
-
-    def draw(figure: Figure, results: Results) -> None:
-        figures.curves_and_path(
-            figure, results, styles, 'MAASI', label='measurements of both robots'
-        )
-
-    return Experiment(
-        name='000-fig15',
-        title='Mambo and TurtleBot over a floor with 12 markers (simulated hardware)',
-        cases=_fig15_cases,
-        run=run_search,
-        quantities=(MEASUREMENTS, TIME, FOUND, FALSE, RMSE),
-        draw=draw,
-        comparisons=(
-            Comparison('MAASI', 'MAAS', FOUND.name),
-            Comparison('MAASI', 'lawnmower', FOUND.name),
-            Comparison('MAASI, recommended', 'lawnmower', MEASUREMENTS.name),
-        ),
-        choices=(
-            *_FLOOR_CHOICES,
-            Choice(
-                'when the drone ends',
-                'after 210 s',
-                'In the video it does so at 3 min 30 s; the TurtleBot goes on alone.',
-            ),
-            Choice('grids', 'centred', 'The paper gives sizes and spacings only.'),
-            _AS_CHOICE,
-        ),
-        causes='As in 000-fig9: with pi = 1 in the field of view E of (22) vanishes.',
-        seconds=6.0,
-        note=_HARDWARE_NOTE,
-    )
-
-
 def experiments() -> list[Experiment]:
     """Return the experiments of 000."""
     return [
@@ -955,11 +612,11 @@ def experiments() -> list[Experiment]:
         _particles_table(2, 1),
         _trigger_figure(6, 1),
         _fig7(),
-        _fig9(),
+        paper_000_floor.fig9(),
         _fig11(),
         _weights_table(3, 2),
         _particles_table(4, 2),
         _trigger_figure(12, 2),
-        _fig13(),
-        _fig15(),
+        paper_000_floor.fig13(),
+        paper_000_floor.fig15(),
     ]

@@ -246,6 +246,14 @@ class RunFolder:
         """Return where a run is kept."""
         return self.path / 'runs' / f'{case.slug}-{number:04d}.csv'
 
+    def maps(self) -> int:
+        """Return on how many maps there are runs: the largest number, and one."""
+        numbers = [
+            int(path.stem.rsplit('-', 1)[1])
+            for path in (self.path / 'runs').glob('*-[0-9][0-9][0-9][0-9].csv')
+        ]
+        return max(numbers, default=-1) + 1
+
     def load(self, case: Case, number: int, seed: int) -> Run | None:
         """Return a run that is there, None where there is none of these settings and seed.
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from maasi_filter.exploration import Exploration
+from maasi_filter.pose import Pose
 from maasi_sim.experiments.registry import Case, Outcome, Quantity
 from maasi_sim.scenario import scenario_from_content, scenario_from_values
 from maasi_sim.search import SearchResult, search
@@ -140,3 +142,28 @@ def outcome_of(result: SearchResult, most_measurements: int, time_limit: float) 
             'step_time': (filter_time + planning_time) / max(result.total_measurements, 1),
         },
     )
+
+
+def add_explored_share(settings: dict[str, Any], outcome: Outcome) -> Outcome:
+    """Add to a search which share of the environment is explored, 1 - e averaged over it.
+
+    Column 'explored' has it after each measurement batch, and the summary in the end.
+    """
+    scenario = scenario_from_content(settings['scenario'], 'settings')
+    bounds = scenario.environment.array()
+    exploration = Exploration(bounds, float((bounds[:, 1] - bounds[:, 0]).max()) / 26.0)
+    columns = {name: np.asarray(values, float) for name, values in outcome.columns.items()}
+    detections = {
+        name: robot.sensor.build(name, scenario.dimension).detection
+        for name, robot in scenario.robots.items()
+    }
+    explored = []
+    for row in range(len(columns['step'])):
+        for name, detection in detections.items():
+            if columns[f'{name}_measures'][row]:
+                place = [columns[f'{name}_{axis}'][row] for axis in 'xyz']
+                exploration.update(detection, Pose.from_yaw(place, scenario.robots[name].yaw))
+        explored.append(exploration.explored_fraction())
+    outcome.columns = {**outcome.columns, 'explored': explored}
+    outcome.summary['explored'] = explored[-1] if explored else 0.0
+    return outcome

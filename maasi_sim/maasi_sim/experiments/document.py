@@ -1,0 +1,151 @@
+"""Writes the page of all experiments that have been run: docs/reproduction.md and its pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from maasi_sim.experiments.campaign import plan
+from maasi_sim.experiments.outputs import described, picture
+from maasi_sim.experiments.registry import Experiment, experiments
+from maasi_sim.experiments.results import Results, RunFolder, write_file
+
+_PICTURE_DPI = 65
+
+_PAPERS = {
+    '000': 'Yousuf, Herzal, Lendek, Buşoniu: Multi-agent active multi-target search with '
+    'intermittent measurements, Control Engineering Practice, 2024',
+    '001': 'Yousuf, Lendek, Buşoniu: Exploration-based planning for multiple-target search with '
+    'real-drone results, Sensors, 2024',
+    '002': 'Yousuf, Lendek, Buşoniu: Multi-agent exploration-based search for an unknown number of '
+    'targets, IFAC 2023',
+    '003': 'Yousuf, Lendek, Buşoniu: Exploration-based search for an unknown number of targets '
+    'using a UAV, IFAC 2022',
+    '004': 'Papaioannou and others: Distributed search planning in 3D environments with a '
+    'dynamically varying number of agents, 2023',
+}
+
+_INTRODUCTION = """\
+# The papers' experiments, run again
+
+Written by `./scripts/reproduce --document docs/reproduction.md`; do not edit. Each section is one
+figure or table of a paper: our numbers beside the paper's, a picture to lay beside the printed
+one, and what the paper leaves open with what was taken and why.
+
+    ./scripts/reproduce --list                      # what there is, and what it takes
+    ./scripts/reproduce 000-fig4 000-fig11 --runs 30
+    ./scripts/reproduce all                         # the same command goes on where it stopped
+    ./scripts/reproduce --document docs/reproduction.md
+
+Each experiment leaves in `runs/reproduction/NAME/`: `runs/` (one file per run, with a checksum),
+`steps.csv` (a row per run and step), `runs.csv` (a row per run), `table.md`, `table.csv`,
+`figure.png`, and `configuration.yaml` with every setting and seed.
+
+Other machines take part through Dask. In an environment in which `maasi_sim` can be imported
+(`source .workspace/install/local_setup.bash`), on one machine and on each that is to work:
+
+    dask scheduler
+    dask worker tcp://SCHEDULER:8786
+
+Then `./scripts/reproduce NAME --cluster tcp://SCHEDULER:8786`. Who makes a run changes none of
+its numbers.
+
+## How to read the tables
+
+- **ours** and **paper** are means with half the width of their 95 % confidence interval (Student's
+  t). The papers' intervals are as printed; a number without one is a single run, or was read off
+  the text or a figure.
+- **difference** is ours minus the paper's. Its interval is Welch's, of both; where the paper gives
+  none it is that of ours alone, and too narrow. An interval with 0 in it shows no difference.
+- **runs** is how many maps a row rests on. "9 of 10" means that 9 runs got there. A run that did
+  not counts with what was tried (restricted mean, the area under Kaplan and Meier's curve), and
+  none is dropped. "More than 900" means that no run got there.
+- **paired** differences are of two methods on the same maps with the same seeds, a finer
+  comparison than that of two separate intervals.
+- **recommended** marks a case with the settings that we would use; all others are the best reading
+  of the paper.
+- "Targets found" are true targets with a found one within the distance given, one to one; "false
+  targets" are the found ones that are left.
+- The papers' computing times are MATLAB's on their machine, ours those of one core here.
+
+The seed of a map is a hash of the name of the experiment's maps and of the map's number. No
+setting was chosen by what came out on these maps. What is called simulated hardware is the camera,
+the drift and the motion of the simulator, not a robot.
+"""
+
+
+def available(experiment: Experiment, out: Path, seed: int = 1, small: bool = False) -> Results:
+    """Return the runs of an experiment that are in a folder."""
+    folder = RunFolder(out / experiment.name, experiment)
+    return plan(experiment, out, folder.maps(), seed, small).results()
+
+
+def how_many(results: Results) -> str:
+    """Return in words on how many runs an experiment rests, and how many the paper has."""
+    wanted, made = [], []
+    for case in results.cases:
+        most = results.experiment.runs
+        wanted.append(most if case.runs is None else min(most, case.runs))
+        made.append(len(results.runs[case.name]))
+    low, high = min(made), max(made)
+    maps = f'{low}' if low == high else f'{low} to {high}'
+    complete = all(number >= least for number, least in zip(made, wanted))
+    text = f'{maps} run{"" if maps == "1" else "s"} of each case'
+    if complete:
+        return text
+    return f'**not in full: {text}, the paper has {max(wanted)}**'
+
+
+def page(results: dict[str, Results]) -> str:
+    """Return the page of experiments that have runs, by name."""
+    parts = [_INTRODUCTION, '## What was run\n']
+    known = experiments()
+    rows = ['| experiment | shows | rests on |', '|---|---|---|']
+    for name, experiment in known.items():
+        rests = how_many(results[name]) if name in results else '**not run**'
+        shown = f'[{name}](#{name})' if name in results else name
+        rows.append(f'| {shown} | {experiment.title} | {rests} |')
+    parts.append('\n'.join(rows) + '\n')
+    paper = ''
+    for name, found in results.items():
+        if found.experiment.paper != paper:
+            paper = found.experiment.paper
+            parts.append(f'## Paper {paper}\n\n{_PAPERS.get(paper, "")}\n')
+        parts.append(f'### {name}\n\n{found.experiment.title}. Rests on {how_many(found)}.\n')
+        parts.append(f'![{found.experiment.title}](reproduction/{name}.png)\n')
+        parts.append(described(found.experiment, found))
+    return '\n'.join(parts)
+
+
+def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) -> list[str]:
+    """Write the page of what is in a folder, with a picture for each experiment beside it.
+
+    Parameters
+    ----------
+    file : Path
+        The page; pictures go to `reproduction/` beside it.
+    out : Path
+        Folder of all experiments.
+    seed : int
+        Of the campaign.
+    small : bool
+        Whether the small cases are meant.
+
+    Returns
+    -------
+    list of str
+        The experiments on it.
+
+    Raises
+    ------
+    NoRoom
+        If something cannot be written.
+    """
+    results = {}
+    for name, experiment in experiments().items():
+        found = available(experiment, out, seed, small)
+        if found.names():
+            results[name] = found
+    for name, found in results.items():
+        write_file(file.parent / 'reproduction' / f'{name}.png', picture(found, _PICTURE_DPI))
+    write_file(file, page(results))
+    return list(results)

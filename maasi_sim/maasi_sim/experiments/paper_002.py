@@ -1,0 +1,288 @@
+"""002: multi-agent exploration-based search for an unknown number of targets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from maasi_sim.experiments import figures
+from maasi_sim.experiments.registry import Case, Choice, Comparison, Experiment, Published
+from maasi_sim.experiments.searches import (
+    FALSE,
+    FOUND,
+    MEASUREMENTS,
+    NEVER_DONE,
+    PERFECT_ODOMETRY,
+    RMSE,
+    STEP_TIME,
+    merged,
+    run_search,
+    search_case,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from maasi_sim.experiments.results import Results
+
+_LOW, _HIGH = -30.0, 300.0
+# 120 and 320 steps of both agents.
+_HOMOGENEOUS, _HETEROGENEOUS = 240, 640
+_PAPER_FILTER = {'preset': 'paper_002', 'particles': 10000}
+_RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 10000}
+_GRID = {'grid': [5, 5], 'spacing': 72.5, 'corner': [-10.0, -10.0]}
+_CENTRALIZED, _INDEPENDENT = 'centralized', 'independent'
+_STYLES = {
+    'lawnmower': 'lawnmower',
+    _INDEPENDENT: 'as',
+    _CENTRALIZED: 'asi',
+    'MAASI, recommended': 'recommended',
+}
+
+CHOICES = (
+    Choice(
+        'noise',
+        'deviations of 1.22 m and 0.42 degrees',
+        'Not given; those of 000 in two dimensions.',
+    ),
+    Choice('weight alpha of exploration', '5', 'Not given; that of 001.'),
+    Choice('motion', 'straight, one move in a step', 'The planner only sees positions.'),
+    Choice(
+        'filter',
+        'preset paper_002',
+        'Births where measurements point, T_m = 0.5 and a jitter: as printed nothing is found; '
+        'docs/filter_presets.md has each with its reason.',
+    ),
+    Choice(
+        'a found target counts',
+        'within T_z = 5 m of a true one, one to one',
+        'The paper does not say when a found target is right.',
+    ),
+    Choice(
+        'a run ends',
+        "when all are found, or after the paper's number of steps",
+        'Measurements are those of both agents: two in a step.',
+    ),
+)
+_LANES_CHOICE = Choice(
+    'lanes of the lawnmower',
+    '55 m apart, 27.5 m from the bounds',
+    'Not given; with these two agents of 8 m per step meet in the middle after 120 steps, as '
+    'the paper has it.',
+)
+
+
+def agent(
+    start: list[float],
+    candidates: dict[str, Any],
+    move: float,
+    view: float,
+    period: float,
+    accuracy: float = 1.0,
+) -> dict[str, Any]:
+    """Return an agent.
+
+    Parameters
+    ----------
+    start : list of two numbers
+        [m].
+    candidates : dict
+        Waypoints.
+    move : float
+        In a step [m].
+    view : float
+        F of its sensor [m].
+    period : float
+        Of possible measurements [s].
+    accuracy : float
+        Factor on the deviations of its noise.
+    """
+    return {
+        'type': 'ranging_drone',
+        'start': [*start, 0.0],
+        'candidates': candidates,
+        'motion': {'speed': move, 'acceleration': None, 'tolerance': 0.001 * move},
+        'sensor': {
+            # Ready at each step where the planner measures on arrival only.
+            'period': period,
+            'detection': {'kind': 'exponential', 'probability': 0.98, 'size': [view, view]},
+            'noise': {
+                'range': 1.5 * accuracy**2,
+                'bearing': 0.175 * accuracy**2,
+                'as': 'variance',
+                'angles': 'degrees',
+            },
+        },
+        'odometry': PERFECT_ODOMETRY,
+    }
+
+
+def square(
+    robots: dict[str, Any], planner: dict[str, Any], search_filter: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return the scenario of section 5 with robots and a planner."""
+    return {
+        'version': 1,
+        'environment': {'bounds': [[_LOW, _HIGH]] * 2},
+        'step': 0.1,
+        'targets': {'count': 12, 'distribution': 'uniform'},
+        'robots': robots,
+        'filter': search_filter or _PAPER_FILTER,
+        'planner': merged(NEVER_DONE, planner),
+        'scoring': {'radius': 5.0},
+        'limits': {'time': 2000.0},
+    }
+
+
+def _planner(coordination: str) -> dict[str, Any]:
+    return {'name': 'maas', 'alpha': 5.0, 'coordination': coordination}
+
+
+_LAWNMOWER = {'name': 'lawnmower', 'lane_spacing': 55.0, 'margin': 27.5}
+_RECOMMENDED = {'name': 'maasi', 'objective': 'information'}
+
+
+def _homogeneous(small: bool) -> list[Case]:
+    def pair(
+        candidates: dict[str, Any], starts: list[list[float]], period: float
+    ) -> dict[str, Any]:
+        return {
+            f'agent{index + 1}': agent(start, candidates, 8.0, 25.0, period)
+            for index, start in enumerate(starts)
+        }
+
+    ring = {'ring': 8, 'distance': 8.0}
+    together = [[0.0, 0.0], [0.0, 0.0]]
+    corners = [[_LOW, _LOW], [_HIGH, _HIGH]]
+
+    def case(name: str, values: dict[str, Any], preset: str = 'paper') -> Case:
+        return search_case(name, values, _HOMOGENEOUS, preset, small)
+
+    return [
+        case('lawnmower', square(pair(ring, corners, 1.0), _LAWNMOWER)),
+        case(_INDEPENDENT, square(pair(ring, together, 0.1), _planner('independent'))),
+        case(_CENTRALIZED, square(pair(ring, together, 0.1), _planner('centralized'))),
+        case(
+            'MAASI, recommended',
+            square(pair(_GRID, together, 1.0), _RECOMMENDED, _RECOMMENDED_FILTER),
+            'recommended',
+        ),
+    ]
+
+
+_CAUSE = (
+    'Eight neighbours at 8 m and pi = 0.98 exp(-d / 50 m): T of a few clusters nearby is larger '
+    'than 5 e, which is below 0.1 wherever an agent has come by; the agents linger.'
+)
+
+
+def _fig5() -> Experiment:
+    def draw(figure: Figure, results: Results) -> None:
+        figures.curves(figure.add_subplot(), results, _STYLES)
+
+    return Experiment(
+        name='002-fig5',
+        title='Two equal agents: independent and centralized planner against a lawnmower',
+        cases=_homogeneous,
+        run=run_search,
+        quantities=(MEASUREMENTS, FOUND, FALSE, RMSE),
+        draw=draw,
+        published=tuple(
+            Published(name, FOUND.name, 12.0, note='"they find all the targets", 120 steps')
+            for name in ('lawnmower', _INDEPENDENT, _CENTRALIZED)
+        ),
+        comparisons=(
+            Comparison(_CENTRALIZED, 'lawnmower', FOUND.name),
+            Comparison(_CENTRALIZED, _INDEPENDENT, FOUND.name),
+            Comparison(_CENTRALIZED, _INDEPENDENT, MEASUREMENTS.name),
+            Comparison('MAASI, recommended', _CENTRALIZED, MEASUREMENTS.name),
+        ),
+        choices=(*CHOICES, _LANES_CHOICE),
+        causes=_CAUSE,
+        seconds=1.5,
+        maps='002, equal agents',
+    )
+
+
+def _fig7() -> Experiment:
+    names = ('lawnmower', _INDEPENDENT, _CENTRALIZED)
+
+    def draw(figure: Figure, results: Results) -> None:
+        figures.paths(figure, results, names)
+
+    return Experiment(
+        name='002-fig7',
+        title='Paths of the two planners, and of the lawnmower (figure 6), on one map',
+        cases=lambda small: [case for case in _homogeneous(small) if case.name in names],
+        run=run_search,
+        quantities=(FOUND, FALSE, RMSE),
+        draw=draw,
+        choices=(*CHOICES, _LANES_CHOICE),
+        runs=1,
+        seconds=1.5,
+        maps='002, equal agents',
+        note='The map is the first of 002-fig5.',
+    )
+
+
+def _heterogeneous(small: bool) -> list[Case]:
+    def pair(ring: bool) -> dict[str, Any]:
+        def around(distance: float) -> dict[str, Any]:
+            return {'ring': 4, 'distance': distance} if ring else _GRID
+
+        period = 0.1 if ring else 1.0
+        return {
+            'rov': agent([0.0, 0.0], around(4.0), 4.0, 15.0, period, 0.5),
+            'uav': agent([0.0, 0.0], around(12.0), 12.0, 60.0, period),
+        }
+
+    return [
+        search_case(
+            _CENTRALIZED, square(pair(True), _planner('centralized')), _HETEROGENEOUS, small=small
+        ),
+        search_case(
+            'MAASI, recommended',
+            square(pair(False), _RECOMMENDED, _RECOMMENDED_FILTER),
+            _HETEROGENEOUS,
+            'recommended',
+            small,
+        ),
+    ]
+
+
+def _fig9() -> Experiment:
+    styles = {_CENTRALIZED: 'asi', 'MAASI, recommended': 'recommended'}
+
+    def draw(figure: Figure, results: Results) -> None:
+        figures.curves_and_path(figure, results, styles, _CENTRALIZED)
+
+    return Experiment(
+        name='002-fig9',
+        title='A fast agent with a wide view and a slow one with a narrow view',
+        cases=_heterogeneous,
+        run=run_search,
+        quantities=(MEASUREMENTS, FOUND, FALSE, RMSE, STEP_TIME),
+        draw=draw,
+        published=(
+            Published(_CENTRALIZED, FOUND.name, 12.0, runs=1, note='figure 9, 320 steps'),
+            Published(_CENTRALIZED, RMSE.name, 1.14, runs=1, note='one run'),
+            Published(_CENTRALIZED, STEP_TIME.name, 1.88, runs=1, note='UAV; ROV 3.02; MATLAB'),
+        ),
+        comparisons=(Comparison('MAASI, recommended', _CENTRALIZED, MEASUREMENTS.name),),
+        choices=(
+            *CHOICES,
+            Choice(
+                'noise of the slow agent',
+                'half the deviations',
+                'The paper says that it is better, not by how much.',
+            ),
+            Choice('runs', '10', 'The paper shows one.'),
+        ),
+        causes=_CAUSE,
+        seconds=4.0,
+        maps='002, different agents',
+    )
+
+
+def experiments() -> list[Experiment]:
+    """Return the experiments of 002."""
+    return [_fig5(), _fig7(), _fig9()]

@@ -1,0 +1,110 @@
+"""Terrain with the statistics of real terrain, where that of a paper is not to be had."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+FloatArray = NDArray[np.float64]
+
+# Self-affine with Hurst's exponent of real terrain, about 0.8 (a fractal dimension of 2.2); the
+# deviation of heights over the whole map is that of hills.
+HURST = 0.8
+MAP_SIZE = 12_000.0
+MAP_NODES = 1024
+DEVIATION = 150.0
+
+
+def self_affine_map(
+    generator: np.random.Generator, nodes: int = MAP_NODES, hurst: float = HURST
+) -> FloatArray:
+    """Return heights of a periodic self-affine map by spectral synthesis.
+
+    The power of a wave number k falls with k^-(2 H + 2), so that the mean square difference of
+    two heights grows with their distance to the power 2 H.
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Where the randomness comes from.
+    nodes : int
+        On each axis.
+    hurst : float
+        H, between 0 and 1.
+
+    Returns
+    -------
+    (nodes, nodes) array
+        With mean 0 and deviation 1.
+    """
+    spectrum = np.fft.rfft2(generator.standard_normal((nodes, nodes)))
+    waves = np.hypot(np.fft.fftfreq(nodes)[:, None], np.fft.rfftfreq(nodes)[None, :])
+    waves[0, 0] = np.inf
+    heights = np.fft.irfft2(spectrum * waves ** -(hurst + 1.0), s=(nodes, nodes))
+    return np.asarray((heights - heights.mean()) / heights.std())
+
+
+def chunk(generator: np.random.Generator, size: float, nodes: int) -> FloatArray:
+    """Return the heights of a small area of a map of 12 km, (nodes, nodes) [m].
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Of map and place.
+    size : float
+        Side of the area [m].
+    nodes : int
+        On each axis.
+    """
+    heights = DEVIATION * self_affine_map(generator)
+    corner = generator.uniform(0.0, MAP_NODES, size=2)
+    along = np.linspace(0.0, size * MAP_NODES / MAP_SIZE, nodes)
+    places = np.meshgrid(corner[0] + along, corner[1] + along, indexing='ij')
+    return np.asarray(ndimage.map_coordinates(heights, places, order=3, mode='grid-wrap'))
+
+
+def littered(
+    heights: FloatArray,
+    bounds: FloatArray,
+    number: int,
+    spread: float,
+    margin: float,
+    generator: np.random.Generator,
+) -> FloatArray:
+    """Return targets in two clusters: around the lowest and around the highest place.
+
+    Of ten places drawn around each, the lowest (highest) one is taken, one target after the other.
+
+    Parameters
+    ----------
+    heights : (n, n) array
+        [m].
+    bounds : (2, 2) array
+        Of the area [m].
+    number : int
+        Of targets, even.
+    spread : float
+        Deviation of the draws [m].
+    margin : float
+        Least distance from the bounds [m].
+    generator : numpy.random.Generator
+        Where the randomness comes from.
+    """
+    nodes = heights.shape[0]
+    low, high = bounds[:, 0] + margin, bounds[:, 1] - margin
+    sides = [np.linspace(bounds[axis, 0], bounds[axis, 1], nodes) for axis in (0, 1)]
+    inside = ((sides[0] >= low[0]) & (sides[0] <= high[0]))[:, None] & (
+        (sides[1] >= low[1]) & (sides[1] <= high[1])
+    )[None, :]
+    targets = []
+    for sign in (1.0, -1.0):
+        signed = np.where(inside, sign * heights, np.inf)
+        row, column = np.unravel_index(int(np.argmin(signed)), signed.shape)
+        centre = np.array([sides[0][row], sides[1][column]])
+        for _ in range(number // 2):
+            places = np.clip(centre + generator.normal(0.0, spread, (10, 2)), low, high)
+            index = (places - bounds[:, 0]) / (bounds[:, 1] - bounds[:, 0]) * (nodes - 1)
+            found = ndimage.map_coordinates(heights, index.T, order=1)
+            targets.append(places[int(np.argmin(sign * found))])
+    return np.array(targets)
