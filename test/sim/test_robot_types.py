@@ -1,0 +1,62 @@
+"""The types of robots in config/robots."""
+
+import pytest
+
+from maasi_drivers.projection import Camera, box_view_margin
+from maasi_sim.scenario import config_folder, scenario_from_values
+from maasi_sim.search import search
+
+TURTLEBOTS = {
+    # Largest speed [m/s] and turning rate [rad/s] of the robot, by its data sheet.
+    'turtlebot3_burger': (0.22, 2.84),
+    'turtlebot3_waffle': (0.26, 1.82),
+    'turtlebot3_waffle_pi': (0.26, 1.82),
+}
+
+
+def scenario(kind, start=(0.0, 0.0, 0.0)):
+    robot = {
+        'type': kind,
+        'start': list(start),
+        'candidates': {'grid': [8, 8], 'spacing': 0.24, 'corner': [-0.2, -0.2]},
+    }
+    values = {
+        'version': 1,
+        'environment': {'bounds': [[-0.2, 1.5], [-0.2, 1.5]]},
+        'targets': {'count': 4, 'separation': 0.2, 'margin': 0.1},
+        'robots': {'rover': robot},
+        'limits': {'time': 400.0},
+    }
+    return scenario_from_values(values, 'test')
+
+
+def test_the_turtlebots_are_there():
+    known = {path.stem for path in (config_folder() / 'robots').glob('turtlebot*.yaml')}
+    assert known == set(TURTLEBOTS)
+
+
+@pytest.mark.parametrize('kind', [*TURTLEBOTS, 'mambo'])
+def test_a_marker_in_the_field_of_view_is_in_the_image_as_a_whole(kind):
+    robot = scenario(kind, (0.0, 0.0, 1.0 if kind == 'mambo' else 0.0)).robots['rover']
+    box = robot.sensor.detection
+    assert robot.camera is not None
+    margin = box_view_margin(
+        Camera.from_settings(robot.camera),
+        box.lower,
+        box.upper,
+        robot.start[2],
+        0.5 * robot.camera.marker_diameter,
+    )
+    assert margin > 0.0
+
+
+@pytest.mark.parametrize('kind', TURTLEBOTS)
+def test_a_turtlebot_keeps_its_limits_and_finds_markers(kind):
+    given = scenario(kind)
+    speed, turn = TURTLEBOTS[kind]
+    motion = given.robots['rover'].motion
+    assert motion.speed <= speed
+    assert motion.yaw_rate <= turn
+    result = search(given, seed=2)
+    assert result.end_reason == 'all_found'
+    assert result.rmse < 0.015
