@@ -23,6 +23,7 @@ setup(
             'turtlebot_driver = maasi_drivers.turtlebot_driver:main',
             'ranging_driver = maasi_drivers.ranging_driver:main',
             'measurement_feed_sender = maasi_drivers.measurement_feed_sender:main',
+            'mavlink_driver = maasi_drivers.mavlink_driver:main',
             'guard_node = maasi_drivers.guard_node:main',
         ],
     },

@@ -32,7 +32,7 @@ from maasi_filter.conversions import (
 )
 from maasi_filter.pose import Pose
 from maasi_filter.qos import RELIABLE, sensor_reader
-from maasi_filter.search_node import SearchNode
+from maasi_filter.search_node import SearchNode, SettingsError
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState, DetectionArray, LockstepStep, MeasurementBatch
 from maasi_planner.motion import MotionModel, RobotState, make_motion
@@ -64,7 +64,7 @@ _LAST_TASKS = 5
 # Commands below these are not expected to change the pose [m/s, rad/s].
 _LEAST_SPEED, _LEAST_TURN = 0.02, 0.05
 # Kinds of trouble.
-_ODOMETRY, _FROZEN_POSE, _SENSOR, _BATTERY = 'odometry', 'frozen pose', 'sensor', 'battery'
+ODOMETRY, _FROZEN_POSE, _SENSOR, BATTERY = 'odometry', 'frozen pose', 'sensor', 'battery'
 
 
 @dataclass(frozen=True)
@@ -118,10 +118,17 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     # What its sensor delivers, in words.
     sensed = 'sweep'
+    # Of the parameter `link`, those that it has.
+    links: tuple[str, ...] = ('topics',)
 
     def __init__(self, **options: Any) -> None:
         super().__init__('driver', DriverSettings, in_robot=True, **options)
         settings = self.settings
+        if settings.link not in self.links:
+            raise SettingsError(
+                f'parameter link: read {settings.link!r}, allowed with this driver is '
+                + ' or '.join(self.links)
+            )
         self._namespace = self.get_namespace().strip('/')
         self.robot = self._namespace.rpartition('/')[2]
         self.dimension = settings.environment.dimension
@@ -394,7 +401,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     def take_pose(self, placed: StampedPose) -> None:
         """Take where the robot is, later than all before."""
         self._odometry_at = time.monotonic()
-        if self.end_trouble(_ODOMETRY):
+        if self.end_trouble(ODOMETRY):
             self.get_logger().info('odometry is back')
             # The sensor may have been silent with it.
             self._sensed_at = None
@@ -662,7 +669,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
                 self.warn_throttled('no odometry', f'odom: nothing yet, for {age:.0f} s')
         elif age > self.settings.odometry_timeout:
             text = f'no odometry for {age:.1f} s'
-            if self.begin_trouble(_ODOMETRY, text):
+            if self.begin_trouble(ODOMETRY, text):
                 self.get_logger().warning(f'odom: {text}: the robot is stopped')
                 self._watches = 0
             self.hold_robot()
@@ -711,10 +718,10 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if not minimum:
             return
         if not 0.0 <= self._battery < minimum:
-            self.end_trouble(_BATTERY)
+            self.end_trouble(BATTERY)
             return
         text = f'battery at {self._battery:.2f}, below {minimum:.2f}'
-        if self.begin_trouble(_BATTERY, text):
+        if self.begin_trouble(BATTERY, text):
             self.get_logger().warning(f'{text}: the robot goes nowhere any more')
 
     # ---- measurements ------------------------------------------------------------------------

@@ -7,11 +7,13 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_filter.node_settings import NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
 from maasi_planner.settings import MotionSettings
 
 CommandType = Literal['auto', 'stamped', 'twist']
+LinkName = Literal['topics', 'mavlink']
 # A driver that is silent for so long is dead to its guard [s].
 LIVELINESS_LEASE = 0.5
 
@@ -46,6 +48,12 @@ class DriverSettings(NodeSettings):
     """What the driver of a robot needs to know."""
 
     environment: EnvironmentSettings = Field(description='Where the robot may go')
+    link: LinkName = Field(
+        default='topics', description='How it is reached: ROS topics, or MAVLink (mavlink_driver)'
+    )
+    mavlink: MavlinkSettings | None = Field(
+        default=None, description='With link mavlink: how, and what it may be made to do'
+    )
     start: list[Finite] = Field(
         default_factory=lambda: [0.0, 0.0, 0.0],
         min_length=3,
@@ -134,6 +142,10 @@ class DriverSettings(NodeSettings):
 
     @model_validator(mode='after')
     def _consistent(self) -> DriverSettings:
+        if self.lockstep and self.link != 'topics':
+            raise ValueError(
+                f'link: got {self.link!r}, which runs in real time; allowed is topics in lockstep'
+            )
         if self.lockstep and self.command_type == 'twist':
             raise ValueError(
                 f'command_type: got {self.command_type!r}, allowed is stamped (or auto) in lockstep'

@@ -163,6 +163,17 @@ class WaypointFollower:
             return self.motion.arrived(position, goal.waypoint)
         return self._distance(position, goal.waypoint) <= goal.tolerance
 
+    @property
+    def target(self) -> FloatArray | None:
+        """Where it goes, or stays [m, map]; None where it was not asked yet."""
+        if self.goal is not None and self.goal.status == GoalStatus.MOVING:
+            return self.goal.waypoint
+        return self._hold
+
+    def stay(self) -> None:
+        """Hold where the robot is at the next step, even if a waypoint was reached before."""
+        self._hold = None
+
     def let_go(self) -> None:
         """Hold, from the next step on, where the robot is then."""
         if self.status != GoalStatus.REACHED:

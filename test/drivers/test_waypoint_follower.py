@@ -110,3 +110,17 @@ def test_a_flying_robot_stops_where_its_goal_is_cancelled():
     follower.end(GoalStatus.CANCELED, 'cancelled')
     assert_allclose(follower.update(at(0.4))[0], np.zeros(4), atol=1e-12)
     assert follower.update(at(0.5))[0][0] < 0.0
+
+
+def test_where_it_goes_or_stays_is_known():
+    follower = follower_of('constant_speed')
+    assert follower.target is None
+    follower.update(at(1.0))
+    assert_array_equal(follower.target, [1.0, 0.0, 1.0])
+    follower.take(goal(3.0))
+    follower.update(at(1.0))
+    assert_array_equal(follower.target, [3.0, 0.0, 1.0])
+    follower.update(at(3.0))
+    follower.stay()
+    follower.update(at(2.5))
+    assert_array_equal(follower.target, [2.5, 0.0, 1.0])

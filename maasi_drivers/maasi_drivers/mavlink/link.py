@@ -44,7 +44,6 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
             baud=baud,
             source_system=system,
             source_component=component,
-            dialect='ardupilotmega',
             autoreconnect=True,
             robust_parsing=True,
         )
@@ -56,6 +55,8 @@ class VehicleLink:
     """
     A vehicle on a wire.
 
+    A wire that cannot be opened is tried again and again; `failure` says why meanwhile.
+
     Parameters
     ----------
     settings : MavlinkSettings
@@ -63,26 +64,25 @@ class VehicleLink:
     height : float
         To which the vehicle rises, over its origin [m].
 
-    Raises
-    ------
-    LinkError
-        If the connection cannot be opened.
+    Attributes
+    ----------
+    failure : str
+        What is wrong with the wire; empty where it works.
 
     """
 
     def __init__(self, settings: MavlinkSettings, height: float) -> None:
         self.settings = settings
-        self._connection = open_connection(
-            settings.url,
-            settings.own_system,
-            mavutil.mavlink.MAV_COMP_ID_MISSIONPLANNER,
-            settings.baud,
+        self.failure = ''
+        self._connection: Any = None
+        # It writes to the wire, once that is there.
+        self._sender = mavutil.mavlink.MAVLink(
+            None, settings.own_system, mavutil.mavlink.MAV_COMP_ID_MISSIONPLANNER
         )
-        self._vehicle = Vehicle(settings, height, self._connection.mav)
+        self._vehicle = Vehicle(settings, height, self._sender)
         self._lock = threading.Lock()
         self._end = threading.Event()
-        #: What ended the thread before it was told to.
-        self.failure: BaseException | None = None
+        self._open()
         self._thread = threading.Thread(target=self._run, name='mavlink', daemon=True)
         self._thread.start()
 
@@ -114,24 +114,45 @@ class VehicleLink:
         """Say nothing any more, and close the wire."""
         self._end.set()
         self._thread.join(timeout=2.0)
-        self._connection.close()
+        self._shut()
+
+    def _open(self) -> None:
+        try:
+            self._connection = open_connection(
+                self.settings.url,
+                self.settings.own_system,
+                mavutil.mavlink.MAV_COMP_ID_MISSIONPLANNER,
+                self.settings.baud,
+            )
+        except LinkError as error:
+            self.failure = str(error)
+            return
+        self._sender.file = self._connection
+        self.failure = ''
+
+    def _shut(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
 
     def _run(self) -> None:
-        try:
-            while not self._end.is_set():
+        while not self._end.is_set():
+            if self._connection is None:
+                self._end.wait(_RETRY)
+                self._open()
+                continue
+            try:
                 self._turn()
-        except Exception as error:
-            # Said by the driver, whose watch sees it.
-            self.failure = error
+            except OSError as error:
+                # A device that was pulled out may come back.
+                self.failure = f'mavlink.url: {self.settings.url}: {error}'
+                self._shut()
 
     def _turn(self) -> None:
-        try:
-            self._connection.select(_PERIOD)
-            while (message := self._connection.recv_msg()) is not None:
-                with self._lock:
-                    self._vehicle.handle(message, time.monotonic())
+        connection = self._connection
+        connection.select(_PERIOD)
+        while (message := connection.recv_msg()) is not None:
             with self._lock:
-                self._vehicle.tick(time.monotonic())
-        except (OSError, ValueError):
-            # A device that was pulled out comes back, or the vehicle counts as lost.
-            self._end.wait(_RETRY)
+                self._vehicle.handle(message, time.monotonic())
+        with self._lock:
+            self._vehicle.tick(time.monotonic())

@@ -422,6 +422,12 @@ class Vehicle:
         if self._checked or now - self._asked_at < _ANSWER_PATIENCE:
             return
         self._asked_at = now
+        assert self.firmware is not None
+        stations = self.firmware.ground_station
+        if any(self.parameters.get(name) is not None for name in stations):
+            # Names of the same in older and newer versions.
+            for name in stations:
+                self.parameters.setdefault(name, None)
         for name in self._names():
             if name not in self.parameters:
                 if self._asked[name] == _TRIES:

@@ -1,0 +1,41 @@
+"""Stamps for what arrives without one: the node's time at an arrival on the steady clock."""
+
+from __future__ import annotations
+
+from collections import deque
+
+# Of what was seen of the node's time, for so long [s].
+_WINDOW = 2.0
+
+
+class ArrivalClock:
+    """
+    The node's time at any instant of the steady clock.
+
+    A simulated time comes in steps, and late: its true course is the earliest that it was seen at.
+    Where the node's time is the system's, it is that.
+    """
+
+    def __init__(self) -> None:
+        # Of the last while, falling: instants, and how far the node's time was ahead [s, ns].
+        self._leads: deque[tuple[float, int]] = deque()
+
+    def observe(self, now: float, time: int) -> None:
+        """Note the node's time [ns] at an instant of the steady clock [s]; 0: it has not begun."""
+        leads = self._leads
+        if time <= 0:
+            leads.clear()
+            return
+        lead = time - round(now * 1e9)
+        while leads and leads[-1][1] <= lead:
+            leads.pop()
+        leads.append((now, lead))
+        while leads[0][0] < now - _WINDOW:
+            leads.popleft()
+
+    def stamp(self, instant: float) -> int | None:
+        """Return the node's time [ns] at an instant [s]; None while it has not begun."""
+        if not self._leads:
+            return None
+        time = round(instant * 1e9) + self._leads[0][1]
+        return time if time > 0 else None

@@ -1,0 +1,361 @@
+"""The MAVLink driver against a fake vehicle, over real UDP and real topics."""
+
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from numpy.testing import assert_allclose
+from rclpy.executors import SingleThreadedExecutor
+from robot_team import STEP, TURTLEBOT, Team, parameters_of
+
+from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.mavlink_driver import MavlinkDriver
+from maasi_drivers.turtlebot_driver import TurtlebotDriver
+from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.parameters import flatten
+from maasi_filter.pose import Pose
+from maasi_filter.search_node import SettingsError
+from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
+from maasi_sim.fake_autopilot import AutopilotSettings
+from maasi_sim.fake_mavlink_vehicle import FakeVehicle
+
+SPEED, STOPPED = 1.0, 0.1
+START, DEEP = [1.0, 2.0, 0.8], [1.0, 2.0, -0.8]
+# Setpoints lead by a second; then it brakes, within half a second [m].
+LONGEST_WAY = 1.5 * SPEED
+COPTER = {
+    'step': STEP,
+    'environment': {'bounds': [[-8.0, 8.0], [-8.0, 8.0], [-5.0, 5.0]]},
+    'start': START,
+    'radius': 0.3,
+    # The machine may be busy, and most tests have no sweeps.
+    'odometry_timeout': 5.0,
+    'sensor_timeout': 0.0,
+    'motion': {'speed': SPEED, 'acceleration': 1.0, 'tolerance': 0.25},
+    'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
+    'link': 'mavlink',
+}
+LINK = {'arm': True, 'link_timeout': 3.0}
+ROV = COPTER | {'start': DEEP}
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(('127.0.0.1', 0))
+        return probe.getsockname()[1]
+
+
+def settings_of(firmware, link, changes):
+    kind = 'submarine' if firmware == 'ardusub' else 'copter'
+    own = {'url': f'udpin:127.0.0.1:{free_port()}', 'vehicle': kind}
+    base = ROV if firmware == 'ardusub' else COPTER
+    return base | {'mavlink': LINK | own | link} | changes
+
+
+class Flight:
+    """A fake vehicle, its driver, and the team around them."""
+
+    def __init__(self, vehicle, driver, team):
+        self.vehicle, self.driver, self.team = vehicle, driver, team
+
+    @property
+    def state(self):
+        return self.team.state
+
+    @property
+    def mode(self):
+        return self.vehicle.autopilot.mode_name
+
+    @property
+    def position(self):
+        return self.vehicle.state.pose.position
+
+    @property
+    def speed(self):
+        return float(np.linalg.norm(self.vehicle.state.velocity[:2]))
+
+    def until(self, condition, what=''):
+        self.team.until(condition, what or self.why)
+
+    @property
+    def why(self):
+        return f'{self.mode}, {self.team.states[-1:]}'
+
+    def fly(self):
+        self.until(
+            lambda: self.team.states and self.state.goal_status != AgentState.UNAVAILABLE,
+            'it does not fly',
+        )
+        return self
+
+    def under_way(self, goal=(1.0, -6.0, 0.8)):
+        _, result = self.team.send_accepted(goal)
+        self.until(lambda: self.speed > 0.8 * SPEED)
+        return result
+
+    def gives_up(self, result, reason):
+        """Check that the goal ends, that the planner hears why, and that the vehicle stops."""
+        before = self.position
+        self.until(lambda: self.state.goal_status == AgentState.UNAVAILABLE)
+        assert reason in self.state.reason
+        self.until(result.done)
+        assert result.result().status == GoalStatus.STATUS_ABORTED
+        assert reason in result.result().result.reason
+        self.until(lambda: self.speed < STOPPED)
+        assert np.linalg.norm((self.position - before)[:2]) < LONGEST_WAY
+        assert not self.team.send([1.0, 1.0, 0.8]).accepted
+
+
+@pytest.fixture
+def fly(context):
+    """Return a function that brings a driver and its vehicle together."""
+    ended = []
+    executor = SingleThreadedExecutor(context=context)
+
+    def start(firmware='arducopter', autopilot=(), link=(), **changes):
+        settings = settings_of(firmware, dict(link), changes)
+        driver = MavlinkDriver(
+            context=context, namespace='/rover', parameter_overrides=parameters_of(settings)
+        )
+        executor.add_node(driver)
+        team = Team(context, settings, executor, deaf=True)
+        team.used = [team.batches, team.ranges]
+        ended.extend([driver.halt, driver.destroy_node, team.destroy_node])
+        assert driver.trigger_configure().name == 'SUCCESS'
+        assert driver.trigger_activate().name == 'SUCCESS'
+        team.connect()
+        url = settings['mavlink']['url'].replace('udpin', 'udpout')
+        values = {'firmware': firmware, 'estimator_time': 0.2} | dict(autopilot)
+        origin = Pose.from_yaw([*settings['start'][:2], 0.0], 0.0)
+        vehicle = FakeVehicle(AutopilotSettings.model_validate(values), url, origin, 1)
+        ended.append(vehicle.close)
+        return Flight(vehicle, driver, team)
+
+    yield start
+    for end in ended:
+        end()
+    executor.shutdown()
+
+
+@pytest.mark.parametrize('firmware', ['arducopter', 'ardusub', 'px4'])
+def test_it_is_armed_flies_to_its_waypoint_and_lands_at_the_end(fly, firmware):
+    flight = fly(firmware).fly()
+    assert flight.mode in ('GUIDED', 'OFFBOARD')
+    height = flight.driver.settings.start[2] + 0.4
+    _, result = flight.team.send_accepted([2.0, 0.5, height])
+    flight.until(result.done)
+    assert result.result().result.reached
+    assert_allclose(flight.position, [2.0, 0.5, height], atol=0.35)
+    assert_allclose(pose_from_ros(flight.state.pose.pose).position, flight.position, atol=0.35)
+    assert flight.state.goal_status == AgentState.REACHED
+    flight.driver.halt()
+    assert flight.mode in ('LAND', 'SURFACE', 'AUTO.LAND')
+
+
+def test_a_map_that_is_turned_against_north(fly):
+    flight = fly(link={'map_yaw': 0.5}).fly()
+    goal = [2.0, 0.5, 0.8]
+    _, result = flight.team.send_accepted(goal)
+    flight.until(result.done)
+    # The fake has its local frame at the start, with east along x.
+    cosine, sine = math.cos(0.5), math.sin(0.5)
+    east = [cosine * 1.0 - sine * -1.5, sine * 1.0 + cosine * -1.5]
+    assert_allclose(flight.position[:2] - START[:2], east, atol=0.35)
+    assert pose_from_ros(flight.state.pose.pose).yaw == pytest.approx(-0.5, abs=0.05)
+
+
+def test_sweeps_answer_batches_with_the_pose_of_their_stamp(fly):
+    flight = fly().fly()
+    flight.under_way()
+    stamp = stamp_from_ros(flight.state.header.stamp)
+    flight.team.ask(stamp)
+    sweep = RangeArray(ranges=[RangeMeasurement(range=2.0, bearing=0.3, elevation=-0.2)])
+    sweep.header.stamp = stamp_to_ros(stamp)
+    flight.team.ranges.publish(sweep)
+    answer = flight.team.answer()
+    seen = answer.detections[0]
+    assert (seen.range, seen.bearing, seen.elevation) == pytest.approx((2.0, 0.3, -0.2))
+    told = next(item for item in flight.team.states if stamp_from_ros(item.header.stamp) == stamp)
+    assert_allclose(
+        pose_from_ros(answer.pose.pose).position, pose_from_ros(told.pose.pose).position
+    )
+
+
+def test_without_arm_nothing_is_armed_and_goals_are_refused(fly, capfd):
+    flight = fly(link={'arm': False})
+    flight.until(lambda: flight.team.states and 'arm is false' in flight.state.reason)
+    assert flight.state.goal_status == AgentState.UNAVAILABLE
+    assert not flight.team.send(START).accepted
+    assert 'the robot cannot go on: vehicle: not armed: arm is false' in capfd.readouterr().err
+    assert not flight.vehicle.autopilot.armed
+    assert flight.mode == 'STABILIZE'
+
+
+def test_what_the_autopilot_does_by_itself_is_shown(fly, capfd):
+    flight = fly(autopilot={'parameters': {'FS_GCS_ENABLE': 0}})
+    shown = []
+    flight.team.create_subscription(
+        DiagnosticArray, '/diagnostics', lambda message: shown.extend(message.status), 10
+    )
+    flight.until(lambda: flight.team.states and 'FS_GCS_ENABLE is 0' in flight.state.reason)
+    assert not flight.vehicle.autopilot.armed
+    said = capfd.readouterr().err
+    assert (
+        'failsafe for when the heartbeats of the driver stop: FS_GCS_ENABLE is 0, which is off'
+        in said
+    )
+    flight.until(
+        lambda: any(
+            (item.key, item.value) == ('parameter FS_GCS_ENABLE', '0.0')
+            for status in shown
+            for item in status.values
+        )
+    )
+
+
+def test_goals_that_are_not_finite_or_outside_the_geofence_are_refused(fly, capfd):
+    flight = fly(link={'geofence': [[-3.0, 3.0], [-3.0, 3.0], [0.5, 3.0]]}).fly()
+    for goal in ([math.nan, 0.0, 0.8], [0.0, 0.0, math.inf], [0.0, 3.5, 0.8], [0.0, 0.0, 4.0]):
+        assert not flight.team.send(goal).accepted
+    flight.until(lambda: flight.driver.dropped['goal'] == 4)
+    assert 'allowed are finite numbers' in capfd.readouterr().err
+    assert 'the geofence' in flight.driver._problem(flight.team.goal([0.0, 3.5, 0.8]))
+    assert flight.vehicle.running
+    assert flight.team.send([0.0, 2.5, 0.8]).accepted
+
+
+def test_blown_out_of_the_geofence_it_comes_back(fly):
+    flight = fly(link={'geofence': [[-3.0, 3.0], [-3.0, 3.0], [0.5, 3.0]]}).fly()
+    with flight.vehicle._lock:
+        flight.vehicle.autopilot.body.position = np.array([3.5, 0.0, 0.8])
+    flight.until(lambda: 'm outside the geofence' in flight.state.reason)
+    flight.until(lambda: flight.position[0] < 3.1)
+    flight.until(lambda: flight.state.goal_status != AgentState.UNAVAILABLE)
+
+
+def test_a_cancelled_goal_stops_it(fly):
+    flight = fly().fly()
+    handle, result = flight.team.send_accepted([1.0, -6.0, 0.8])
+    flight.until(lambda: flight.speed > 0.8 * SPEED)
+    before = flight.position
+    handle.cancel_goal_async()
+    flight.until(result.done)
+    assert result.result().status == GoalStatus.STATUS_CANCELED
+    flight.until(lambda: flight.speed < STOPPED)
+    assert np.linalg.norm(flight.position - before) < LONGEST_WAY
+    assert flight.mode == 'GUIDED'
+
+
+@pytest.mark.parametrize('firmware', ['arducopter', 'ardusub'])
+def test_a_cut_link(fly, firmware):
+    flight = fly(firmware, link={'link_timeout': 0.6}).fly()
+    result = flight.under_way([1.0, -6.0, flight.driver.settings.start[2]])
+    flight.vehicle.cut()
+    flight.gives_up(result, 'link: nothing heard from system 1')
+    # The autopilot misses the driver, too.
+    flight.until(lambda: flight.vehicle.autopilot.mode == flight.vehicle.autopilot.firmware.land)
+
+
+def test_a_link_that_comes_back(fly):
+    flight = fly(link={'link_timeout': 0.6}, autopilot={'parameters': {'FS_GCS_TIMEOUT': 60}})
+    result = flight.fly().under_way()
+    flight.vehicle.cut()
+    flight.gives_up(result, 'link: nothing heard from system 1')
+    flight.vehicle.cut(False)
+    flight.fly()
+    _, result = flight.team.send_accepted([1.0, 1.5, 0.8])
+    flight.until(result.done)
+    assert result.result().result.reached
+
+
+def test_a_position_that_hangs(fly):
+    flight = fly(odometry_timeout=0.5).fly()
+    result = flight.under_way()
+    with flight.vehicle._lock:
+        flight.vehicle.autopilot.freeze()
+    flight.gives_up(result, 'no odometry for')
+
+
+def test_the_pilot_takes_over_and_keeps_it(fly, capfd):
+    flight = fly().fly()
+    result = flight.under_way()
+    with flight.vehicle._lock:
+        flight.vehicle.autopilot.take_mode('LOITER')
+    flight.gives_up(result, 'the pilot has taken over: mode LOITER')
+    assert 'mode LOITER; the driver lets go' in capfd.readouterr().err
+    flight.driver.halt()
+    assert flight.mode == 'LOITER'
+
+
+def test_with_a_low_battery_it_lands(fly):
+    flight = fly(battery_minimum=0.2).fly()
+    result = flight.under_way()
+    with flight.vehicle._lock:
+        flight.vehicle.autopilot.charge = 0.15
+    flight.gives_up(result, 'battery at 0.15, below 0.20')
+    flight.until(lambda: flight.mode == 'LAND')
+
+
+def test_a_port_that_is_taken_is_tried_again(context, fly):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('127.0.0.1', 0))
+        flight = fly(link={'url': f'udpin:127.0.0.1:{other.getsockname()[1]}'})
+        flight.until(lambda: flight.team.states and 'mavlink.url: read' in flight.state.reason)
+    flight.fly()
+
+
+def test_other_drivers_do_not_have_this_link(context):
+    with pytest.raises(SettingsError, match=r"link: read 'mavlink', allowed .* topics"):
+        TurtlebotDriver(
+            context=context, parameter_overrides=parameters_of(TURTLEBOT | {'link': 'mavlink'})
+        )
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
+def test_a_driver_that_ends_or_is_killed(context, tmp_path, number):
+    """With SIGKILL only the failsafe of the autopilot is left."""
+    settings = settings_of('arducopter', {}, {})
+    file = tmp_path / 'parameters.yaml'
+    flat = flatten(DriverSettings.model_validate(settings))
+    file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
+    command = [sys.executable, '-m', 'maasi_drivers.mavlink_driver', '--ros-args']
+    command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
+    driver = subprocess.Popen(command, env=os.environ.copy())
+    values = {'estimator_time': 0.2, 'parameters': {'FS_GCS_TIMEOUT': 3}}
+    vehicle = FakeVehicle(
+        AutopilotSettings.model_validate(values),
+        settings['mavlink']['url'].replace('udpin', 'udpout'),
+        Pose.from_yaw([*START[:2], 0.0], 0.0),
+        1,
+    )
+    executor = SingleThreadedExecutor(context=context)
+    team = Team(context, settings, executor, deaf=True)
+    team.used = [team.batches, team.ranges]
+    flight = Flight(vehicle, driver, team)
+    try:
+        team.connect()
+        result = flight.fly().under_way()
+        before = flight.position
+        driver.send_signal(number)
+        assert driver.wait(timeout=30.0) == (0 if number == signal.SIGINT else -signal.SIGKILL)
+        if number == signal.SIGINT:
+            assert flight.mode == 'LAND'
+            flight.until(result.done)
+            assert result.result().result.reason == 'the driver stops'
+        flight.until(lambda: flight.speed < STOPPED)
+        assert np.linalg.norm((flight.position - before)[:2]) < LONGEST_WAY
+        flight.until(lambda: flight.mode == 'LAND')
+    finally:
+        driver.kill()
+        driver.wait()
+        vehicle.close()
+        executor.shutdown()
+        team.destroy_node()
