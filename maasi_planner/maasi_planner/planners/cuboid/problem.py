@@ -332,9 +332,8 @@ class PlanSolver:
         wanted = np.asarray(problem.wanted, dtype=bool).copy()
         if problem.homing or not len(wanted):
             return [], np.zeros_like(wanted)
-        inside = ((problem.cuboids[:, :, 0] <= place) & (place <= problem.cuboids[:, :, 1])).all(
-            axis=1
-        )
+        low, high = problem.cuboids[:, :, 0] - TOUCH, problem.cuboids[:, :, 1] + TOUCH
+        inside = ((low <= place) & (place <= high)).all(axis=1)
         due = np.flatnonzero(inside & wanted)
         wanted[due] = False
         return due.tolist(), wanted
