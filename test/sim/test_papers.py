@@ -35,7 +35,10 @@ def test_small_version_writes_what_makes_sense(name, tmp_path):
     for case in work.cases:
         run = results.load_run(work.folder.file(case, 0))
         assert run.seed == experiment.seed(0) and run.columns
-        check_search(run, case.settings)
+        if 'mission' in case.settings:
+            check_mission(experiment, run, case.settings)
+        else:
+            check_search(run, case.settings)
     with (folder / 'runs.csv').open() as stream:
         assert len(list(csv.DictReader(stream))) == len(work.cases)
     configuration = yaml.safe_load((folder / 'configuration.yaml').read_text())
@@ -48,6 +51,20 @@ def test_small_version_writes_what_makes_sense(name, tmp_path):
         assert case.name in table
     picture = (folder / 'figure.png').read_bytes()
     assert picture.startswith(b'\x89PNG') and len(picture) > 5000
+
+
+def check_mission(experiment, run, settings):
+    summary, columns = run.summary, run.columns
+    if experiment.name == '004-table1':
+        assert summary['cuboids'] == 32
+        assert run.timing['distributed'] > 0.0 and run.timing['centralized'] > 0.0
+        return
+    assert summary['complete'] and summary['visited'] == summary['cuboids'] > 0
+    assert summary['collisions'] == 0 and summary['outside'] == 0
+    assert (np.diff(columns['visited']) >= 0).all()
+    assert columns['visited'][-1] == summary['cuboids'] and summary['steps'] == columns['step'][-1]
+    assert columns['active'].max() <= len([name for name in columns if name.endswith('_x')])
+    assert {shot['cuboid'] for shot in run.details['snapshots']} == set(range(summary['cuboids']))
 
 
 def check_search(run, settings):

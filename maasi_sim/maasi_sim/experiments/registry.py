@@ -22,7 +22,7 @@ Value = float | int | str | bool | None
 
 # Modules of this package that hold experiments, in the order in which they are listed. Each has
 # a function `experiments()` that returns a list of Experiment.
-PAPERS = ('paper_000', 'paper_001', 'paper_002', 'paper_003')
+PAPERS = ('paper_000', 'paper_001', 'paper_002', 'paper_003', 'paper_004')
 
 
 class UnknownExperiment(ValueError):
