@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import time
+from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 from zlib import crc32
 
@@ -12,11 +15,15 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from maasi_drivers.agent_driver import AgentDriver, Sighting
+from maasi_drivers.arrival_clock import ArrivalClock
 from maasi_drivers.camera_settings import CameraSettings, load_calibration
 from maasi_drivers.image_encoding import image_to_array
+from maasi_drivers.image_source import ImageSourceError, VideoSource
 from maasi_drivers.marker_detector import MarkerDetector
+from maasi_drivers.measurement_feed import FeedReceiver
 from maasi_drivers.odometry import StampedPose
 from maasi_drivers.projection import box_view_margin
+from maasi_drivers.segmentation import Blobs
 from maasi_drivers.warm_up import warm_up
 from maasi_filter.conversions import stamp_from_ros
 from maasi_filter.detection_model import BoxDetection
@@ -25,8 +32,15 @@ from maasi_filter.qos import RELIABLE, SENSOR, sensor_reader
 from maasi_filter.search_node import SettingsError
 
 ImageArray = NDArray[np.uint8]
-# An image that may still have to be decoded.
-Picture = Callable[[], ImageArray]
+# An image that may still have to be decoded, or what was found in it on board.
+Picture = Callable[[], ImageArray | Blobs]
+
+# Between two looks at a video or feed [s].
+_POLL_PERIOD = 0.01
+
+
+def _known(blobs: Blobs) -> Blobs:
+    return blobs
 
 
 class CameraDriver(AgentDriver[Picture]):
@@ -36,6 +50,9 @@ class CameraDriver(AgentDriver[Picture]):
     Calibration: from the file that the parameter `calibration_file` names, else from the
     parameters;
     a `camera_info` with a focal length replaces either.
+
+    Images come from a topic, or by the parameter `image_source` from a video (a stream, a device
+    or a file), or as blobs that were found on board (measurement feed).
 
     Subscribes
     ----------
@@ -54,6 +71,16 @@ class CameraDriver(AgentDriver[Picture]):
             )
         self._calibration: tuple[object, ...] | None = None
         self._checksum: int | None = None
+        #: Stamps for what comes without one.
+        self.arrivals = ArrivalClock()
+        self._video: VideoSource | None = None
+        self._feed: FeedReceiver | None = None
+        self._counted: Counter[str] = Counter()
+        if self.settings.image_source != 'topic':
+            try:
+                self._open_source()
+            except (ImageSourceError, OSError) as error:
+                raise SettingsError(f'parameter image_source: {error}') from error
         camera = self.settings.camera
         if self.settings.calibration_file:
             try:
@@ -88,8 +115,12 @@ class CameraDriver(AgentDriver[Picture]):
         view = np.frombuffer(grey.tobytes(), np.uint8).reshape(grey.shape)
         height = max(self.settings.start[2], 0.1)
         self.detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0), np.zeros((6, 6)))
+        if self.settings.image_source != 'topic':
+            self._entities.append(self.create_wall_timer(_POLL_PERIOD, self._poll_source))
         quality = sensor_reader(self.settings.lockstep)
         self.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
+        if self.settings.image_source != 'topic':
+            return
         # Images read reliably are sent again when lost: on a thin link that delays the next ones.
         if self.settings.image_reliability == 'reliable':
             quality = RELIABLE if self.settings.lockstep else SENSOR
@@ -99,6 +130,72 @@ class CameraDriver(AgentDriver[Picture]):
             self.create_subscription(
                 CompressedImage, 'camera/image_raw/compressed', self._on_compressed, quality
             )
+
+    # ---- images that are no topic ------------------------------------------------------------
+
+    def _open_source(self) -> None:
+        if self.settings.image_source == 'video':
+            self._video = VideoSource(self.settings.video)
+            return
+        port = self.settings.feed_port
+        try:
+            self._feed = FeedReceiver(port)
+        except OSError as error:
+            raise OSError(
+                f'feed_port: UDP port {port}: {error.strerror}, allowed is one that is free'
+            ) from error
+
+    def destroy_node(self) -> None:
+        """Let go of video or feed, and leave."""
+        super().destroy_node()
+        for source in (self._video, self._feed):
+            if source is not None:
+                source.close()
+        self._video = self._feed = None
+
+    def _poll_source(self) -> None:
+        self.arrivals.observe(time.monotonic(), self.get_clock().now().nanoseconds)
+        if self._video is not None:
+            self._take_video(self._video)
+        if self._feed is not None:
+            self._take_feed(self._feed)
+
+    def _take_video(self, source: VideoSource) -> None:
+        if source.error:
+            self.warn_throttled('video', source.error)
+        frame = source.take()
+        stamp = None if frame is None else self.arrivals.stamp(frame.received)
+        if frame is None or stamp is None:
+            return
+        image = frame.image
+        try:
+            self._check_size(image)
+        except ValueError as error:
+            self.drop('image', f'video: {error}')
+            return
+        self.take_frame('video', stamp, lambda: image, repeated=self._is_repeated(image.tobytes()))
+
+    def _take_feed(self, feed: FeedReceiver) -> None:
+        camera = self.camera
+        for item in feed.take():
+            packet, stamp = item.packet, self.arrivals.stamp(item.taken)
+            if stamp is None:
+                continue
+            if (packet.width, packet.height) != (camera.width, camera.height):
+                self.drop(
+                    'image',
+                    f'feed: width, height: read {packet.width} x {packet.height} px, allowed is '
+                    f'the size of the calibration, {camera.width} x {camera.height} px',
+                )
+                continue
+            self.take_frame('feed', stamp, partial(_known, packet.blobs))
+        for reason, number in feed.counts.items():
+            new = number - self._counted[reason]
+            if new and reason != 'received':
+                self._counted[reason] = number
+                self.drop(f'feed: {reason}', f'feed: {feed.problem or reason}', new)
+
+    # ---- images of a topic -------------------------------------------------------------------
 
     def _on_calibration(self, message: CameraInfo) -> None:
         calibration = (
@@ -132,7 +229,7 @@ class CameraDriver(AgentDriver[Picture]):
             'camera/image_raw',
             stamp_from_ros(message.header.stamp),
             lambda: image,
-            repeated=self._is_repeated(message),
+            repeated=self._is_repeated(message.data),
         )
 
     def _on_compressed(self, message: CompressedImage) -> None:
@@ -148,13 +245,13 @@ class CameraDriver(AgentDriver[Picture]):
 
         topic = 'camera/image_raw/compressed'
         stamp = stamp_from_ros(message.header.stamp)
-        self.take_frame(topic, stamp, decode, repeated=self._is_repeated(message))
+        self.take_frame(topic, stamp, decode, repeated=self._is_repeated(message.data))
 
-    def _is_repeated(self, message: Image | CompressedImage) -> bool:
+    def _is_repeated(self, data: Any) -> bool:
         """Return whether an image is the one before to the bit: noise never is."""
         if self.settings.lockstep or not self.settings.sensor_patience:
             return False
-        before, self._checksum = self._checksum, crc32(message.data)
+        before, self._checksum = self._checksum, crc32(data)
         return self._checksum == before
 
     def _check_size(self, image: ImageArray) -> None:
@@ -169,7 +266,11 @@ class CameraDriver(AgentDriver[Picture]):
         """Find the markers in an image."""
         # Odometry that says nothing of its errors carries zeros.
         covariance = pose.covariance if pose.covariance.any() else None
-        seen = self.detector.detect(data(), pose.pose, covariance)
+        picture = data()
+        if isinstance(picture, Blobs):
+            seen = self.detector.locate(picture, pose.pose, covariance)
+        else:
+            seen = self.detector.detect(picture, pose.pose, covariance)
         positions = seen.positions
         if self.dimension == 3:
             positions = np.pad(positions, ((0, 0), (0, 1)))

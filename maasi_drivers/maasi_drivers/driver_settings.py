@@ -7,13 +7,14 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.mambo_settings import MamboSettings
 from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_filter.node_settings import NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
 from maasi_planner.settings import MotionSettings
 
 CommandType = Literal['auto', 'stamped', 'twist']
-LinkName = Literal['topics', 'mavlink']
+LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mavlink']
 # A driver that is silent for so long is dead to its guard [s].
 LIVELINESS_LEASE = 0.5
 
@@ -49,7 +50,13 @@ class DriverSettings(NodeSettings):
 
     environment: EnvironmentSettings = Field(description='Where the robot may go')
     link: LinkName = Field(
-        default='topics', description='How it is reached: ROS topics, or MAVLink (mavlink_driver)'
+        default='topics',
+        description='How it is reached: ROS topics; pyparrot over WiFi or Bluetooth '
+        '(mambo_driver); MAVLink (mavlink_driver)',
+    )
+    mambo: MamboSettings | None = Field(
+        default=None,
+        description='With link mambo_wifi or mambo_ble: how, and what it may be made to do',
     )
     mavlink: MavlinkSettings | None = Field(
         default=None, description='With link mavlink: how, and what it may be made to do'
@@ -78,6 +85,18 @@ class DriverSettings(NodeSettings):
         default='own',
         description="Who drives a ground robot to its waypoints: the driver, or Nav2's "
         'NavigateToPose; not in lockstep',
+    )
+    image_source: Literal['topic', 'video', 'feed'] = Field(
+        default='topic',
+        description='Where images come from: a topic, what `video` names, or blobs that the robot '
+        'finds on board and sends to `feed_port` (docs/measurement_feed.md)',
+    )
+    video: str = Field(
+        default='',
+        description='Address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it',
+    )
+    feed_port: int = Field(
+        default=14700, ge=1, le=65535, description='UDP port of the measurement feed'
     )
     image_transport: Literal['raw', 'compressed'] = Field(
         default='raw',
@@ -145,6 +164,16 @@ class DriverSettings(NodeSettings):
         if self.lockstep and self.link != 'topics':
             raise ValueError(
                 f'link: got {self.link!r}, which runs in real time; allowed is topics in lockstep'
+            )
+        if self.lockstep and self.image_source != 'topic':
+            raise ValueError(
+                f'image_source: got {self.image_source!r}, which runs in real time; allowed is '
+                'topic in lockstep'
+            )
+        if (self.image_source == 'video') != bool(self.video):
+            raise ValueError(
+                f'video: got {self.video!r}, allowed is a source with image_source video, and '
+                'nothing with another one'
             )
         if self.lockstep and self.command_type == 'twist':
             raise ValueError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
 import socket
 import threading
 import time
@@ -29,6 +30,7 @@ _ROUND = 0.05
 # From one take-off or landing command to the next while the drone does not obey [s].
 _REPEAT = 0.7
 _RETRIES = 3
+_BLUETOOTH = re.compile(r'([0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}')
 # Farthest that a position can be from the take-off point [m].
 _FARTHEST = 1000.0
 
@@ -128,8 +130,6 @@ class MamboLink:
             If it is clear at once that this cannot work.
 
         """
-        if self.kind == 'wifi':
-            _check_port(self.port)
         make = self._make_drone()
         # pyparrot's own thread inherits that this one does not keep the process alive.
         self._thread = threading.Thread(
@@ -199,9 +199,16 @@ class MamboLink:
                 self._steering = None
         self._wake.set()
 
-    # ---- the thread --------------------------------------------------------------------------
+    def check(self) -> Any:
+        """
+        Return pyparrot's module for such drones, if it can be used here.
 
-    def _make_drone(self) -> Any:
+        Raises
+        ------
+        MamboLinkError
+            If it cannot, with what can be done.
+
+        """
         try:
             # Only a driver that has such a robot needs it.
             minidrone = importlib.import_module('pyparrot.Minidrone')
@@ -215,8 +222,19 @@ class MamboLink:
                 'link to a Mambo by Bluetooth: bluepy is not installed (pip install bluepy; it '
                 "needs GLib's headers, libglib2.0-dev, to build), or use WiFi"
             )
-        if self.kind == 'ble' and not self.address:
-            raise MamboLinkError('link to a Mambo by Bluetooth: its address is missing')
+        if self.kind == 'ble' and not _BLUETOOTH.fullmatch(self.address):
+            raise MamboLinkError(
+                f'address of a Mambo by Bluetooth: read {self.address!r}, allowed is one such as '
+                "e0:14:d0:63:3d:d0 (pyparrot's findMinidrone shows it)"
+            )
+        if self.kind == 'wifi':
+            _check_port(self.port)
+        return minidrone
+
+    # ---- the thread --------------------------------------------------------------------------
+
+    def _make_drone(self) -> Any:
+        minidrone = self.check()
         link = self
 
         class Sensors(minidrone.MinidroneSensors):  # type: ignore[name-defined, misc]

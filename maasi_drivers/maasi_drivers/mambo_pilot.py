@@ -42,14 +42,20 @@ _STILL = np.zeros(4)
 class Link(Protocol):
     """What the pilot needs of a `MamboLink`."""
 
-    connected: bool
     error: str
     flying_state: str
     battery: float
     heard_at: float
     tilt: float
     climb: float
-    position: PositionEvent | None
+
+    @property
+    def connected(self) -> bool:
+        """Whether the drone has answered."""
+
+    @property
+    def position(self) -> PositionEvent | None:
+        """The last position event, or None."""
 
     def take_off(self) -> None:
         """Have it take off."""

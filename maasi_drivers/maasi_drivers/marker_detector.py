@@ -112,7 +112,21 @@ class MarkerDetector:
                 f'image: got {image.shape[1]} x {image.shape[0]} px, allowed is the size of the '
                 f'calibration, {camera.width} x {camera.height} px'
             )
-        blobs = segment(image, settings.segmentation)
+        return self.locate(segment(image, settings.segmentation), pose, pose_covariance)
+
+    def locate(
+        self, blobs: Blobs, pose: Pose, pose_covariance: ArrayLike | None = None
+    ) -> MarkerDetections:
+        """
+        Find the markers that blobs in an image are; pose and covariance as in `detect`.
+
+        Raises
+        ------
+        ValueError
+            If the covariance is not finite.
+
+        """
+        camera, settings = self.camera, self.settings
         if pose_covariance is None:
             pose_covariance = self._pose_covariance
         positions, by_pixel, by_pose = camera.back_project(blobs.centroids, pose, self.floor_height)

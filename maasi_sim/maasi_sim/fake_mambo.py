@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import json
 import math
+import secrets
 import signal
 import socket
 import struct
@@ -51,6 +52,7 @@ _POLL = 0.1
 _STEP = 0.02
 # Longest time caught up at once when the host stood still [s].
 _CATCH_UP = 0.5
+_TRIES = 100
 
 
 class FrameError(ValueError):
@@ -92,6 +94,35 @@ def frames(data: bytes) -> Iterator[Frame]:
             )
         yield Frame(kind, buffer, sequence, data[_HEADER.size : size])
         data = data[size:]
+
+
+def free_address() -> str:
+    """
+    Return a loopback address where a fake can be reached for its handshake.
+
+    Raises
+    ------
+    OSError
+        If there is none.
+
+    """
+    for _ in range(_TRIES):
+        numbers = [secrets.randbelow(200) + 20 for _ in range(3)]
+        address = '.'.join(map(str, [127, *numbers]))
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as test:
+            try:
+                test.bind((address, HANDSHAKE_PORT))
+            except OSError:
+                continue
+        return address
+    raise OSError(f'no address 127.x.y.z of this host with TCP port {HANDSHAKE_PORT} free')
+
+
+def free_port() -> int:
+    """Return a UDP port that nobody has, on which a driver can hear its drone."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as test:
+        test.bind(('0.0.0.0', 0))
+        return int(test.getsockname()[1])
 
 
 class FakeMambo:
