@@ -265,13 +265,11 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._queue.offset = self.offset
         self._state_publisher = self.create_publisher(AgentState, 'state', LIVELY)
         self._detections_publisher = self.create_publisher(DetectionArray, 'detections', RELIABLE)
-        self._entities = [
-            self._state_publisher,
-            self._detections_publisher,
-            self.create_subscription(
-                MeasurementBatch, self.team_topic('measurement_batch'), self._on_batch, RELIABLE
-            ),
-        ]
+        batches = self.create_subscription(
+            MeasurementBatch, self.team_topic('measurement_batch'), self._on_batch, RELIABLE
+        )
+        self.hurry(self.step_subscription, batches)
+        self._entities = [self._state_publisher, self._detections_publisher, batches]
         self.connect_robot()
         self._server = ActionServer(
             self,

@@ -3,11 +3,13 @@
 rclpy's own builds its wait set anew for each callback, with all event handlers of all topics, and
 wakes itself twice per callback: about a millisecond. This one keeps its lists until an entity is
 added or removed, takes all messages that wait at once, and looks at events twenty times a second.
+In lockstep a node is woken only by what it has to answer: what else has come is taken then, too.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from typing import Any
 
 from rclpy.event_handler import EventHandler
@@ -18,6 +20,8 @@ from rclpy.node import Node
 
 # Between two looks at events such as incompatible qualities of service [s].
 _EVENTS_PERIOD = 0.05
+# A node in lockstep that was not woken for so long looks at everything [s].
+_HURRY = 0.005
 # Messages of one topic that are taken in a row.
 _IN_A_ROW = 100
 
@@ -29,11 +33,17 @@ class LeanExecutor(SingleThreadedExecutor):
     ----------
     node : Node
         To run.
+    urgent : collection of str, optional
+        Topics, full names, to whose messages the node has to answer at once. Where there are any,
+        everything else waits for them, for at most 5 ms. Read again when entities change.
     """
 
-    def __init__(self, node: Node, **options: Any) -> None:
+    def __init__(self, node: Node, urgent: Collection[str] = (), **options: Any) -> None:
         super().__init__(**options)
         self._only = node
+        self._urgent_topics = urgent
+        self._busy = False
+        self._everything_at = 0.0
         self._stale = True
         self._events_at = 0.0
         self._wait_set: Any = None
@@ -59,6 +69,8 @@ class LeanExecutor(SingleThreadedExecutor):
         if events:
             self._events_at = now
         try:
+            if self._busy and not events and not self._stale and self._wait_for_urgent():
+                return
             self._wait(min(timeout, _EVENTS_PERIOD), events)
         except InvalidHandle:
             # Something was destroyed in the meantime.
@@ -79,6 +91,8 @@ class LeanExecutor(SingleThreadedExecutor):
             return bool(self._tasks)
 
     def _collect(self) -> None:
+        if not self._context.ok():
+            raise ExternalShutdownException
         node = self._only
         self._stale = False
         self._subscriptions = list(node.subscriptions)
@@ -104,10 +118,35 @@ class LeanExecutor(SingleThreadedExecutor):
             counts[4] += more.num_services
             counts[5] += more.num_events
         self._wait_set = rclpy_implementation.WaitSet(*counts, self._context.handle)
+        self._urgent = [item for item in self._subscriptions if item.topic in self._urgent_topics]
+        self._urgent_set = rclpy_implementation.WaitSet(
+            len(self._urgent), 2, 0, 0, 0, 0, self._context.handle
+        )
+        self._busy = False
+
+    def _wait_for_urgent(self) -> bool:
+        """Wait for what has to be answered, and take all messages; return whether there was one."""
+        if time.monotonic() - self._everything_at >= _EVENTS_PERIOD:
+            return False
+        wait_set = self._urgent_set
+        wait_set.clear_entities()
+        for subscription in self._urgent:
+            wait_set.add_subscription(subscription.handle)
+        for guard in (self._guard, self._sigint_gc):
+            wait_set.add_guard_condition(guard.handle)
+        wait_set.wait(round(_HURRY * 1e9))
+        if not self._context.ok():
+            raise ExternalShutdownException
+        if not wait_set.get_ready_entities('subscription'):
+            return False
+        for subscription in self._subscriptions:
+            self._take_all(subscription)
+        return True
 
     def _wait(self, timeout: float, events: bool) -> None:
         if self._stale:
             self._collect()
+        self._everything_at = time.monotonic()
         wait_set = self._wait_set
         waitables = [*self._waitables, *self._events] if events else self._waitables
         wait_set.clear_entities()
@@ -150,6 +189,7 @@ class LeanExecutor(SingleThreadedExecutor):
                 if service.handle.pointer in ready['service']:
                     self._make_handler(service, node, self._take_service)
         self._run_tasks()
+        self._busy = bool(self._urgent and ready['subscription'])
         if ready['subscription']:
             for subscription in self._subscriptions:
                 if subscription.handle.pointer in ready['subscription']:

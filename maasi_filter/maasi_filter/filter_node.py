@@ -135,12 +135,15 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         self._particles_publisher = self.create_publisher(PointCloud2, 'particles', 2)
         self._markers_publisher = self.create_publisher(MarkerArray, 'markers', 10)
         self.create_subscription(MeasurementBatch, 'measurement_batch', self._on_batch, RELIABLE)
+        self.hurry(self.step_subscription)
         for name in self._sensors:
-            self.create_subscription(
-                DetectionArray,
-                self.team_topic(f'{name}/detections'),
-                partial(self._on_detections, name),
-                RELIABLE,
+            self.hurry(
+                self.create_subscription(
+                    DetectionArray,
+                    self.team_topic(f'{name}/detections'),
+                    partial(self._on_detections, name),
+                    RELIABLE,
+                )
             )
         self._sharing = []
         for name in self._shared:
@@ -151,6 +154,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
                 )
             )
             self.expect_publisher(topic)
+        self.hurry(*self._sharing)
         self.expect_subscribers(self._found_publisher, len(self._shared))
         if not settings.lockstep:
             self.create_wall_timer(_TIMEOUT_PERIOD, self._look_at_waiting)

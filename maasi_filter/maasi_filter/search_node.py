@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Generic, TypeVar
 
 import rclpy
@@ -19,6 +20,8 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.utilities import get_default_context
 
 from maasi_filter.executor import LeanExecutor
 from maasi_filter.node_settings import NodeSettings
@@ -91,6 +94,8 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         self.step = -1
         self._warned: dict[str, float] = {}
         self._peers: list[Callable[[], bool]] = []
+        self._urgent_topics: set[str] = set()
+        self.step_subscription: Subscription | None = None
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -163,7 +168,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
                 LockstepDone, self.team_topic('lockstep/done'), RELIABLE
             )
             self.expect_subscribers(self._done_publisher)
-            self._step_subscription = self.create_subscription(
+            self.step_subscription = self.create_subscription(
                 LockstepStep, self.team_topic('lockstep/step'), self._hear_step, RELIABLE
             )
         self.set_up()
@@ -206,10 +211,22 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
             self._ready_publisher = None
         if self._done_publisher is not None:
             self.destroy_publisher(self._done_publisher)
-            self.destroy_subscription(self._step_subscription)
             self._done_publisher = None
+        if self.step_subscription is not None:
+            self.destroy_subscription(self.step_subscription)
+            self.step_subscription = None
 
     # ---- readiness and lockstep --------------------------------------------------------------
+
+    def hurry(self, *subscriptions: Subscription | None) -> None:
+        """In lockstep: be woken by these; what comes otherwise is taken along."""
+        if self.settings.lockstep:
+            self._urgent_topics |= {item.topic for item in subscriptions if item is not None}
+
+    @property
+    def urgent(self) -> Collection[str]:
+        """Topics to whose messages the node has to answer at once."""
+        return self._urgent_topics
 
     def expect(self, condition: Callable[[], bool]) -> None:
         """Count as ready only where this holds."""
@@ -358,10 +375,13 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
     node: SearchNode[Any] | None = None
     try:
         node = make_node()
-        executor = LeanExecutor(node)
+        executor = LeanExecutor(node, node.urgent)
         if node.settings.autostart:
             node.trigger_configure()
             node.trigger_activate()
+        # What was made so far stays: the collector need not look at it in every round.
+        gc.collect()
+        gc.freeze()
         while rclpy.ok():
             executor.spin_for(_SIGNAL_PERIOD)
     except SettingsError as error:
@@ -377,4 +397,6 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
                 node.halt()
             node.destroy_node()
         rclpy.try_shutdown()
+        # Not left to the end of the process, which may be a copy of another one.
+        get_default_context(shutting_down=True).destroy()
     return 0

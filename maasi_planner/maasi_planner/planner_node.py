@@ -160,11 +160,13 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             client = ActionClient(self, GoToWaypoint, self.team_topic(f'{name}/go_to'))
             self._go_to[name] = client
             self.expect(client.server_is_ready)
-            self.create_subscription(
-                AgentState,
-                self.team_topic(f'{name}/state'),
-                partial(self._on_state, name),
-                RELIABLE,
+            self.hurry(
+                self.create_subscription(
+                    AgentState,
+                    self.team_topic(f'{name}/state'),
+                    partial(self._on_state, name),
+                    RELIABLE,
+                )
             )
             self.create_subscription(
                 DetectionArray,
@@ -180,11 +182,15 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                 self._destination_publishers[name] = publisher
         for name in sorted(self.settings.others):
             topic = self.team_topic(f'{name}/destination')
-            self.create_subscription(
-                PointStamped, topic, partial(self._on_destination, name), RELIABLE
+            self.hurry(
+                self.create_subscription(
+                    PointStamped, topic, partial(self._on_destination, name), RELIABLE
+                )
             )
             self.expect_publisher(topic)
-        self.create_subscription(FilterUpdate, 'filter_update', self._on_update, UPDATES)
+        self.hurry(
+            self.create_subscription(FilterUpdate, 'filter_update', self._on_update, UPDATES)
+        )
         self._search_server = ActionServer(
             self,
             SearchTargets,

@@ -1,0 +1,127 @@
+"""The lean executor: nothing that comes is left lying, whatever is urgent."""
+
+import time
+
+import pytest
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from std_msgs.msg import Int32
+from std_srvs.srv import Trigger
+
+from maasi_filter.executor import LeanExecutor
+from maasi_filter.qos import RELIABLE
+from maasi_sim.processes import Domain
+
+PATIENCE = 30.0
+
+
+class Pair:
+    """A node that listens, and one that talks to it."""
+
+    def __init__(self, context):
+        self.listener = Node('listener', context=context)
+        self.talker = Node('talker', context=context)
+        self.heard = []
+        self.publishers = {}
+        for name in ('step', 'other'):
+            self.listener.create_subscription(
+                Int32, name, lambda message, name=name: self.hear(name, message.data), RELIABLE
+            )
+            self.publishers[name] = self.talker.create_publisher(Int32, name, RELIABLE)
+        self.executor = LeanExecutor(self.listener, {'/step'}, context=context)
+        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()))
+
+    def hear(self, name, value):
+        self.heard.append((name, value))
+
+    def say(self, name, value):
+        self.publishers[name].publish(Int32(data=value))
+
+    def until(self, condition):
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline
+            self.executor.spin_for(0.05)
+
+
+@pytest.fixture
+def pair(tmp_path):
+    with Domain() as domain:
+        context = Context()
+        context.init(domain_id=domain.number)
+        made = Pair(context)
+        yield made
+        made.executor.shutdown()
+        made.listener.destroy_node()
+        made.talker.destroy_node()
+        context.try_shutdown()
+
+
+def test_everything_is_heard_in_the_order_of_its_topic(pair):
+    for value in range(50):
+        pair.say('step', value)
+        pair.say('other', value)
+    pair.until(lambda: len(pair.heard) == 100)
+    for name in ('step', 'other'):
+        assert [value for topic, value in pair.heard if topic == name] == list(range(50))
+
+
+def test_what_is_not_urgent_comes_without_anything_urgent(pair):
+    pair.say('step', 0)
+    pair.until(lambda: pair.heard)
+    for value in range(5):
+        pair.say('other', value)
+        pair.until(lambda value=value: ('other', value) in pair.heard)
+
+
+def test_timers_and_services_are_not_starved_by_what_is_urgent(pair):
+    ticks = []
+    pair.listener.create_timer(0.01, lambda: ticks.append(len(pair.heard)))
+    pair.listener.create_service(Trigger, 'ask', lambda request, response: response)
+    client = pair.talker.create_client(Trigger, 'ask')
+    # The answer is taken with another executor: it must be there, not be waited for.
+    answers = LeanExecutor(pair.talker, context=pair.talker.context)
+    deadline = time.monotonic() + PATIENCE
+    while not client.service_is_ready():
+        assert time.monotonic() < deadline
+        answers.spin_for(0.01)
+    future = client.call_async(Trigger.Request())
+    value = 0
+    while not (future.done() and len(ticks) >= 3):
+        assert time.monotonic() < deadline
+        pair.say('step', value)
+        value += 1
+        pair.executor.spin_for(0.05)
+        answers.spin_for(0.0)
+    answers.shutdown()
+
+
+def test_entities_made_later_are_served(pair):
+    pair.say('step', 0)
+    pair.until(lambda: pair.heard)
+    pair.listener.create_subscription(
+        Int32, 'late', lambda message: pair.hear('late', message.data), RELIABLE
+    )
+    late = pair.talker.create_publisher(Int32, 'late', RELIABLE)
+    pair.until(late.get_subscription_count)
+    late.publish(Int32(data=7))
+    pair.until(lambda: ('late', 7) in pair.heard)
+
+
+def test_an_error_in_a_callback_ends_the_spin(pair):
+    def fail(message):
+        raise RuntimeError(f'read {message.data}')
+
+    pair.listener.create_subscription(Int32, 'bad', fail, RELIABLE)
+    bad = pair.talker.create_publisher(Int32, 'bad', RELIABLE)
+    pair.until(bad.get_subscription_count)
+    bad.publish(Int32(data=3))
+    with pytest.raises(RuntimeError, match='read 3'):
+        pair.until(lambda: False)
+
+
+def test_the_end_of_the_context_ends_the_spin(pair):
+    pair.listener.context.try_shutdown()
+    with pytest.raises(ExternalShutdownException):
+        pair.executor.spin_for(0.05)
