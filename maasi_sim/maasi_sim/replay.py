@@ -21,7 +21,7 @@ EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
 _PATIENCE = 60.0
 _START_PATIENCE = 180.0
 # There is no clock, no step and nobody late; nothing is loaded, and nothing saved.
-_REPLAYED = {
+REPLAYED = {
     'use_sim_time': False,
     'lockstep': False,
     'batch_timeout': 1e6,
@@ -234,7 +234,7 @@ def _process(facts: dict[str, Any], namespace: str, folder: Path) -> NodeProcess
         recorded['executable'],
         FILTER,
         namespace,
-        {**recorded['parameters'], **_REPLAYED},
+        {**recorded['parameters'], **REPLAYED},
     )
     parameters = folder / f'{plan.file_name}.yaml'
     parameters.write_text(plan.parameter_text(), encoding='utf-8')

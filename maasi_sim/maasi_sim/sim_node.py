@@ -398,6 +398,7 @@ class SimNode(SearchNode[SimNodeSettings]):
         if self._ready_since is None:
             self._ready_since = now
         unheard = [topic for node in self._expected for topic in self._unheard(node)]
+        unheard += self._unmatched()
         if unheard and now - self._ready_since < _CONNECTION_PATIENCE:
             return
         for topic in unheard:
@@ -415,7 +416,8 @@ class SimNode(SearchNode[SimNodeSettings]):
     def _look_for_returned(self) -> None:
         now = time.monotonic()
         for node, since in sorted(self._returned.items()):
-            if not self._unheard(node) or now - since > _CONNECTION_PATIENCE:
+            connected = not self._unheard(node) and not self._unmatched()
+            if connected or now - since > _CONNECTION_PATIENCE:
                 del self._returned[node]
                 self._remember_endpoints()
                 self._repeated = self._stamp
@@ -439,6 +441,16 @@ class SimNode(SearchNode[SimNodeSettings]):
             for topic in self._expected[node]
             if topic
             and not self._listeners(node, topic) - self._endpoints.get((node, topic), set())
+        ]
+
+    def _unmatched(self) -> list[str]:
+        """Return the topics with a subscription that is known but would miss a message sent now."""
+        return [
+            publisher.topic_name
+            for publisher in self._entities
+            if isinstance(publisher, Publisher)
+            and publisher.get_subscription_count()
+            < len(self.get_subscriptions_info_by_topic(publisher.topic_name))
         ]
 
     def _remember_endpoints(self) -> None:

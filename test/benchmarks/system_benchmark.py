@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,12 @@ import numpy as np
 
 from maasi_sim.node_plan import NodePlan
 from maasi_sim.processes import Domain, NodeProcess, find_executable, stop
-from maasi_sim.replay import FILTER, read_recording
+from maasi_sim.replay import FILTER, REPLAYED, read_recording
 from maasi_sim.replay_node import ReplayNode
 
 SECONDS = 40.0
+# For an answer of the filter node [s].
+PATIENCE = 30.0
 
 
 def row(name: str, value: float, unit: str) -> dict[str, Any]:
@@ -48,11 +51,20 @@ def real_time_factor(folder: Path) -> float:
     return float(json.loads((folder / 'report.json').read_text())['real_time_factor'])
 
 
+def wait_for(node: ReplayNode, condition: Callable[[], bool]) -> None:
+    """Take what comes until a condition holds."""
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        if time.monotonic() > deadline:
+            raise RuntimeError(f'{FILTER} did not answer for {PATIENCE:g} s')
+        node.spin()
+
+
 def latencies(bag: Path, folder: Path) -> list[float]:
     """Return the times from detections to the update that holds them, over DDS [s]."""
     recording = read_recording(bag)
     facts = recording.facts['nodes'][f'/{FILTER}']
-    parameters = {**facts['parameters'], 'lockstep': True}
+    parameters = {**facts['parameters'], **REPLAYED}
     plan = NodePlan(facts['package'], facts['executable'], FILTER, parameters=parameters)
     file = folder / 'filter_node.yaml'
     file.write_text(plan.parameter_text(), encoding='utf-8')
@@ -66,13 +78,11 @@ def latencies(bag: Path, folder: Path) -> list[float]:
         process.start()
         node = ReplayNode(domain.number, sorted(recording.facts['scenario']['robots']))
         try:
-            while not node.ready:
-                node.spin()
+            wait_for(node, lambda: node.ready)
             for number, batch in enumerate(recording.batches, start=1):
                 begin = time.perf_counter()
                 node.publish(batch)
-                while len(node.updates) < number:
-                    node.spin()
+                wait_for(node, lambda number=number: len(node.updates) >= number)
                 times.append(time.perf_counter() - begin)
         finally:
             node.close()

@@ -14,6 +14,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
@@ -311,6 +312,26 @@ def test_nothing_is_published_until_everybody_is_there(make_team):
     recorder.say_ready()
     team.run(5)
     recorder.destroy_node()
+
+
+def test_the_time_starts_only_when_no_subscription_would_miss_it(make_team, monkeypatch):
+    team = make_team()
+    counts = {}
+
+    def late(publisher):
+        # As if discovery had told of the subscriptions, and was still about to connect them.
+        return counts.get(publisher.topic_name, matched(publisher))
+
+    matched = Publisher.get_subscription_count
+    monkeypatch.setattr(Publisher, 'get_subscription_count', late)
+    counts['/clock'] = 0
+    team.say_ready()
+    team.settle()
+    assert team.sim.status()['waits for'] == '' and team.sim.step < 0
+    assert not team.filter.steps and not team.filter.seen['/clock']
+    del counts['/clock']
+    team.run(2)
+    assert seconds(team.filter.seen['/clock'][0].clock) == 0.0
 
 
 def test_a_step_waits_for_everybody_and_for_every_command(make_team):
