@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linear_sum_assignment
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,15 @@ def _distances(estimates: ArrayLike, truth: ArrayLike) -> FloatArray:
     return np.sqrt(((ours[:, None, :] - theirs[None, :, :]) ** 2).sum(axis=2))
 
 
+def _assign(cost: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the pairs whose costs add up to the least."""
+    # Imported late: it takes longer than all else that a node imports, and no node needs it.
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(cost)
+    return rows, columns
+
+
 def _positive(name: str, value: float, least: float = 0.0) -> None:
     if not (math.isfinite(value) and value > 0.0 and value >= least):
         raise ValueError(f'{name}: got {value}, allowed are finite numbers above {least}')
@@ -83,7 +92,7 @@ def gospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 
     _positive('power', power, 1.0)
     apart = _distances(estimates, truth)
     cost = np.minimum(apart, cutoff) ** power
-    rows, columns = linear_sum_assignment(cost)
+    rows, columns = _assign(cost)
     matched = apart[rows, columns] < cutoff
     localisation = float(cost[rows, columns][matched].sum())
     pairs = int(matched.sum())
@@ -106,7 +115,7 @@ def ospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 2
     if larger == 0:
         return 0.0
     cost = np.minimum(apart, cutoff) ** power
-    rows, columns = linear_sum_assignment(cost)
+    rows, columns = _assign(cost)
     total = float(cost[rows, columns].sum()) + cutoff**power * (larger - min(apart.shape))
     return float((total / larger) ** (1.0 / power))
 
@@ -142,7 +151,7 @@ def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Matc
     # One more pair outweighs any distances.
     worth = (min(apart.shape) + 1.0) * radius**2 if apart.size else 0.0
     cost = np.where(apart <= radius, apart**2 - worth, 0.0)
-    rows, columns = linear_sum_assignment(cost)
+    rows, columns = _assign(cost)
     near = apart[rows, columns] <= radius
     pairs = [(int(i), int(j)) for i, j in zip(rows[near], columns[near])]
     squares = apart[rows, columns][near] ** 2

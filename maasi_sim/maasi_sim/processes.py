@@ -7,11 +7,16 @@ import fcntl
 import os
 import signal
 import subprocess
+import sys
 import time
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import Any, NoReturn
+
+from setproctitle import setproctitle
 
 # Domains whose ports lie below those that Linux gives to others (from 32768).
 DOMAINS = range(0, 102)
@@ -144,6 +149,97 @@ def _die_with_parent(parent: int) -> None:
         os._exit(1)
 
 
+class ForkedProcess:
+    """A copy of this process that runs a function; with the interface of `subprocess.Popen`.
+
+    What was imported and compiled here is there already: a node is up in a tenth of the time.
+
+    Parameters
+    ----------
+    function : callable
+        What to run; its result is the exit code.
+    command : list of str
+        What it finds in `sys.argv`, and what `ps` shows.
+    log : int
+        File that takes what it prints.
+    environment : dict
+        Variables on top of this process's own.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[], Any],
+        command: list[str],
+        log: int,
+        environment: Mapping[str, str],
+    ) -> None:
+        parent = os.getpid()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.pid = os.fork()
+        self.returncode: int | None = None
+        if self.pid == 0:
+            _run_and_exit(function, command, log, environment, parent)
+
+    def poll(self) -> int | None:
+        """Return the exit code, negative for a signal, or None while it runs."""
+        if self.returncode is None:
+            try:
+                pid, status = os.waitpid(self.pid, os.WNOHANG)
+            except ChildProcessError:
+                # Somebody else has asked for it.
+                self.returncode = 0
+            else:
+                if pid:
+                    self.returncode = os.waitstatus_to_exitcode(status)
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, if it still runs."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+
+def _run_and_exit(
+    function: Callable[[], Any],
+    command: list[str],
+    log: int,
+    environment: Mapping[str, str],
+    parent: int,
+) -> NoReturn:
+    """Be a process of its own from here on, whatever was above it when it was forked."""
+    code: Any = 1
+    try:
+        os.setsid()
+        _die_with_parent(parent)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        for source, target in ((nothing, 0), (log, 1), (log, 2)):
+            os.dup2(source, target)
+        sys.stdout = open(1, 'w', buffering=1, encoding='utf-8', closefd=False)  # noqa: SIM115
+        sys.stderr = open(2, 'w', buffering=1, encoding='utf-8', closefd=False)  # noqa: SIM115
+        os.environ.update(environment)
+        sys.argv = list(command)
+        setproctitle(' '.join(command))
+        code = function()
+    except SystemExit as leaving:
+        code = leaving.code
+        if isinstance(code, str):
+            print(code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code if isinstance(code, int) else 0 if code is None else 1)
+
+
+def _single_threaded() -> bool:
+    """Return whether this process can be forked: locks of other threads would stay locked."""
+    return len(os.listdir('/proc/self/task')) == 1
+
+
 @dataclass
 class NodeProcess:
     """A node that runs as a process of its own and cannot outlive this one.
@@ -158,6 +254,9 @@ class NodeProcess:
         Takes what it prints; goes on growing over restarts.
     environment : dict
         Variables on top of this process's own.
+    main : callable, optional
+        What `command` runs, where it is loaded already: the node is then forked from this process,
+        unless that has several threads.
     restarts : int
         How often it was started again.
     """
@@ -166,8 +265,9 @@ class NodeProcess:
     command: list[str]
     log: Path
     environment: Mapping[str, str] = field(default_factory=dict)
+    main: Callable[[], Any] | None = None
     restarts: int = 0
-    _process: subprocess.Popen[bytes] | None = None
+    _process: subprocess.Popen[bytes] | ForkedProcess | None = None
 
     def start(self) -> None:
         """Start it.
@@ -180,6 +280,11 @@ class NodeProcess:
         parent = os.getpid()
         with self.log.open('ab') as output:
             try:
+                if self.main is not None and _single_threaded():
+                    self._process = ForkedProcess(
+                        self.main, self.command, output.fileno(), self.environment
+                    )
+                    return
                 self._process = subprocess.Popen(
                     self.command,
                     stdin=subprocess.DEVNULL,

@@ -8,6 +8,8 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -46,11 +48,23 @@ class Interruption:
 
     def __init__(self) -> None:
         self.count = 0
+        self._at_once = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._note)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.count += 1
+        if self._at_once:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Let it cut short what takes long and leaves nothing behind."""
+        self._at_once = True
+        try:
+            yield
+        finally:
+            self._at_once = False
 
     def __bool__(self) -> bool:
         """Tell whether it came."""
@@ -138,6 +152,9 @@ def _positive(text: str) -> float:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     interruption = Interruption()
+    # Before NumPy is loaded; the nodes inherit it.
+    for key, value in _NODE_ENVIRONMENT.items():
+        os.environ.setdefault(key, value)
     parser = build_parser()
     options = parser.parse_args(arguments)
     if (options.replay is None) == (options.scenario is None):
@@ -254,6 +271,11 @@ class ScenarioRun:
                 f'{self.name}: seed {self.seed}, {len(self.processes)} nodes in ROS domain '
                 f'{domain.number}, results in {_short(self.folder)}'
             )
+            try:
+                with self.interruption.at_once():
+                    self._load()
+            except KeyboardInterrupt:
+                return INTERRUPTED
             return self._execute(domain)
 
     def _prepare(self) -> None:
@@ -281,8 +303,15 @@ class ScenarioRun:
                 plan.full_name,
                 plan.command(find_executable(plan.package, plan.executable), path),
                 self.folder / f'{plan.file_name}.log',
-                {key: value for key, value in _NODE_ENVIRONMENT.items() if key not in os.environ},
             )
+
+    def _load(self) -> None:
+        """Load once what the nodes share, where they can be copies of this process."""
+        from maasi_sim.warm_up import main_of, warm_up_all
+
+        for plan in self.plans:
+            self.processes[plan.full_name].main = main_of(plan.package, plan.executable)
+        warm_up_all()
 
     def _execute(self, domain: Domain) -> int:
         from maasi_sim.processes import stop

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.distance import pdist
 
 from maasi_filter.metrics import Gospa, Match, gospa, match_targets
 from maasi_sim.scenario import Scenario
@@ -37,6 +36,9 @@ def matching_radius(removal_distance: float, truth: ArrayLike) -> float:
         raise ValueError(
             f'removal_distance: got {removal_distance}, allowed are finite numbers above 0'
         )
+    # Imported late: it takes longer than all else that a run imports.
+    from scipy.spatial.distance import pdist
+
     positions = np.asarray(truth, dtype=float)
     radius = 3.0 * removal_distance
     if len(positions) > 1:

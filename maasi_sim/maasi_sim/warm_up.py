@@ -1,9 +1,19 @@
-"""Compilation of what the simulation uses, before anything waits for it."""
+"""Compilation of what the nodes use, before anything waits for it."""
 
 from __future__ import annotations
 
+import gc
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import maasi_filter
+import maasi_planner
+from maasi_drivers.warm_up import warm_up as warm_up_drivers
 from maasi_sim.scenario import load_scenario
 from maasi_sim.simulation import simulated_robot
+
+_PACKAGES = ('maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
 
 
 def warm_up() -> None:
@@ -15,3 +25,26 @@ def warm_up() -> None:
             robot = simulated_robot(robot_name, scenario, world, scenario.seed)
             robot.warm_up()
             robot.step(1, scenario.step)
+
+
+def warm_up_all() -> None:
+    """Compile, or load from the cache, the kernels of all packages."""
+    maasi_filter.warm_up()
+    maasi_planner.warm_up()
+    warm_up_drivers()
+    warm_up()
+    # What is there now stays: copies of this process share it.
+    gc.collect()
+    gc.freeze()
+
+
+def main_of(package: str, executable: str) -> Callable[[], Any] | None:
+    """Return what runs an executable of this suite, or None for one of another package.
+
+    The node itself is imported only then: rclpy begins threads of its own, and a process that has
+    some is not to be copied.
+    """
+    if package not in _PACKAGES:
+        return None
+    module = f'{package}.{executable}'
+    return lambda: importlib.import_module(module).main()
