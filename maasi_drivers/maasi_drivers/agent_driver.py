@@ -212,7 +212,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             self.create_subscription(Odometry, 'odom', self._on_odometry, quality),
             self.create_subscription(BatteryState, 'battery', self._on_battery, quality),
         ]
-        self.expect(lambda: commands.listeners() > 0)
+        self.expect_subscribers(lambda: commands.publisher)
 
     def disconnect_robot(self) -> None:
         """Undo `connect_robot`; what is in `_entities` goes by itself."""
@@ -285,17 +285,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._entities += list(self.subscriptions)[known:]
         if not settings.lockstep:
             self._entities.append(self.create_wall_timer(_WATCH_PERIOD, self._watch))
-        self.expect(lambda: self._heard(self._state_publisher, {'planner_node'}))
-        self.expect(
-            lambda: self._heard(self._detections_publisher, {'filter_node', 'planner_node'})
-        )
-
-    def _heard(self, publisher: Any, names: set[str]) -> bool:
-        """Return whether these nodes, and all others that are known, are matched."""
-        known = self.get_subscriptions_info_by_topic(publisher.topic_name)
-        return names <= {item.node_name for item in known} and (
-            publisher.get_subscription_count() >= len(known)
-        )
+        self.expect_subscribers(self._state_publisher, names={'planner_node'})
+        self.expect_subscribers(self._detections_publisher, names={'filter_node', 'planner_node'})
 
     def start(self) -> None:
         """Begin to work."""

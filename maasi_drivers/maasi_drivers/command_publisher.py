@@ -8,6 +8,7 @@ from typing import Any
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from maasi_drivers.driver_settings import CommandType
@@ -76,6 +77,11 @@ class CommandPublisher:
         """Return the names of the types that are subscribed, the most frequent first."""
         known = self._node.get_subscriptions_info_by_topic(self.topic)
         return [name for name, _ in Counter(item.topic_type for item in known).most_common()]
+
+    @property
+    def publisher(self) -> Publisher | None:
+        """The present one; None where the type is not known yet."""
+        return self._publisher
 
     def listeners(self) -> int:
         """Return how many subscriptions are matched."""

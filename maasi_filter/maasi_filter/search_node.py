@@ -44,6 +44,10 @@ _SIGNAL_PERIOD = 0.1
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
+# Between the discovery of a subscription and its connection [s].
+_CONNECTION_PATIENCE = 5.0
+
+
 class SettingsError(Exception):
     """Parameters that are not allowed; the text says which and why."""
 
@@ -232,9 +236,45 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         """Count as ready only where this holds."""
         self._peers.append(condition)
 
-    def expect_subscribers(self, publisher: Publisher, number: int = 1) -> None:
-        """Count as ready only with so many subscriptions to a publisher."""
-        self.expect(lambda: publisher.get_subscription_count() >= number)
+    def expect_subscribers(
+        self,
+        publisher: Callable[[], Publisher | None] | Publisher,
+        number: int = 1,
+        names: Collection[str] = (),
+    ) -> None:
+        """Count as ready only when a message would reach all who are known to listen.
+
+        Parameters
+        ----------
+        publisher : Publisher, or a function that returns the present one
+            Of the message.
+        number : int
+            How many have to listen; those who only look on do not count.
+        names : collection of str
+            Nodes that have to be among them, without namespace.
+        """
+        get = publisher if callable(publisher) else lambda: publisher
+        known_since: list[float] = []
+
+        def heard() -> bool:
+            present = get()
+            if present is None:
+                return False
+            kind: Any = present.msg_type
+            known = [
+                info.node_name
+                for info in self.get_subscriptions_info_by_topic(present.topic_name)
+                if info.topic_type == f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
+            ]
+            if not set(names) <= set(known) or sum(map(_takes_part, known)) < number:
+                return False
+            known_since.append(time.monotonic())
+            # Somebody who looks on with another quality of service is never connected.
+            late = known_since[-1] - known_since[0] > _CONNECTION_PATIENCE
+            del known_since[1:]
+            return late or present.get_subscription_count() >= len(known)
+
+        self.expect(heard)
 
     def expect_publisher(self, topic: str) -> None:
         """Count as ready only with a publisher of a topic."""
@@ -349,6 +389,11 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+def _takes_part(name: str) -> bool:
+    """Return whether a node that listens is one that something depends on."""
+    return name not in ('recorder', 'guard', 'rosbag2_recorder') and not name.startswith('_')
 
 
 def _backward_threshold() -> Any:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -57,7 +57,7 @@ class Interruption:
         if self._at_once:
             raise KeyboardInterrupt
 
-    @contextmanager
+    @contextlib.contextmanager
     def at_once(self) -> Iterator[None]:
         """Let it cut short what takes long and leaves nothing behind."""
         self._at_once = True
@@ -271,11 +271,9 @@ class ScenarioRun:
                 f'{self.name}: seed {self.seed}, {len(self.processes)} nodes in ROS domain '
                 f'{domain.number}, results in {_short(self.folder)}'
             )
-            try:
-                with self.interruption.at_once():
-                    self._load()
-            except KeyboardInterrupt:
-                return INTERRUPTED
+            # What comes then says that it was interrupted.
+            with contextlib.suppress(KeyboardInterrupt), self.interruption.at_once():
+                self._load()
             return self._execute(domain)
 
     def _prepare(self) -> None:
@@ -320,8 +318,9 @@ class ScenarioRun:
         recorder: Recorder | None = None
         try:
             # Before all that takes time, and while there is a single thread.
-            for process in self.processes.values():
-                process.start()
+            if not self.interruption:
+                for process in self.processes.values():
+                    process.start()
             threading.Thread(target=self._warn, daemon=True).start()
             from maasi_sim.bag import BagWriter, load_types
             from maasi_sim.observer import RunObserver

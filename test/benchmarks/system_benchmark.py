@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -30,8 +31,8 @@ def row(name: str, value: float, unit: str) -> dict[str, Any]:
 
 
 def scenario(name: str, folder: Path, limit: float) -> float:
-    """Run a scenario in lockstep, recorded; return the wall time of all of it [s]."""
-    begin = time.perf_counter()
+    """Run a scenario in lockstep, recorded; return the wall time until its time started [s]."""
+    begin = time.time()
     done = subprocess.run(
         [
             *(sys.executable, '-m', 'maasi_sim.run_scenario', name, '--lockstep', '--seed', '1'),
@@ -43,7 +44,11 @@ def scenario(name: str, folder: Path, limit: float) -> float:
     )
     if done.returncode not in (0, 1):
         raise RuntimeError(f'{name} ended with {done.returncode}:\n{done.stdout}{done.stderr}')
-    return time.perf_counter() - begin
+    log = (folder / 'sim_node.log').read_text()
+    found = re.search(r'\[(\d+\.\d+)\] \[sim_node\]: all are there', log)
+    if found is None:
+        raise RuntimeError(f'{name}: the time did not start:\n{log}')
+    return float(found.group(1)) - begin
 
 
 def real_time_factor(folder: Path) -> float:
@@ -103,7 +108,7 @@ def run() -> list[dict[str, Any]]:
         return [
             row('demo_real_time_factor', real_time_factor(folder / 'floor'), 'x'),
             row('ranging_pair_real_time_factor', real_time_factor(folder / 'space'), 'x'),
-            row('start_and_end', start, 's'),
+            row('start_to_first_step', start, 's'),
             row('detections_to_update_p50', 1e3 * float(np.percentile(times, 50)), 'ms'),
             row('detections_to_update_p99', 1e3 * float(np.percentile(times, 99)), 'ms'),
         ]

@@ -65,9 +65,15 @@ class Fake(Node):
             self.ready_timer = self.create_timer(0.01, self.look_for_peers)
 
     def look_for_peers(self):
-        if all(publisher.get_subscription_count() >= number for publisher, number in self.peers):
+        if all(self.is_heard(publisher, number) for publisher, number in self.peers):
             self.ready_timer.cancel()
             self.ready.publish(LockstepDone(node=self.full_name, step=0))
+
+    def is_heard(self, publisher, number):
+        known = self.get_subscriptions_info_by_topic(publisher.topic_name)
+        return sum(
+            info.node_name != 'recorder' for info in known
+        ) >= number and publisher.get_subscription_count() >= len(known)
 
     def finish(self, step):
         self.done.publish(LockstepDone(node=self.full_name, step=step))
@@ -112,18 +118,26 @@ class Sim(Fake):
         self.taking_part = set(self.missing)
         self.step = -1
         self.waiting = set()
+        self.returned = set()
         self.create_subscription(LockstepDone, '/lockstep/ready', self.on_ready, LATCHED)
         self.create_subscription(LockstepDone, '/lockstep/done', self.on_done, ALL)
-        if not self.lockstep:
+        if self.lockstep:
+            self.timer = self.create_timer(0.1, self.look)
+        else:
             self.timer = self.create_timer(0.02, self.tick)
 
     def on_ready(self, message):
-        if self.missing:
-            self.missing.discard(message.node)
-            if not self.missing and self.lockstep:
-                self.advance()
-        elif self.lockstep and message.node in self.waiting:
-            # Somebody who was started again: the step is for it as well.
+        if message.node in self.waiting:
+            self.returned.add(message.node)
+        self.missing.discard(message.node)
+
+    def look(self):
+        """Begin once all that are ready are connected too; repeat steps for who comes back."""
+        others = len(self.taking_part) - 1
+        if self.step < 0 and not self.missing and self.is_heard(self.steps, others):
+            self.advance()
+        self.returned &= self.waiting
+        if self.returned:
             self.publish_step()
 
     def tick(self):
