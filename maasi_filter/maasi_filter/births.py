@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.detection_model import DetectionModel
+from maasi_filter.elementary import sines
 from maasi_filter.exploration import Exploration, interpolate_at
 from maasi_filter.phd import MeasurementSet
 from maasi_filter.pose import Pose
@@ -37,42 +38,53 @@ def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 ):
     """Fill birth particles (n, d), and |dx/dz| at each, 0 where it is outside the bounds."""
     d = noise.shape[1]
-    z = np.empty(d)
+    most = 1
     for m in range(values.shape[0]):
-        inside[m] = False
-        for j in range(starts[m], starts[m + 1]):
-            for a in range(d):
-                total = 0.0
+        most = max(most, starts[m + 1] - starts[m])
+    z = np.empty((3, most))
+    sine = np.empty((2, most))
+    cosine = np.ones((2, most))
+    sine[1] = 0.0
+    for m in range(values.shape[0]):
+        first = starts[m]
+        number = starts[m + 1] - first
+        root = roots[m]
+        origin = centres[m] if cartesian[m] else values[m]
+        for a in range(d):
+            for j in range(number):
+                total = origin[a]
                 for b in range(a + 1):
-                    total += roots[m, a, b] * noise[j, b]
-                z[a] = total
-            if cartesian[m]:
+                    total += root[a, b] * noise[first + j, b]
+                z[a, j] = total
+        out = particles[first : first + number]
+        size = jacobian[first : first + number]
+        if cartesian[m]:
+            for j in range(number):
                 for a in range(d):
-                    particles[j, a] = centres[m, a] + z[a]
-                size = volume[m]
-            else:
-                for a in range(d):
-                    z[a] += values[m, a]
-                level = z[0]
-                size = abs(z[0])
+                    out[j, a] = z[a, j]
+                size[j] = volume[m]
+        else:
+            sines(z[1], number, sine[0], cosine[0])
+            if d == 3:
+                sines(z[2], number, sine[1], cosine[1])
+            for j in range(number):
+                level = z[0, j] * cosine[1, j]
+                out[j, 0] = sensor_position[0] + level * cosine[0, j]
+                out[j, 1] = sensor_position[1] + level * sine[0, j]
+                size[j] = z[0, j]
                 if d == 3:
-                    cosine = math.cos(z[2])
-                    level *= cosine
-                    size *= abs(level)
-                    particles[j, 2] = sensor_position[2] + z[0] * math.sin(z[2])
-                    if cosine < 0.0:
-                        # Beyond straight up no measurement can point.
-                        size = 0.0
-                particles[j, 0] = sensor_position[0] + level * math.cos(z[1])
-                particles[j, 1] = sensor_position[1] + level * math.sin(z[1])
-                if z[0] <= 0.0:
-                    size = 0.0
+                    out[j, 2] = sensor_position[2] + z[0, j] * sine[1, j]
+                    size[j] *= level
+                # Beyond straight up no measurement can point, nor behind.
+                if not (z[0, j] > 0.0 and level > 0.0):
+                    size[j] = 0.0
+        inside[m] = False
+        for j in range(number):
+            within = True
             for a in range(d):
-                if not bounds[a, 0] <= particles[j, a] <= bounds[a, 1]:
-                    size = 0.0
-            jacobian[j] = size
-            if size > 0.0:
-                inside[m] = True
+                within = within and bounds[a, 0] <= out[j, a] <= bounds[a, 1]
+            size[j] = size[j] if within else 0.0
+            inside[m] = inside[m] or size[j] > 0.0
 
 
 @njit(cache=True, error_model='numpy')

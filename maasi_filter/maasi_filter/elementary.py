@@ -14,6 +14,10 @@ MAGIC = 6755399441055744.0
 LOG2_E = 1.4426950408889634
 LOG_2_HIGH = 6.93147180369123816490e-01
 LOG_2_LOW = 1.90821492927058770002e-10
+# pi / 2 in three parts, the first two with few digits.
+HALF_PI_HIGH = 1.57079632673412561417e00
+HALF_PI_MIDDLE = 6.07710050630396597660e-11
+HALF_PI_LOW = 2.02226624879595063154e-21
 # Below this exp(x) is taken as 0.
 LEAST_EXPONENT = -708.0
 
@@ -22,28 +26,66 @@ LEAST_EXPONENT = -708.0
 def arctan2(y: float, x: float) -> float:  # pragma: no cover - compiled
     """Return the angle of (x, y), to about one unit in the last place; 0 at the origin.
 
-    Cephes' rational approximation.
+    fdlibm's polynomial, with one division.
     """
     ax = abs(x)
     ay = abs(y)
     small = min(ax, ay)
     large = max(ax, ay)
     # Choices instead of branches, so that loops over arrays become vector instructions.
-    upper = small > 0.66 * large
+    upper = small > 0.42 * large
     top = small - large if upper else small
     bottom = small + large if upper else large
     t = top / (bottom if bottom > 0.0 else 1.0)
     z = t * t
-    top = -8.750608600031904122785e-1 * z - 1.615753718733365076637e1
-    top = (top * z - 7.500855792314704667340e1) * z - 1.228866684490136173410e2
-    top = top * z - 6.485021904942025371773e1
-    bottom = (z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2
-    bottom = (bottom * z + 4.328810604912902668951e2) * z + 4.853903996359136964868e2
-    bottom = bottom * z + 1.945506571482613964425e2
-    angle = (0.25 * math.pi if upper else 0.0) + (t + t * (z * top / bottom))
+    value = 1.62858201153657823623e-02
+    value = value * z - 3.65315727442169155270e-02
+    value = value * z + 4.97687799461593236017e-02
+    value = value * z - 5.83357013379057348645e-02
+    value = value * z + 6.66107313738753120669e-02
+    value = value * z - 7.69187620504482999495e-02
+    value = value * z + 9.09088713343650656196e-02
+    value = value * z - 1.11111104054623557880e-01
+    value = value * z + 1.42857142725034663711e-01
+    value = value * z - 1.99999999998764832476e-01
+    value = value * z + 3.33333333333329318027e-01
+    angle = (0.25 * math.pi if upper else 0.0) + (t - t * (z * value))
     angle = 0.5 * math.pi - angle if ay > ax else angle
     angle = math.pi - angle if x < 0.0 else angle
     return angle if y >= 0.0 else -angle
+
+
+@njit(cache=True, error_model='numpy', fastmath={'contract'})
+def sines(x, number, sine, cosine):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fill sine and cosine of the first `number` of `x`, of some thousand radians at most.
+
+    To about one unit in the last place of 1; fdlibm's polynomials.
+    """
+    for i in range(number):
+        k = (x[i] * (2.0 / math.pi) + MAGIC) - MAGIC
+        r = ((x[i] - k * HALF_PI_HIGH) - k * HALF_PI_MIDDLE) - k * HALF_PI_LOW
+        z = r * r
+        s = 1.58969099521155010221e-10
+        s = s * z - 2.50507602534068634195e-08
+        s = s * z + 2.75573137070700676789e-06
+        s = s * z - 1.98412698298579493134e-04
+        s = s * z + 8.33333333332248946124e-03
+        s = s * z - 1.66666666666666324348e-01
+        s = r + r * (z * s)
+        c = -1.13596475577881948265e-11
+        c = c * z + 2.08757232129817482790e-09
+        c = c * z - 2.75573143513906633035e-07
+        c = c * z + 2.48015872894767294178e-05
+        c = c * z - 1.38888888888741095749e-03
+        c = c * z + 4.16666666666666019037e-02
+        c = 1.0 - 0.5 * z + z * z * c
+        # The quarter of the circle, -2 to 2.
+        quarter = k - 4.0 * ((k * 0.25 + MAGIC) - MAGIC)
+        turned = abs(quarter) == 1.0
+        a = c if turned else s
+        b = s if turned else c
+        sine[i] = -a if quarter == -1.0 or abs(quarter) == 2.0 else a
+        cosine[i] = -b if quarter == 1.0 or abs(quarter) == 2.0 else b
 
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})

@@ -19,9 +19,10 @@ IntArray = NDArray[np.int64]
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=SUMS)
 def _sum_chunks(first_chunk, last_chunk, weights, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
     for chunk in range(first_chunk, last_chunk):
+        part = weights[chunk * CHUNK : (chunk + 1) * CHUNK]
         total = 0.0
-        for i in range(chunk * CHUNK, min(weights.shape[0], (chunk + 1) * CHUNK)):
-            total += weights[i]
+        for i in range(len(part)):
+            total += part[i]
         sums[chunk] = total
 
 
@@ -69,10 +70,11 @@ def _select_evenly_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover -
     cumulative = np.empty(CHUNK)
     for chunk in range(first_chunk, last_chunk):
         start = chunk * CHUNK
-        size = min(weights.shape[0], start + CHUNK) - start
+        part = weights[start : start + CHUNK]
+        size = len(part)
         total = bases[chunk]
         for i in range(size):
-            total += weights[start + i]
+            total += part[i]
             cumulative[i] = total
         for i in range(size):
             cumulative[i] = np.ceil(cumulative[i] * rate - offset)
@@ -81,10 +83,22 @@ def _select_evenly_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover -
         holder = start
         for i in range(size):
             reached = min(np.int64(cumulative[i]), last)
+            # Four at a time, needed or not: what is too much is overwritten, and few guesses of
+            # the processor at the number of copies go wrong.
+            if point + 4 <= last:
+                index[point] = start + i
+                index[point + 1] = start + i
+                index[point + 2] = start + i
+                index[point + 3] = start + i
+                while point + 4 < reached:
+                    point += 4
+                    for k in range(point, min(point + 4, last)):
+                        index[k] = start + i
+                point = max(point, reached)
             while point < reached:
                 index[point] = start + i
                 point += 1
-            holder = start + i if weights[start + i] > 0.0 else holder
+            holder = start + i if part[i] > 0.0 else holder
         # Rounding can leave points just behind the last cumulative weight.
         while point < last:
             index[point] = holder
@@ -172,8 +186,15 @@ def _mix(state):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 @njit(cache=True, nogil=True, error_model='numpy')
 def _count_chunks(first_chunk, last_chunk, index, group, counts):  # type: ignore[no-untyped-def]  # pragma: no cover
     for chunk in range(first_chunk, last_chunk):
-        for k in range(chunk * CHUNK, min(index.shape[0], (chunk + 1) * CHUNK)):
-            counts[chunk, group[index[k]]] += 1
+        part = index[chunk * CHUNK : (chunk + 1) * CHUNK]
+        k = 0
+        while k < len(part):
+            # A run of one group.
+            g = group[part[k]]
+            first = k
+            while k < len(part) and group[part[k]] == g:
+                k += 1
+            counts[chunk, g] += k - first
 
 
 @njit(cache=True, error_model='numpy')
@@ -200,17 +221,36 @@ def _gather_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     first_chunk, last_chunk, index, particles, group, places, out, copy
 ):
     d = particles.shape[1]
+    flat = particles.reshape(particles.size)
+    flat_out = out.reshape(out.size)
     for chunk in range(first_chunk, last_chunk):
-        start = chunk * CHUNK
-        before = index[start - 1] if start > 0 else -1
-        for k in range(start, min(index.shape[0], start + CHUNK)):
-            i = index[k]
-            place = places[chunk, group[i]]
-            places[chunk, group[i]] = place + 1
-            for a in range(d):
-                out[place, a] = particles[i, a]
-            copy[place] = i == before
-            before = i
+        k = chunk * CHUNK
+        stop = min(index.shape[0], k + CHUNK)
+        before = index[k - 1] if k > 0 else -1
+        while k < stop:
+            # A run of one group.
+            g = group[index[k]]
+            first = k
+            while k < stop and group[index[k]] == g:
+                k += 1
+            place = places[chunk, g]
+            places[chunk, g] = place + k - first
+            if d == 3:
+                for j in range(first, k):
+                    source = 3 * index[j]
+                    target = 3 * (place + j - first)
+                    flat_out[target] = flat[source]
+                    flat_out[target + 1] = flat[source + 1]
+                    flat_out[target + 2] = flat[source + 2]
+            else:
+                for j in range(first, k):
+                    source = 2 * index[j]
+                    target = 2 * (place + j - first)
+                    flat_out[target] = flat[source]
+                    flat_out[target + 1] = flat[source + 1]
+            for j in range(first, k):
+                copy[place + j - first] = index[j] == before
+                before = index[j]
 
 
 def gather(

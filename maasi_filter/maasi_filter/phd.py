@@ -335,39 +335,96 @@ def position_measurements(values: FloatArray, covariances: FloatArray) -> Measur
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _extent(x, number, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    low = np.inf
-    high = -np.inf
+def _lowest(values, number):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return the smallest of the first `number` values, which are used up; inf if there is none.
+
+    By halves: loops over pairs become vector instructions, a running minimum does not.
+    """
+    if number == 0:
+        return np.inf
+    while number > 1:
+        half = (number + 1) // 2
+        other = values[number - half : number]
+        for i in range(half):
+            values[i] = other[i] if other[i] < values[i] else values[i]
+        number = half
+    return values[0]
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _halve(values, other, number, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(number):
-        value = x[i]
-        low = value if value < low else low
-        high = value if value > high else high
-    out[0] = low
-    out[1] = high
+        low[i] = other[i] if other[i] < values[i] else values[i]
+    for i in range(number):
+        high[i] = other[i] if other[i] > values[i] else values[i]
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _halve_again(low, high, number, offset):  # type: ignore[no-untyped-def]  # pragma: no cover
+    low_other = low[offset:]
+    high_other = high[offset:]
+    for i in range(number):
+        low[i] = low_other[i] if low_other[i] < low[i] else low[i]
+    for i in range(number):
+        high[i] = high_other[i] if high_other[i] > high[i] else high[i]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _box_chunks(first_chunk, last_chunk, particles, boxes):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill lower and upper bounds (tiles, 2, d) of the particles of each tile.
+
+    By halves: loops over pairs become vector instructions, a running minimum does not.
+    """
+    n, d = particles.shape
+    flat = particles.reshape(n * d)
+    low = np.empty(TILE * d)
+    high = np.empty(TILE * d)
+    for tile in range(first_chunk * TILES, last_chunk * TILES):
+        size = min(TILE, n - tile * TILE)
+        if size <= 0:
+            break
+        part = flat[tile * TILE * d : (tile * TILE + size) * d]
+        half = (size + 1) // 2
+        _halve(part, part[(size - half) * d :], half * d, low, high)
+        size = half
+        while size > 1:
+            half = (size + 1) // 2
+            _halve_again(low, high, half * d, (size - half) * d)
+            size = half
+        for axis in range(d):
+            boxes[tile, 0, axis] = low[axis]
+            boxes[tile, 1, axis] = high[axis]
 
 
 @njit(cache=True, error_model='numpy')
-def _least_square(box, c0, c1, c2, z0, cartesian, gate):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return a number that q is nowhere below in a tile, inf for an empty one.
+def _least_square(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    box, sensor_position, solid, c0, c1, c2, z0, cartesian, gate
+):
+    """Return a number that q is nowhere below in a tile, but for rounding.
 
-    In a tile offsets from the sensor lie in `box[:6]`, distances in `box[6:]`. With u the
-    smallest eigenvalue of the inverse correlation, q is at least u times the sum of squared errors
-    over variances; and for angles a and b, and distance r from the sensor, the distance s between
-    particle and detection has s^2 - (r - z)^2 <= r z (a^2 + b^2).
+    Particles of the tile lie in `box`. With u the smallest eigenvalue of the inverse correlation,
+    q is at least u times the sum of squared errors over variances; and for angles a and b, and
+    distance r from the sensor, the distance s between particle and detection has
+    s^2 - (r - z)^2 <= r z (a^2 + b^2).
     """
-    if box[6] == np.inf:
-        return np.inf
-    a = max(max(box[0] - c0, c0 - box[1]), 0.0)
-    b = max(max(box[2] - c1, c1 - box[3]), 0.0)
-    c = max(max(box[4] - c2, c2 - box[5]), 0.0)
-    apart = a * a + b * b + c * c
+    apart = 0.0
+    near = 0.0
+    far = 0.0
+    for axis in range(3 if solid else 2):
+        low = box[0, axis] - sensor_position[axis]
+        high = box[1, axis] - sensor_position[axis]
+        centre = c0 if axis == 0 else (c1 if axis == 1 else c2)
+        apart += max(max(low - centre, centre - high), 0.0) ** 2
+        near += max(max(low, -high), 0.0) ** 2
+        far += max(-low, high) ** 2
     if cartesian:
         return gate[1] * apart
-    gap = max(max(box[6] - z0, z0 - box[7]), 0.0)
-    square = gate[0] * gap * gap
-    if z0 > 0.0 and box[7] > 0.0:
-        widest = max(abs(box[6] - z0), abs(box[7] - z0))
-        square += gate[1] * max(apart - widest * widest, 0.0) / (z0 * box[7])
+    near = math.sqrt(near)
+    far = math.sqrt(far)
+    square = gate[0] * max(max(near - z0, z0 - far), 0.0) ** 2
+    if z0 > 0.0 and far > 0.0:
+        widest = max(abs(near - z0), abs(far - z0))
+        square += gate[1] * max(apart - widest * widest, 0.0) / (z0 * far)
     return square
 
 
@@ -487,13 +544,11 @@ def _angles(x, y, height, solid, number, bearing, elevation):  # type: ignore[no
             elevation[i] = arctan2(height[i], math.sqrt(x[i] * x[i] + y[i] * y[i]))
 
 
-@njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _smallest(row, seen, number):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    smallest = np.inf
+@njit(cache=True, error_model='numpy')
+def _smallest(row, seen, number, scratch):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in range(number):
-        square = row[i] if seen[i] > 0.0 else np.inf
-        smallest = square if square < smallest else smallest
-    return smallest
+        scratch[i] = row[i] if seen[i] > 0.0 else np.inf
+    return _lowest(scratch, number)
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
@@ -513,20 +568,6 @@ def _likelihoods(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     return total
 
 
-@njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _bounding_box(x, y, height, distance, seen, number, box):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill lower and upper bounds of offsets and distances; inf if no particle counts."""
-    _extent(x, number, box[0:2])
-    _extent(y, number, box[2:4])
-    _extent(height, number, box[4:6])
-    _extent(distance, number, box[6:8])
-    most = 0.0
-    for i in range(number):
-        most = seen[i] if seen[i] > most else most
-    if most <= 0.0:
-        box[6] = np.inf
-
-
 @njit(cache=True, error_model='numpy')
 def _products(a, b, number, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in range(number):
@@ -539,12 +580,40 @@ def _norms(x, y, z, number, out):  # type: ignore[no-untyped-def]  # pragma: no 
         out[i] = math.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    first_chunk,
-    last_chunk,
+@njit(cache=True, error_model='numpy')
+def _squares(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    z,
+    cartesian,
+    c0,
+    c1,
+    c2,
+    information,
+    x,
+    y,
+    height,
+    distance,
+    bearing,
+    elevation,
+    turned,
+    solid,
+    number,
+    row,
+):
+    """Fill squared normalised errors; range and angles of the particles first, unless `turned`."""
+    if cartesian:
+        _cartesian_squares(c0, c1, c2, information, x, y, height, number, row)
+        return
+    if not turned:
+        _norms(x, y, height, number, distance)
+        _angles(x, y, height, solid, number, bearing, elevation)
+    _polar_squares(z, information, distance, bearing, elevation, number, row)
+
+
+@njit(cache=True, error_model='numpy')
+def _fill_references(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     particles,
     weights,
+    boxes,
     kind,
     parameters,
     cos_yaw,
@@ -556,6 +625,100 @@ def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
     centres,
     information,
     gates,
+    references,
+):
+    """Fill for each detection the smallest square in the tile that promises it.
+
+    The smallest of all is not above it, so that it rules out most tiles before they are looked at.
+    """
+    solid = particles.shape[1] == 3
+    n = particles.shape[0]
+    x = np.empty(TILE)
+    y = np.empty(TILE)
+    height = np.empty(TILE)
+    distance = np.empty(TILE)
+    bearing = np.empty(TILE)
+    elevation = np.zeros(TILE)
+    chance = np.empty(TILE)
+    seen = np.empty(TILE)
+    row = np.empty(TILE)
+    scratch = np.empty(TILE)
+    bits = scratch.view(np.int64)
+    tiles = (n + TILE - 1) // TILE
+    for m in range(values.shape[0]):
+        c0 = centres[m, 0] - sensor_position[0]
+        c1 = centres[m, 1] - sensor_position[1]
+        c2 = centres[m, 2] - sensor_position[2] if solid else 0.0
+        best = -1
+        lowest = np.inf
+        for tile in range(tiles):
+            lower = _least_square(
+                boxes[tile],
+                sensor_position,
+                solid,
+                c0,
+                c1,
+                c2,
+                values[m, 0],
+                cartesian[m],
+                gates[m],
+            )
+            if lower < lowest:
+                lowest = lower
+                best = tile
+        references[m] = np.inf
+        if best < 0:
+            continue
+        start = best * TILE
+        size = min(TILE, n - start)
+        offsets(particles, start, size, sensor_position, x, y, height)
+        if kind == GIVEN:
+            chance[:size] = probability[start : start + size]
+        else:
+            fill_probabilities(
+                kind, parameters, x, y, height, size, cos_yaw, sin_yaw, chance, scratch, bits
+            )
+        _products(chance, weights[start : start + size], size, seen)
+        _squares(
+            values[m],
+            cartesian[m],
+            c0,
+            c1,
+            c2,
+            information[m],
+            x,
+            y,
+            height,
+            distance,
+            bearing,
+            elevation,
+            False,
+            solid,
+            size,
+            row,
+        )
+        references[m] = _smallest(row, seen, size, scratch)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk,
+    last_chunk,
+    particles,
+    weights,
+    boxes,
+    kind,
+    parameters,
+    cos_yaw,
+    sin_yaw,
+    probability,
+    sensor_position,
+    values,
+    cartesian,
+    centres,
+    information,
+    gates,
+    references,
     likelihood,
     active,
     all_smallest,
@@ -578,9 +741,7 @@ def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
     seen = np.empty((TILES, TILE))
     scratch = np.empty(TILE)
     bits = scratch.view(np.int64)
-    box = np.empty((TILES, 8))
     least_here = np.empty(TILES)
-    lower = np.empty(TILES)
     turned = np.empty(TILES, np.bool_)
     for chunk in range(first_chunk, last_chunk):
         first = chunk * CHUNK
@@ -590,7 +751,6 @@ def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
             start = first + tile * TILE
             size = min(TILE, stop - start)
             chance = probability[start : start + size]
-            mine = weights[start : start + size]
             turned[tile] = False
             offsets(particles, start, size, sensor_position, x[tile], y[tile], height[tile])
             if kind != GIVEN:
@@ -607,62 +767,56 @@ def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
                     scratch,
                     bits,
                 )
-            _products(chance, mine, size, seen[tile])
-            _norms(x[tile], y[tile], height[tile], size, distance[tile])
-            _bounding_box(
-                x[tile], y[tile], height[tile], distance[tile], seen[tile], size, box[tile]
-            )
+            _products(chance, weights[start : start + size], size, seen[tile])
         for m in range(number):
             c0 = centres[m, 0] - sensor_position[0]
             c1 = centres[m, 1] - sensor_position[1]
             c2 = centres[m, 2] - sensor_position[2] if solid else 0.0
-            best = 0
-            for tile in range(tiles):
-                lower[tile] = _least_square(
-                    box[tile], c0, c1, c2, values[m, 0], cartesian[m], gates[m]
-                )
-                if lower[tile] < lower[best]:
-                    best = tile
+            bound = references[m]
             least = np.inf
-            for turn in range(tiles):
-                # The most promising tile first: its likelihoods rule out most others.
-                tile = best if turn == 0 else (turn - 1 if turn <= best else turn)
+            for tile in range(tiles):
                 least_here[tile] = np.inf
-                if lower[tile] == np.inf or lower[tile] > least + 1.01 * RELATIVE_GATE:
+                lower = _least_square(
+                    boxes[chunk * TILES + tile],
+                    sensor_position,
+                    solid,
+                    c0,
+                    c1,
+                    c2,
+                    values[m, 0],
+                    cartesian[m],
+                    gates[m],
+                )
+                if lower > bound + 1.01 * RELATIVE_GATE:
                     continue
                 start = first + tile * TILE
                 size = min(TILE, stop - start)
                 row = likelihood[m, start : start + size]
-                if cartesian[m]:
-                    _cartesian_squares(
-                        c0, c1, c2, information[m], x[tile], y[tile], height[tile], size, row
-                    )
-                else:
-                    if not turned[tile]:
-                        turned[tile] = True
-                        _angles(
-                            x[tile],
-                            y[tile],
-                            height[tile],
-                            solid,
-                            size,
-                            bearing[tile],
-                            elevation[tile],
-                        )
-                    _polar_squares(
-                        values[m],
-                        information[m],
-                        distance[tile],
-                        bearing[tile],
-                        elevation[tile],
-                        size,
-                        row,
-                    )
-                least_here[tile] = _smallest(row, seen[tile], size)
+                _squares(
+                    values[m],
+                    cartesian[m],
+                    c0,
+                    c1,
+                    c2,
+                    information[m],
+                    x[tile],
+                    y[tile],
+                    height[tile],
+                    distance[tile],
+                    bearing[tile],
+                    elevation[tile],
+                    turned[tile],
+                    solid,
+                    size,
+                    row,
+                )
+                turned[tile] |= not cartesian[m]
+                least_here[tile] = _smallest(row, seen[tile], size, scratch)
                 least = min(least, least_here[tile])
+                bound = min(bound, least)
             total = 0.0
             for tile in range(tiles):
-                here = least_here[tile] < least + RELATIVE_GATE
+                here = least_here[tile] < bound + RELATIVE_GATE
                 active[m, chunk * TILES + tile] = here
                 if here:
                     start = first + tile * TILE
@@ -676,7 +830,7 @@ def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
                         scratch,
                         bits,
                     )
-            all_smallest[chunk, m] = least
+            all_smallest[chunk, m] = least if total > 0.0 else np.inf
             all_sums[chunk, m] = total
 
 
@@ -833,12 +987,15 @@ def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
             for i in range(size):
                 before[i] = all_group[start + i]
             single = _one_group(before, size)
-            offsets(particles, start, size, origin, x, y, z)
             if first_detection == 0:
                 _begin(all_probability[start:stop], factor, share, component, size)
+            apart = False
             for m in range(number):
                 if not active[m, tile] or scale[chunk, m] == 0.0:
                     continue
+                if not apart:
+                    apart = True
+                    offsets(particles, start, size, origin, x, y, z)
                 _shares(
                     likelihood[m, start:stop],
                     scale[chunk, m],
@@ -1032,6 +1189,7 @@ class Association:
 def _explain(
     particles: FloatArray,
     denominator: FloatArray,
+    boxes: FloatArray,
     kernel: tuple[int, FloatArray],
     probability: FloatArray,
     measurements: MeasurementSet,
@@ -1048,10 +1206,12 @@ def _explain(
     active = workspace.take('active', (width, chunks * TILES), np.bool_)
     smallest = np.empty((chunks, width))
     sums = np.empty((chunks, width))
+    references = np.empty(width)
     yaw = pose.yaw
     work = (
         particles,
         denominator,
+        boxes,
         *kernel,
         math.cos(yaw),
         math.sin(yaw),
@@ -1062,12 +1222,11 @@ def _explain(
         measurements.centres[block],
         measurements.information[block],
         measurements.gates[block],
-        likelihood,
-        active,
-        smallest,
-        sums,
+        references,
     )
-    run_chunks(lambda c, e: _explain_chunks(c, e, *work), n, pool)
+    _fill_references(*work)
+    out = (likelihood, active, smallest, sums)
+    run_chunks(lambda c, e: _explain_chunks(c, e, *work, *out), n, pool)
     log_own = np.empty(width)
     _log_sums(smallest, sums, measurements.log_norm[block], log_own)
     return likelihood, active, smallest, sums, log_own
@@ -1126,7 +1285,9 @@ def associate(
         probability = workspace.take('probability', (n,))
     blocks = [slice(first, min(number, first + BLOCK)) for first in range(0, number, BLOCK)]
     blocks = blocks or [slice(0, 0)]
-    parts = (particles, denominator, kernel, probability, measurements)
+    boxes = workspace.take('boxes', (max(1, -(-n // CHUNK)) * TILES, 2, d))
+    run_chunks(lambda c, e: _box_chunks(c, e, particles, boxes), n, pool)
+    parts = (particles, denominator, boxes, kernel, probability, measurements)
     explained = _explain(*parts, blocks[0], pose, workspace, pool)
     if callable(other):
         own = [explained[4]]

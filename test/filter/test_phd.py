@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 
 from maasi_filter import ExponentialDetection, Pose, RangeBearing, RangeBearingElevation
-from maasi_filter.elementary import arctan2, exponentials
+from maasi_filter.elementary import arctan2, exponentials, sines
 from maasi_filter.phd import associate, position_measurements, prepare_measurements
 
 ORIGIN = Pose([0.0, 0.0, 0.0])
@@ -53,6 +53,32 @@ def test_update_is_equation_13(dimension):
     np.testing.assert_allclose(weights * update.factor, expected, rtol=1e-10, atol=1e-16)
     normaliser = other + (probability * likelihood * weights).sum(axis=1)
     np.testing.assert_allclose(np.exp(update.log_normaliser), normaliser, rtol=1e-10)
+
+
+@pytest.mark.parametrize('correlated', [False, True])
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_tiles_that_are_left_out_explain_nothing(dimension, correlated):
+    """Clouds that lie together, of which a bound rules most out, against the formula itself."""
+    generator = np.random.default_rng(4)
+    centres = generator.uniform(-60.0, 60.0, (12, dimension))
+    positions = np.repeat(centres, 500, axis=0) + generator.normal(0.0, 1.0, (6000, dimension))
+    weights = generator.random(6000) * 0.004
+    pose = Pose.from_yaw([5.0, -3.0, 2.0], 0.5)
+    model = MODELS[dimension]
+    probability = ExponentialDetection(0.9, [30.0] * dimension).probability(positions, pose)
+    # One of a cloud, one between two, one behind the robot's back, one beyond everything.
+    points = np.array([centres[3], 0.5 * (centres[0] + centres[1]), centres[7], centres[5] * 9.0])
+    values = model.measure(points, pose)
+    covariance = np.diag([0.5, 0.02, 0.05][:dimension]) ** 2
+    if correlated:
+        covariance[0, 1] = covariance[1, 0] = 0.8 * np.sqrt(covariance[0, 0] * covariance[1, 1])
+    other = np.array([0.0, 1e-6, 1e-3, 1e-9])
+    update = associate(
+        positions, weights, probability, polar(values, covariance, pose), pose, other
+    )
+    likelihood = np.exp(model.log_density(values, positions, pose, covariance))
+    expected = dense_update(positions, weights, probability, likelihood, other)
+    np.testing.assert_allclose(update.weights, expected, rtol=1e-10, atol=1e-18)
 
 
 @pytest.mark.parametrize('dimension', [2, 3])
@@ -292,6 +318,22 @@ def test_own_arctangent_is_the_librarys():
     assert arctan2(0.0, 0.0) == 0.0
     assert arctan2(0.0, -1.0) == np.pi
     assert arctan2(1.0, 0.0) == np.pi / 2
+
+
+def test_own_sines_are_the_librarys():
+    generator = np.random.default_rng(0)
+    x = np.concatenate(
+        [
+            generator.uniform(-4.0, 4.0, 20_000),
+            generator.uniform(-2e3, 2e3, 20_000),
+            np.pi * np.arange(-8, 9) / 4.0,
+        ]
+    )
+    sine = np.empty_like(x)
+    cosine = np.empty_like(x)
+    sines(x, len(x), sine, cosine)
+    np.testing.assert_allclose(sine, np.sin(x), rtol=0.0, atol=3e-16)
+    np.testing.assert_allclose(cosine, np.cos(x), rtol=0.0, atol=3e-16)
 
 
 def test_own_exponential_is_the_librarys_and_becomes_zero():
