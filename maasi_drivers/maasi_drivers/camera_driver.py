@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 from zlib import crc32
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -17,7 +16,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from maasi_drivers.agent_driver import AgentDriver, Sighting
 from maasi_drivers.arrival_clock import ArrivalClock
 from maasi_drivers.camera_settings import CameraSettings, load_calibration
-from maasi_drivers.image_encoding import image_to_array
+from maasi_drivers.image_encoding import decode_image, image_to_array
 from maasi_drivers.image_source import ImageSourceError, VideoSource
 from maasi_drivers.marker_detector import MarkerDetector
 from maasi_drivers.measurement_feed import FeedReceiver
@@ -233,19 +232,14 @@ class CameraDriver(AgentDriver[Picture]):
         )
 
     def _on_compressed(self, message: CompressedImage) -> None:
-        def decode() -> ImageArray:
-            data = np.frombuffer(message.data, np.uint8)
-            image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-            if image is None:
-                raise ValueError(
-                    f'camera/image_raw/compressed: got {data.size} bytes of '
-                    f"'{message.format}', allowed is what OpenCV decodes"
-                )
-            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
         topic = 'camera/image_raw/compressed'
         stamp = stamp_from_ros(message.header.stamp)
-        self.take_frame(topic, stamp, decode, repeated=self._is_repeated(message.data))
+        self.take_frame(
+            topic,
+            stamp,
+            lambda: decode_image(message.data, message.format),
+            repeated=self._is_repeated(message.data),
+        )
 
     def _is_repeated(self, data: Any) -> bool:
         """Return whether an image is the one before to the bit: noise never is."""

@@ -99,3 +99,36 @@ def image_to_array(
     if conversion is None:
         return pixels
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
+
+
+def decode_image(
+    data: bytes | bytearray | array | NDArray[np.uint8], kind: str
+) -> NDArray[np.uint8]:
+    """
+    Decode the data of a ``sensor_msgs/CompressedImage``.
+
+    Parameters
+    ----------
+    data : bytes-like
+        JPEG, PNG, ...
+    kind : str
+        Its format, for messages.
+
+    Returns
+    -------
+    ndarray, shape (height, width, 3), uint8
+        R, G, B.
+
+    Raises
+    ------
+    ValueError
+        If it is nothing that OpenCV decodes.
+
+    """
+    flat = np.frombuffer(data, np.uint8)
+    image = cv2.imdecode(flat, cv2.IMREAD_COLOR) if flat.size else None
+    if image is None:
+        raise ValueError(
+            f"image: got {flat.size} bytes of '{kind}', allowed is what OpenCV decodes"
+        )
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)

@@ -1,0 +1,340 @@
+"""A sensor's noise R from recordings of one target."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from numpy.testing import assert_allclose
+
+from maasi_drivers.calibrate_sensor import main
+from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.sensor_calibration import Look, sensor_noise
+from maasi_filter.parameters import flatten
+from maasi_filter.pose import Pose
+from maasi_filter.settings import SensorSettings
+from maasi_sim.bag import BagWriter, load_types
+from maasi_sim.scenario import scenario_from_values
+from maasi_sim.simulation import Simulation
+
+TARGET = [0.8, 0.9]
+NOISE, HEADING_NOISE = 0.008, 0.02
+# Stamps of the recorded images are late by so much [s].
+LATE = 0.05
+STEP = 0.05
+LEAST_RANGE = 0.05
+
+
+# ---- from looks to R -------------------------------------------------------------------------
+
+
+def looks_at(target, deviations, number, seed, sensor, spread=0.2, height=0.0):
+    generator = np.random.default_rng(seed)
+    looks = []
+    for _ in range(number):
+        place = np.zeros(3)
+        place[: len(target)] = target + generator.uniform(-spread, spread, len(target))
+        place[2] += height
+        pose = Pose.from_yaw(place, generator.uniform(-3.0, 3.0))
+        exact = sensor.measurement.measure(np.atleast_2d(target), pose)
+        looks.append(Look(pose, exact + generator.normal(0.0, deviations, exact.shape)))
+    return looks
+
+
+def sensor_of(dimension, **settings):
+    return SensorSettings.model_validate(settings).build('rover', dimension)
+
+
+@pytest.mark.parametrize('given', [True, False])
+def test_a_known_covariance_is_found_again_in_3d(given):
+    target, deviations = np.array([9.0, 12.0, 7.0]), [1.5, 0.175, 0.295]
+    sensor = sensor_of(3, detection={'size': [25.0, 25.0, 25.0]})
+    looks = looks_at(target, deviations, 2000, 3, sensor, spread=6.0)
+    if given:
+        noise = sensor_noise(looks, sensor, target)
+        assert_allclose(noise.deviations, deviations, rtol=0.06)
+        correlation = noise.covariance / np.outer(noise.deviations, noise.deviations)
+        assert np.abs(correlation - np.eye(3)).max() < 0.08
+        assert np.abs(noise.bias).max() < 0.1
+    else:
+        noise = sensor_noise(looks, sensor)
+        assert_allclose(noise.target, target, atol=0.3)
+        assert_allclose(noise.deviations, deviations, rtol=0.1)
+    assert noise.used == 2000
+
+
+def test_misses_and_other_things_are_counted_and_not_part_of_r():
+    sensor = sensor_of(2, detection={'kind': 'box', 'lower': [-1, -1], 'upper': [1, 1]})
+    target = np.array([1.0, 2.0])
+    looks = looks_at(target, [0.01, 0.03], 400, 4, sensor, spread=0.5)
+    generator = np.random.default_rng(5)
+    for i in range(0, 400, 10):
+        looks[i] = Look(looks[i].pose, np.zeros((0, 2)))
+    for i in range(5, 400, 10):
+        false = [[generator.uniform(0.5, 0.9), generator.uniform(-3, 3)]]
+        looks[i] = Look(looks[i].pose, np.concatenate([false, looks[i].values]))
+    noise = sensor_noise(looks, sensor)
+    assert_allclose(noise.deviations, [0.01, 0.03], rtol=0.15)
+    assert (noise.inside, noise.missed, noise.others) == (400, 40, 40)
+    assert noise.probability == pytest.approx(0.9)
+    assert noise.used + noise.near == 360
+
+
+def test_bearings_across_pi_have_small_errors():
+    sensor = sensor_of(2)
+    target = np.array([-1.0, 0.0])
+    looks = []
+    generator = np.random.default_rng(6)
+    for _ in range(50):
+        pose = Pose.from_yaw([0.0, generator.normal(0.0, 0.01), 0.0], 0.0)
+        value = sensor.measurement.measure(target[None], pose)
+        value[0, 1] += generator.normal(0.0, 0.01)
+        value[0, 1] -= 2.0 * np.pi * (value[0, 1] > np.pi)
+        looks.append(Look(pose, value))
+    assert sensor_noise(looks, sensor, target).deviations[1] < 0.015
+
+
+def test_too_few_looks_are_refused():
+    sensor = sensor_of(2)
+    looks = looks_at(np.array([1.0, 2.0]), [0.01, 0.03], 9, 4, sensor)
+    with pytest.raises(ValueError, match=r'seen . times from .* allowed is at least 10'):
+        sensor_noise(looks, sensor)
+    with pytest.raises(ValueError, match='seen 0 times'):
+        sensor_noise([], sensor)
+    with pytest.raises(ValueError, match='target: got'):
+        sensor_noise(looks, sensor, [np.nan, 1.0])
+
+
+# ---- from a recording to R -------------------------------------------------------------------
+
+
+def single_target():
+    robot = {
+        'type': 'mambo',
+        'start': [0.7, 0.7, 1.0],
+        'yaw': 0.4,
+        'candidates': {'grid': [4, 4], 'spacing': 0.3, 'corner': [0.3, 0.3]},
+        'odometry': {
+            'position_noise': NOISE,
+            'heading_noise': HEADING_NOISE,
+            'position_drift': 0.0,
+            'heading_drift': 0.0,
+        },
+        'camera': {'stamp_offset': -LATE},
+    }
+    values = {
+        'version': 1,
+        'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
+        'targets': {'positions': [TARGET]},
+        'robots': {'mambo': robot},
+    }
+    return scenario_from_values(values, 'test')
+
+
+@pytest.fixture(scope='module')
+def recording(tmp_path_factory):
+    """Record a drone that hovers about over one target; return the folder, and what is true."""
+    folder = tmp_path_factory.mktemp('calibration')
+    scenario = single_target()
+    simulation = Simulation(scenario, 7)
+    robot = simulation.robots['mambo']
+    types = load_types()
+    made = types.types
+    generator = np.random.default_rng(8)
+    ranges = []
+    with BagWriter(folder / 'bag', types, images='png') as writer:
+        writer.add_topic('/mambo/odom', 'nav_msgs/msg/Odometry')
+        writer.add_topic('/mambo/camera/image_raw', 'sensor_msgs/msg/Image')
+
+        def header(time):
+            stamp = made['builtin_interfaces/msg/Time'](
+                sec=round(1e3 * time) // 1000, nanosec=round(1e3 * time) % 1000 * 1_000_000
+            )
+            return made['std_msgs/msg/Header'](stamp=stamp, frame_id='odom')
+
+        waypoint = np.array(TARGET)
+        for step in range(1200):
+            simulation.advance()
+            place = robot.state.pose.position
+            if step % 30 == 0:
+                waypoint = TARGET + generator.uniform(-0.18, 0.18, 2)
+            robot.command([*np.clip(1.5 * (waypoint - place[:2]), -0.4, 0.4), 0.0, 0.0])
+            now = round(1e9 * simulation.time)
+            pose = robot.odometry.pose
+            point = made['geometry_msgs/msg/Point'](*pose.position)
+            w, x, y, z = pose.orientation
+            writer.write_message(
+                '/mambo/odom',
+                now,
+                made['nav_msgs/msg/Odometry'](
+                    header=header(simulation.time),
+                    child_frame_id='base_link',
+                    pose=made['geometry_msgs/msg/PoseWithCovariance'](
+                        pose=made['geometry_msgs/msg/Pose'](
+                            position=point,
+                            orientation=made['geometry_msgs/msg/Quaternion'](x, y, z, w),
+                        ),
+                        covariance=np.zeros(36),
+                    ),
+                    twist=made['geometry_msgs/msg/TwistWithCovariance'](
+                        twist=made['geometry_msgs/msg/Twist'](
+                            linear=made['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0),
+                            angular=made['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0),
+                        ),
+                        covariance=np.zeros(36),
+                    ),
+                ),
+            )
+            if simulation.images_due('mambo'):
+                image = robot.image(simulation.step, simulation.time)
+                writer.write_message(
+                    '/mambo/camera/image_raw',
+                    now + 1,
+                    made['sensor_msgs/msg/Image'](
+                        header=header(simulation.time + LATE),
+                        height=image.shape[0],
+                        width=image.shape[1],
+                        encoding='rgb8',
+                        is_bigendian=0,
+                        step=3 * image.shape[1],
+                        data=np.ascontiguousarray(image).reshape(-1),
+                    ),
+                )
+                ranges.append(float(np.linalg.norm(place[:2] - TARGET)))
+    write_parameters(folder / 'driver.yaml', scenario)
+    return folder, np.array(ranges)
+
+
+def write_parameters(path, scenario, **changes):
+    robot = scenario.robots['mambo']
+    settings = DriverSettings(
+        environment=scenario.environment,
+        start=robot.start,
+        yaw=robot.yaw,
+        sensor=robot.sensor,
+        camera=robot.camera,
+    )
+    content = flatten(settings) | {'use_sim_time': True} | changes
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': content}}))
+
+
+def calibrate(folder, *arguments, parameters='driver.yaml'):
+    result = folder / 'result.json'
+    words = [str(folder), '--parameters', str(folder / parameters), '--json', str(result)]
+    assert main([*words, *arguments]) == 0
+    return json.loads(result.read_text())
+
+
+@pytest.mark.parametrize('given', [True, False])
+def test_r_of_a_recorded_flight_is_that_of_its_odometry(recording, given, capsys):
+    folder, ranges = recording
+    noise = calibrate(folder, *(['--target', *map(str, TARGET)] if given else []))
+    far = ranges[ranges >= LEAST_RANGE]
+    # The errors of the pose: the image's are a tenth of them.
+    expected = [NOISE, np.sqrt(np.mean((NOISE / far) ** 2) + HEADING_NOISE**2)]
+    assert_allclose(noise['deviations'], expected, rtol=0.2)
+    assert_allclose(noise['target'], TARGET, atol=0.003)
+    assert noise['used'] > 0.95 * len(far)
+    assert noise['missed'] <= 0.02 * noise['inside']
+    said = capsys.readouterr().out
+    assert 'poses of /mambo/odom' in said
+    snippet = yaml.safe_load(said[said.index('sensor:') :])
+    SensorSettings.model_validate(snippet['sensor'])
+    assert snippet['sensor']['noise']['range'] == pytest.approx(noise['deviations'][0], rel=1e-3)
+
+
+def test_a_wrong_stamp_offset_shows(recording, capsys):
+    folder, _ = recording
+    scenario = single_target()
+    write_parameters(folder / 'late.yaml', scenario, **{'camera.stamp_offset': 0.1})
+    target = ['--target', *map(str, TARGET)]
+    right = calibrate(folder, *target)
+    wrong = calibrate(folder, *target, parameters='late.yaml')
+    assert wrong['deviations'][0] > 1.5 * right['deviations'][0]
+
+
+def test_a_target_given_at_the_wrong_place_shows_as_a_bias(recording, capsys):
+    folder, _ = recording
+    calibrate(folder, '--target', '0.83', '0.9')
+    assert 'look at mount, stamp_offset, start and target' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['--robot', 'rover'], ['robot: found none', '/mambo/odom']),
+        (['--use', 'detections'], ['found none with detections']),
+        (['--poses', '/nowhere'], ['poses: /nowhere is not recorded']),
+        (['--poses', '/mambo/camera/image_raw/compressed'], ['allowed are AgentState']),
+        (['--target', '1'], ['target: got [1.0]', '2 finite numbers']),
+        (['--least-range', '5'], ['seen 0 times', 'at least 10']),
+    ],
+)
+def test_what_is_wrong_is_said(recording, capsys, arguments, words):
+    folder, _ = recording
+    assert main([str(folder), '--parameters', str(folder / 'driver.yaml'), *arguments]) == 2
+    said = capsys.readouterr().err
+    assert all(word in said for word in words), said
+
+
+@pytest.mark.parametrize(
+    ('content', 'words'),
+    [
+        ('- 1\n', 'not a parameter file'),
+        ('/**: {ros__parameters: {camera.widht: 5}}\n', 'camera.widht: there is no such parameter'),
+        ('/**: {ros__parameters: {camera.width: 5}}\n', 'read'),
+    ],
+)
+def test_a_wrong_parameter_file_is_said(recording, tmp_path, capsys, content, words):
+    file = tmp_path / 'driver.yaml'
+    file.write_text(content)
+    assert main([str(recording[0]), '--parameters', str(file)]) == 2
+    assert words in capsys.readouterr().err
+    assert main([str(recording[0]), '--parameters', str(tmp_path / 'none.yaml')]) == 2
+    assert main([str(tmp_path / 'none'), '--parameters', str(recording[0] / 'driver.yaml')]) == 2
+
+
+def test_detections_of_a_driver_do_as_well(tmp_path, capsys):
+    """For robots that segment on board, or range: there are no images to record."""
+    scenario = single_target()
+    sensor = scenario.robots['mambo'].sensor.build('mambo', 2)
+    types = load_types()
+    made = types.types
+    looks = looks_at(np.array(TARGET), [0.011, 0.03], 300, 9, sensor, height=1.0)
+    with BagWriter(tmp_path / 'bag', types) as writer:
+        writer.add_topic('/mambo/detections', 'maasi_msgs/msg/DetectionArray')
+        writer.add_topic('/mambo/state', 'maasi_msgs/msg/AgentState')
+        for number, look in enumerate(looks):
+            pose = made['geometry_msgs/msg/Pose'](
+                position=made['geometry_msgs/msg/Point'](*look.pose.position),
+                orientation=made['geometry_msgs/msg/Quaternion'](
+                    *look.pose.orientation[1:], look.pose.orientation[0]
+                ),
+            )
+            detections = [
+                made['maasi_msgs/msg/Detection'](
+                    range=value[0], bearing=value[1], elevation=0.0, covariance=np.zeros(0)
+                )
+                for value in look.values
+            ]
+            message = made['maasi_msgs/msg/DetectionArray'](
+                header=made['std_msgs/msg/Header'](
+                    stamp=made['builtin_interfaces/msg/Time'](sec=number, nanosec=0),
+                    frame_id='map',
+                ),
+                batch_id=number,
+                step=number,
+                robot='mambo',
+                measurement=number,
+                sensor='mambo',
+                pose=made['geometry_msgs/msg/PoseWithCovariance'](
+                    pose=pose, covariance=np.zeros(36)
+                ),
+                detections=detections,
+                dropped=0,
+            )
+            writer.write_message('/mambo/detections', number, message)
+    write_parameters(tmp_path / 'driver.yaml', scenario)
+    noise = calibrate(tmp_path, '--target', *map(str, TARGET))
+    assert_allclose(noise['deviations'], [0.011, 0.03], rtol=0.15)
+    assert 'detections used' in capsys.readouterr().out
