@@ -30,7 +30,8 @@ from maasi_filter.conversions import (
 from maasi_filter.node_settings import FilterNodeSettings
 from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
 from maasi_filter.search_filter import AgentMeasurement, SearchFilter
-from maasi_filter.search_node import SearchNode, run
+from maasi_filter.search_node import SearchNode, SettingsError, run
+from maasi_filter.state_file import StateFileError
 from maasi_msgs.msg import (
     BatchMember,
     ClusterArray,
@@ -99,6 +100,36 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         bounds = settings.environment.array()
         self._size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
         self._begin_anew()
+        if self.settings.save_file and Path(self.settings.save_file).exists():
+            self._load()
+
+    def _load(self) -> None:
+        """Go on where the saved search was.
+
+        Raises
+        ------
+        SettingsError
+            If the file is damaged, or of another environment.
+        """
+        settings = self.settings
+        try:
+            saved = SearchFilter.load(settings.save_file)
+        except StateFileError as error:
+            raise SettingsError(f'parameter save_file: {error}') from None
+        bounds = settings.environment.array()
+        if not np.array_equal(saved.bounds, bounds):
+            raise SettingsError(
+                f'parameter save_file: {settings.save_file}: bounds: got {saved.bounds.tolist()}, '
+                f'allowed are those of the environment, {bounds.tolist()}'
+            )
+        if saved.settings != settings.filter:
+            self.get_logger().warning(
+                f'{settings.save_file} was saved with other settings of the filter; they go on'
+            )
+        self.filter = saved
+        self.get_logger().info(
+            f'state loaded from {settings.save_file}: {len(saved.found_targets)} found targets'
+        )
 
     def _begin_anew(self) -> None:
         settings = self.settings
@@ -120,15 +151,9 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         self._latency = 0.0
 
     def set_up(self) -> None:
-        """Compile, load the state and connect."""
+        """Compile and connect."""
         settings = self.settings
         warm_up()
-        if settings.save_file and Path(settings.save_file).exists():
-            self.filter = SearchFilter.load(settings.save_file)
-            self.get_logger().info(
-                f'state loaded from {settings.save_file}: '
-                f'{len(self.filter.found_targets)} found targets'
-            )
         self._update_publisher = self.create_publisher(FilterUpdate, 'filter_update', UPDATES)
         self._clusters_publisher = self.create_publisher(ClusterArray, 'clusters', 10)
         self._found_publisher = self.create_publisher(FoundTargetArray, 'found_targets', LATCHED)
@@ -167,8 +192,13 @@ class FilterNode(SearchNode[FilterNodeSettings]):
             self._save()
 
     def _save(self) -> None:
-        if self.settings.save_file:
+        if not self.settings.save_file:
+            return
+        try:
             self.filter.save(self.settings.save_file)
+        except OSError as error:
+            # The search is worth more than its copy.
+            self.get_logger().error(f'{self.settings.save_file}: state not saved: {error.strerror}')
 
     def reset(self) -> None:
         """Begin a new search."""

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import beta, chi2, t
 
 from maasi_filter import NoiseSettings, warm_up
-from maasi_filter.metrics import match_targets, restricted_mean
+from maasi_filter.metrics import match_targets, normalised_error, restricted_mean
 from maasi_sim.scenario import Scenario, load_scenario
 from maasi_sim.search import search
 
@@ -49,6 +49,8 @@ class Run:
         True targets that were found, true targets, and found targets that are none.
     squares : float
         Sum of the squared errors of the found ones, square metres.
+    normalised : float
+        Sum of their squared errors, normalised with their covariances (NEES).
     measurements : int
         Taken in all.
     finished : bool
@@ -62,6 +64,7 @@ class Run:
     targets: int
     false_found: int
     squares: float
+    normalised: float
     measurements: int
     finished: bool
     seconds: float
@@ -86,13 +89,19 @@ def run_one(scenario: Scenario, seed: int, cap: int = CAP) -> Run:
     start = time.perf_counter()
     result = search(scenario, seed, cap)
     found = np.array([target.position for target in result.found_targets]).reshape(-1, 3)
-    match = match_targets(found[:, : result.truth.shape[1]], result.truth, RADIUS)
+    found = found[:, : result.truth.shape[1]]
+    match = match_targets(found, result.truth, RADIUS)
+    normalised = sum(
+        normalised_error(found[i] - result.truth[j], result.found_targets[i].covariance)
+        for i, j in match.pairs
+    )
     return Run(
         seed=seed,
         found=match.true_found,
         targets=len(result.truth),
         false_found=match.false_found,
         squares=match.true_found * match.rmse**2 if match.true_found else 0.0,
+        normalised=normalised,
         measurements=result.total_measurements,
         finished=match.missed == 0,
         seconds=time.perf_counter() - start,
@@ -136,6 +145,7 @@ def summary(runs: Sequence[Run], cap: int = CAP) -> dict[str, Any]:
             math.sqrt(max(mean_square - half, 0.0)),
             math.sqrt(mean_square + half),
         ],
+        'nees': sum(run.normalised for run in runs) / found.sum(),
         'measurements': times.mean,
         'measurements_half_width': 1.96 * times.standard_error,
         'seconds_per_run': float(np.mean([run.seconds for run in runs])),
@@ -150,8 +160,38 @@ def show(name: str, row: dict[str, Any]) -> str:
     text += f' | {row["false_per_run"]:.2f} ({low:.2f} to {high:.2f})'
     low, high = row['rmse_interval']
     text += f' | {row["rmse"]:.2f} m ({low:.2f} to {high:.2f})'
+    text += f' | {row["nees"]:.2f}'
     text += f' | {row["measurements"]:.0f} +- {row["measurements_half_width"]:.0f}'
     return text + f' | {row["seconds_per_run"]:.1f} s |'
+
+
+def report(options: argparse.Namespace, lines: Sequence[str]) -> str:
+    """Return a page in Markdown: how the table was made, and the table."""
+    last = options.first_seed + options.runs - 1
+    words = ['python test/benchmarks/search_quality.py', f'--scenario {options.scenario}']
+    words += [f'--runs {options.runs} --first-seed {options.first_seed} --cap {options.cap}']
+    for name in ('planner', 'filter'):
+        if getattr(options, name):
+            words.append(f"--{name} '{json.dumps(getattr(options, name))}'")
+    command = ' '.join(words)
+    return f"""# Quality of searches with the filter
+
+Whole searches of the scenario `{options.scenario}` in one process, for seeds
+{options.first_seed} to {last}, each ended when all targets are found or after {options.cap}
+measurements. Written by
+
+    {command}
+
+`degrees` and `radians` are the two readings of R = diag[1.5, 0.175, 0.295] of 000
+(`docs/filter_presets.md`): variances with angles in degrees, or deviations with angles in
+radians. A found target is true when it is matched, one to one, to a true one within {RADIUS:g} m;
+a run is complete when all true ones are found. NEES is the mean normalised squared error of the
+true ones at the end: 3 where covariances are right, below 3 where they are cautious.
+Measurements to find all are a restricted mean. Brackets hold 95 % intervals: Clopper and
+Pearson's, Poisson's, and Student's.
+
+{chr(10).join(lines)}
+"""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -165,11 +205,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--planner', type=json.loads, default={}, help='settings, as JSON')
     parser.add_argument('--filter', type=json.loads, default={}, help='settings, as JSON')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write runs and table there')
+    parser.add_argument('--report', type=Path, metavar='FILE', help='write a page with the table')
     options = parser.parse_args(arguments)
     scenario = load_scenario(options.scenario)
     warm_up()
-    print('| noise | complete | false found per run | RMSE | measurements to find all | a run |')
-    print('|---|---|---|---|---|---|', flush=True)
+    lines = [
+        '| noise | complete | false found per run | RMSE | NEES | measurements | a run |',
+        '|---|---|---|---|---|---|---|',
+    ]
+    print('\n'.join(lines), flush=True)
     output = {}
     for name in options.noise:
         wanted = prepared(scenario, NOISES[name], options.planner, options.filter)
@@ -179,9 +223,12 @@ def main(arguments: list[str] | None = None) -> int:
             runs.append(run_one(wanted, seed, options.cap))
             print(asdict(runs[-1]), file=sys.stderr, flush=True)
         output[name] = {'runs': [asdict(run) for run in runs], 'table': summary(runs, options.cap)}
-        print(show(name, output[name]['table']), flush=True)
+        lines.append(show(name, output[name]['table']))
+        print(lines[-1], flush=True)
     if options.json is not None:
         options.json.write_text(json.dumps(output, indent=2) + '\n', encoding='utf-8')
+    if options.report is not None:
+        options.report.write_text(report(options, lines), encoding='utf-8')
     return 0
 
 

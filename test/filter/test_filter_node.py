@@ -2,7 +2,9 @@
 
 import math
 import time
+from contextlib import contextmanager
 
+import numpy as np
 import pytest
 import rclpy
 from rclpy.context import Context
@@ -10,6 +12,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from maasi_filter import FilterSettings, SearchFilter
 from maasi_filter.executor import LeanExecutor
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.node_settings import FilterNodeSettings
@@ -87,12 +90,14 @@ class Team:
             self.detections[name].publish(message)
 
 
-@pytest.fixture
-def world():
+@contextmanager
+def running(**changes):
+    """Run a node with the team around it; yield both, and how to wait for something."""
     with Domain(None) as domain:
         context = Context()
         rclpy.init(context=context, domain_id=domain.number)
-        node = FilterNode(context=context, parameter_overrides=overrides(SETTINGS))
+        settings = SETTINGS.model_copy(update=changes)
+        node = FilterNode(context=context, parameter_overrides=overrides(settings))
         node.trigger_configure()
         node.trigger_activate()
         team = Team(context)
@@ -116,6 +121,12 @@ def world():
         node.destroy_node()
         team.node.destroy_node()
         rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def world():
+    with running() as everything:
+        yield everything
 
 
 def test_a_target_seen_again_and_again_is_found(world):
@@ -201,3 +212,62 @@ def test_wrong_parameters_are_refused_by_name():
                     )
         finally:
             rclpy.shutdown(context=context)
+
+
+def seen_from_a(team, until, numbers):
+    for number in numbers:
+        before = len(team.updates)
+        team.measure(number, ['a'], {'a': [(0.3, 0.5), (0.25, -1.0)]})
+        until(lambda before=before: len(team.updates) == before + 1)
+
+
+def test_a_node_saves_on_a_timer_and_another_one_goes_on_to_the_bit(tmp_path):
+    file = tmp_path / 'state.maasi'
+    with running() as (_, team, until):
+        seen_from_a(team, until, range(1, 9))
+        until(lambda: team.found[-1].batch_id == 8)
+        expected = [update.expected_number for update in team.updates]
+        targets = list(team.found[-1].targets)
+    assert len(targets) == 2
+    with running(save_file=str(file), save_period=0.05) as (_, team, until):
+        seen_from_a(team, until, [1])
+        file.unlink(missing_ok=True)
+        until(file.exists)
+        first = [update.expected_number for update in team.updates]
+    # The file is the timer's: the node was destroyed without being told to end.
+    with running(save_file=str(file)) as (_, team, until):
+        seen_from_a(team, until, range(2, 9))
+        until(lambda: team.found[-1].batch_id == 8)
+        assert first + [update.expected_number for update in team.updates] == expected
+        again = list(team.found[-1].targets)
+    assert [target.position for target in again] == [target.position for target in targets]
+    assert [list(target.covariance) for target in again] == [
+        list(target.covariance) for target in targets
+    ]
+
+
+def test_a_node_that_cannot_save_goes_on(tmp_path):
+    with running(save_file=str(tmp_path / 'nowhere' / 'state'), save_period=0.01) as (
+        node,
+        team,
+        until,
+    ):
+        seen_from_a(team, until, range(1, 4))
+        node.trigger_deactivate()
+    assert team.updates[-1].found == 2
+
+
+@pytest.mark.parametrize('wrong', ['damaged', 'elsewhere'])
+def test_a_file_that_cannot_be_used_is_refused_with_the_reason(tmp_path, wrong):
+    file = tmp_path / 'state.maasi'
+    bounds = SETTINGS.environment.array()
+    if wrong == 'elsewhere':
+        bounds = bounds + 0.5
+    SearchFilter(FilterSettings(), bounds, np.random.default_rng(0)).save(file)
+    if wrong == 'damaged':
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(bytes(content))
+    reason = 'checksum' if wrong == 'damaged' else 'bounds'
+    with pytest.raises(SettingsError, match=f'save_file: .*{reason}'), running(save_file=str(file)):
+        pass
