@@ -1,5 +1,6 @@
 """Whole scenarios: separate processes over DDS, from camera image to found target."""
 
+import json
 import os
 import signal
 import subprocess
@@ -44,6 +45,16 @@ def test_the_demo_finds_all_targets(tmp_path):
     assert (run.folder / 'report.png').stat().st_size > 10_000
     for name in ('sim_node', 'mambo_driver', 'turtlebot_driver', 'filter_node', 'planner_node'):
         assert (run.folder / f'{name}.log').exists()
+
+
+def test_a_run_beside_another_does_not_hear_it(repeated):
+    first, _ = repeated
+    other = first.folder.parent / 'other'
+    assert json.loads((other / 'report.json').read_text())['seed'] == 4
+    with Bag(other / 'bag') as bag:
+        steps = [item.message.step for item in bag.messages(['/lockstep/step'])]
+    # Of two clocks some steps would be there twice.
+    assert steps == list(range(len(steps))) and len(steps) >= 100
 
 
 def test_the_same_seed_gives_the_same_run_to_the_bit(repeated):
@@ -189,17 +200,15 @@ def test_free_running_finds_targets_too(tmp_path):
     assert sum(run.report['measurements'].values()) >= 20
 
 
-@pytest.mark.parametrize('name', ['filter_node', 'turtlebot_driver'])
-def test_a_killed_node_ends_the_run(tmp_path, name):
-    folder = tmp_path / 'run'
+def under_way(scenario, folder, *options):
+    """Return the process of a run that has recorded something."""
     process = subprocess.Popen(
-        command('mambo_turtlebot', folder, '--lockstep'),
+        command(scenario, folder, *options),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
     )
-    parameters = f'{folder}/'
     wait_for(
         lambda: (
             any((folder / 'bag').glob('*.mcap'))
@@ -207,19 +216,71 @@ def test_a_killed_node_ends_the_run(tmp_path, name):
         ),
         'the run is under way',
     )
-    victims = [pid for pid in processes_with(parameters) if name in _command_line(pid)]
+    return process
+
+
+def kill(folder, name):
+    """Kill a node of a run."""
+    victims = [pid for pid in processes_with(f'{folder}/') if name in _command_line(pid)]
     os.kill(victims[0], signal.SIGKILL)
-    output, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 3, output
-    assert name.split('_', maxsplit=1)[0] in output
-    with Bag(folder / 'bag') as bag:
-        assert any(True for _ in bag.raw(['/clock']))
-    assert not processes_with(parameters)
 
 
 def _command_line(pid):
     with open(f'/proc/{pid}/cmdline', 'rb') as file:
         return file.read().decode()
+
+
+@pytest.mark.parametrize('name', ['filter_node', 'turtlebot_driver'])
+def test_a_killed_node_ends_the_run(tmp_path, name):
+    folder = tmp_path / 'run'
+    process = under_way('mambo_turtlebot', folder, '--lockstep')
+    kill(folder, name)
+    output, _ = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 3, output
+    assert name.split('_', maxsplit=1)[0] in output
+    with Bag(folder / 'bag') as bag:
+        assert any(True for _ in bag.raw(['/clock']))
+    assert not processes_with(f'{folder}/')
+
+
+def test_a_killed_node_is_started_again_where_the_scenario_says_so(tmp_path):
+    content = load_scenario('mambo').content()
+    content['on_exit'] = 'respawn'
+    file, folder = tmp_path / 'respawn.yaml', tmp_path / 'run'
+    file.write_text(yaml.safe_dump(content))
+    process = under_way(file, folder, '--lockstep', '--time-limit', 40)
+    kill(folder, 'filter_node')
+    output, _ = process.communicate(timeout=PATIENCE)
+    assert process.returncode in (0, 1), output
+    with Bag(folder / 'bag') as bag:
+        updates = [item.message.batch_id for item in bag.messages(['/filter_update'])]
+        batches = [item.message.id for item in bag.messages(['/measurement_batch'])]
+    report = json.loads((folder / 'report.json').read_text())
+    assert [event['node'] for event in report['events'] if event['event'] == 'restarted'] == [
+        '/filter_node'
+    ]
+    # It takes part again: the last batches are answered.
+    assert updates[-1] >= batches[-1] - 1 and len(batches) > 30
+    assert 'started again' in output
+
+
+def test_ctrl_c_leaves_no_process_and_a_readable_bag(tmp_path):
+    folder = tmp_path / 'run'
+    process = under_way('mambo_turtlebot', folder)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130, output
+    assert 'Traceback' not in output
+    assert not processes_with(f'{folder}/')
+    with Bag(folder / 'bag') as bag:
+        assert any(True for _ in bag.raw(['/clock']))
+        # Drivers stop their robots before they go.
+        last = {}
+        for item in bag.messages(['/mambo/cmd_vel', '/turtlebot/cmd_vel']):
+            last[item.topic] = item.message.twist
+    for twist in last.values():
+        assert twist.linear.x == twist.linear.y == twist.linear.z == twist.angular.z == 0.0
+    assert len(last) == 2
 
 
 def test_a_wrong_file_is_refused_before_anything_starts(tmp_path):
