@@ -31,6 +31,11 @@ FLOOR_CHOICES = (
         'With weight 1 the force that keeps the drone in the air outweighs T and E.',
     ),
     Choice(
+        'period of measurements',
+        '0.2 m at full speed: 0.5 s, of the ground robot 1 s',
+        'Not given. It is the way between two measurements of AS, as in the simulations of 000.',
+    ),
+    Choice(
         'filter',
         "the paper's preset, with its lengths for the floor",
         'Births where measurements point, T_m = 0.5 and a jitter: as printed nothing is found; '
@@ -48,6 +53,9 @@ HARDWARE_NOTE = (
 )
 # The control cost without the force that holds a drone up.
 MAMBO_MOTION = {'control_inputs': 'torques'}
+# 0.2 m between measurements at 0.4 m/s, and as much for the ground robot at 0.2 m/s.
+MAMBO_SENSOR = {'period': 0.5}
+TURTLEBOT_SENSOR = {'period': 1.0}
 _TARGETS = {'count': 12, 'distribution': 'uniform', 'separation': 0.15, 'margin': 0.1}
 
 

@@ -9,6 +9,8 @@ from maasi_sim.experiments.floors import (
     FLOOR_CHOICES,
     HARDWARE_NOTE,
     MAMBO_MOTION,
+    MAMBO_SENSOR,
+    TURTLEBOT_SENSOR,
     floor,
     floor_filter,
 )
@@ -56,6 +58,7 @@ def _fig9_cases(small: bool) -> list[Case]:
                 'start': [0.1, 0.1, 1.0],
                 'candidates': candidates,
                 'motion': MAMBO_MOTION,
+                'sensor': MAMBO_SENSOR,
             }
         }
 
@@ -246,11 +249,13 @@ def _fig15_cases(small: bool) -> list[Case]:
                 'start': [1.9, 1.9, 1.0],
                 'candidates': candidates[0],
                 'motion': MAMBO_MOTION,
+                'sensor': MAMBO_SENSOR,
             },
             'turtlebot': {
                 'type': 'turtlebot3_burger',
                 'start': [0.0, 0.0, 0.0],
                 'candidates': candidates[1],
+                'sensor': TURTLEBOT_SENSOR,
             },
         }
 

@@ -11,6 +11,7 @@ from maasi_sim.experiments.floors import (
     FLOOR_CHOICES,
     HARDWARE_NOTE,
     MAMBO_MOTION,
+    MAMBO_SENSOR,
     floor,
     floor_filter,
 )
@@ -480,7 +481,8 @@ def _e7() -> Experiment:
         ),
         seconds=8.0,
         maps='001, obstacles',
-        note='Distances are those of straight ways from one measurement to the next.',
+        note='Distances are those of straight ways from one measurement to the next. A target that '
+        'would lie inside an obstacle is drawn again: the maps without obstacles can differ.',
     )
 
 
@@ -498,8 +500,7 @@ def _fig14_cases(small: bool) -> list[Case]:
                 'start': [0.0, 0.0, 1.0],
                 'candidates': candidates,
                 'motion': MAMBO_MOTION,
-                # 0.2 m between measurements at 0.4 m/s.
-                'sensor': {'period': 0.5},
+                'sensor': MAMBO_SENSOR,
             }
         }
         search_filter = (
