@@ -6,23 +6,20 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
-from pymavlink import mavutil
 
 from maasi_drivers.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, Firmware
 from maasi_drivers.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation, swap_yaw
+from maasi_drivers.mavlink.protocol import mavlink
 from maasi_filter.pose import Pose
-from maasi_filter.settings import Settings
+from maasi_sim.autopilot_settings import AutopilotSettings
 from maasi_sim.flight_model import FlightLimits, FlightModel
 
 Array = NDArray[np.float64]
-mavlink = mavutil.mavlink
 
-Kind = Literal['arducopter', 'ardusub', 'px4']
 FIRMWARES: dict[str, Firmware] = {
     'arducopter': ARDUCOPTER,
     'ardusub': ARDUSUB,
@@ -67,31 +64,6 @@ _EKF_GOOD = 1 | 2 | 4 | 8 | 16 | 32
 _EKF_START = 1 | 128
 _POSITION_IGNORED, _VELOCITY_IGNORED, _YAW_IGNORED = 0b111, 0b111 << 3, 1 << 10
 _COMMON_RATES = {'LOCAL_POSITION_NED': 4.0, 'ATTITUDE_QUATERNION': 4.0}
-
-
-class AutopilotSettings(Settings):
-    """What a fake autopilot is like."""
-
-    firmware: Kind = Field(default='arducopter', description='Whose manners it has')
-    system: int = Field(default=1, ge=1, le=255, description='Its system id')
-    depth: float = Field(
-        default=0.0, ge=0.0, description='Of a submarine when it is switched on [m]'
-    )
-    estimator_time: float = Field(
-        default=2.0, ge=0.0, description='Until its position estimate is ready [s]'
-    )
-    noise: float = Field(
-        default=0.005, ge=0.0, description='Deviation of the position that it says [m]'
-    )
-    endurance: float = Field(
-        default=1200.0, gt=0.0, description='Time for which a full battery lasts in the air [s]'
-    )
-    charge: float = Field(default=1.0, ge=0.0, le=1.0, description='At the start, 0 to 1')
-    speed: float = Field(default=2.0, gt=0.0, description='Largest speed, level [m/s]')
-    acceleration: float = Field(default=1.0, gt=0.0, description='Largest acceleration [m/s^2]')
-    parameters: dict[str, float] = Field(
-        default_factory=dict, description='Parameters of the autopilot that differ'
-    )
 
 
 @dataclass

@@ -11,12 +11,15 @@ import time
 from typing import Any
 
 import numpy as np
-from pymavlink import mavutil
 
 from maasi_drivers.mavlink.link import LinkError, open_connection
+from maasi_drivers.mavlink.protocol import mavlink
+from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_filter.pose import Pose
 from maasi_planner.motion import RobotState
-from maasi_sim.fake_autopilot import FIRMWARES, AutopilotSettings, FakeAutopilot
+from maasi_sim.autopilot_settings import AutopilotSettings
+from maasi_sim.fake_autopilot import FIRMWARES, FakeAutopilot
+from maasi_sim.scenario import RobotSettings
 
 _PERIOD = 0.02
 # Of a turn that came late, in steps of the period [s].
@@ -48,7 +51,7 @@ class FakeVehicle:
         As pymavlink has it: where the driver listens.
     start : Pose
         In the map, of the origin of its local frame, and its heading; that frame is ENU.
-    seed : int
+    generator : Generator
         Of its noise.
 
     Raises
@@ -58,15 +61,13 @@ class FakeVehicle:
 
     """
 
-    def __init__(self, settings: AutopilotSettings, url: str, start: Pose, seed: int) -> None:
-        self._connection = open_connection(
-            url, settings.system, mavutil.mavlink.MAV_COMP_ID_AUTOPILOT1
-        )
+    def __init__(
+        self, settings: AutopilotSettings, url: str, start: Pose, generator: np.random.Generator
+    ) -> None:
+        self._connection = open_connection(url, settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1)
         self._origin = np.array(start.position)
         self._gate = self._connection.mav.file = _Gate(self._connection)
-        self.autopilot = FakeAutopilot(
-            settings, self._connection.mav, start.yaw, np.random.default_rng(seed)
-        )
+        self.autopilot = FakeAutopilot(settings, self._connection.mav, start.yaw, generator)
         self._lock = threading.Lock()
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name='fake vehicle', daemon=True)
@@ -82,6 +83,13 @@ class FakeVehicle:
                 body.velocity,
                 np.array([0.0, 0.0, body.yaw_rate]),
             )
+
+    @property
+    def obeys(self) -> bool:
+        """Whether it is armed, and goes where the driver says."""
+        with self._lock:
+            autopilot = self.autopilot
+            return autopilot.armed and autopilot.mode == autopilot.firmware.external
 
     def cut(self, cut: bool = True) -> None:
         """Cut the link, so that nothing goes out or comes in, or mend it."""
@@ -111,6 +119,26 @@ class FakeVehicle:
                 steps = max(1, math.ceil(late / _PERIOD - 0.5))
                 for _ in range(steps):
                     self.autopilot.advance(late / steps)
+
+
+def vehicle_of(robot: RobotSettings, generator: np.random.Generator) -> FakeVehicle:
+    """
+    Return the vehicle of a robot of a scenario, at its start.
+
+    Raises
+    ------
+    LinkError
+        If the connection cannot be opened.
+
+    """
+    link = robot.mavlink or MavlinkSettings()
+    host, port = link.url.removeprefix('udpin:').split(':')
+    return FakeVehicle(
+        robot.autopilot.model_copy(update={'system': link.system}),
+        f'udpout:{"127.0.0.1" if host == "0.0.0.0" else host}:{port}',
+        Pose.from_yaw([*robot.start[:2], link.ground], robot.yaw),
+        generator,
+    )
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -180,7 +208,9 @@ def main(arguments: list[str] | None = None) -> int:
             charge=options.charge,
             parameters=read_parameters(options.parameter),
         )
-        vehicle = FakeVehicle(settings, options.url, Pose.from_yaw(np.zeros(3), 0.0), 1)
+        vehicle = FakeVehicle(
+            settings, options.url, Pose.from_yaw(np.zeros(3), 0.0), np.random.default_rng(1)
+        )
     except (ValueError, LinkError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2

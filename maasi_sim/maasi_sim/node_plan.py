@@ -112,7 +112,13 @@ def plan_nodes(
         Whether the sim waits for a recorder.
     file : Path
         Scenario file with all layers, for the sim.
+
+    Raises
+    ------
+    ScenarioError
+        If a link cannot keep this pace.
     """
+    scenario.check_pace(lockstep, rate)
     common = {'step': scenario.step, 'seed': seed, 'lockstep': lockstep}
     simulation: dict[str, Any] = {
         'scenario': str(file),
@@ -194,8 +200,13 @@ def _robot_plans(
             'motion': robot.motion,
             'sensor': robot.sensor,
             'camera': robot.camera,
+            'link': robot.link,
+            'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
         }
     )
+    topics = ['state', 'detections']
+    if robot.link == 'topics':
+        topics.append('cmd_vel')
     own = name in scenario.namespaces()
     plans = [
         NodePlan(
@@ -206,7 +217,7 @@ def _robot_plans(
             {**flatten(settings), **_SIMULATED},
             # Its batches are those of its own planner, if it has one.
             remaps={BATCH: within(name, BATCH)} if own else {},
-            topics=tuple(f'/{name}/{topic}' for topic in ('state', 'detections', 'cmd_vel')),
+            topics=tuple(f'/{name}/{topic}' for topic in topics),
         )
     ]
     if robot.guard:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,6 +91,14 @@ class Equipment:
     battery: BatterySettings
 
 
+class Leader(Protocol):
+    """What moves a robot in place of its simulation."""
+
+    @property
+    def state(self) -> RobotState:
+        """Where it truly is, in the map."""
+
+
 class SimulatedRobot:
     """
     A robot as the simulation plays it.
@@ -146,6 +155,7 @@ class SimulatedRobot:
         self.battery = Battery(equipment.battery)
         self._odometry = OdometryModel(equipment.odometry, start, seed, name)
         self.odometry: OdometryReading = self._odometry.step(self.state, 0)
+        self._leader: Leader | None = None
         self.camera: CameraRenderer | None = None
         if equipment.camera is not None:
             self.camera = CameraRenderer(
@@ -184,8 +194,19 @@ class SimulatedRobot:
         """
         self._command = check_command(velocity)
 
+    def follow(self, leader: Leader) -> None:
+        """Be from now on where `leader` is: what moves it is not this simulation."""
+        self._leader = leader
+        self.state = leader.state
+
     def step(self, step: int, dt: float) -> None:
         """Go on by `dt` seconds to the discrete step `step`, from 1."""
+        if self._leader is not None:
+            was_clear = not self._hits(self.state.pose.position)
+            self.state = self._leader.state
+            self.collisions += was_clear and self._hits(self.state.pose.position)
+            self.odometry = self._odometry.step(self.state, step)
+            return
         command = self._command
         if self.battery.empty:
             command = np.array([0.0, 0.0, -_SINKING if self._flies else 0.0, 0.0])
@@ -206,6 +227,9 @@ class SimulatedRobot:
 
     def stand(self, step: int) -> None:
         """Stay where it is until the discrete step `step`, at rest; the last command is void."""
+        if self._leader is not None:
+            self.step(step, 0.0)
+            return
         self._command = np.zeros(4)
         if self.state.velocity.any() or self.state.angular_velocity.any():
             self._halt(self.state.pose)

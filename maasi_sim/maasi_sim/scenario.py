@@ -14,6 +14,7 @@ import yaml
 from pydantic import Field
 
 from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_filter.settings import (
     EnvironmentSettings,
     FilterSettings,
@@ -24,6 +25,7 @@ from maasi_filter.settings import (
 from maasi_planner.candidates import CandidateSet, Viewer, unseen_parts
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
+from maasi_sim.autopilot_settings import AutopilotSettings
 from maasi_sim.camera import RenderSettings
 from maasi_sim.laser_scan import LaserSettings
 from maasi_sim.odometry_model import OdometrySettings
@@ -50,6 +52,10 @@ _RESERVED = ('exploration', 'ground_truth', 'lockstep', 'scenario')
 _STEP_TOLERANCE = 1e-6
 # Farther than any way between two waypoints [m].
 _FAR = 1e9
+# Drivers of robots that have no camera.
+_RANGING = ('ranging_driver', 'mavlink_driver')
+# Where the driver of a vehicle listens that the sim plays.
+_MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
 
 
 class RobotSettings(Settings):
@@ -57,14 +63,20 @@ class RobotSettings(Settings):
 
     type: str = Field(description='Name of the type: a file in config/robots')
     description: str = Field(default='', description='What it is, in words')
-    driver: Literal['mambo_driver', 'turtlebot_driver', 'ranging_driver'] = Field(
+    driver: Literal['mambo_driver', 'turtlebot_driver', 'ranging_driver', 'mavlink_driver'] = Field(
         description='Executable of maasi_drivers that drives it'
     )
     guard: bool = Field(
         default=False, description='Whether a guard stops it when its driver is gone'
     )
-    link: Literal['topics'] = Field(
+    link: Literal['topics', 'mavlink'] = Field(
         default='topics', description='How its driver reaches it; the sim plays the other end'
+    )
+    mavlink: MavlinkSettings | None = Field(
+        default=None, description='With link mavlink: how, and what it may be made to do'
+    )
+    autopilot: AutopilotSettings = Field(
+        default_factory=AutopilotSettings, description='With link mavlink: its autopilot, simulated'
     )
     start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
         description='Position at the start, x y z [m, map]'
@@ -179,6 +191,23 @@ class Scenario(Settings):
         if self.planner.coordination == 'independent':
             return {name: [name] for name in self.names()}
         return {'': self.names()}
+
+    def check_pace(self, lockstep: bool, rate: float | None) -> None:
+        """Check that it can be run in lockstep, or at a rate (simulated over wall time).
+
+        Raises
+        ------
+        ScenarioError
+            If it cannot: links other than topics run in real time.
+        """
+        for name in self.names():
+            link = self.robots[name].link
+            if link != 'topics' and (lockstep or rate not in (None, 1.0)):
+                asked = 'lockstep' if lockstep else f'rate {rate:g}'
+                raise ScenarioError(
+                    f'robots.{name}.link: read {link!r}, which runs in real time, and {asked}; '
+                    'allowed is topics, or rate 1 without lockstep'
+                )
 
     def removal_distance(self) -> float:
         """Return T_z [m]: the filter's, or four deviations of the coarsest range without."""
@@ -363,6 +392,7 @@ def _problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
     for name, robot in scenario.robots.items():
         for inner, text in _robot_problems(name, robot, scenario):
             yield ('robots', name, *inner), text
+    yield from _mavlink_problems(scenario)
     yield from _event_problems(scenario)
     if scenario.stop == 'all_found' and scenario.targets.count == 0:
         yield ('stop',), "read 'all_found' but there are no targets, allowed is 'planner_done'"
@@ -469,10 +499,67 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple
             time > 0.0 and round(steps) == 0
         ):
             yield key, f'is every {time:g} s, allowed are whole multiples of step, {scenario.step}'
-    if robot.driver == 'ranging_driver' and robot.camera is not None:
-        yield ('camera',), "read one, but driver 'ranging_driver' has none; allowed is null"
-    if robot.driver != 'ranging_driver' and robot.camera is None:
+    if robot.driver in _RANGING and robot.camera is not None:
+        yield ('camera',), f"read one, but driver '{robot.driver}' has none; allowed is null"
+    if robot.driver not in _RANGING and robot.camera is None:
         yield ('camera',), f"is missing, driver '{robot.driver}' needs it"
+
+
+def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    ports: dict[str, str] = {}
+    for name in scenario.names():
+        robot = scenario.robots[name]
+        if robot.link != 'mavlink':
+            continue
+        key: Key = ('robots', name)
+        if robot.driver != 'mavlink_driver':
+            yield (
+                (*key, 'link'),
+                f"read 'mavlink', but driver '{robot.driver}' does not have it; allowed is "
+                "'topics', or driver 'mavlink_driver'",
+            )
+        if robot.guard:
+            yield (
+                (*key, 'guard'),
+                'read true, allowed with link mavlink is false: its autopilot stops it',
+            )
+        link = robot.mavlink
+        if link is None:
+            yield (*key, 'mavlink'), 'is missing, link mavlink needs it: at least {arm: true}'
+            continue
+        key = (*key, 'mavlink')
+        if not link.arm:
+            yield (*key, 'arm'), 'read false, allowed is true: nothing would ever fly'
+        match = _MAVLINK_URL.match(link.url)
+        if match is None:
+            yield (
+                (*key, 'url'),
+                f"read '{link.url}', allowed is udpin:HOST:PORT, as the sim plays the vehicle",
+            )
+        elif match[1] in ports:
+            yield (
+                (*key, 'url'),
+                f'read port {match[1]}, which {ports[match[1]]} has as well; allowed is any other',
+            )
+        else:
+            ports[match[1]] = name
+        if link.map_yaw != 0.0:
+            yield (*key, 'map_yaw'), f'read {link.map_yaw}, allowed in simulation is 0'
+        firmware = robot.autopilot.firmware
+        submarine = firmware == 'ardusub'
+        if submarine != (link.vehicle == 'submarine'):
+            yield (
+                (*key, 'vehicle'),
+                f"read '{link.vehicle}', but its autopilot.firmware is '{firmware}'",
+            )
+        rise = robot.start[2] - link.ground
+        if rise >= 0.0 if submarine else rise <= 0.0:
+            side = 'below' if submarine else 'above'
+            yield (
+                ('robots', name, 'start'),
+                f'read height {robot.start[2]}, allowed is what lies {side} mavlink.ground, '
+                f'{link.ground}',
+            )
 
 
 def _event_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:

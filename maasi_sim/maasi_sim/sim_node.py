@@ -38,6 +38,7 @@ from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_writer
 from maasi_filter.search_node import SearchNode, SettingsError, run
 from maasi_msgs.msg import LockstepDone, LockstepStep, RangeArray, RangeMeasurement
 from maasi_sim.laser_scan import LaserSettings
+from maasi_sim.linked_robots import LinkedRobot, linked_robot
 from maasi_sim.robots import SimulatedRobot
 from maasi_sim.scenario import ScenarioError, load_scenario, steps_of
 from maasi_sim.sim_settings import SimNodeSettings
@@ -56,6 +57,8 @@ _BATTERY_PERIOD = 1.0
 _LEAST_VARIANCE = 1e-12
 # In lockstep: how long messages are taken without the executor, and the longest wait for one [s].
 _HURRY, _HURRY_WAIT = 0.05, 0.01
+# At the end: how long robots with a link of their own are there for drivers that stop them [s].
+_FAREWELL = 1.0
 
 
 class RobotTopics:
@@ -87,13 +90,15 @@ class RobotTopics:
             return made
 
         equipment = self.robot.equipment
-        self._odometry_publisher = publisher(Odometry, 'odom')
+        # One with a link of its own says by that where it is.
+        self.linked = simulation.scenario.robots[name].link != 'topics'
+        self._odometry_publisher = None if self.linked else publisher(Odometry, 'odom')
         self._odometry = Odometry(child_frame_id=f'{name}/base_link')
         self._odometry.header.frame_id = f'{name}/odom'
         linear = max(equipment.odometry.velocity_noise**2, _LEAST_VARIANCE)
         angular = max(equipment.odometry.heading_noise**2, _LEAST_VARIANCE)
         self._odometry.twist.covariance[::7] = [linear] * 3 + [angular] * 3
-        self._battery_publisher = publisher(BatteryState, 'battery')
+        self._battery_publisher = None if self.linked else publisher(BatteryState, 'battery')
         self._battery = BatteryState(
             **dict.fromkeys(('voltage', 'temperature', 'current', 'charge', 'capacity'), math.nan),
             design_capacity=math.nan,
@@ -118,13 +123,14 @@ class RobotTopics:
 
     @property
     def odometry_topic(self) -> str:
-        """Full name of its odometry's topic."""
-        return self._odometry_publisher.topic_name
+        """Full name of its odometry's topic; empty where it has none."""
+        return '' if self._odometry_publisher is None else self._odometry_publisher.topic_name
 
     def publish(self, stamp: Time) -> bool:
         """Publish what is due; return whether camera or ranging sensor had something."""
         simulation, robot, name = self.simulation, self.robot, self.name
-        self._publish_odometry(stamp)
+        if self._odometry_publisher is not None:
+            self._publish_odometry(stamp, self._odometry_publisher)
         imaging = simulation.images_due(name)
         if imaging and robot.camera is not None:
             image = robot.image(simulation.step, simulation.time)
@@ -149,13 +155,13 @@ class RobotTopics:
             self._scan.header.stamp = stamp
             self._scan.ranges = array.array('f', simulation.scan(name).tobytes())
             self._scan_publisher.publish(self._scan)
-        if simulation.step % self._battery_steps == 0:
+        if self._battery_publisher is not None and simulation.step % self._battery_steps == 0:
             self._battery.header.stamp = stamp
             self._battery.percentage = robot.battery.charge
             self._battery_publisher.publish(self._battery)
         return imaging
 
-    def _publish_odometry(self, stamp: Time) -> None:
+    def _publish_odometry(self, stamp: Time, publisher: Publisher) -> None:
         reading, message = self.robot.odometry, self._odometry
         message.header.stamp = stamp
         place, turn = message.pose.pose.position, message.pose.pose.orientation
@@ -165,7 +171,7 @@ class RobotTopics:
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
         linear.x, linear.y, linear.z = reading.velocity.tolist()
         angular.x, angular.y, angular.z = reading.angular_velocity.tolist()
-        self._odometry_publisher.publish(message)
+        publisher.publish(message)
 
 
 def camera_messages(settings: CameraSettings, frame: str) -> tuple[Image, CameraInfo]:
@@ -218,7 +224,8 @@ class SimNode(SearchNode[SimNodeSettings]):
 
     Publishes
     ---------
-    `<robot>/odom` (nav_msgs/Odometry), `<robot>/battery` (sensor_msgs/BatteryState);
+    `<robot>/odom` (nav_msgs/Odometry), `<robot>/battery` (sensor_msgs/BatteryState), unless its
+    link is another one than topics;
     `<robot>/camera/image_raw` (sensor_msgs/Image), `<robot>/camera/camera_info`
     (sensor_msgs/CameraInfo), `<robot>/scan` (sensor_msgs/LaserScan), `<robot>/ranges`
     (maasi_msgs/RangeArray): those that the robot has;
@@ -240,12 +247,15 @@ class SimNode(SearchNode[SimNodeSettings]):
         overrides = {'parameter step': (('step',), settings.step)} if settings.step > 0.0 else {}
         try:
             self.scenario = load_scenario(settings.scenario, overrides)
+            rate = None if settings.lockstep else settings.rate
+            self.scenario.check_pace(settings.lockstep, rate)
             self.simulation = Simulation(self.scenario, settings.seed)
         except (ScenarioError, ValueError) as error:
             raise SettingsError(str(error)) from error
         self._length = self.scenario.step
         self._period = self._length / settings.rate if settings.rate > 0.0 else 0.0
         self._entities: list[Any] = []
+        self._linked: dict[str, LinkedRobot] = {}
         self._stamp = 0
         # Of the last step that was published anew.
         self._repeated = -1
@@ -281,7 +291,10 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._robot_of = {node: name for name, node in self._driver_of.items()}
         step_topics = [self._step_publisher.topic_name] if lockstep else []
         self._expected = {
-            self._driver_of[name]: [*step_topics, topics.odometry_topic, topics.sensor_topic]
+            self._driver_of[name]: [
+                *step_topics,
+                *filter(None, (topics.odometry_topic, topics.sensor_topic)),
+            ]
             for name, topics in self._robots.items()
         }
         for namespace in self.scenario.namespaces():
@@ -290,7 +303,12 @@ class SimNode(SearchNode[SimNodeSettings]):
         if self.settings.recorder:
             self._expected[RECORDER] = step_topics
         self._publish_truth()
-        for name in self._robots:
+        for name, topics in self._robots.items():
+            if topics.linked:
+                robot = linked_robot(name, self.scenario.robots[name], self.settings.seed)
+                self._linked[name] = robot
+                self.simulation.robots[name].follow(robot)
+                continue
             self._entities.append(
                 self.create_subscription(
                     TwistStamped,
@@ -349,9 +367,23 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._returned.clear()
         self._waiting.clear()
         self._last_command.clear()
+        self._close_links()
         self._ready_since = None
         self.step = -1
         self.simulation = Simulation(self.scenario, self.settings.seed)
+
+    def destroy_node(self) -> None:
+        """Leave, once robots with a link of their own have been told to stop."""
+        until = time.monotonic() + _FAREWELL
+        while any(robot.obeys for robot in self._linked.values()) and time.monotonic() < until:
+            time.sleep(_LOOK_PERIOD)
+        self._close_links()
+        super().destroy_node()
+
+    def _close_links(self) -> None:
+        for robot in self._linked.values():
+            robot.close()
+        self._linked.clear()
 
     def status(self) -> dict[str, Any]:
         """Return where the simulation stands."""
@@ -439,8 +471,7 @@ class SimNode(SearchNode[SimNodeSettings]):
         return [
             topic
             for topic in self._expected[node]
-            if topic
-            and not self._listeners(node, topic) - self._endpoints.get((node, topic), set())
+            if not self._listeners(node, topic) - self._endpoints.get((node, topic), set())
         ]
 
     def _unmatched(self) -> list[str]:
@@ -612,6 +643,8 @@ class SimNode(SearchNode[SimNodeSettings]):
             self._go_on_if_complete()
         else:
             self.simulation.advance()
+            for name, robot in self._linked.items():
+                robot.cut(name in self.simulation.away)
             self._begin_step()
 
     # ---- the truth ---------------------------------------------------------------------------

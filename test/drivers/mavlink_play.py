@@ -1,13 +1,13 @@
 """A vehicle's driver side and a fake autopilot on a wire in memory, in simulated time."""
 
 import numpy as np
-from pymavlink import mavutil
 
+from maasi_drivers.mavlink.protocol import mavlink
 from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_drivers.mavlink.vehicle import Phase, Vehicle
-from maasi_sim.fake_autopilot import AutopilotSettings, FakeAutopilot
+from maasi_sim.autopilot_settings import AutopilotSettings
+from maasi_sim.fake_autopilot import FakeAutopilot
 
-mavlink = mavutil.mavlink
 PERIOD = 0.02
 FIRMWARES = ('arducopter', 'px4', 'ardusub')
 HEIGHTS = {'arducopter': 2.0, 'px4': 2.0, 'ardusub': -1.5}

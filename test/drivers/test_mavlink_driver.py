@@ -24,7 +24,7 @@ from maasi_filter.parameters import flatten
 from maasi_filter.pose import Pose
 from maasi_filter.search_node import SettingsError
 from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
-from maasi_sim.fake_autopilot import AutopilotSettings
+from maasi_sim.autopilot_settings import AutopilotSettings
 from maasi_sim.fake_mavlink_vehicle import FakeVehicle
 
 SPEED, STOPPED = 1.0, 0.1
@@ -135,7 +135,9 @@ def fly(context):
         url = settings['mavlink']['url'].replace('udpin', 'udpout')
         values = {'firmware': firmware, 'estimator_time': 0.2} | dict(autopilot)
         origin = Pose.from_yaw([*settings['start'][:2], 0.0], 0.0)
-        vehicle = FakeVehicle(AutopilotSettings.model_validate(values), url, origin, 1)
+        vehicle = FakeVehicle(
+            AutopilotSettings.model_validate(values), url, origin, np.random.default_rng(1)
+        )
         ended.append(vehicle.close)
         return Flight(vehicle, driver, team)
 
@@ -284,6 +286,25 @@ def test_a_position_that_hangs(fly):
     flight.gives_up(result, 'no odometry for')
 
 
+def test_a_sensor_that_falls_silent(fly):
+    flight = fly(sensor_timeout=1.0)
+
+    def sweep():
+        if flight.team.states:
+            flight.team.ranges.publish(RangeArray(header=flight.state.header))
+
+    flight.until(
+        lambda: (
+            sweep() or (flight.team.states and flight.state.goal_status != AgentState.UNAVAILABLE)
+        )
+    )
+    _, result = flight.team.send_accepted([1.0, -6.0, 0.8])
+    flight.until(lambda: sweep() or flight.speed > 0.8 * SPEED)
+    flight.until(lambda: flight.state.goal_status == AgentState.UNAVAILABLE)
+    flight.gives_up(result, 'no new sweep for')
+    assert flight.mode == 'GUIDED'
+
+
 def test_the_pilot_takes_over_and_keeps_it(fly, capfd):
     flight = fly().fly()
     result = flight.under_way()
@@ -334,7 +355,7 @@ def test_a_driver_that_ends_or_is_killed(context, tmp_path, number):
         AutopilotSettings.model_validate(values),
         settings['mavlink']['url'].replace('udpin', 'udpout'),
         Pose.from_yaw([*START[:2], 0.0], 0.0),
-        1,
+        np.random.default_rng(1),
     )
     executor = SingleThreadedExecutor(context=context)
     team = Team(context, settings, executor, deaf=True)

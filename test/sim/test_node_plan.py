@@ -127,3 +127,20 @@ def test_lawnmowers_share_their_lanes():
     overrides = {'planner': (('planner',), {'name': 'lawnmower', 'coordination': 'independent'})}
     with pytest.raises(ScenarioError, match='coordination'):
         load_scenario('mambo_turtlebot', overrides)
+
+
+def test_a_linked_robot_has_its_link_and_no_commands_by_topic():
+    linked = {'drone': (('robots', 'drone', 'link'), 'mavlink')}
+    linked['arm'] = (('robots', 'drone', 'mavlink', 'arm'), True)
+    scenario = load_scenario('drone_rov', linked)
+    plans = plans_of(scenario, lockstep=False)
+    driver, _ = read_back(plans['/drone/driver'], DriverSettings)
+    assert driver.link == 'mavlink'
+    assert driver.mavlink == scenario.robots['drone'].mavlink
+    assert plans['/drone/driver'].topics == ('/drone/state', '/drone/detections')
+    driver, _ = read_back(plans['/rov/driver'], DriverSettings)
+    assert (driver.link, driver.mavlink) == ('topics', None)
+    assert '/rov/cmd_vel' in plans['/rov/driver'].topics
+    for pace in ({'lockstep': True}, {'lockstep': False, 'rate': 2.0}):
+        with pytest.raises(ScenarioError, match=r'drone\.link: .* runs in real time'):
+            plans_of(scenario, **pace)

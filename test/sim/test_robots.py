@@ -1,5 +1,6 @@
 """Simulated robots: odometry, battery, obstacles, sensors."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -219,3 +220,22 @@ def test_warming_up_changes_nothing():
         drive(each, 5)
     assert_array_equal(one.state.pose.position, other.state.pose.position)
     assert_array_equal(one.image(5, 0.25), other.image(5, 0.25))
+
+
+def test_a_robot_that_follows_is_where_its_leader_is():
+    sensor = SensorSettings(detection={'kind': 'box', 'lower': [-9, -9], 'upper': [9, 9]})
+    place = world(obstacles=[{'centre': [1.8, 1.0], 'radius': 0.1}])
+    one = robot('constant_speed', place=place, sensor=sensor.build('robot', 2))
+    leader = SimpleNamespace(state=RobotState.at_rest([1.0, 1.5, 1.0]))
+    one.follow(leader)
+    one.command([0.3, 0.0, 0.0, 0.0])
+    one.step(1, 0.05)
+    assert_allclose(one.state.pose.position, [1.0, 1.5, 1.0])
+    # It is led through an obstacle: one collision.
+    for step, x in enumerate((1.5, 1.75, 1.8, 1.85, 2.2), start=2):
+        leader.state = RobotState.at_rest([x, 1.0, 1.0])
+        one.step(step, 0.05)
+    assert one.collisions == 1
+    leader.state = RobotState.at_rest([2.0, 2.0, 1.0])
+    one.stand(8)
+    assert_allclose(one.state.pose.position, [2.0, 2.0, 1.0])

@@ -68,6 +68,7 @@ def test_our_scenarios_load_and_every_point_can_be_seen(path):
 
 def test_our_scenarios_are_those_of_the_papers():
     assert [path.stem for path in SCENARIOS] == [
+        'drone_rov',
         'mambo',
         'mambo_turtlebot',
         'mambo_turtlebot_obstacles',
@@ -201,6 +202,34 @@ def test_wrong_files_get_a_message_with_file_line_and_key(load, changes, key, wo
     assert rest.startswith(f'{key}: '), message
     for word in words:
         assert word in message
+
+
+LINKED = {'link': 'mavlink', 'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}
+WRONG_LINKS = [
+    ('drone', {'mavlink': None}, 'drone.mavlink', 'is missing'),
+    ('drone', {'mavlink': {'arm': False}}, 'drone.mavlink.arm', 'nothing would ever fly'),
+    ('drone', {'mavlink': {'arm': True, 'url': 'tcp:a:1'}}, 'drone.mavlink.url', 'udpin'),
+    ('drone', {'mavlink': {'arm': True, 'map_yaw': 0.1}}, 'drone.mavlink.map_yaw', 'is 0'),
+    ('drone', {'autopilot': {'firmware': 'ardusub'}}, 'drone.mavlink.vehicle', "'ardusub'"),
+    ('drone', {'start': [1.0, 1.0, -1.0]}, 'drone.start', 'above mavlink.ground'),
+    ('rov', {'start': [1.0, 1.0, 1.0]}, 'rov.start', 'below mavlink.ground'),
+    ('drone', {'guard': True}, 'drone.guard', 'its autopilot stops it'),
+    ('rov', {'mavlink': {'arm': True, 'url': 'udpin:0.0.0.0:14550'}}, 'rov.mavlink.url', 'drone'),
+    ('drone', {'driver': 'ranging_driver'}, 'drone.link', 'does not have it'),
+]
+
+
+@pytest.mark.parametrize('robot, changes, key, words', WRONG_LINKS)
+def test_links_that_cannot_work_are_refused(load, robot, changes, key, words):
+    content = yaml.safe_load(find_scenario('drone_rov').read_text())
+    content['robots']['drone'] |= LINKED
+    content['robots']['rov'] |= {'link': 'mavlink', 'mavlink': {'arm': True}}
+    assert load(content).robots['rov'].mavlink.system == 2
+    for name, value in changes.items():
+        content['robots'][robot][name] = value
+    with pytest.raises(ScenarioError, match=words) as caught:
+        load(content)
+    assert f': robots.{key}: ' in str(caught.value)
 
 
 def test_each_wrong_key_gets_a_line(load):

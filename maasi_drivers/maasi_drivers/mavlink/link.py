@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pymavlink import mavutil
-
+from maasi_drivers.mavlink.protocol import mavlink, mavutil
 from maasi_drivers.mavlink.settings import Ending, MavlinkSettings
 from maasi_drivers.mavlink.vehicle import Vehicle
 
@@ -33,7 +32,7 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
         If it cannot be opened; the text says why.
 
     """
-    if mavutil.mavlink.WIRE_PROTOCOL_VERSION != '2.0':
+    if mavlink.WIRE_PROTOCOL_VERSION != '2.0':
         raise LinkError(
             'pymavlink was imported before maasi_drivers.mavlink and speaks MAVLink 1: set '
             'MAVLINK20=1'
@@ -76,8 +75,8 @@ class VehicleLink:
         self.failure = ''
         self._connection: Any = None
         # It writes to the wire, once that is there.
-        self._sender = mavutil.mavlink.MAVLink(
-            None, settings.own_system, mavutil.mavlink.MAV_COMP_ID_MISSIONPLANNER
+        self._sender = mavlink.MAVLink(
+            None, settings.own_system, mavlink.MAV_COMP_ID_MISSIONPLANNER
         )
         self._vehicle = Vehicle(settings, height, self._sender)
         self._lock = threading.Lock()
@@ -121,7 +120,7 @@ class VehicleLink:
             self._connection = open_connection(
                 self.settings.url,
                 self.settings.own_system,
-                mavutil.mavlink.MAV_COMP_ID_MISSIONPLANNER,
+                mavlink.MAV_COMP_ID_MISSIONPLANNER,
                 self.settings.baud,
             )
         except LinkError as error:

@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pymavlink import mavutil
 
 from maasi_drivers.mavlink.firmware import Firmware, identify
 from maasi_drivers.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation, swap_yaw
+from maasi_drivers.mavlink.protocol import mavlink
 from maasi_drivers.mavlink.settings import Ending, MavlinkSettings
 
 FloatArray = NDArray[np.float64]
-mavlink = mavutil.mavlink
 
 _HEARTBEAT_PERIOD = 1.0
 # A command that is not answered is said again after so long, so often [s, 1].

@@ -1,0 +1,36 @@
+"""Settings of a fake autopilot."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from maasi_filter.settings import Settings
+
+FirmwareName = Literal['arducopter', 'ardusub', 'px4']
+
+
+class AutopilotSettings(Settings):
+    """What a fake autopilot is like."""
+
+    firmware: FirmwareName = Field(default='arducopter', description='Whose manners it has')
+    system: int = Field(default=1, ge=1, le=255, description='Its system id')
+    depth: float = Field(
+        default=0.0, ge=0.0, description='Of a submarine when it is switched on [m]'
+    )
+    estimator_time: float = Field(
+        default=2.0, ge=0.0, description='Until its position estimate is ready [s]'
+    )
+    noise: float = Field(
+        default=0.005, ge=0.0, description='Deviation of the position that it says [m]'
+    )
+    endurance: float = Field(
+        default=1200.0, gt=0.0, description='Time for which a full battery lasts in the air [s]'
+    )
+    charge: float = Field(default=1.0, ge=0.0, le=1.0, description='At the start, 0 to 1')
+    speed: float = Field(default=2.0, gt=0.0, description='Largest speed, level [m/s]')
+    acceleration: float = Field(default=1.0, gt=0.0, description='Largest acceleration [m/s^2]')
+    parameters: dict[str, float] = Field(
+        default_factory=dict, description='Parameters of the autopilot that differ'
+    )

@@ -1,0 +1,85 @@
+"""Whole searches by vehicles with an autopilot, in simulation and through the real protocol."""
+
+import socket
+
+import pytest
+import yaml
+from scenario_runs import run_scenario
+
+from maasi_sim.scenario import load_scenario
+
+pytestmark = pytest.mark.system
+
+
+def free_ports(number):
+    """Return UDP ports that nobody has."""
+    probes = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(number)]
+    try:
+        for probe in probes:
+            probe.bind(('127.0.0.1', 0))
+        return [probe.getsockname()[1] for probe in probes]
+    finally:
+        for probe in probes:
+            probe.close()
+
+
+def test_a_drone_and_an_underwater_vehicle_find_all(tmp_path):
+    run = run_scenario('drone_rov', tmp_path / 'run', '--seed', 1, '--lockstep', '--no-record')
+    assert run.code == 0, run.output
+    report = run.report
+    assert report['true_found'] == 12
+    assert report['missed'] == report['false_found'] == 0
+    assert min(report['measurements'].values()) >= 10
+
+
+def short_search(folder):
+    """Write a small scenario of three vehicles under three autopilots, linked by MAVLink."""
+    scenario = load_scenario('drone_rov').content()
+    scenario['environment']['bounds'] = [[0.0, 40.0], [0.0, 40.0]]
+    scenario['targets'] |= {'count': 5, 'margin': 2.0}
+    robots = scenario['robots']
+    robots['drone']['candidates'] |= {'grid': [4, 4], 'spacing': 10.0, 'corner': [5.0, 5.0]}
+    robots['drone']['start'] = [4.0, 4.0, 3.0]
+    robots['rov']['candidates'] |= {'grid': [7, 7], 'spacing': 6.0, 'corner': [2.0, 2.0]}
+    robots['rov']['start'] = [20.0, 20.0, -1.5]
+    robots['other'] = yaml.safe_load(yaml.safe_dump(robots['drone']))
+    robots['other'] |= {'start': [36.0, 36.0, 2.5]}
+    robots['other']['autopilot'] |= {'firmware': 'px4', 'parameters': {'COM_OF_LOSS_T': 5.0}}
+    for number, port in enumerate(free_ports(3)):
+        robot = list(robots.values())[number]
+        robot['link'] = 'mavlink'
+        robot['mavlink'] |= {
+            'arm': True,
+            'url': f'udpin:127.0.0.1:{port}',
+            'system': 11 + number,
+            # The machine may be busy.
+            'link_timeout': 3.0,
+        }
+    scenario['limits']['time'] = 150.0
+    file = folder / 'short.yaml'
+    file.write_text(yaml.safe_dump(scenario))
+    return file
+
+
+def test_three_vehicles_find_all_through_the_real_protocol(tmp_path):
+    run = run_scenario(short_search(tmp_path), tmp_path / 'run', '--seed', 1)
+    assert run.code == 0, run.output
+    report = run.report
+    assert report['true_found'] == 5
+    assert report['false_found'] == 0
+    assert min(report['measurements'].values()) >= 4
+    assert min(report['distance'].values()) > 2.0
+    for name, firmware, system in (
+        ('drone', 'ArduCopter', 11),
+        ('rov', 'ArduSub', 12),
+        ('other', 'PX4', 13),
+    ):
+        log = (run.folder / f'{name}_driver.log').read_text()
+        assert f'{firmware} is there as system {system}' in log
+        assert 'the autopilot has not said' not in log
+
+
+def test_a_link_in_real_time_is_not_run_in_lockstep(tmp_path):
+    run = run_scenario(short_search(tmp_path), tmp_path / 'run', '--lockstep')
+    assert run.code == 2
+    assert "robots.drone.link: read 'mavlink', which runs in real time" in run.output
