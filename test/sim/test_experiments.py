@@ -78,7 +78,13 @@ def toy(monkeypatch):
 
 
 def run_files(out: Path) -> dict[str, str]:
-    return {file.name: file.read_text() for file in (out / '000-toy' / 'runs').glob('*.csv')}
+    """Return the files of the runs without the time they took."""
+    found = {}
+    for file in (out / '000-toy' / 'runs').glob('*.csv'):
+        run = results.load_run(file)
+        assert run.timing.pop('processor_time') >= 0.0
+        found[file.name] = results.to_text(run)
+    return found
 
 
 # Statistics
@@ -236,7 +242,7 @@ def test_interrupted_campaign_goes_on_without_losing_or_doubling_a_run(toy, tmp_
     # Four maps of two cases, and one of the third.
     assert len(made) == len(set(made)) == 9
     assert run_files(parts) == run_files(whole)
-    for name in ('steps.csv', 'runs.csv', 'table.csv', 'table.md', 'configuration.yaml'):
+    for name in ('steps.csv', 'table.csv', 'table.md', 'configuration.yaml'):
         assert (parts / '000-toy' / name).read_text() == (whole / '000-toy' / name).read_text()
 
 

@@ -64,7 +64,9 @@ def execute(task: Task) -> tuple[str, str]:
         if case is None or case.digest() != task.digest:
             return '', 'this worker has other settings for it: another version of the code'
         seed = experiment.seed(task.number, task.seed)
+        begin = time.process_time()
         outcome = experiment.run(case.settings, seed)
+        outcome.timing['processor_time'] = time.process_time() - begin
         return to_text(run_of(experiment, case, task.number, seed, outcome)), ''
     except Exception as error:
         return '', f'{type(error).__name__}: {error}'

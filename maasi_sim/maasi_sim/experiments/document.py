@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from maasi_sim.experiments.campaign import plan
 from maasi_sim.experiments.outputs import described, picture
 from maasi_sim.experiments.registry import Experiment, experiments
@@ -95,6 +97,17 @@ def how_many(results: Results) -> str:
     return f'**not in full: {text}, the paper has {max(wanted)}**'
 
 
+def how_long(results: Results) -> str:
+    """Return in words the median time of a run on one core, '' where it is not known."""
+    times = [
+        value
+        for name in results.names()
+        for value in results.values(name, 'processor_time')
+        if value is not None
+    ]
+    return f' A run takes about {np.median(times):.1f} s on one core.' if times else ''
+
+
 def page(results: dict[str, Results]) -> str:
     """Return the page of experiments that have runs, by name."""
     parts = [_INTRODUCTION, '## What was run\n']
@@ -110,7 +123,10 @@ def page(results: dict[str, Results]) -> str:
         if found.experiment.paper != paper:
             paper = found.experiment.paper
             parts.append(f'## Paper {paper}\n\n{_PAPERS.get(paper, "")}\n')
-        parts.append(f'### {name}\n\n{found.experiment.title}. Rests on {how_many(found)}.\n')
+        parts.append(
+            f'### {name}\n\n{found.experiment.title}. Rests on {how_many(found)}.'
+            f'{how_long(found)}\n'
+        )
         parts.append(f'![{found.experiment.title}](reproduction/{name}.png)\n')
         parts.append(described(found.experiment, found))
     return '\n'.join(parts)
