@@ -342,6 +342,11 @@ def test_table_compares_with_the_paper_and_in_pairs(toy, tmp_path):
     values = [LIMIT if value is None else value for value in got.values('first', 'steps')]
     assert row.ours.mean == pytest.approx(np.mean(values))
     assert row.difference.mean == pytest.approx(np.mean(values) - 30.0)
+    # With more than half of the runs cut short there is no median.
+    assert math.isnan(row.median) == (sum(value == LIMIT for value in values) >= 2)
+    assert tables.median(np.array([3.0, np.nan, 9.0]), STEPS) == 9.0
+    assert math.isnan(tables.median(np.array([3.0, np.nan, np.nan]), STEPS))
+    assert tables.median(np.array([3.0, np.nan, 9.0]), ERROR) == 6.0
     assert ('first', 'error') not in table
     other = [LIMIT if value is None else value for value in got.values('second', 'steps')]
     [pair] = tables.paired_rows(got)

@@ -60,7 +60,8 @@ its numbers.
   none it is that of ours alone, and too narrow. An interval with 0 in it shows no difference.
 - **runs** is how many maps a row rests on. "9 of 10" means that 9 runs got there. A run that did
   not counts with what was tried (restricted mean, the area under Kaplan and Meier's curve), and
-  none is dropped. "More than 900" means that no run got there.
+  none is dropped. "More than 900" means that no run got there. A median far below the mean says
+  that a few runs took very long.
 - **paired** differences are of two methods on the same maps with the same seeds, a finer
   comparison than that of two separate intervals.
 - **recommended** marks a case with the settings that we would use; all others are the best reading

@@ -35,6 +35,8 @@ class Row:
         Runs, and how many have the quantity.
     ours : Interval
         What we measure.
+    median : float
+        Of our runs; those that did not get there count as the longest, nan where they are half.
     paper, difference : Interval or None
         What the paper reports, and ours minus it.
     note : str
@@ -47,6 +49,7 @@ class Row:
     runs: int
     finished: int
     ours: Interval
+    median: float
     paper: Interval | None
     difference: Interval | None
     note: str
@@ -71,6 +74,14 @@ def interval(results: Results, case: str, quantity: Quantity) -> Interval:
     return restricted_mean(
         np.where(np.isnan(values), limits, values), ~np.isnan(values), float(limits.min())
     )
+
+
+def median(values: np.ndarray, quantity: Quantity) -> float:
+    """Return the median of a quantity; of durations, runs that did not get there are longest."""
+    if quantity.kind == 'restricted':
+        middle = float(np.median(np.where(np.isnan(values), np.inf, values)))
+        return middle if math.isfinite(middle) else math.nan
+    return float(np.nanmedian(values))
 
 
 def rows(results: Results) -> list[Row]:
@@ -99,6 +110,7 @@ def rows(results: Results) -> list[Row]:
                     len(values),
                     finished,
                     ours,
+                    median(values, quantity),
                     paper,
                     difference,
                     theirs.note if theirs is not None else '',
@@ -164,6 +176,8 @@ def markdown(results: Results) -> str:
         name = row.case if row.preset == 'paper' else f'{row.case} (recommended)'
         # Where no run got there, the mean restricted to what was tried says nothing else.
         ours = shown(row.ours) if row.finished else f'more than {number(row.ours.mean)}'
+        if row.quantity.kind == 'restricted' and row.runs > 2 and math.isfinite(row.median):
+            ours += f' (median {number(row.median)})'
         lines.append(
             f'| {name} | {_label(row.quantity)} | {runs} | {ours} | {paper} | '
             f'{shown(row.difference, sign=True)} |'
@@ -197,6 +211,7 @@ def table_text(results: Results) -> str:
             'finished',
             'ours',
             'ours_95',
+            'ours_median',
             'paper',
             'paper_95',
             'difference',
@@ -211,6 +226,8 @@ def table_text(results: Results) -> str:
                 cells += ['', '']
             else:
                 cells += [v if math.isfinite(v) else '' for v in (item.mean, item.half_width)]
+            if item is row.ours:
+                cells.append(row.median if math.isfinite(row.median) else '')
         writer.writerow(
             [
                 row.case,
@@ -232,6 +249,7 @@ def table_text(results: Results) -> str:
                 pair.quantity.name,
                 pair.quantity.unit,
                 pair.difference.number,
+                '',
                 '',
                 '',
                 '',
