@@ -162,6 +162,23 @@ def test_recommended_and_paper_see_the_same_maps():
     assert truths[0] == truths[1] and len(truths[0]) == 12
 
 
+def test_robot_that_leaves_measures_no_more():
+    experiment = KNOWN['000-fig11']
+    case = next(case for case in experiment.cases(True) if case.name == 'MAASI')
+    leave = {'at': 4.95, 'robot': 'drone2', 'do': 'leave'}
+    content = {**case.settings['scenario'], 'events': [leave]}
+    outcome = experiment.run({'scenario': content, 'most_measurements': 20}, 3)
+    time = np.array(outcome.columns['time'])
+    second = np.array(outcome.columns['drone2_measures'])
+    assert second[time < 4.95].all() and not second[time >= 4.95].any()
+    assert np.array(outcome.columns['drone1_measures']).all()
+    assert outcome.summary['measurements'] == 20
+    back = {'at': 8.0, 'robot': 'drone2', 'do': 'back'}
+    content = {**content, 'events': [leave, back]}
+    with pytest.raises(ValueError, match='only leave'):
+        experiment.run({'scenario': content, 'most_measurements': 20}, 3)
+
+
 def test_terrain_is_self_affine():
     # The mean square difference grows with the distance to the power 2 H.
     heights = terrain.self_affine_map(np.random.default_rng(4), 512)
