@@ -17,7 +17,8 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of
 
 from maasi_drivers.driver_settings import DriverSettings
-from maasi_drivers.mavlink_driver import MavlinkDriver
+from maasi_drivers.mavlink.settings import MavlinkSettings
+from maasi_drivers.mavlink_driver import _POLL_PERIOD, MavlinkDriver
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.parameters import flatten
@@ -145,6 +146,15 @@ def fly(context):
     for end in ended:
         end()
     executor.shutdown()
+
+
+def test_what_is_waited_for_is_short_enough():
+    """After a fault it has stopped, and the planner has heard why, within 1.5 s."""
+    link = MavlinkSettings()
+    assert link.link_timeout + 2.0 * _POLL_PERIOD <= 1.5
+    assert 1.0 / link.setpoint_rate + link.lead <= 1.5
+    assert link.arm is False
+    assert link.require_failsafe is True
 
 
 @pytest.mark.parametrize('firmware', ['arducopter', 'ardusub', 'px4'])

@@ -1,8 +1,10 @@
 """The simulation node over real topics, against nodes that play the rest of the team."""
 
+import socket
 import threading
 import time
 from collections import defaultdict
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -20,6 +22,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from visualization_msgs.msg import MarkerArray
 
+from maasi_drivers.mavlink.link import VehicleLink
+from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_filter.qos import LATCHED, RELIABLE
 from maasi_filter.search_node import SettingsError
 from maasi_msgs.msg import LockstepDone, LockstepStep, RangeArray
@@ -63,6 +67,27 @@ RANGING = {
             'sensor': {'detection': {'size': [500.0, 500.0, 500.0]}},
         },
     },
+}
+LINKED = {
+    'version': 1,
+    'environment': {'bounds': [[0.0, 20.0], [0.0, 20.0]]},
+    'step': 0.1,
+    'targets': {'positions': [[6.0, 10.0]]},
+    'robots': {
+        'drone': {
+            'type': 'mavlink_drone',
+            'start': [2.0, 10.0, 1.0],
+            'candidates': {'grid': [2, 2], 'spacing': 10.0, 'corner': [5.0, 5.0]},
+            'sensor': {'detection': {'probability': 1.0}},
+            'link': 'mavlink',
+            'mavlink': {'arm': True},
+            'autopilot': {'estimator_time': 0.2, 'parameters': {'FS_GCS_TIMEOUT': 60.0}},
+        },
+    },
+    'events': [
+        {'at': 6.0, 'robot': 'drone', 'do': 'leave'},
+        {'at': 9.0, 'robot': 'drone', 'do': 'back'},
+    ],
 }
 FORWARD = (0.2, 0.0, 0.0, 0.0)
 
@@ -496,3 +521,51 @@ def test_lockstep_keeps_to_the_rate_that_is_asked_for(make_team):
 def test_wrong_parameters_are_refused_with_what_is_wrong(make_team, parameters, text):
     with pytest.raises(SettingsError, match=text):
         make_team(**parameters)
+
+
+@pytest.fixture
+def vehicle_link():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(('127.0.0.1', 0))
+        port = probe.getsockname()[1]
+    settings = {'arm': True, 'url': f'udpin:127.0.0.1:{port}'}
+    link = VehicleLink(MavlinkSettings.model_validate(settings), 1.0)
+    yield link
+    link.close()
+
+
+def test_a_linked_robot_is_where_its_autopilot_is(make_team, vehicle_link):
+    content = deepcopy(LINKED)
+    content['robots']['drone']['mavlink']['url'] = vehicle_link.settings.url
+    team = make_team(content, robots=('drone',), lockstep=False, rate=1.0)
+    with vehicle_link.vehicle() as vehicle:
+        vehicle.wanted = True
+
+    def flies():
+        with vehicle_link.vehicle() as vehicle:
+            return vehicle.flying
+
+    # It lives before the time starts.
+    team.spin_until(flies, limit=60.0)
+    team.say_ready()
+    drone = team.drivers['drone']
+    team.spin_until(lambda: drone.of('ranges'))
+    assert drone.of('ranges')[0].ranges[0].range == pytest.approx(4.0, abs=2.0)
+    assert drone.command.get_subscription_count() == 0
+    with vehicle_link.vehicle() as vehicle:
+        # A metre to the east.
+        vehicle.set_target([1.0, 0.0, 1.0], 0.0)
+    robot = team.sim.simulation.robots['drone']
+    team.spin_until(lambda: abs(robot.state.pose.position[0] - 3.0) < 0.2)
+    # While it is away nothing is heard from it.
+    team.spin_until(lambda: not flies())
+    with vehicle_link.vehicle() as vehicle:
+        assert vehicle.trouble == 'link: nothing heard from system 1'
+    team.spin_until(flies)
+    assert not drone.of('odom') and not drone.of('battery')
+
+
+def test_links_run_in_real_time(make_team):
+    for pace in ({'lockstep': True}, {'lockstep': False, 'rate': 2.0}):
+        with pytest.raises(SettingsError, match=r'drone\.link: .* runs in real time'):
+            make_team(LINKED, robots=('drone',), **pace)
