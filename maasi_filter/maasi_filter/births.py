@@ -161,7 +161,8 @@ def measurement_births(
     count = len(measurements)
     bounds = exploration.bounds
     starts = np.zeros(count + 1, np.int64)
-    np.cumsum(np.broadcast_to(number, (count,)), out=starts[1:])
+    starts[1:] = number
+    starts = starts.cumsum()
     total = int(starts[-1])
     noise = generator.standard_normal((total, d))
     particles = np.empty((total, d))

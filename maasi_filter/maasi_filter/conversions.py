@@ -192,9 +192,12 @@ def measurement_from_ros(
     Raises
     ------
     ValueError
-        If the pose is not finite.
+        If the pose is not finite, or its covariance.
     """
     pose = pose_from_ros(message.pose.pose)
+    position_covariance = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
+    if not np.isfinite(position_covariance).all():
+        raise ValueError(f'pose.covariance: read {position_covariance.tolist()}, allowed is finite')
     problems = []
     kept: list[Detection] = []
     for index, detection in enumerate(message.detections):
@@ -224,6 +227,10 @@ def measurement_from_ros(
             values=values,
             covariances=covariances,
             index=int(message.measurement),
+            # A negative variance stands for an error that is not known.
+            position_covariance=(
+                position_covariance if np.diagonal(position_covariance).min() >= 0.0 else None
+            ),
         ),
         problems,
     )

@@ -555,6 +555,25 @@ def found_intensity(
     return kappa
 
 
+@njit(cache=True, error_model='numpy')
+def _exclude(kappa, other, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    targets, number = kappa.shape
+    total = other.copy()
+    for f in range(targets):
+        for m in range(number):
+            total[m] += kappa[f, m]
+    for f in range(targets):
+        best = 0
+        most = -1.0
+        for m in range(number):
+            share = kappa[f, m] / total[m] if total[m] > 0.0 else 0.0
+            if share > most:
+                most = share
+                best = m
+        for m in range(number):
+            out[f, m] = kappa[f, m] if m == best else kappa[f, m] * (1.0 - most)
+
+
 def exclusive(kappa: FloatArray, other: FloatArray) -> FloatArray:
     """Return kappa (f, m) with each found target having caused one detection at most.
 
@@ -567,14 +586,8 @@ def exclusive(kappa: FloatArray, other: FloatArray) -> FloatArray:
     """
     if kappa.shape[1] < 2:
         return kappa
-    out = kappa.copy()
-    total = other + kappa.sum(axis=0)
-    share = kappa / np.where(total > 0.0, total, 1.0)
-    best = share.argmax(axis=1)
-    rows = np.arange(len(kappa))
-    factor = 1.0 - share[rows, best]
-    out *= factor[:, None]
-    out[rows, best] = kappa[rows, best]
+    out = np.empty_like(kappa)
+    _exclude(kappa, other, out)
     return out
 
 

@@ -787,7 +787,7 @@ def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
                     cartesian[m],
                     gates[m],
                 )
-                if lower > bound + 1.01 * RELATIVE_GATE:
+                if lower * (1.0 - 1e-9) > bound + 1.01 * RELATIVE_GATE:
                     continue
                 start = first + tile * TILE
                 size = min(TILE, stop - start)

@@ -102,6 +102,9 @@ class AgentMeasurement:
         Of each detection; they win over the sensor's, except in the `paper_*` presets.
     index : int
         That robot's measurement index.
+    position_covariance : (3, 3) array, optional
+        What the robot says of the error of its own position, square metres. Covariances of
+        detections are taken to have it in them already.
     """
 
     robot: str
@@ -110,6 +113,7 @@ class AgentMeasurement:
     values: FloatArray
     covariances: FloatArray | None = None
     index: int = 0
+    position_covariance: FloatArray | None = None
 
 
 @dataclass
@@ -141,7 +145,8 @@ class FilterResult:
 class _Member:
     """A checked measurement: every detection has a covariance, and their order is fixed.
 
-    `own` tells whether the covariances are the detections' own.
+    `own` tells whether the covariances are the detections' own; `pose_error` is the deviation of
+    the error of the robot's position, per axis, as far as it is not in them.
     """
 
     robot: str
@@ -151,6 +156,7 @@ class _Member:
     covariances: FloatArray
     own: bool
     index: int
+    pose_error: float
 
     def only(self, keep: NDArray[np.bool_]) -> _Member:
         """Return a copy with some of the detections."""
@@ -356,6 +362,7 @@ class SearchFilter:
     # What the settings leave to the sensor.
 
     def _pose_error(self, sensor: Sensor) -> float:
+        """Return the error of a robot's position, where it does not say more of it."""
         if self._numbers.pose_error is not None:
             return self._numbers.pose_error
         if isinstance(sensor.detection, BoxDetection):
@@ -375,11 +382,12 @@ class SearchFilter:
             return self._numbers.jitter_deviation
         return JITTER_DEVIATIONS * math.sqrt(sensor.covariance[0, 0])
 
-    def _detection(self, sensor: Sensor) -> DetectionModel:
+    def _detection(self, member: _Member) -> DetectionModel:
         """Return pi as the filter has it: a box's edge is softened by the pose's error."""
-        if isinstance(sensor.detection, BoxDetection):
-            return sensor.detection.softened(2.0 * self._pose_error(sensor))
-        return sensor.detection
+        detection = member.sensor.detection
+        if isinstance(detection, BoxDetection):
+            return detection.softened(2.0 * member.pose_error)
+        return detection
 
     # One step.
 
@@ -591,17 +599,32 @@ class SearchFilter:
                         'positive definite matrix of finite numbers'
                     )
         else:
-            covariances = np.broadcast_to(measurement.sensor.covariance, (len(values), d, d))
+            covariances = np.empty((len(values), d, d))
+            covariances[:] = measurement.sensor.covariance
+        pose_error = self._pose_error(measurement.sensor)
+        reported = measurement.position_covariance
+        if reported is not None:
+            variances = np.diagonal(np.asarray(reported, dtype=float))
+            if variances.shape != (3,) or not (
+                np.isfinite(variances).all() and min(variances) >= 0
+            ):
+                raise ValueError(
+                    f'{name}: position_covariance: got {np.asarray(reported).tolist()}, allowed is '
+                    'a (3, 3) matrix with finite variances from 0'
+                )
+            if self._numbers.pose_error is None and not own:
+                pose_error = max(pose_error, math.sqrt(float(variances[:d].max())))
         # The order in which a sensor lists its detections means nothing, so it decides nothing.
         order = np.lexsort(values.T[::-1])
         return _Member(
             name,
             measurement.pose,
             measurement.sensor,
-            np.ascontiguousarray(values[order]),
-            np.array(covariances[order]),
+            values[order],
+            covariances[order],
             own,
             measurement.index,
+            pose_error,
         )
 
     def _without_found(self, member: _Member, dropped: dict[str, int]) -> _Member:
@@ -682,7 +705,7 @@ class SearchFilter:
             member.values,
             member.covariances,
             member.pose,
-            self._pose_error(member.sensor),
+            member.pose_error,
             cartesian_near=member.own,
             cap_angles=self._numbers.births == 'measurement',
         )
@@ -710,7 +733,7 @@ class SearchFilter:
         """
         numbers = self._numbers
         sensor = member.sensor
-        detection = self._detection(sensor)
+        detection = self._detection(member)
         if math.isfinite(sensor.maximum_range):
             reach = member.values[:, 0] <= sensor.maximum_range
             _count(dropped, 'range', int((~reach).sum()))
@@ -847,7 +870,7 @@ class SearchFilter:
     def _refine(self, member: _Member, prepared: MeasurementSet, claims: FloatArray) -> bool:
         """Update found targets with the detections that most probably are theirs."""
         moved = False
-        own = self._pose_error(member.sensor) ** 2 * np.eye(self.dimension)
+        own = member.pose_error**2 * np.eye(self.dimension)
         best = claims.argmax(axis=1)
         for f, target in enumerate(self.found_targets):
             # What another robot found is its to refine.
@@ -886,7 +909,7 @@ class SearchFilter:
         numbers = self._numbers
         assert numbers.found_mass is not None
         radius = self._found_radius(member.sensor)
-        own = self._pose_error(member.sensor) ** 2 * np.eye(self.dimension)
+        own = member.pose_error**2 * np.eye(self.dimension)
         known = len(claims)
         candidates, bounded = narrow_clouds(
             own_mass,

@@ -161,7 +161,15 @@ class _Robot:
         """Return what the robot sees at a step."""
         if self.detector is None:
             values = self.body.ranges(step)
-            return AgentMeasurement(self.name, self.pose.pose, self.sensor, values, None, index)
+            return AgentMeasurement(
+                self.name,
+                self.pose.pose,
+                self.sensor,
+                values,
+                None,
+                index,
+                self.pose.covariance[:3, :3],
+            )
         image = self.body.image(step, time)
         covariance = self.pose.covariance if self.pose.covariance.any() else None
         seen = self.detector.detect(image, self.pose.pose, covariance)
@@ -177,6 +185,7 @@ class _Robot:
             seen.values[inside],
             seen.covariances[inside],
             index,
+            self.pose.covariance[:3, :3],
         )
 
 

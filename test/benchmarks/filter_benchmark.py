@@ -54,7 +54,6 @@ def state(number: int, threads: int | None) -> tuple[SearchFilter, FloatArray]:
     """Return a filter in the middle of a search, with `number` particles, and the targets."""
     settings = FilterSettings(
         particles=number,
-        particles_per_target=number,
         particles_minimum=number,
         threads=threads,
     )

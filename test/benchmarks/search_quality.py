@@ -204,7 +204,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--cap', type=int, default=CAP, help='measurements at most in a run')
     parser.add_argument('--planner', type=json.loads, default={}, help='settings, as JSON')
     parser.add_argument('--filter', type=json.loads, default={}, help='settings, as JSON')
-    parser.add_argument('--json', type=Path, metavar='FILE', help='write runs and table there')
+    parser.add_argument(
+        '--json',
+        type=Path,
+        metavar='FILE',
+        help='keep runs and table there; go on with those that are',
+    )
     parser.add_argument('--report', type=Path, metavar='FILE', help='write a page with the table')
     options = parser.parse_args(arguments)
     scenario = load_scenario(options.scenario)
@@ -214,19 +219,22 @@ def main(arguments: list[str] | None = None) -> int:
         '|---|---|---|---|---|---|---|',
     ]
     print('\n'.join(lines), flush=True)
-    output = {}
+    output: dict[str, Any] = {}
+    if options.json is not None and options.json.exists():
+        output = json.loads(options.json.read_text(encoding='utf-8'))
     for name in options.noise:
         wanted = prepared(scenario, NOISES[name], options.planner, options.filter)
-        seeds = range(options.first_seed, options.first_seed + options.runs)
+        there = {run['seed']: Run(**run) for run in output.get(name, {}).get('runs', [])}
         runs = []
-        for seed in seeds:
-            runs.append(run_one(wanted, seed, options.cap))
+        for seed in range(options.first_seed, options.first_seed + options.runs):
+            runs.append(there.get(seed) or run_one(wanted, seed, options.cap))
             print(asdict(runs[-1]), file=sys.stderr, flush=True)
-        output[name] = {'runs': [asdict(run) for run in runs], 'table': summary(runs, options.cap)}
+            table = summary(runs, options.cap)
+            output[name] = {'runs': [asdict(run) for run in runs], 'table': table}
+            if options.json is not None:
+                options.json.write_text(json.dumps(output, indent=2) + '\n', encoding='utf-8')
         lines.append(show(name, output[name]['table']))
         print(lines[-1], flush=True)
-    if options.json is not None:
-        options.json.write_text(json.dumps(output, indent=2) + '\n', encoding='utf-8')
     if options.report is not None:
         options.report.write_text(report(options, lines), encoding='utf-8')
     return 0

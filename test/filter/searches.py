@@ -57,8 +57,14 @@ def wander(generator, number, centre=130.0, size=110.0, stride=12.0):
         yield position
 
 
-def follow_one_target(seed, noise, settings=None, after=15, most=300):
-    """Return error and covariance of one target: when found, and `after` measurements later."""
+def follow_one_target(
+    seed, noise, settings=None, after=15, most=300, position_deviation=0.0, told=True
+):
+    """Return error and covariance of one target: when found, and `after` measurements later.
+
+    The robot believes to be `position_deviation` from where it is, another way each time, and
+    tells so, or not.
+    """
     generator = np.random.default_rng([seed, 5])
     sensor = cube_sensor(noise)
     target = 130.0 + 40.0 * (generator.random((1, 3)) - 0.5)
@@ -66,10 +72,14 @@ def follow_one_target(seed, noise, settings=None, after=15, most=300):
     first = None
     left = after
     for step, position in enumerate(wander(generator, most)):
+        values = observe(generator, sensor, target, Pose(position))
         pose = Pose(position)
-        values = observe(generator, sensor, target, pose)
+        reported = None
+        if position_deviation > 0.0:
+            pose = Pose(position + position_deviation * generator.standard_normal(3))
+            reported = position_deviation**2 * np.eye(3) if told else None
         result = search.step(
-            [AgentMeasurement('drone', pose, sensor, values, None, step)], 1, float(step)
+            [AgentMeasurement('drone', pose, sensor, values, None, step, reported)], 1, float(step)
         )
         if result.newly_found and first is None:
             first = result.newly_found[0]

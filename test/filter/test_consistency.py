@@ -50,6 +50,18 @@ def test_more_measurements_make_errors_smaller(followed):
     assert (after**2).sum() < 0.5 * (before**2).sum()
 
 
+def test_errors_of_the_position_that_the_robot_tells_of_do_not_make_it_bold():
+    """Errors that are new each time average out, which the filter does not count on."""
+    upper = chi2.ppf(0.995, 3 * 40)
+    for told in (True, False):
+        runs = [
+            follow_one_target(seed, DEGREES, position_deviation=0.5, told=told)
+            for seed in range(40)
+        ]
+        total = sum(normalised_error(*states[1]) for states, _ in runs)
+        assert (total < upper) == told
+
+
 def test_a_covariance_is_widened_to_the_bound_and_no_further():
     generator = np.random.default_rng(0)
     for _ in range(50):

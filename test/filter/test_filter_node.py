@@ -163,6 +163,7 @@ def test_a_missing_robot_is_named_and_its_late_answer_is_a_batch_of_its_own(worl
         ({'robot': 'nobody'}, 'bad detections'),
         ({'pose__pose__position__x': math.nan}, 'bad detections'),
         ({'pose__pose__orientation__w': 0.0}, 'bad detections'),
+        ({'pose__covariance': [math.nan] * 36}, 'bad detections'),
         ({'detections': [Detection(range=math.nan)]}, 'bad detection'),
         ({'detections': [Detection(range=-1.0)]}, 'bad detection'),
         ({'detections': [Detection(range=1.0, bearing=9.0)]}, 'bad detection'),

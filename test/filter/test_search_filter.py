@@ -413,3 +413,42 @@ def test_warm_up_leaves_nothing_to_compile():
     mow_floor(0)
     assert [len(kernel.signatures) for kernel in kernels] == before
     assert sum(before) > 20
+
+
+def test_what_a_robot_says_of_its_position_is_believed():
+    """Covariances have the error of the position in them, once: not if detections have it."""
+
+    def covariance(own, **changes):
+        sensor = cube_sensor()
+        search = cube_search()
+        target = np.array([[130.0, 130.0, 130.0]])
+        for position in ([100.0, 120.0, 110.0], [110.0, 125.0, 120.0], [125.0, 120.0, 125.0]) * 2:
+            pose = Pose(position)
+            values = sensor.measurement.measure(target, pose)
+            covariances = sensor.covariance[None] if own else None
+            search.step(
+                [AgentMeasurement('drone', pose, sensor, values, covariances, **changes)], 1, 0.0
+            )
+        assert len(search.found_targets) == 1
+        return search.found_targets[0].covariance
+
+    silent = covariance(False)
+    exact = covariance(False, position_covariance=np.zeros((3, 3)))
+    np.testing.assert_array_equal(exact, silent)
+    wide = covariance(False, position_covariance=np.diag([0.25, 0.16, 0.09]))
+    assert np.linalg.eigvalsh(wide - silent)[0] > 0.2
+    np.testing.assert_array_equal(
+        covariance(True, position_covariance=np.diag([0.25, 0.16, 0.09])), silent
+    )
+
+
+@pytest.mark.parametrize(
+    'wrong',
+    [np.full((3, 3), np.nan), np.diag([-1.0, 1.0, 1.0]), np.eye(2), np.full((3, 3), np.inf)],
+)
+def test_a_covariance_of_the_position_that_is_none_is_refused(wrong):
+    search = cube_search()
+    values = np.array([[30.0, 0.1, 0.1]])
+    with pytest.raises(ValueError, match='drone: position_covariance'):
+        search.step([drone(values, position_covariance=wrong)], 1, 0.0)
+    assert len(search.particles) == 0
