@@ -33,6 +33,8 @@ NOISES = {
     'radians': NoiseSettings(range=1.5, bearing=0.175, elevation=0.295),
 }
 CAP = 400
+# A planner that never ends a search.
+PERSISTENT = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
 # A found target is true within this distance of a true one, one to one, metres.
 RADIUS = 5.0
 
@@ -177,8 +179,10 @@ def report(options: argparse.Namespace, lines: Sequence[str]) -> str:
     return f"""# Quality of searches with the filter
 
 Whole searches of the scenario `{options.scenario}` in one process, for seeds
-{options.first_seed} to {last}, each ended when all targets are found or after {options.cap}
-measurements. Written by
+{options.first_seed} to {last}, each ended when all targets are found, after {options.cap}
+measurements, or when its planner sees nothing left to gain; `to the cap` are the same searches
+with a planner that goes on. (A PHD holds a target that is missed again and again for gone, by
+1 - pi each time; a planner that ends then leaves it unfound.) Written by
 
     {command}
 
@@ -223,18 +227,24 @@ def main(arguments: list[str] | None = None) -> int:
     if options.json is not None and options.json.exists():
         output = json.loads(options.json.read_text(encoding='utf-8'))
     for name in options.noise:
-        wanted = prepared(scenario, NOISES[name], options.planner, options.filter)
-        there = {run['seed']: Run(**run) for run in output.get(name, {}).get('runs', [])}
-        runs = []
-        for seed in range(options.first_seed, options.first_seed + options.runs):
-            runs.append(there.get(seed) or run_one(wanted, seed, options.cap))
-            print(asdict(runs[-1]), file=sys.stderr, flush=True)
-            table = summary(runs, options.cap)
-            output[name] = {'runs': [asdict(run) for run in runs], 'table': table}
-            if options.json is not None:
-                options.json.write_text(json.dumps(output, indent=2) + '\n', encoding='utf-8')
-        lines.append(show(name, output[name]['table']))
-        print(lines[-1], flush=True)
+        ended: dict[int, Run] = {}
+        for row, planner in ((name, {}), (f'{name}, to the cap', PERSISTENT)):
+            settings = {**options.planner, **planner}
+            wanted = prepared(scenario, NOISES[name], settings, options.filter)
+            there = {run['seed']: Run(**run) for run in output.get(row, {}).get('runs', [])}
+            # A search that found all before its planner ended it is the same one.
+            there.update({seed: run for seed, run in ended.items() if run.finished})
+            runs = []
+            for seed in range(options.first_seed, options.first_seed + options.runs):
+                runs.append(there.get(seed) or run_one(wanted, seed, options.cap))
+                ended[seed] = runs[-1]
+                print(asdict(runs[-1]), file=sys.stderr, flush=True)
+                table = summary(runs, options.cap)
+                output[row] = {'runs': [asdict(run) for run in runs], 'table': table}
+                if options.json is not None:
+                    options.json.write_text(json.dumps(output, indent=2) + '\n', encoding='utf-8')
+            lines.append(show(row, output[row]['table']))
+            print(lines[-1], flush=True)
     if options.report is not None:
         options.report.write_text(report(options, lines), encoding='utf-8')
     return 0
