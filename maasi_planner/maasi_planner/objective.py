@@ -22,7 +22,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.detection_model import BOX, PARAMETERS, detection_probability_at
+from maasi_filter.detection_model import (
+    BOX,
+    PARAMETERS,
+    detection_probability_at,
+    fill_probabilities,
+)
 from maasi_filter.pose import Pose
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
@@ -33,6 +38,9 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 CACHE_ROWS = 8000
+# Room for so many offsets at a time: x, y, z, pi and scratch.
+ROOM = 1024
+ROOM_ROWS = 5
 # Above this many pairs of a candidate and another robot, values of candidates that were not
 # chosen are reported as without the other planning robots.
 REPORT_LIMIT = 600
@@ -249,6 +257,111 @@ class Joint(NamedTuple):
 
 
 @njit(cache=True)
+def _together(kind: int) -> bool:  # pragma: no cover - compiled
+    """Return whether pi does not depend on the heading and is nowhere 0, so that many at a time
+    are quicker than one by one with an early end.
+    """
+    return kind != BOX
+
+
+@njit(cache=True)
+def _fill(
+    kind: int, parameters: FloatArray, number: int, room: FloatArray
+) -> FloatArray:  # pragma: no cover - compiled
+    """Return pi at the first `number` offsets in room (rows x, y, z and two more)."""
+    scratch = room[4]
+    fill_probabilities(
+        kind,
+        parameters,
+        room[0],
+        room[1],
+        room[2],
+        number,
+        1.0,
+        0.0,
+        room[3],
+        scratch,
+        scratch.view(np.int64),
+    )
+    return room[3]
+
+
+@njit(cache=True)
+def _see(
+    nodes: FloatArray,
+    until: IntArray,
+    margin: int,
+    times: IntArray,
+    places: FloatArray,
+    turns: FloatArray,
+    dimension: int,
+    kind: int,
+    parameters: FloatArray,
+    values: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Multiply values at nodes (n, 3) by what a row of measurements leaves there.
+
+    Of the measurements those count that are at least `margin` steps before `until` (n,); neither
+    these times nor those of the measurements decrease.
+    """
+    number = nodes.shape[0]
+    if not _together(kind):
+        for i in range(number):
+            left = values[i]
+            for e in range(times.shape[0]):
+                if times[e] + margin > until[i] or left <= 0.0:
+                    break
+                left *= 1.0 - detection_probability_at(
+                    kind,
+                    parameters,
+                    nodes[i, 0] - places[e, 0],
+                    nodes[i, 1] - places[e, 1],
+                    (nodes[i, 2] - places[e, 2]) if dimension == 3 else 0.0,
+                    turns[e, 0],
+                    turns[e, 1],
+                )
+            values[i] = left
+        return
+    # Many at a time: as much as there is room for.
+    room = np.empty((ROOM_ROWS, max(ROOM, number)))
+    first = np.empty(times.shape[0], np.int64)
+    begin = 0
+    filled = 0
+    done = 0
+    for e in range(times.shape[0] + 1):
+        width = 0
+        if e < times.shape[0]:
+            while begin < number and until[begin] < times[e] + margin:
+                begin += 1
+            width = number - begin
+        if width == 0 or filled + width > room.shape[1]:
+            chances = _fill(kind, parameters, filled, room)
+            for b in range(done, e):
+                later = values[first[b] :]
+                for i in range(later.shape[0]):
+                    later[i] *= 1.0 - chances[i]
+                chances = chances[later.shape[0] :]
+            done = e
+            filled = 0
+        if width == 0:
+            return
+        first[e] = begin
+        # Slices: an index that might be negative keeps loops from becoming vector instructions.
+        x = room[0, filled : filled + width]
+        y = room[1, filled : filled + width]
+        z = room[2, filled : filled + width]
+        seen = nodes[begin:]
+        x0 = places[e, 0]
+        y0 = places[e, 1]
+        z0 = places[e, 2]
+        for i in range(width):
+            x[i] = seen[i, 0] - x0
+            y[i] = seen[i, 1] - y0
+            z[i] = seen[i, 2] - z0 if dimension == 3 else 0.0
+        filled += width
+
+
+@njit(cache=True)
 def _centre_sum(
     places: FloatArray,
     turns: FloatArray,
@@ -260,47 +373,30 @@ def _centre_sum(
     parameters: FloatArray,
     out: FloatArray,
 ) -> None:  # pragma: no cover - compiled
+    together = _together(kind)
+    room = np.empty((ROOM_ROWS, places.shape[1] * centres.shape[0]))
     for w in range(places.shape[0]):
         total = 0.0
+        number = 0
         for i in range(first, own[w]):
             for c in range(centres.shape[0]):
+                dx = centres[c, 0] - places[w, i, 0]
+                dy = centres[c, 1] - places[w, i, 1]
                 dz = centres[c, 2] - places[w, i, 2] if dimension == 3 else 0.0
-                total += detection_probability_at(
-                    kind,
-                    parameters,
-                    centres[c, 0] - places[w, i, 0],
-                    centres[c, 1] - places[w, i, 1],
-                    dz,
-                    turns[w, i, 0],
-                    turns[w, i, 1],
-                )
+                if together:
+                    room[0, number] = dx
+                    room[1, number] = dy
+                    room[2, number] = dz
+                    number += 1
+                else:
+                    total += detection_probability_at(
+                        kind, parameters, dx, dy, dz, turns[w, i, 0], turns[w, i, 1]
+                    )
+        if together:
+            chances = _fill(kind, parameters, number, room)
+            for i in range(number):
+                total += chances[i]
         out[w] = total
-
-
-@njit(cache=True)
-def _missed(
-    times: IntArray,
-    places: FloatArray,
-    turns: FloatArray,
-    until: int,
-    number: int,
-    x: float,
-    y: float,
-    z: float,
-    dimension: int,
-    kind: int,
-    parameters: FloatArray,
-) -> float:  # pragma: no cover - compiled
-    """Return the product of 1 - pi at a point over one row's measurements up to a time."""
-    product = 1.0
-    for i in range(number):
-        if times[i] > until or product == 0.0:
-            break
-        dz = z - places[i, 2] if dimension == 3 else 0.0
-        product *= 1.0 - detection_probability_at(
-            kind, parameters, x - places[i, 0], y - places[i, 1], dz, turns[i, 0], turns[i, 1]
-        )
-    return product
 
 
 @njit(cache=True)
@@ -329,6 +425,7 @@ def _entries(
     part = np.zeros(3)
     nodes = np.zeros((8, 3))
     weights = np.zeros(8)
+    together = _together(kind)
     for w in range(places.shape[0]):
         begin = number
         for m in range(first, own[w]):
@@ -357,8 +454,8 @@ def _entries(
                     nodes[kept, 1] = lower[1] + j * step[1]
                     nodes[kept, 2] = lower[2] + k * step[2]
                     kept += 1
+            before = -1 if together else (m if own_counts else m - 1)
             # The latest first: with a sharp view it ends the product at once.
-            before = m if own_counts else m - 1
             while before >= 0 and kept > 0:
                 x = places[w, before, 0]
                 y = places[w, before, 1]
@@ -387,37 +484,20 @@ def _entries(
                     entry_time[number] = times[w, m]
                     number += 1
         entry_count[w] = number - begin
+        if together:
+            _see(
+                entry_node[begin:number],
+                entry_time[begin:number],
+                0 if own_counts else 1,
+                times[w, : own[w]],
+                places[w],
+                turns[w],
+                dimension,
+                kind,
+                parameters,
+                entry_value[begin:number],
+            )
     return number
-
-
-@njit(cache=True)
-def _fold(
-    entry_value: FloatArray,
-    entry_node: FloatArray,
-    entry_time: IntArray,
-    times: IntArray,
-    places: FloatArray,
-    turns: FloatArray,
-    number: int,
-    dimension: int,
-    kind: int,
-    parameters: FloatArray,
-) -> None:  # pragma: no cover - compiled
-    """Multiply the entries by what a robot whose trajectory is settled will have seen."""
-    for i in range(entry_value.shape[0]):
-        entry_value[i] *= _missed(
-            times,
-            places,
-            turns,
-            entry_time[i],
-            number,
-            entry_node[i, 0],
-            entry_node[i, 1],
-            entry_node[i, 2],
-            dimension,
-            kind,
-            parameters,
-        )
 
 
 @njit(cache=True)
@@ -594,21 +674,40 @@ def _fill_left(
     out: FloatArray,
 ) -> None:  # pragma: no cover - compiled
     """Write what a row of measurements leaves at each entry, up to the entry's own time."""
-    for i in range(nodes.shape[0]):
-        left = 1.0
-        for e in range(times.shape[0]):
-            if times[e] > until[i] or left <= 0.0:
-                break
-            left *= 1.0 - detection_probability_at(
-                kind,
-                parameters,
-                nodes[i, 0] - places[e, 0],
-                nodes[i, 1] - places[e, 1],
-                (nodes[i, 2] - places[e, 2]) if dimension == 3 else 0.0,
-                turns[e, 0],
-                turns[e, 1],
-            )
-        out[i] = left
+    out[:] = 1.0
+    _see(nodes, until, 0, times, places, turns, dimension, kind, parameters, out)
+
+
+@njit(cache=True)
+def _fold(
+    entry_count: IntArray,
+    entry_value: FloatArray,
+    entry_node: FloatArray,
+    entry_time: IntArray,
+    times: IntArray,
+    places: FloatArray,
+    turns: FloatArray,
+    dimension: int,
+    kind: int,
+    parameters: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Multiply the entries by what a robot whose trajectory is settled will have seen."""
+    begin = 0
+    for w in range(entry_count.shape[0]):
+        end = begin + entry_count[w]
+        _see(
+            entry_node[begin:end],
+            entry_time[begin:end],
+            0,
+            times,
+            places,
+            turns,
+            dimension,
+            kind,
+            parameters,
+            entry_value[begin:end],
+        )
+        begin = end
 
 
 @njit(cache=True)
@@ -1170,14 +1269,15 @@ class TeamObjective:
             entry_node = entry_node[:number]
             entry_time = entry_time[:number]
             for _, other, tail in settled:
+                total = int(tail.total[0])
                 _fold(
+                    count,
                     entry_value,
                     entry_node,
                     entry_time,
-                    tail.times[0],
-                    tail.places[0],
-                    tail.turns[0],
-                    int(tail.total[0]),
+                    tail.times[0, :total],
+                    tail.places[0, :total],
+                    tail.turns[0, :total],
                     self.team.dimension,
                     *other,
                 )
@@ -1314,12 +1414,13 @@ class TeamObjective:
 
         In teams too large for that, all but the chosen one as without the others.
         """
-        if int(self.start[-1]) * (len(self.names) - 1) > REPORT_LIMIT:
+        others = len(self.names) - 1
+        if others == 0 or int(self.start[-1]) * others > REPORT_LIMIT:
             if self._alone is None:
                 self._alone = self.alone()
             rows = self._alone[self.start[robot] : self.start[robot + 1]].copy()
             g = int(chosen[robot])
-            if g >= 0:
+            if others and g >= 0:
                 rows[g - self.start[robot]] = candidate_value(
                     self.joint, g, chosen, np.zeros((3, 3, 3))
                 )
@@ -1339,19 +1440,22 @@ class TeamObjective:
         """
         self._alone = self.alone()
         alone = self._alone[:, 2]
-        order = np.zeros(len(alone), np.int64)
-        for r in range(len(self.names)):
-            rows = slice(int(self.start[r]), int(self.start[r + 1]))
-            order[rows] = self.start[r] + np.argsort(-alone[rows], kind='stable')
         robots = len(self.names)
         chosen = np.full(robots, -1, np.int64)
         if robots == 0:
             return chosen, 0.0, True, 0
+        if robots == 1:
+            best_alone = int(alone.argmax())
+            if alone[best_alone] > -np.inf:
+                chosen[0] = best_alone
+            return chosen, float(alone[best_alone]), True, len(alone)
+        order = np.zeros(len(alone), np.int64)
+        for r in range(robots):
+            rows = slice(int(self.start[r]), int(self.start[r + 1]))
+            order[rows] = self.start[r] + np.argsort(-alone[rows], kind='stable')
         best = np.full(robots, -1, np.int64)
         rounds = self.settings.improvement_rounds
         alone_best, work = search_in_turn(self.joint, alone, order, rounds, False, best)
-        if robots == 1:
-            return best, alone_best, True, work
         best_value = alone_best
         joint_number = 1.0
         for r in range(robots):
@@ -1488,8 +1592,12 @@ def _rows(planned: list[Events], number: int) -> tuple[IntArray, IntArray, Float
 
 
 def _joined(parts: list, dtype: type) -> NDArray:
-    return np.concatenate(parts).astype(dtype) if parts else np.zeros(0, dtype)
+    if len(parts) == 1:
+        return np.ascontiguousarray(parts[0], dtype)
+    return np.concatenate(parts).astype(dtype, copy=False) if parts else np.zeros(0, dtype)
 
 
 def _stacked(parts: list, width: int) -> FloatArray:
-    return np.ascontiguousarray(np.vstack(parts)) if parts else np.zeros((0, width))
+    if len(parts) == 1:
+        return np.ascontiguousarray(parts[0])
+    return np.concatenate(parts) if parts else np.zeros((0, width))
