@@ -18,6 +18,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from maasi_filter.clusters import Cluster
 from maasi_filter.conversions import (
     cluster_from_ros,
     particles_to_ros,
@@ -51,6 +52,7 @@ from maasi_planner.conversions import (
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.planners.base import check_clusters
 
 FloatArray = NDArray[np.float64]
 
@@ -113,7 +115,7 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self._away: set[str] = set(self.coordinator.names)
         self._poses: dict[tuple[str, int], Pose] = {}
         self._poses_order: deque[tuple[str, int]] = deque()
-        self._updates: deque[FilterUpdate] = deque()
+        self._updates: deque[tuple[FilterUpdate, list[Cluster]]] = deque()
         self._taken_step = -1
         self._expected: LockstepStep | None = None
         self._waiting_goals: set[tuple[str, int]] = set()
@@ -237,6 +239,17 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self._expected = message
         self._try_step()
 
+    def _in_frame(self, reason: str, topic: str, header: Header) -> bool:
+        """Return whether a message is in the frame of the map; drop it otherwise."""
+        if header.frame_id == self.settings.frame:
+            return True
+        self.drop(
+            reason,
+            f'{topic}.header.frame_id: read {header.frame_id!r}, allowed is '
+            f'{self.settings.frame!r}',
+        )
+        return False
+
     def _on_state(self, name: str, message: AgentState) -> None:
         if not self.active:
             return
@@ -245,12 +258,7 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                 'bad state', f'{name}/state.robot: read {message.robot!r}, allowed is {name!r}'
             )
             return
-        if message.header.frame_id != self.settings.frame:
-            self.drop(
-                'bad state',
-                f'{name}/state.header.frame_id: read {message.header.frame_id!r}, allowed is '
-                f'{self.settings.frame!r}',
-            )
+        if not self._in_frame('bad state', f'{name}/state', message.header):
             return
         try:
             state = robot_state_from_ros(message)
@@ -283,7 +291,15 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             self._try_free_step()
 
     def _on_detections(self, name: str, message: DetectionArray) -> None:
-        if not self.active or message.robot != name:
+        if not self.active:
+            return
+        if message.robot != name:
+            self.drop(
+                'bad detections',
+                f'{name}/detections.robot: read {message.robot!r}, allowed is {name!r}',
+            )
+            return
+        if not self._in_frame('bad detections', f'{name}/detections', message.header):
             return
         try:
             pose = pose_from_ros(message.pose.pose)
@@ -354,27 +370,38 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
     def _on_update(self, message: FilterUpdate) -> None:
         if not self.active:
             return
+        if not self._in_frame('bad update', 'filter_update', message.header):
+            return
+        try:
+            clusters = [cluster_from_ros(item, self._dimension) for item in message.clusters]
+            strangers = {item.robot for item in message.members} - set(self.coordinator.names)
+            if strangers:
+                raise ValueError(
+                    f'members: read {sorted(strangers)}, allowed are {self.coordinator.names}'
+                )
+            check_clusters(clusters)
+        except ValueError as error:
+            self.drop('bad update', f'filter_update.{error}')
+            return
         if int(message.batch_id) > self._batch:
             # Of a planner before this one: go on after its batches.
             self._batch = int(message.batch_id)
             for member in message.members:
-                if member.robot in self.coordinator.names:
-                    self.coordinator.skip_measurements(member.robot, int(member.measurement) + 1)
+                self.coordinator.skip_measurements(member.robot, int(member.measurement) + 1)
             return
-        self._updates.append(message)
+        self._updates.append((message, clusters))
         self._take_updates()
 
     def _take_updates(self) -> None:
         """Take in the updates whose measurements have been heard as well, in their order."""
         while self._updates:
-            update = self._updates[0]
+            update, clusters = self._updates[0]
             keys = [(member.robot, int(member.measurement)) for member in update.members]
             if not all(key in self._poses for key in keys):
                 return
             self._updates.popleft()
             self.coordinator.absorb(
-                {name: self._poses.pop((name, index)) for name, index in keys},
-                [cluster_from_ros(item, self._dimension) for item in update.clusters],
+                {name: self._poses.pop((name, index)) for name, index in keys}, clusters
             )
             self._used_batch = max(self._used_batch, int(update.batch_id))
             self._found = int(update.found)

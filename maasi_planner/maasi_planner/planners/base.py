@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.clusters import Cluster
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotView, TeamView
@@ -71,6 +73,11 @@ class Planner(ABC):
         return f'{reason} and no potential target is left'
 
 
+def finite(*arrays: FloatArray) -> bool:
+    """Return whether all numbers in some small arrays are finite."""
+    return all(all(map(math.isfinite, array.ravel().tolist())) for array in arrays)
+
+
 def check_team(team: TeamView) -> None:
     """Refuse a team that cannot be planned for.
 
@@ -116,23 +123,27 @@ def check_team(team: TeamView) -> None:
                 f'taken: got {np.asarray(place).tolist()} with radius {radius}, allowed are finite '
                 'numbers, the radius from 0 [m]'
             )
-    for index, cluster in enumerate(team.clusters):
-        if not (
-            np.isfinite(cluster.position).all()
-            and np.isfinite(cluster.covariance).all()
-            and math.isfinite(cluster.mass)
-        ):
+    check_clusters(team.clusters)
+
+
+def check_clusters(clusters: Sequence[Cluster]) -> None:
+    """Refuse clusters with numbers that are not finite.
+
+    Raises
+    ------
+    ValueError
+        Naming the cluster.
+    """
+    for index, cluster in enumerate(clusters):
+        if not (finite(cluster.position, cluster.covariance) and math.isfinite(cluster.mass)):
             raise ValueError(f'clusters[{index}]: got a number that is not finite')
 
 
 def state_problem(view: RobotView) -> str | None:
     """Return what is wrong with a robot's state, if anything."""
     state = view.state
-    if not (
-        np.isfinite(state.pose.position).all()
-        and np.isfinite(state.pose.orientation).all()
-        and np.isfinite(state.velocity).all()
-        and np.isfinite(state.angular_velocity).all()
+    if not finite(
+        state.pose.position, state.pose.orientation, state.velocity, state.angular_velocity
     ):
         return 'the state of the robot is not finite'
     return None

@@ -1,0 +1,317 @@
+"""The planner node over real topics: decisions, trouble, and what it says of it."""
+
+import math
+import time
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PointStamped
+from rcl_interfaces.msg import Log
+from rclpy.action import ActionClient, ActionServer, GoalResponse
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from maasi_filter.executor import LeanExecutor
+from maasi_filter.parameters import flatten
+from maasi_filter.qos import RELIABLE, UPDATES
+from maasi_filter.search_node import SettingsError
+from maasi_msgs.action import GoToWaypoint, SearchTargets
+from maasi_msgs.msg import (
+    AgentState,
+    BatchMember,
+    Cluster,
+    DetectionArray,
+    FilterUpdate,
+    MeasurementBatch,
+    PlanDecision,
+)
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.planner_node import PlannerNode
+from maasi_sim.processes import Domain
+
+PATIENCE = 60.0
+ROBOTS = ('a', 'b')
+START = {'a': (0.5, 0.5), 'b': (1.5, 1.5)}
+BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}
+SETTINGS = PlannerNodeSettings.model_validate(
+    {
+        'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+        'planner': {'name': 'maasi'},
+        'state_timeout': 30.0,
+        'robots': {
+            name: {
+                'candidates': {'grid': [3, 3], 'spacing': 0.5, 'corner': [0.5, 0.5]},
+                'motion': {'model': 'constant_speed', 'speed': 0.5},
+                'sensor': {
+                    'detection': BOX,
+                    'noise': {'range': 0.01, 'bearing': 0.03},
+                    'period': 0.5,
+                },
+                'start': [*START[name], 0.0],
+            }
+            for name in ROBOTS
+        },
+        'others': {'c': {'start': [0.2, 1.8, 0.0]}},
+    }
+)
+
+
+def changed(message, changes):
+    """Return a message with some fields, named with '__' between the levels, replaced."""
+    for path, value in changes.items():
+        target = message
+        *parts, last = path.split('__')
+        for part in parts:
+            target = getattr(target, part)
+        setattr(target, last, value)
+    return message
+
+
+class Team:
+    """The rest of the team: drivers, filter and users."""
+
+    def __init__(self, context):
+        self.node = Node('team', context=context)
+        self.decisions, self.batches, self.warnings, self.diagnostics = [], [], [], []
+        self.goals = {name: [] for name in ROBOTS}
+        node = self.node
+        self.states = {
+            name: node.create_publisher(AgentState, f'{name}/state', RELIABLE) for name in ROBOTS
+        }
+        self.detections = {
+            name: node.create_publisher(DetectionArray, f'{name}/detections', RELIABLE)
+            for name in ROBOTS
+        }
+        self.updates = node.create_publisher(FilterUpdate, 'filter_update', UPDATES)
+        self.destination = node.create_publisher(PointStamped, 'c/destination', RELIABLE)
+        self.search = ActionClient(node, SearchTargets, 'search')
+        self.servers = [
+            ActionServer(
+                node,
+                GoToWaypoint,
+                f'{name}/go_to',
+                execute_callback=lambda handle: GoToWaypoint.Result(),
+                goal_callback=lambda goal, name=name: self._take_goal(name, goal),
+                handle_accepted_callback=lambda handle: None,
+            )
+            for name in ROBOTS
+        ]
+        node.create_subscription(PlanDecision, 'decisions', self.decisions.append, RELIABLE)
+        node.create_subscription(
+            MeasurementBatch, 'measurement_batch', self.batches.append, RELIABLE
+        )
+        node.create_subscription(Log, '/rosout', self._take_log, 50)
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, 10)
+
+    def _take_goal(self, name, goal):
+        self.goals[name].append(goal)
+        return GoalResponse.ACCEPT
+
+    def _take_log(self, message):
+        if 'dropped' in message.msg:
+            self.warnings.append(message.msg)
+
+    def _take_diagnostics(self, message):
+        self.diagnostics.extend(message.status)
+
+    def state(self, name, step, **changes):
+        message = AgentState(robot=name, step=step)
+        message.header.frame_id = 'map'
+        message.pose.pose.position.x, message.pose.pose.position.y = START[name]
+        message.pose.pose.orientation.w = 1.0
+        self.states[name].publish(changed(message, changes))
+
+    def detect(self, name, index, **changes):
+        message = DetectionArray(robot=name, measurement=index)
+        message.header.frame_id = 'map'
+        message.pose.pose.position.x, message.pose.pose.position.y = START[name]
+        message.pose.pose.orientation.w = 1.0
+        self.detections[name].publish(changed(message, changes))
+
+    def update(self, batch, members, **changes):
+        message = FilterUpdate(
+            batch_id=batch,
+            members=[BatchMember(robot=name, measurement=0) for name in members],
+        )
+        message.header.frame_id = 'map'
+        self.updates.publish(changed(message, changes))
+
+    @property
+    def connected(self):
+        publishers = [
+            *self.states.values(),
+            *self.detections.values(),
+            self.updates,
+            self.destination,
+        ]
+        return (
+            all(item.get_subscription_count() == 1 for item in publishers)
+            and self.node.count_publishers('/decisions') == 1
+            and self.node.count_publishers('/measurement_batch') == 1
+            and self.search.server_is_ready()
+        )
+
+
+@pytest.fixture
+def world():
+    with Domain(None) as domain:
+        context = Context()
+        rclpy.init(context=context, domain_id=domain.number)
+        parameters = [Parameter(name, value=value) for name, value in flatten(SETTINGS).items()]
+        node = PlannerNode(context=context, parameter_overrides=parameters)
+        node.trigger_configure()
+        node.trigger_activate()
+        team = Team(context)
+        lean = LeanExecutor(node, context=context)
+        other = SingleThreadedExecutor(context=context)
+        other.add_node(team.node)
+
+        def until(condition):
+            deadline = time.monotonic() + PATIENCE
+            while not condition():
+                assert time.monotonic() < deadline
+                lean.spin_for(0.01)
+                other.spin_once(timeout_sec=0.01)
+
+        until(lambda: team.connected)
+        until(lambda: all(client.server_is_ready() for client in node._go_to.values()))
+        yield node, team, until
+        lean.shutdown()
+        other.shutdown()
+        node.destroy_node()
+        team.node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def begin(team, until):
+    """Let both robots say where they are; return once they are sent on their way."""
+    for name in ROBOTS:
+        team.state(name, 0)
+    until(lambda: {item.robot for d in team.decisions for item in d.robots} == set(ROBOTS))
+    until(lambda: all(team.goals[name] for name in ROBOTS))
+
+
+BAD_STATES = [
+    {'pose__pose__position__x': math.nan},
+    {'pose__pose__position__y': math.inf},
+    {'pose__pose__orientation__w': 0.0},
+    {'twist__linear__x': math.nan},
+    {'twist__angular__z': math.inf},
+    {'header__frame_id': 'odom'},
+    {'robot': 'nobody'},
+]
+
+
+def test_wrong_states_are_dropped_counted_and_told_and_nobody_is_sent_anywhere(world):
+    node, team, until = world
+    for number, changes in enumerate(BAD_STATES, start=1):
+        team.state('a', 0, **changes)
+        until(lambda number=number: node.dropped['bad state'] == number)
+    assert team.decisions == []
+    until(lambda: team.warnings)
+    # The first one is told, the others only counted.
+    assert 'a/state' in team.warnings[0]
+    assert len(team.warnings) < len(BAD_STATES)
+    begin(team, until)
+    team.state('a', 5)
+    until(lambda: node._heard['a'].step == 5)
+    team.state('a', 3)
+    until(lambda: node.dropped['old state'] == 1)
+    until(lambda: any('dropped: old state' in _values(item) for item in team.diagnostics))
+    last = next(item for item in team.diagnostics[::-1] if 'planner_node' in item.name)
+    assert last.level == DiagnosticStatus.WARN
+    assert _values(last)['dropped: bad state'] == str(len(BAD_STATES))
+
+
+def _values(status):
+    return {item.key: item.value for item in status.values}
+
+
+def test_wrong_detections_and_updates_change_nothing(world):
+    node, team, until = world
+    begin(team, until)
+    until(lambda: team.batches)
+    batch = team.batches[0].id
+    members = [item.robot for item in team.batches[0].members]
+    before = node.coordinator.exploration.explored_fraction()
+    for number, changes in enumerate(
+        (
+            {'pose__pose__position__x': math.nan},
+            {'pose__pose__orientation__w': 0.0},
+            {'header__frame_id': 'odom'},
+            {'robot': 'nobody'},
+        ),
+        start=1,
+    ):
+        team.detect(members[0], 0, **changes)
+        until(lambda number=number: node.dropped['bad detections'] == number)
+    for name in members:
+        team.detect(name, 0)
+    wrong = Cluster(mass=0.5)
+    wrong.position.x = math.nan
+    for number, changes in enumerate(
+        (
+            {'clusters': [wrong]},
+            {'clusters': [Cluster(mass=math.inf)]},
+            {'clusters': [Cluster(covariance=[math.nan] * 9)]},
+            {'header__frame_id': 'odom'},
+            {'members': [BatchMember(robot='nobody')]},
+        ),
+        start=1,
+    ):
+        team.update(batch, members, **changes)
+        until(lambda number=number: node.dropped['bad update'] == number)
+    assert node.coordinator.exploration.explored_fraction() == before
+    right = Cluster(mass=0.5)
+    right.position.x = right.position.y = 1.0
+    team.update(batch, members, clusters=[right])
+    until(lambda: node.coordinator.clusters)
+    assert node.coordinator.exploration.explored_fraction() > before
+
+
+def test_destinations_that_are_wrong_are_dropped(world):
+    node, team, until = world
+    for number, changes in enumerate(
+        ({'point__x': math.nan}, {'header__frame_id': 'odom'}), start=1
+    ):
+        message = PointStamped()
+        message.header.frame_id = 'map'
+        team.destination.publish(changed(message, changes))
+        until(lambda number=number: node.dropped['bad destination'] == number)
+    assert node._taken(0, None)[0][0].tolist() == [0.2, 1.8, 0.0]
+
+
+def test_a_search_of_no_finite_time_is_refused(world):
+    node, team, until = world
+    for limit in (math.nan, -1.0):
+        answer = team.search.send_goal_async(SearchTargets.Goal(time_limit=limit))
+        until(answer.done)
+        assert not answer.result().accepted
+    assert node.dropped['bad goal'] == 2
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('planner.alpha', -1.0),
+        ('planner.beta', math.nan),
+        ('planner.alfa', 0.5),
+        ('environment.bounds', [0.0, 2.0, 0.0, math.inf]),
+    ],
+)
+def test_wrong_parameters_are_refused_by_name(name, value):
+    flat = {**flatten(SETTINGS), name: value}
+    with Domain(None) as domain:
+        context = Context()
+        rclpy.init(context=context, domain_id=domain.number)
+        try:
+            with pytest.raises(SettingsError, match=name):
+                PlannerNode(
+                    context=context,
+                    parameter_overrides=[Parameter(key, value=item) for key, item in flat.items()],
+                )
+        finally:
+            rclpy.shutdown(context=context)
