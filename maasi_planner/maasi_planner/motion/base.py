@@ -134,7 +134,6 @@ class MotionModel(ABC):
         self._goal: FloatArray | None = None
         self._goal_table = np.zeros(0)
 
-    @abstractmethod
     def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
         """Return the trajectory to each waypoint under this controller.
 
@@ -146,6 +145,29 @@ class MotionModel(ABC):
             Metres, frame `map`.
         step : float
             Seconds between positions, and between commands.
+        """
+        goals = check_waypoints(waypoints)
+        dt = check_step(step)
+        limit = self.steps_limit(state, goals, dt)
+        number = len(goals)
+        out = Trajectories(
+            np.empty((number, limit + 1, 3)),
+            np.empty((number, limit + 1)),
+            np.empty(number, np.int64),
+            np.empty(number),
+            np.zeros(number, dtype=bool),
+        )
+        self.roll_out(state, goals, dt, out)
+        return trimmed(out)
+
+    @abstractmethod
+    def roll_out(
+        self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
+    ) -> None:
+        """Run controller and body against each other to each waypoint, and fill `out`.
+
+        Its rows are filled as far as each trajectory goes; one that does not arrive within the
+        room there is gets a length that does not fit.
         """
 
     @abstractmethod
@@ -241,23 +263,22 @@ def _pad(
             yaws[w, k] = yaws[w, last]
 
 
-def trimmed(
-    positions: FloatArray,
-    yaws: FloatArray,
-    lengths: IntArray,
-    control_cost: FloatArray,
-    limit: int,
-) -> Trajectories:
+def trimmed(out: Trajectories) -> Trajectories:
     """Return trajectories of equal width, each extended by its last position.
 
-    A length above `limit` marks a waypoint that was not reached.
+    A length that does not fit marks a waypoint that was not reached.
     """
-    reached = lengths <= limit
-    lengths = np.minimum(lengths, limit)
+    limit = out.positions.shape[1] - 1
+    reached = out.lengths <= limit
+    lengths = np.minimum(out.lengths, limit)
     longest = int(lengths.max()) if len(lengths) else 0
-    _pad(positions, yaws, lengths, longest)
+    _pad(out.positions, out.yaws, lengths, longest)
     return Trajectories(
-        positions[:, : longest + 1], yaws[:, : longest + 1], lengths, control_cost, reached
+        out.positions[:, : longest + 1],
+        out.yaws[:, : longest + 1],
+        lengths,
+        out.control_cost,
+        reached,
     )
 
 

@@ -19,7 +19,6 @@ from maasi_planner.motion.base import (
     check_waypoints,
     sideways_command,
     straight_command,
-    trimmed,
 )
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
@@ -265,22 +264,16 @@ class ConstantSpeed(MotionModel):
             settings.yaw_rate,
         )
 
-    def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
-        """See `MotionModel.predict`."""
-        goals = check_waypoints(waypoints)
-        dt = check_step(step)
-        limit = self.steps_limit(state, goals, dt)
-        number = len(goals)
-        positions = np.empty((number, limit + 1, 3))
-        yaws = np.empty((number, limit + 1))
-        lengths = np.empty(number, np.int64)
-        costs = np.empty(number)
+    def roll_out(
+        self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
+    ) -> None:
+        """See `MotionModel.roll_out`."""
         rate, speed, barrier, face, yaw_rate = self._arguments()
         _roll_out(
             np.array(state.pose.position),
             state.velocity,
             state.pose.yaw,
-            goals,
+            waypoints,
             rate,
             speed,
             self._acceleration,
@@ -290,16 +283,15 @@ class ConstantSpeed(MotionModel):
             self.settings.tolerance,
             self.keep_out.circles,
             self.keep_out.vertices,
-            self._tables(goals),
+            self._tables(waypoints),
             self.keep_out.clearance,
-            dt,
-            limit,
-            positions,
-            yaws,
-            lengths,
-            costs,
+            step,
+            out.positions.shape[1] - 1,
+            out.positions,
+            out.yaws,
+            out.lengths,
+            out.control_cost,
         )
-        return trimmed(positions, yaws, lengths, costs, limit)
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`."""

@@ -27,7 +27,6 @@ from maasi_planner.motion.base import (
     check_step,
     check_waypoints,
     sideways_command,
-    trimmed,
 )
 from maasi_planner.motion.obstacle_term import add_obstacle_term
 from maasi_planner.obstacles import Obstacles
@@ -615,19 +614,14 @@ class Mambo(MotionModel):
         self.barrier = float(min(0.18 * natural, 0.5 * slowing))
         self._term = ('none', 'printed', 'away').index(settings.obstacle_term)
 
-    def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
-        """See `MotionModel.predict`."""
-        goals = check_waypoints(waypoints)
-        periods, h = control_periods(check_step(step))
-        limit = self.steps_limit(state, goals, step)
-        number = len(goals)
-        positions = np.empty((number, limit + 1, 3))
-        yaws = np.empty((number, limit + 1))
-        lengths = np.empty(number, np.int64)
-        costs = np.empty(number)
+    def roll_out(
+        self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
+    ) -> None:
+        """See `MotionModel.roll_out`."""
+        periods, h = control_periods(step)
         _roll_out(
             twelve_states(state),
-            goals,
+            waypoints,
             self.parameters,
             self.rate,
             self.barrier,
@@ -635,7 +629,7 @@ class Mambo(MotionModel):
             self.settings.tolerance,
             self.keep_out.circles,
             self.keep_out.vertices,
-            self._tables(goals),
+            self._tables(waypoints),
             self.keep_out.clearance,
             self._term,
             self.settings.obstacle_distance,
@@ -643,13 +637,12 @@ class Mambo(MotionModel):
             closed_loop(self.parameters, periods, h),
             periods,
             h,
-            limit,
-            positions,
-            yaws,
-            lengths,
-            costs,
+            out.positions.shape[1] - 1,
+            out.positions,
+            out.yaws,
+            out.lengths,
+            out.control_cost,
         )
-        return trimmed(positions, yaws, lengths, costs, limit)
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`: the LQR's set-point as a velocity command."""

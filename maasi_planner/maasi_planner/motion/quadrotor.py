@@ -30,7 +30,6 @@ from maasi_planner.motion.base import (
     check_step,
     check_waypoints,
     sideways_command,
-    trimmed,
 )
 from maasi_planner.motion.mambo import GRAVITY, control_periods
 from maasi_planner.obstacles import Obstacles
@@ -295,19 +294,14 @@ class Quadrotor(MotionModel):
         self.rate = float(min(settings.approach_rate or C1, slowing / settings.speed))
         self.barrier = float(min(0.15 * C2, 0.5 * slowing / settings.speed))
 
-    def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
-        """See `MotionModel.predict`."""
-        goals = check_waypoints(waypoints)
-        periods, h = control_periods(check_step(step))
-        limit = self.steps_limit(state, goals, step)
-        number = len(goals)
-        positions = np.empty((number, limit + 1, 3))
-        yaws = np.empty((number, limit + 1))
-        lengths = np.empty(number, np.int64)
-        costs = np.empty(number)
+    def roll_out(
+        self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
+    ) -> None:
+        """See `MotionModel.roll_out`."""
+        periods, h = control_periods(step)
         _roll_out(
             thirteen_states(state),
-            goals,
+            waypoints,
             self.limits,
             self.rate,
             self.barrier,
@@ -315,17 +309,16 @@ class Quadrotor(MotionModel):
             self.settings.tolerance,
             self.keep_out.circles,
             self.keep_out.vertices,
-            self._tables(goals),
+            self._tables(waypoints),
             self.keep_out.clearance,
             periods,
             h,
-            limit,
-            positions,
-            yaws,
-            lengths,
-            costs,
+            out.positions.shape[1] - 1,
+            out.positions,
+            out.yaws,
+            out.lengths,
+            out.control_cost,
         )
-        return trimmed(positions, yaws, lengths, costs, limit)
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`: the first stage of the backstepping."""

@@ -26,7 +26,6 @@ from maasi_planner.motion.base import (
     check_command,
     check_step,
     check_waypoints,
-    trimmed,
 )
 from maasi_planner.motion.dynamic_window import (
     ACCELERATION,
@@ -353,35 +352,28 @@ class Unicycle(MotionModel):
         tolerance = self.settings.tolerance
         return float(offset[0] * offset[0] + offset[1] * offset[1]) <= tolerance * tolerance
 
-    def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
-        """See `MotionModel.predict`."""
-        goals = check_waypoints(waypoints)
-        dt = check_step(step)
-        limit = self.steps_limit(state, goals, dt)
-        number = len(goals)
-        positions = np.empty((number, limit + 1, 3))
-        yaws = np.empty((number, limit + 1))
-        lengths = np.empty(number, np.int64)
-        costs = np.empty(number)
+    def roll_out(
+        self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
+    ) -> None:
+        """See `MotionModel.roll_out`."""
         _roll_out(
             five_states(state),
             float(state.pose.position[2]),
-            goals,
+            waypoints,
             self.limits,
             self._window,
             self.settings.tolerance,
             self.keep_out.circles,
             self.keep_out.vertices,
-            self._tables(goals),
+            self._tables(waypoints),
             self.keep_out.clearance,
-            dt,
-            limit,
-            positions,
-            yaws,
-            lengths,
-            costs,
+            step,
+            out.positions.shape[1] - 1,
+            out.positions,
+            out.yaws,
+            out.lengths,
+            out.control_cost,
         )
-        return trimmed(positions, yaws, lengths, costs, limit)
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`."""
