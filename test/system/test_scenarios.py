@@ -179,6 +179,19 @@ def test_independent_robots_share_what_they_find_and_nothing_else(tmp_path):
     assert 'equal to the bit' in done.stdout
 
 
+def test_without_targets_the_planner_says_when_nothing_is_left(tmp_path):
+    run = run_scenario('no_targets', tmp_path / 'run', '--lockstep', '--no-record')
+    assert run.code == 0, run.output
+    report = run.report
+    assert report['end_reason'] == 'planner_done'
+    assert report['found'] == []
+    # The same as in one process, to the last measurement.
+    result = search(load_scenario('no_targets'), report['seed'])
+    assert result.end_reason == 'planner_done'
+    assert report['measurements'] == result.measurements
+    assert report['time_to_find_all'] is None
+
+
 @pytest.mark.parametrize('name', ['asi', 'as', 'mutual_information', 'nearest_widest', 'lawnmower'])
 def test_every_planner_runs_in_the_planner_node(tmp_path, name):
     options = ('--planner', name, '--lockstep', '--no-record', '--time-limit', 12)
