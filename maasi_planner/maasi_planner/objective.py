@@ -759,6 +759,20 @@ def _explored(joint: Joint, g: int, chosen: IntArray) -> float:  # pragma: no co
 
 
 @njit(cache=True)
+def _weighed(
+    control: float,
+    refinement: float,
+    exploration: float,
+    norm: float,
+    alpha: float,
+    beta: float,
+    control_weight: float,
+) -> float:  # pragma: no cover - compiled
+    """Return J (17), (26) of one candidate."""
+    return (-control_weight * control + alpha * refinement + beta * exploration) / norm
+
+
+@njit(cache=True)
 def candidate_value(
     joint: Joint, g: int, chosen: IntArray, work: FloatArray
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
@@ -769,11 +783,15 @@ def candidate_value(
     else:
         refinement = joint.refinement[g]
         exploration = _explored(joint, g, chosen) if joint.beta > 0.0 else 0.0
-    value = (
-        -joint.control_weight * joint.control[g]
-        + joint.alpha * refinement
-        + joint.beta * exploration
-    ) / joint.norm[g]
+    value = _weighed(
+        joint.control[g],
+        refinement,
+        exploration,
+        joint.norm[g],
+        joint.alpha,
+        joint.beta,
+        joint.control_weight,
+    )
     return refinement, exploration, value
 
 
@@ -804,6 +822,30 @@ def total_value(
         if chosen[r] >= 0:
             total += candidate_value(joint, chosen[r], chosen, work)[2]
     return total
+
+
+@njit(cache=True)
+def _alone_on_paper(
+    refinement: FloatArray,
+    entry_start: IntArray,
+    entry_value: FloatArray,
+    control: FloatArray,
+    norm: FloatArray,
+    allowed: BoolArray,
+    alpha: float,
+    beta: float,
+    control_weight: float,
+    out: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Do what `alone_values` does for `paper`, without handing over the whole of `Joint`."""
+    for g in range(out.shape[0]):
+        explored = 0.0
+        for i in range(entry_start[g], entry_start[g + 1]):
+            explored += entry_value[i]
+        out[g, 0] = refinement[g]
+        out[g, 1] = explored
+        value = _weighed(control[g], refinement[g], explored, norm[g], alpha, beta, control_weight)
+        out[g, 2] = value if allowed[g] else -np.inf
 
 
 @njit(cache=True)
@@ -1405,8 +1447,23 @@ class TeamObjective:
 
     def alone(self) -> FloatArray:
         """Return T, E and J of each candidate without the other planning robots, (G, 3)."""
-        out = np.zeros((int(self.start[-1]), 3))
-        alone_values(self.joint, out)
+        joint = self.joint
+        out = np.empty((int(self.start[-1]), 3))
+        if joint.information:
+            alone_values(joint, out)
+        else:
+            _alone_on_paper(
+                joint.refinement,
+                joint.entry_start,
+                joint.entry_value,
+                joint.control,
+                joint.norm,
+                joint.allowed,
+                joint.alpha,
+                joint.beta,
+                joint.control_weight,
+                out,
+            )
         return out
 
     def given(self, robot: int, chosen: IntArray) -> FloatArray:

@@ -131,10 +131,10 @@ class Team:
         message.pose.pose.orientation.w = 1.0
         self.detections[name].publish(changed(message, changes))
 
-    def update(self, batch, members, **changes):
+    def update(self, batch, measured, **changes):
         message = FilterUpdate(
             batch_id=batch,
-            members=[BatchMember(robot=name, measurement=0) for name in members],
+            members=[BatchMember(robot=name, measurement=0) for name in measured],
         )
         message.header.frame_id = 'map'
         self.updates.publish(changed(message, changes))
@@ -186,10 +186,13 @@ def world():
         rclpy.shutdown(context=context)
 
 
-def begin(team, until):
+def begin(node, team, until):
     """Let both robots say where they are; return once they are sent on their way."""
-    for name in ROBOTS:
-        team.state(name, 0)
+    # Who is heard first plans alone; the other one at the next step.
+    for step in (0, 10):
+        for name in ROBOTS:
+            team.state(name, step)
+        until(lambda step=step: [item.step for item in node._heard.values()] == [step, step])
     until(lambda: {item.robot for d in team.decisions for item in d.robots} == set(ROBOTS))
     until(lambda: all(team.goals[name] for name in ROBOTS))
 
@@ -215,10 +218,10 @@ def test_wrong_states_are_dropped_counted_and_told_and_nobody_is_sent_anywhere(w
     # The first one is told, the others only counted.
     assert 'a/state' in team.warnings[0]
     assert len(team.warnings) < len(BAD_STATES)
-    begin(team, until)
-    team.state('a', 5)
-    until(lambda: node._heard['a'].step == 5)
-    team.state('a', 3)
+    begin(node, team, until)
+    team.state('a', 15)
+    until(lambda: node._heard['a'].step == 15)
+    team.state('a', 12)
     until(lambda: node.dropped['old state'] == 1)
     until(lambda: any('dropped: old state' in _values(item) for item in team.diagnostics))
     last = next(item for item in team.diagnostics[::-1] if 'planner_node' in item.name)
@@ -232,7 +235,7 @@ def _values(status):
 
 def test_wrong_detections_and_updates_change_nothing(world):
     node, team, until = world
-    begin(team, until)
+    begin(node, team, until)
     until(lambda: team.batches)
     batch = team.batches[0].id
     members = [item.robot for item in team.batches[0].members]
