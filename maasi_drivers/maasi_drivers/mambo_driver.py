@@ -195,6 +195,9 @@ class MamboDriver(CameraDriver):
         if link.battery >= 0.0 and link.battery != self._battery:
             self.take_charge(link.battery)
         state, stamp = pilot.state, self.arrivals.stamp(now)
+        if stamp is None:
+            # A simulated time has not begun: nothing is late.
+            self._odometry_at = now
         latest = self._history.latest
         if (
             self._mambo.pose == 'events'
@@ -217,9 +220,8 @@ class MamboDriver(CameraDriver):
         """Note whether it can go on."""
         if pilot.phase is not self._phase:
             self._phase = pilot.phase
-            self.get_logger().info(
-                f'{pilot.phase.value}' + (f': {pilot.problem}' if pilot.problem else '')
-            )
+            why = '' if pilot.phase in _RISING else pilot.problem
+            self.get_logger().info(pilot.phase.value + (f': {why}' if why else ''))
         # One that takes off for a goal is on its way.
         if pilot.problem and (pilot.phase not in _RISING or self._follower.current is None):
             if self.begin_trouble(_FLIGHT, pilot.problem):

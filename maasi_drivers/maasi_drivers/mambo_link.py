@@ -30,6 +30,8 @@ _ROUND = 0.05
 # From one take-off or landing command to the next while the drone does not obey [s].
 _REPEAT = 0.7
 _RETRIES = 3
+# From one try to connect to the next [s].
+_RECONNECT = 1.0
 _BLUETOOTH = re.compile(r'([0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}')
 # Farthest that a position can be from the take-off point [m].
 _FARTHEST = 1000.0
@@ -95,6 +97,7 @@ class MamboLink:
         self.port = port
         self.tilt = tilt
         self.climb = climb
+        #: What is wrong with the link; while it is not connected it goes on trying.
         self.error = ''
         #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...
         self.flying_state = ''
@@ -256,15 +259,12 @@ class MamboLink:
 
     def _work(self, drone: Any) -> None:
         where = self.address if self.kind == 'ble' else f'{self.address}, TCP {HANDSHAKE_PORT}'
-        try:
-            done = drone.connect(num_retries=_RETRIES)
-        except Exception as error:
-            # pyparrot raises whatever comes up below it.
-            self.error = f'no Mambo at {where}: {error}'
+        while (why := self._try_to_connect(drone)) and not self._closing.is_set():
+            self.error = f'no Mambo at {where}: {why}'
+            self._closing.wait(_RECONNECT)
+        if why:
             return
-        if not done:
-            self.error = f'no Mambo at {where}: it refused the connection'
-            return
+        self.error = ''
         self._drone = drone
         try:
             drone.set_max_tilt(math.degrees(self.tilt))
@@ -284,6 +284,14 @@ class MamboLink:
         finally:
             self._connected.clear()
             self._leave(drone)
+
+    def _try_to_connect(self, drone: Any) -> str:
+        """Return why there is no connection, or nothing."""
+        try:
+            return '' if drone.connect(num_retries=_RETRIES) else 'it refused the connection'
+        except Exception as error:
+            # pyparrot raises whatever comes up below it.
+            return str(error) or type(error).__name__
 
     def _do_wanted(self) -> None:
         with self._lock:

@@ -389,12 +389,12 @@ class MamboPilot:
     def _go_on(self, now: float) -> str:
         """Do what the phase asks for; return why it takes no goals, or nothing."""
         link = self.link
-        if link.error:
-            return self._give_up(link.error)
         if self.phase is Phase.CONNECTING:
             if not link.connected:
-                return 'connecting to the Mambo'
+                return link.error or 'connecting to the Mambo'
             self.phase = Phase.GROUND
+        if link.error:
+            return self._give_up(link.error)
         lost = self._see_to_pose(now)
         if self.phase is Phase.GROUND:
             return self._stand(now)

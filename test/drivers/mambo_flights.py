@@ -40,6 +40,8 @@ class Flight:
         self.fake = FakeMambo(firmware, self.address)
         self.fake.run()
         link = {'arm': True, 'address': self.address, 'port': free_port()} | (mambo or {})
+        # The machine may be busy.
+        link.setdefault('link_timeout', 2.0)
         self.settings = MAMBO | {
             'start': START,
             'yaw': YAW,

@@ -31,7 +31,7 @@ from maasi_filter.parameters import flatten
 from maasi_filter.pose import Pose
 from maasi_filter.search_node import SettingsError
 from maasi_msgs.msg import AgentState
-from maasi_sim.fake_mambo import free_port
+from maasi_sim.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.mambo_firmware import FirmwareSettings, FlyingState
 
 # After a fault the drone hovers or lands by then [s].
@@ -401,7 +401,14 @@ def test_a_link_that_cannot_be_is_said(context, monkeypatch):
     )
 
 
-def test_a_drone_that_is_not_there_is_said(fly):
-    flight = fly(mambo={'address': '127.0.0.3'})
-    flight.until(lambda: 'no Mambo at 127.0.0.3' in flight.reason)
+def test_a_drone_that_is_not_there_is_said_and_awaited(fly):
+    address = free_address()
+    flight = fly(mambo={'address': address})
+    flight.until(lambda: f'no Mambo at {address}' in flight.reason)
     assert flight.status == AgentState.UNAVAILABLE
+    firmware = flight.fake.firmware
+    flight.fake.close()
+    flight.fake = FakeMambo(firmware, address)
+    flight.fake.run()
+    flight.up()
+    assert firmware.take_offs == 1
