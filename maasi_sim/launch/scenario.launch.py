@@ -20,6 +20,7 @@ ARGUMENTS = {
 
 def start_nodes(context: LaunchContext) -> list:
     """Return the actions that start the scenario's nodes."""
+    from maasi_sim.linked_robots import with_addresses
     from maasi_sim.node_plan import plan_nodes
     from maasi_sim.scenario import config_folder, load_scenario
 
@@ -27,7 +28,7 @@ def start_nodes(context: LaunchContext) -> list:
     overrides = {}
     if given['seed']:
         overrides['seed:='] = (('seed',), int(given['seed']))
-    scenario = load_scenario(given['scenario'], overrides)
+    scenario = with_addresses(load_scenario(given['scenario'], overrides))
     folder = Path(tempfile.mkdtemp(prefix='maasi_'))
     file = folder / 'scenario.yaml'
     file.write_text(scenario.text(), encoding='utf-8')

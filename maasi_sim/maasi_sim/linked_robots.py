@@ -6,7 +6,9 @@ from typing import Protocol
 
 from maasi_sim.noise_streams import noise_stream
 from maasi_sim.robots import Leader
-from maasi_sim.scenario import RobotSettings
+from maasi_sim.scenario import RobotSettings, Scenario
+
+_LOOPBACK = '127.'
 
 
 class LinkedRobot(Leader, Protocol):
@@ -33,6 +35,31 @@ def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
         If it cannot be opened.
 
     """
+    if robot.link == 'mambo_wifi':
+        from maasi_sim.linked_mambo import LinkedMambo
+
+        return LinkedMambo(name, robot, seed)
     from maasi_sim.fake_mavlink_vehicle import vehicle_of
 
     return vehicle_of(robot, noise_stream(seed, name, purpose='autopilot'))
+
+
+def with_addresses(scenario: Scenario) -> Scenario:
+    """
+    Return a scenario in which each Mambo has an address of this host.
+
+    Raises
+    ------
+    OSError
+        If there are none.
+
+    """
+    robots = dict(scenario.robots)
+    for name, robot in scenario.robots.items():
+        mambo = robot.mambo
+        if robot.link == 'mambo_wifi' and mambo and not mambo.address.startswith(_LOOPBACK):
+            from maasi_sim.fake_mambo import free_address, free_port
+
+            mambo = mambo.model_copy(update={'address': free_address(), 'port': free_port()})
+            robots[name] = robot.model_copy(update={'mambo': mambo})
+    return scenario.model_copy(update={'robots': robots})

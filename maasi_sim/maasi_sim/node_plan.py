@@ -201,6 +201,7 @@ def _robot_plans(
             'sensor': robot.sensor,
             'camera': robot.camera,
             'link': robot.link,
+            'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
             'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
         }
     )

@@ -278,9 +278,11 @@ class ScenarioRun:
 
     def _prepare(self) -> None:
         """Write down what is run, and find the nodes' executables."""
+        from maasi_sim.linked_robots import with_addresses
         from maasi_sim.node_plan import plan_nodes
         from maasi_sim.processes import NodeProcess, find_executable
 
+        self.scenario = with_addresses(self.scenario)
         file = self.folder / 'scenario.yaml'
         file.write_text(self.scenario.text(), encoding='utf-8')
         self.plans = plan_nodes(

@@ -14,6 +14,7 @@ import yaml
 from pydantic import Field
 
 from maasi_drivers.camera_settings import CameraSettings
+from maasi_drivers.mambo_settings import MamboSettings
 from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_filter.settings import (
     EnvironmentSettings,
@@ -69,8 +70,13 @@ class RobotSettings(Settings):
     guard: bool = Field(
         default=False, description='Whether a guard stops it when its driver is gone'
     )
-    link: Literal['topics', 'mavlink'] = Field(
+    link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
         default='topics', description='How its driver reaches it; the sim plays the other end'
+    )
+    mambo: MamboSettings | None = Field(
+        default=None,
+        description='With link mambo_wifi: how, and what it may be made to do; an address that '
+        'is not of this host is replaced, as the sim plays the drone',
     )
     mavlink: MavlinkSettings | None = Field(
         default=None, description='With link mavlink: how, and what it may be made to do'
@@ -392,6 +398,7 @@ def _problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
     for name, robot in scenario.robots.items():
         for inner, text in _robot_problems(name, robot, scenario):
             yield ('robots', name, *inner), text
+    yield from _mambo_problems(scenario)
     yield from _mavlink_problems(scenario)
     yield from _event_problems(scenario)
     if scenario.stop == 'all_found' and scenario.targets.count == 0:
@@ -503,6 +510,45 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple
         yield ('camera',), f"read one, but driver '{robot.driver}' has none; allowed is null"
     if robot.driver not in _RANGING and robot.camera is None:
         yield ('camera',), f"is missing, driver '{robot.driver}' needs it"
+
+
+def _mambo_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    for name in scenario.names():
+        robot = scenario.robots[name]
+        if robot.link != 'mambo_wifi':
+            continue
+        key: Key = ('robots', name)
+        if robot.driver != 'mambo_driver':
+            yield (
+                (*key, 'link'),
+                f"read 'mambo_wifi', but driver '{robot.driver}' does not have it; allowed is "
+                "'topics', or driver 'mambo_driver'",
+            )
+        if robot.motion.model != 'mambo':
+            yield (
+                (*key, 'motion', 'model'),
+                f"read '{robot.motion.model}', allowed with link mambo_wifi is 'mambo'",
+            )
+        if robot.guard:
+            yield (
+                (*key, 'guard'),
+                'read true, allowed with link mambo_wifi is false: the drone has one link only',
+            )
+        link = robot.mambo
+        if link is None:
+            yield (*key, 'mambo'), 'is missing, link mambo_wifi needs it: at least {arm: true}'
+            continue
+        key = (*key, 'mambo')
+        if not link.arm:
+            yield (*key, 'arm'), 'read false, allowed is true: it would never take off'
+        if link.pose != 'events':
+            yield (*key, 'pose'), f"read '{link.pose}', allowed in simulation is 'events'"
+        if robot.start[2] <= link.ground:
+            yield (
+                ('robots', name, 'start'),
+                f'read height {robot.start[2]}, allowed is what lies above mambo.ground, '
+                f'{link.ground}',
+            )
 
 
 def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:

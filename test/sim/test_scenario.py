@@ -72,6 +72,7 @@ def test_our_scenarios_are_those_of_the_papers():
         'mambo',
         'mambo_turtlebot',
         'mambo_turtlebot_obstacles',
+        'mambo_turtlebot_wifi',
         'no_targets',
         'ranging_drone_3d',
         'ranging_pair_3d',
