@@ -278,7 +278,7 @@ def _fig9() -> Experiment:
             Choice('runs', '10', 'The paper shows one.'),
         ),
         causes=_CAUSE,
-        seconds=4.0,
+        seconds=1.5,
         maps='002, different agents',
     )
 

@@ -197,7 +197,7 @@ def _fig4() -> Experiment:
         causes='pi = 0.98 exp(-d^2 / 450 m^2) ends at about 40 m: what counts is how soon the '
         'robot comes near a cluster. One step ahead the planner lingers where all neighbours are '
         'explored, far from what is still unseen.',
-        seconds=1.5,
+        seconds=2.5,
     )
 
 
