@@ -103,7 +103,11 @@ def littered(
         row, column = np.unravel_index(int(np.argmin(signed)), signed.shape)
         centre = np.array([sides[0][row], sides[1][column]])
         for _ in range(number // 2):
-            places = np.clip(centre + generator.normal(0.0, spread, (10, 2)), low, high)
+            places = centre + generator.normal(0.0, spread, (10, 2))
+            # Folded back at the bounds, so that targets do not lie in a line along them.
+            places = np.where(places < low, 2.0 * low - places, places)
+            places = np.where(places > high, 2.0 * high - places, places)
+            places = np.clip(places, low, high)
             index = (places - bounds[:, 0]) / (bounds[:, 1] - bounds[:, 0]) * (nodes - 1)
             found = ndimage.map_coordinates(heights, index.T, order=1)
             targets.append(places[int(np.argmin(sign * found))])
