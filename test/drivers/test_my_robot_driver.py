@@ -1,0 +1,141 @@
+"""The driver of a robot of one's own that `docs/robots.md` shows, with a rover on the other end."""
+
+import importlib.util
+import json
+import math
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from rclpy.executors import SingleThreadedExecutor
+from robot_team import TURTLEBOT, Team, parameters_of, rendered, stamped
+
+from maasi_filter.conversions import pose_from_ros, stamp_from_ros
+from maasi_filter.pose import Pose, compose, inverse
+from maasi_msgs.msg import AgentState
+
+FILE = Path(__file__).parents[2] / 'docs' / 'my_robot_driver.py'
+
+
+class Rover:
+    """The robot: a body that moves in real time, behind a socket."""
+
+    def __init__(self, team):
+        self.start, self.body = team.start, team.body
+        self.link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.link.bind(('127.0.0.1', 0))
+        self.link.setblocking(False)
+        self.command, self.commands, self.peer = (0.0, 0.0), 0, None
+        self.talks, self.extra = True, {}
+        self.at = self.said_at = time.monotonic()
+
+    def live(self):
+        while True:
+            try:
+                data, self.peer = self.link.recvfrom(1500)
+            except BlockingIOError:
+                break
+            words = json.loads(data)
+            self.command = (words['forward'], words['turn'])
+            self.commands += 1
+        now = time.monotonic()
+        self.body.step([self.command[0], 0.0, 0.0, self.command[1]], min(now - self.at, 0.1))
+        self.at = now
+        if self.peer and self.talks and now - self.said_at > 0.04:
+            self.said_at = now
+            self.link.sendto(json.dumps(self.report()).encode(), self.peer)
+
+    def report(self):
+        state = self.body.robot_state()
+        own = compose(inverse(self.start), state.pose)
+        forward = math.hypot(state.velocity[0], state.velocity[1])
+        report = {'x': own.position[0], 'y': own.position[1], 'yaw': own.yaw}
+        report |= {'forward': forward, 'turn': state.angular_velocity[2], 'battery': 0.8}
+        return report | self.extra
+
+
+@pytest.fixture
+def rover_and_team(context):
+    spec = importlib.util.spec_from_file_location('my_robot_driver', FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    executor = SingleThreadedExecutor(context=context)
+    settings = TURTLEBOT | {'odometry_timeout': 1.0}
+    driver = module.RoverDriver(
+        context=context, namespace='/rover', parameter_overrides=parameters_of(settings)
+    )
+    executor.add_node(driver)
+    team = Team(context, settings, executor, deaf=True)
+    team.used = [team.batches, team.images]
+    rover = Rover(team)
+    module.ROVER = rover.link.getsockname()
+    assert driver.trigger_configure().name == 'SUCCESS'
+    assert driver.trigger_activate().name == 'SUCCESS'
+    team.connect()
+    team.until(lambda: rover.live() or team.states, 'the rover was not heard')
+    yield rover, team, driver
+    driver.halt()
+    driver.destroy_node()
+    team.destroy_node()
+    executor.shutdown()
+    rover.link.close()
+
+
+def test_the_file_is_as_short_as_the_page_says():
+    assert len(FILE.read_text().splitlines()) < 80
+
+
+def test_it_goes_where_it_is_sent_and_tells_what_it_sees(rover_and_team):
+    rover, team, driver = rover_and_team
+    assert_allclose(pose_from_ros(team.state.pose.pose).position, team.start.position, atol=0.01)
+    assert team.state.battery == pytest.approx(0.8)
+    # Sent to a waypoint.
+    waypoint = team.start.position + np.array([0.35, 0.15, 0.0])
+    answer = team.go_to.send_goal_async(team.goal(waypoint))
+    team.until(lambda: rover.live() or answer.done())
+    assert answer.result().accepted
+    result = answer.result().get_result_async()
+    team.until(lambda: rover.live() or result.done(), 'it never arrived')
+    assert result.result().result.reached
+    place = rover.body.robot_state().pose
+    assert np.linalg.norm(place.position - waypoint) < 0.08
+    # Asked what it sees: a marker.
+    ahead = place.position + place.rotation() @ [0.05, 0.05, 0.0]
+    team.until(lambda: rover.live() or stamp_from_ros(team.state.header.stamp) > 0)
+    stamp = stamp_from_ros(team.state.header.stamp)
+    team.ask(stamp)
+    pose = pose_from_ros(team.state.pose.pose)
+    image = rendered(team, [ahead[:2].tolist()], Pose.from_yaw(pose.position, pose.yaw))
+    team.images.publish(stamped(image, stamp))
+    team.until(lambda: rover.live() or team.detections, 'no detections')
+    (seen,) = team.detections[0].detections
+    spot = pose.position[:2] + seen.range * np.array([np.cos(seen.bearing), np.sin(seen.bearing)])
+    assert_allclose(spot, ahead[:2], atol=0.01)
+    # At the end it stands.
+    rover.command = (0.2, 0.0)
+    driver.halt()
+    team.until(lambda: rover.live() or rover.command == (0.0, 0.0), 'it goes on')
+
+
+def test_a_rover_that_is_silent_or_talks_nonsense_is_stopped_and_said(rover_and_team):
+    rover, team, driver = rover_and_team
+    answer = team.go_to.send_goal_async(team.goal(team.start.position + np.array([1.0, 0.8, 0.0])))
+    team.until(lambda: rover.live() or answer.done())
+    result = answer.result().get_result_async()
+    team.until(lambda: rover.live() or rover.command != (0.0, 0.0), 'it does not go')
+    rover.extra = {'x': math.nan}
+    team.until(lambda: rover.live() or team.state.goal_status == AgentState.UNAVAILABLE)
+    assert 'no odometry for' in team.state.reason
+    assert driver.dropped['report'] > 3
+    team.until(lambda: rover.live() or rover.command == (0.0, 0.0), 'it goes on')
+    team.until(lambda: rover.live() or result.done())
+    rover.extra = {}
+    team.until(lambda: rover.live() or team.state.goal_status == AgentState.ABORTED)
+    rover.talks = False
+    team.until(lambda: rover.live() or team.state.goal_status == AgentState.UNAVAILABLE)
+    known = rover.commands
+    team.until(lambda: rover.live() or rover.commands > known + 2)
+    assert rover.command == (0.0, 0.0)
