@@ -24,6 +24,7 @@ setup(
             'ranging_driver = maasi_drivers.ranging_driver:main',
             'measurement_feed_sender = maasi_drivers.measurement_feed_sender:main',
             'mavlink_driver = maasi_drivers.mavlink_driver:main',
+            'mavlink_camera_driver = maasi_drivers.mavlink_camera_driver:main',
             'calibrate_sensor = maasi_drivers.calibrate_sensor:main',
             'guard_node = maasi_drivers.guard_node:main',
         ],

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent_driver import BATTERY, ODOMETRY, FloatArray
+from maasi_drivers.agent_driver import BATTERY, ODOMETRY, AgentDriver, DataT, FloatArray
 from maasi_drivers.arrival_clock import ArrivalClock
 from maasi_drivers.mavlink.link import VehicleLink
 from maasi_drivers.mavlink.settings import MavlinkSettings
@@ -35,16 +35,12 @@ _TURNING = 0.3
 _ERROR, _WARNING, _INFO = 3, 4, 6
 
 
-class MavlinkDriver(RangingDriver):
+class MavlinkRobot(AgentDriver[DataT]):
     """
-    A vehicle with an autopilot and a ranging sensor.
+    A vehicle with an autopilot.
 
     With `link: mavlink` it is reached by MAVLink; `odom`, `battery` and `cmd_vel` are not used
-    then. With `link: topics` it is a `RangingDriver`.
-
-    Subscribes
-    ----------
-    `ranges` (maasi_msgs/RangeArray)
+    then. With `link: topics` it is a robot like any other.
     """
 
     links = ('topics', 'mavlink')
@@ -281,6 +277,10 @@ class MavlinkDriver(RangingDriver):
         goal = compose(self._map_from_local.inverse(), Pose.from_yaw(self._inside(position), yaw))
         with self._vehicle_link.vehicle() as vehicle:
             vehicle.set_target(goal.position + self._local_origin, goal.yaw)
+
+
+class MavlinkDriver(MavlinkRobot[FloatArray], RangingDriver):
+    """A vehicle with an autopilot and a ranging sensor; see `RangingDriver`."""
 
 
 def main(arguments: list[str] | None = None) -> int:

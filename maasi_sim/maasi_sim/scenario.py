@@ -55,6 +55,8 @@ _STEP_TOLERANCE = 1e-6
 _FAR = 1e9
 # Drivers of robots that have no camera.
 _RANGING = ('ranging_driver', 'mavlink_driver')
+# Drivers that have link mavlink.
+_MAVLINK = ('mavlink_driver', 'mavlink_camera_driver')
 # Where the driver of a vehicle listens that the sim plays.
 _MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
 
@@ -64,9 +66,13 @@ class RobotSettings(Settings):
 
     type: str = Field(description='Name of the type: a file in config/robots')
     description: str = Field(default='', description='What it is, in words')
-    driver: Literal['mambo_driver', 'turtlebot_driver', 'ranging_driver', 'mavlink_driver'] = Field(
-        description='Executable of maasi_drivers that drives it'
-    )
+    driver: Literal[
+        'mambo_driver',
+        'turtlebot_driver',
+        'ranging_driver',
+        'mavlink_driver',
+        'mavlink_camera_driver',
+    ] = Field(description='Executable of maasi_drivers that drives it')
     guard: bool = Field(
         default=False, description='Whether a guard stops it when its driver is gone'
     )
@@ -558,11 +564,11 @@ def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
         if robot.link != 'mavlink':
             continue
         key: Key = ('robots', name)
-        if robot.driver != 'mavlink_driver':
+        if robot.driver not in _MAVLINK:
             yield (
                 (*key, 'link'),
                 f"read 'mavlink', but driver '{robot.driver}' does not have it; allowed is "
-                "'topics', or driver 'mavlink_driver'",
+                "'topics', or one of the drivers " + ', '.join(_MAVLINK),
             )
         if robot.guard:
             yield (

@@ -14,10 +14,11 @@ from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
-from robot_team import STEP, TURTLEBOT, Team, parameters_of
+from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
 
 from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.mavlink.settings import MavlinkSettings
+from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
 from maasi_drivers.mavlink_driver import _POLL_PERIOD, MavlinkDriver
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
@@ -46,6 +47,11 @@ COPTER = {
 }
 LINK = {'arm': True, 'link_timeout': 3.0}
 ROV = COPTER | {'start': DEEP}
+CAMERA = {
+    'environment': {'bounds': [[-2.0, 4.0], [-2.0, 4.0]]},
+    'sensor': {'detection': {'kind': 'box'}},
+    'camera': {'focal_length': [220.0, 220.0]},
+}
 
 
 def free_port():
@@ -123,12 +129,13 @@ def fly(context):
 
     def start(firmware='arducopter', autopilot=(), link=(), **changes):
         settings = settings_of(firmware, dict(link), changes)
-        driver = MavlinkDriver(
+        kind = MavlinkCameraDriver if 'camera' in settings else MavlinkDriver
+        driver = kind(
             context=context, namespace='/rover', parameter_overrides=parameters_of(settings)
         )
         executor.add_node(driver)
         team = Team(context, settings, executor, deaf=True)
-        team.used = [team.batches, team.ranges]
+        team.used = [team.batches, team.images if 'camera' in settings else team.ranges]
         ended.extend([driver.halt, driver.destroy_node, team.destroy_node])
         assert driver.trigger_configure().name == 'SUCCESS'
         assert driver.trigger_activate().name == 'SUCCESS'
@@ -199,6 +206,26 @@ def test_sweeps_answer_batches_with_the_pose_of_their_stamp(fly):
     assert_allclose(
         pose_from_ros(answer.pose.pose).position, pose_from_ros(told.pose.pose).position
     )
+
+
+def test_a_camera_is_looked_through_where_the_vehicle_is(fly):
+    flight = fly(**CAMERA).fly()
+    assert flight.mode == 'GUIDED'
+    stamp = stamp_from_ros(flight.state.header.stamp)
+    pose = pose_from_ros(flight.state.pose.pose)
+    target = pose.position[:2] + np.array([0.1, -0.05])
+    image = rendered(flight.team, [target.tolist()], pose)
+    flight.team.ask(stamp)
+    flight.team.images.publish(stamped(image, stamp))
+    answer = flight.team.answer()
+    assert len(answer.detections) == 1
+    seen = answer.detections[0]
+    there = pose.position[:2] + seen.range * np.array(
+        [math.cos(seen.bearing), math.sin(seen.bearing)]
+    )
+    assert_allclose(there, target, atol=0.03)
+    flight.driver.halt()
+    assert flight.mode == 'LAND'
 
 
 def test_without_arm_nothing_is_armed_and_goals_are_refused(fly, capfd):

@@ -233,6 +233,14 @@ def test_links_that_cannot_work_are_refused(load, robot, changes, key, words):
     assert f': robots.{key}: ' in str(caught.value)
 
 
+def test_a_drone_with_a_camera_may_be_linked_by_mavlink(load):
+    robot = ('robots.mambo', changed()['robots']['mambo'] | LINKED)
+    scenario = load(changed(robot, ('robots.mambo.driver', 'mavlink_camera_driver')))
+    assert scenario.robots['mambo'].link == 'mavlink'
+    with pytest.raises(ScenarioError, match=r'robots\.mambo\.camera: read one'):
+        load(changed(robot, ('robots.mambo.driver', 'mavlink_driver')))
+
+
 def test_each_wrong_key_gets_a_line(load):
     with pytest.raises(ScenarioError) as caught:
         load(changed(('step', 'fast'), ('stopp', 1)))
