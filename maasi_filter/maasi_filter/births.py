@@ -50,12 +50,15 @@ def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
         number = starts[m + 1] - first
         root = roots[m]
         origin = centres[m] if cartesian[m] else values[m]
+        drawn = noise[first : first + number]
         for a in range(d):
+            value = z[a]
             for j in range(number):
-                total = origin[a]
-                for b in range(a + 1):
-                    total += root[a, b] * noise[first + j, b]
-                z[a, j] = total
+                value[j] = origin[a]
+            for b in range(a + 1):
+                factor = root[a, b]
+                for j in range(number):
+                    value[j] += factor * drawn[j, b]
         out = particles[first : first + number]
         size = jacobian[first : first + number]
         if cartesian[m]:
@@ -78,13 +81,12 @@ def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                 # Beyond straight up no measurement can point, nor behind.
                 if not (z[0, j] > 0.0 and level > 0.0):
                     size[j] = 0.0
-        inside[m] = False
-        for j in range(number):
-            within = True
-            for a in range(d):
-                within = within and bounds[a, 0] <= out[j, a] <= bounds[a, 1]
-            size[j] = size[j] if within else 0.0
-            inside[m] = inside[m] or size[j] > 0.0
+        for a in range(d):
+            lower = bounds[a, 0]
+            upper = bounds[a, 1]
+            for j in range(number):
+                size[j] = size[j] if lower <= out[j, a] <= upper else 0.0
+        inside[m] = (size > 0.0).any()
 
 
 @njit(cache=True, error_model='numpy')
