@@ -21,6 +21,7 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
+            'cuboid_planner_node = maasi_planner.cuboid_planner_node:main',
             'planner_node = maasi_planner.planner_node:main',
         ],
     },

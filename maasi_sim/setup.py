@@ -19,6 +19,7 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
+            'cuboid_sim_node = maasi_sim.cuboid_sim_node:main',
             'sim_node = maasi_sim.sim_node:main',
             'fake_mambo = maasi_sim.fake_mambo:main',
             'fake_mavlink_vehicle = maasi_sim.fake_mavlink_vehicle:main',

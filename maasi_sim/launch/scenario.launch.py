@@ -20,15 +20,18 @@ ARGUMENTS = {
 
 def start_nodes(context: LaunchContext) -> list:
     """Return the actions that start the scenario's nodes."""
+    from maasi_sim.cuboid_scenario import CuboidScenario, load_any_scenario
     from maasi_sim.linked_robots import with_addresses
     from maasi_sim.node_plan import plan_nodes
-    from maasi_sim.scenario import config_folder, load_scenario
+    from maasi_sim.scenario import config_folder
 
     given = {name: LaunchConfiguration(name).perform(context).strip() for name in ARGUMENTS}
     overrides = {}
     if given['seed']:
         overrides['seed:='] = (('seed',), int(given['seed']))
-    scenario = with_addresses(load_scenario(given['scenario'], overrides))
+    scenario = load_any_scenario(given['scenario'], overrides)
+    if not isinstance(scenario, CuboidScenario):
+        scenario = with_addresses(scenario)
     folder = Path(tempfile.mkdtemp(prefix='maasi_'))
     file = folder / 'scenario.yaml'
     file.write_text(scenario.text(), encoding='utf-8')

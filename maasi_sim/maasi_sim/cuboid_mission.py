@@ -21,10 +21,10 @@ from maasi_planner.planners.cuboid import (
     Mission,
     SearchAgent,
     Snapshot,
+    decision_stream,
     plan_mission,
     solve_jointly,
 )
-from maasi_sim.noise_streams import noise_stream
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -233,7 +233,7 @@ class CuboidMission:
         return broadcasts
 
     def _rng(self, name: str) -> np.random.Generator:
-        return noise_stream(self.seed, name, self.step, 'cuboid')
+        return decision_stream(self.seed, name, self.step)
 
     def _decide(self, broadcasts: dict[str, Broadcast]) -> list[float]:
         heard = self.heard(broadcasts)

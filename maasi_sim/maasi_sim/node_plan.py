@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from maasi_sim.cuboid_scenario import AnyScenario, CuboidScenario
 from maasi_sim.observer import BATCH, DECISIONS, FOUND, STEP, UPDATE, within
 from maasi_sim.scenario import RobotSettings, Scenario, planner_settings
 
@@ -88,7 +89,7 @@ class NodePlan:
 
 
 def plan_nodes(
-    scenario: Scenario,
+    scenario: AnyScenario,
     *,
     seed: int,
     lockstep: bool,
@@ -97,6 +98,8 @@ def plan_nodes(
     file: Path,
 ) -> list[NodePlan]:
     """Return the nodes that a scenario needs: sim, drivers and guards, filter, planner.
+
+    In a search of buildings: sim, and a planner for each robot.
 
     Parameters
     ----------
@@ -127,10 +130,11 @@ def plan_nodes(
         'rate': rate if rate is not None else 0.0 if lockstep else 1.0,
         'recorder': recorder,
     }
+    alone = isinstance(scenario, CuboidScenario)
     plans = [
         NodePlan(
             'maasi_sim',
-            'sim_node',
+            'cuboid_sim_node' if alone else 'sim_node',
             'sim_node',
             parameters=simulation,
             topics=(CLOCK, STEP) if lockstep else (CLOCK,),
@@ -139,11 +143,48 @@ def plan_nodes(
             is_clock=True,
         )
     ]
+    if isinstance(scenario, CuboidScenario):
+        return plans + [_cuboid_plan(name, scenario, common) for name in scenario.names()]
     for name in scenario.names():
         plans += _robot_plans(name, scenario.robots[name], scenario, common)
     for namespace, names in scenario.namespaces().items():
         plans += _team_plans(namespace, names, scenario, common)
     return plans
+
+
+def _cuboid_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -> NodePlan:
+    """Return the planner of a robot that searches buildings for itself."""
+    from maasi_filter.parameters import flatten
+    from maasi_planner.planners.cuboid.node_settings import (
+        CuboidPlannerSettings,
+        box_numbers,
+        face_words,
+    )
+
+    robot, search = scenario.robots[name], scenario.planner
+    floor = float(scenario.environment.array()[2, 0])
+    settings = CuboidPlannerSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment,
+            'start': robot.start,
+            'yaw': robot.yaw,
+            'dynamics': robot.dynamics,
+            'hazard': robot.hazard,
+            'planner': search.model_dump(exclude={'name', 'objects', 'obstacles'}),
+            'objects': [box_numbers(item, floor) for item in search.objects],
+            'faces': [face_words(item) for item in search.objects],
+            'obstacles': [box_numbers(item, floor) for item in search.obstacles],
+        }
+    )
+    return NodePlan(
+        'maasi_planner',
+        'cuboid_planner_node',
+        'cuboid_planner',
+        name,
+        {**flatten(settings), **_SIMULATED},
+        topics=tuple(f'/{name}/{topic}' for topic in ('state', 'decision', 'cmd_vel', 'link/tx')),
+    )
 
 
 def _team_plans(

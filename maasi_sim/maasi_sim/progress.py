@@ -22,13 +22,14 @@ class Status:
     targets: int
     explored: float
     factor: float
+    word: str = 'found'
 
     def text(self) -> str:
         """Return it as one line."""
         targets = f' of {self.targets}' if self.targets else ''
         return (
             f'{self.time:7.1f} s   {self.measurements:4d} measurements   '
-            f'{self.found} found{targets}   {100.0 * self.explored:3.0f} % explored   '
+            f'{self.found} {self.word}{targets}   {100.0 * self.explored:3.0f} % explored   '
             f'{self.factor:.1f} x real time'
         )
 

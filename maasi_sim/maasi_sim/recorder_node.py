@@ -22,14 +22,18 @@ from rclpy.subscription import Subscription
 from maasi_filter.conversions import stamp_of_step
 from maasi_msgs.msg import (
     AgentState,
+    CuboidDecision,
     DetectionArray,
     FilterUpdate,
     LockstepDone,
     LockstepStep,
     MeasurementBatch,
     PlanDecision,
+    SearchLink,
+    SearchLinkArray,
 )
 from maasi_sim.bag import BagError, BagWriter, TopicQos
+from maasi_sim.cuboid_observer import CuboidObserver
 from maasi_sim.observer import STEP, RunObserver
 
 NAME = '/recorder'
@@ -40,12 +44,15 @@ _SKIPPED = ('/parameter_events', READY)
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
 _WITH_STEP = (
     AgentState,
+    CuboidDecision,
     DetectionArray,
     FilterUpdate,
     LockstepDone,
     LockstepStep,
     MeasurementBatch,
     PlanDecision,
+    SearchLink,
+    SearchLinkArray,
 )
 _READY_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -81,7 +88,9 @@ class Recorder:
         Recording; None: nothing is recorded, and only what the observer needs is taken.
     """
 
-    def __init__(self, domain: int, observer: RunObserver, bag: BagWriter | None) -> None:
+    def __init__(
+        self, domain: int, observer: RunObserver | CuboidObserver, bag: BagWriter | None
+    ) -> None:
         self.context = Context()
         rclpy.init(
             context=self.context,

@@ -17,12 +17,15 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
     from maasi_sim.bag import BagWriter
+    from maasi_sim.cuboid_observer import CuboidObserver, CuboidRecord
+    from maasi_sim.cuboid_scenario import AnyScenario
     from maasi_sim.node_plan import NodePlan
     from maasi_sim.observer import RunObserver, RunRecord
     from maasi_sim.processes import Domain, NodeProcess
     from maasi_sim.recorder_node import Recorder
-    from maasi_sim.scenario import Scenario
 
 DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -233,8 +236,9 @@ class ScenarioRun:
     """
 
     def __init__(self, options: Options, interruption: Interruption) -> None:
+        from maasi_sim.cuboid_scenario import load_any_scenario
         from maasi_sim.progress import ProgressDisplay
-        from maasi_sim.scenario import find_scenario, load_scenario
+        from maasi_sim.scenario import find_scenario
 
         self.options = options
         self.interruption = interruption
@@ -247,7 +251,7 @@ class ScenarioRun:
             overrides['--time-limit'] = (('limits', 'time'), options.time_limit)
         if options.seed is not None:
             overrides['--seed'] = (('seed',), options.seed)
-        self.scenario: Scenario = load_scenario(path, overrides)
+        self.scenario: AnyScenario = load_any_scenario(path, overrides)
         self.seed = self.scenario.seed
         self.display = ProgressDisplay()
         self.events: list[dict[str, Any]] = []
@@ -281,8 +285,10 @@ class ScenarioRun:
         from maasi_sim.linked_robots import with_addresses
         from maasi_sim.node_plan import plan_nodes
         from maasi_sim.processes import NodeProcess, find_executable
+        from maasi_sim.scenario import Scenario
 
-        self.scenario = with_addresses(self.scenario)
+        if isinstance(self.scenario, Scenario):
+            self.scenario = with_addresses(self.scenario)
         file = self.folder / 'scenario.yaml'
         file.write_text(self.scenario.text(), encoding='utf-8')
         self.plans = plan_nodes(
@@ -325,11 +331,10 @@ class ScenarioRun:
                     process.start()
             threading.Thread(target=self._warn, daemon=True).start()
             from maasi_sim.bag import BagWriter, load_types
-            from maasi_sim.observer import RunObserver
             from maasi_sim.recorder_node import Recorder
 
             types = load_types()
-            observer = RunObserver(self.name, self.scenario, self.seed, types)
+            observer = make_observer(self.name, self.scenario, self.seed, types)
             if self.options.record:
                 bag = BagWriter(self.folder / 'bag', types, self.scenario.record.images)
                 bag.write_scenario(self._facts_text(), {'seed': str(self.seed)})
@@ -347,9 +352,9 @@ class ScenarioRun:
         return self._report(ending, recorder, observer)
 
     def _warn(self) -> None:
-        from maasi_sim.scenario import never_seen
+        from maasi_sim.scenario import Scenario, never_seen
 
-        warning = never_seen(self.scenario)
+        warning = never_seen(self.scenario) if isinstance(self.scenario, Scenario) else ''
         if warning:
             self.display.say(f'warning: {warning}')
 
@@ -408,7 +413,7 @@ class ScenarioRun:
         recorder.publish_ready()
         return None
 
-    def _follow(self, recorder: Recorder, observer: RunObserver) -> Ending:
+    def _follow(self, recorder: Recorder, observer: RunObserver | CuboidObserver) -> Ending:
         """Follow the run until it ends, and return how."""
         lockstep = self.options.lockstep
         limit = round(self.scenario.limits.time * 1e9)
@@ -433,7 +438,7 @@ class ScenarioRun:
             if self.display.due or observer.news:
                 self._show(recorder, observer)
 
-    def _goal(self, recorder: Recorder, observer: RunObserver) -> Ending | None:
+    def _goal(self, recorder: Recorder, observer: RunObserver | CuboidObserver) -> Ending | None:
         """Return the ending that the scenario asks for, if it has come."""
         if observer.completed is not None:
             return Ending('all_found', DONE)
@@ -459,7 +464,7 @@ class ScenarioRun:
             text = f'{name} {process.how_it_ended()}'
             event = {'time': recorder.time / 1e9, 'node': name, 'event': 'died'}
             robot = self._robot_of(name)
-            if robot is not None and name.endswith('/driver'):
+            if robot is not None and name.endswith(('/driver', '/cuboid_planner')):
                 recorder.stop_robot(robot)
             tries = self.scenario.limits.restarts
             # Another sim would begin with another time.
@@ -498,7 +503,7 @@ class ScenarioRun:
         name = node.strip('/').partition('/')[0]
         return name if name in self.scenario.robots else None
 
-    def _show(self, recorder: Recorder, observer: RunObserver) -> None:
+    def _show(self, recorder: Recorder, observer: RunObserver | CuboidObserver) -> None:
         from maasi_sim.progress import Status
 
         observer.news = False
@@ -511,6 +516,7 @@ class ScenarioRun:
                 found=observer.found,
                 targets=len(observer.truth),
                 explored=observer.explored,
+                word='found' if hasattr(observer, 'measurements') else 'visited',
                 factor=seconds / wall if wall > 0.0 else 0.0,
             )
         )
@@ -520,7 +526,11 @@ class ScenarioRun:
         from maasi_sim.processes import stop
 
         recorder.finish()
-        drivers = [plan.full_name for plan in self.plans if plan.package == 'maasi_drivers']
+        drivers = [
+            plan.full_name
+            for plan in self.plans
+            if plan.package == 'maasi_drivers' or plan.executable == 'cuboid_planner_node'
+        ]
         others = [name for name in self.processes if name not in drivers]
         if ending.reason == 'node_hung':
             for name in self.scenario.names():
@@ -534,16 +544,16 @@ class ScenarioRun:
         if stubborn:
             self.display.say(f'had to be killed: {", ".join(stubborn)}')
 
-    def _report(self, ending: Ending, recorder: Recorder, observer: RunObserver) -> int:
+    def _report(
+        self, ending: Ending, recorder: Recorder, observer: RunObserver | CuboidObserver
+    ) -> int:
         """Write the report, say how it went, and return the exit code."""
-        from maasi_sim.report import summary, write_report
-
         wall = 0.0
         if self._begun is not None and self._ended is not None:
             wall = self._ended - self._begun
-        record: RunRecord = observer.record(ending.reason, recorder.time / 1e9, wall, self.events)
-        report = write_report(record, self.folder)
-        self.display.say(summary(report))
+        record = observer.record(ending.reason, recorder.time / 1e9, wall, self.events)
+        report, words = report_on(record, self.folder)
+        self.display.say(words)
         if ending.text:
             self.display.say(f'ended: {ending.text}')
         if ending.code == NODE_FAILED:
@@ -557,6 +567,32 @@ class ScenarioRun:
         for process in self.processes.values():
             if process.name in self._failed:
                 self.display.say(f'--- {_short(process.log)}\n{process.last_words()}')
+
+
+def make_observer(
+    name: str, scenario: AnyScenario, seed: int, types: Typestore
+) -> RunObserver | CuboidObserver:
+    """Return who gathers what the report of a scenario needs."""
+    from maasi_sim.cuboid_observer import CuboidObserver
+    from maasi_sim.cuboid_scenario import CuboidScenario
+    from maasi_sim.observer import RunObserver
+
+    if isinstance(scenario, CuboidScenario):
+        return CuboidObserver(name, scenario, seed, types)
+    return RunObserver(name, scenario, seed, types)
+
+
+def report_on(record: RunRecord | CuboidRecord, folder: Path) -> tuple[dict[str, Any], str]:
+    """Write a report into a folder; return it, and what to say of it."""
+    from maasi_sim.cuboid_observer import CuboidRecord
+    from maasi_sim.cuboid_report import cuboid_summary, write_cuboid_report
+    from maasi_sim.report import summary, write_report
+
+    if isinstance(record, CuboidRecord):
+        report = write_cuboid_report(record, folder)
+        return report, cuboid_summary(report)
+    report = write_report(record, folder)
+    return report, summary(report)
 
 
 def _short(path: Path) -> str:

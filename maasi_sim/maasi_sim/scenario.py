@@ -303,12 +303,25 @@ def load_scenario(
     ScenarioError
         With file, line, key, what was read and what is allowed.
     """
+    return check_scenario(read_scenario(path, overrides))
+
+
+def read_scenario(
+    path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> Layer:
+    """Return the values of a scenario file with its layers, not checked yet.
+
+    Raises
+    ------
+    ScenarioError
+        If a file cannot be read, or a robot's type is not known.
+    """
     path = find_scenario(path)
     layer = read_layer(path)
     _lay_types_under(layer, path)
     for origin, (key, value) in (overrides or {}).items():
         override(layer, key, value, origin)
-    return check_scenario(layer)
+    return layer
 
 
 def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
@@ -406,7 +419,7 @@ def _problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
             yield ('robots', name, *inner), text
     yield from _mambo_problems(scenario)
     yield from _mavlink_problems(scenario)
-    yield from _event_problems(scenario)
+    yield from event_problems(scenario.events, scenario.names(), scenario.limits)
     if scenario.stop == 'all_found' and scenario.targets.count == 0:
         yield ('stop',), "read 'all_found' but there are no targets, allowed is 'planner_done'"
 
@@ -457,10 +470,8 @@ def _room_for_targets(scenario: Scenario) -> int:
 def _robot_problems(
     name: str, robot: RobotSettings, scenario: Scenario
 ) -> Iterator[tuple[Key, str]]:
-    if not _ROBOT_NAME.match(name) or name.endswith('_') or '__' in name:
-        yield (), f"read '{name}' as a name, allowed are lower case letters, digits and single _"
-    if name in _RESERVED:
-        yield (), f"read '{name}' as a name, which is that of a topic; allowed is any other"
+    for text in check_names(name):
+        yield (), text
     bounds = scenario.environment.array()
     start = np.array(robot.start)
     if not _inside(start, bounds):
@@ -488,6 +499,14 @@ def _robot_problems(
         if not len(candidates.at(robot.start)):
             yield ('candidates',), 'leave no waypoint inside environment.bounds'
     yield from _sensor_problems(robot, scenario)
+
+
+def check_names(name: str) -> Iterator[str]:
+    """Yield what is wrong with the name of a robot."""
+    if not _ROBOT_NAME.match(name) or name.endswith('_') or '__' in name:
+        yield f"read '{name}' as a name, allowed are lower case letters, digits and single _"
+    if name in _RESERVED:
+        yield f"read '{name}' as a name, which is that of a topic; allowed is any other"
 
 
 def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
@@ -614,19 +633,22 @@ def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
             )
 
 
-def _event_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+def event_problems(
+    events: Sequence[EventSettings], names: Sequence[str], limits: LimitSettings
+) -> Iterator[tuple[Key, str]]:
+    """Yield what is wrong with what happens to robots: key and text."""
     away: set[str] = set()
-    order = sorted(range(len(scenario.events)), key=lambda index: scenario.events[index].at)
+    order = sorted(range(len(events)), key=lambda index: events[index].at)
     for index in order:
-        event = scenario.events[index]
+        event = events[index]
         key: Key = ('events', index)
-        if event.robot not in scenario.robots:
-            yield (*key, 'robot'), unknown(event.robot, scenario.names(), 'robot')
+        if event.robot not in names:
+            yield (*key, 'robot'), unknown(event.robot, list(names), 'robot')
             continue
-        if event.at > scenario.limits.time:
+        if event.at > limits.time:
             yield (
                 (*key, 'at'),
-                f'read {event.at}, allowed is at most limits.time, {scenario.limits.time}',
+                f'read {event.at}, allowed is at most limits.time, {limits.time}',
             )
         if (event.do == 'back') != (event.robot in away):
             state = 'is there' if event.do == 'back' else 'has left'

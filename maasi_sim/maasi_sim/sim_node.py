@@ -5,7 +5,7 @@ from __future__ import annotations
 import array
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -40,9 +40,10 @@ from maasi_msgs.msg import LockstepDone, LockstepStep, RangeArray, RangeMeasurem
 from maasi_sim.laser_scan import LaserSettings
 from maasi_sim.linked_robots import LinkedRobot, linked_robot
 from maasi_sim.robots import SimulatedRobot
-from maasi_sim.scenario import ScenarioError, load_scenario, steps_of
+from maasi_sim.scenario import Scenario, ScenarioError, load_scenario, steps_of
 from maasi_sim.sim_settings import SimNodeSettings
 from maasi_sim.simulation import Simulation
+from maasi_sim.yaml_files import Key
 
 RECORDER = '/recorder'
 
@@ -239,6 +240,9 @@ class SimNode(SearchNode[SimNodeSettings]):
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
     """
 
+    #: Name of the node of each robot that commands it.
+    robot_node = 'driver'
+
     def __init__(self, **options: Any) -> None:
         super().__init__('sim_node', SimNodeSettings, lockstep_member=False, **options)
         settings = self.settings
@@ -246,10 +250,10 @@ class SimNode(SearchNode[SimNodeSettings]):
             raise SettingsError('parameter rate: read 0, allowed is above 0 unless in lockstep')
         overrides = {'parameter step': (('step',), settings.step)} if settings.step > 0.0 else {}
         try:
-            self.scenario = load_scenario(settings.scenario, overrides)
+            self.scenario = self.load(settings.scenario, overrides)
             rate = None if settings.lockstep else settings.rate
             self.scenario.check_pace(settings.lockstep, rate)
-            self.simulation = Simulation(self.scenario, settings.seed)
+            self.simulation = self.simulate()
         except (ScenarioError, ValueError) as error:
             raise SettingsError(str(error)) from error
         self._length = self.scenario.step
@@ -272,6 +276,21 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._said, self._said_at = '', 0.0
         self._wall_start = self._wall_step = time.monotonic()
 
+    def load(self, path: str, overrides: Mapping[str, tuple[Key, Any]]) -> Scenario:
+        """Return the scenario of a file."""
+        return load_scenario(path, overrides)
+
+    def simulate(self) -> Simulation:
+        """Return the robots at the start."""
+        return Simulation(self.scenario, self.settings.seed)
+
+    def connect(self) -> list[Any]:
+        """Return publishers and subscriptions beside those of all robots, and of the time."""
+        return []
+
+    def on_new_step(self) -> None:
+        """Note that the simulation has come to another step."""
+
     # ---- life cycle --------------------------------------------------------------------------
 
     def set_up(self) -> None:
@@ -287,7 +306,9 @@ class SimNode(SearchNode[SimNodeSettings]):
         }
         for topics in self._robots.values():
             self._entities += topics.publishers
-        self._driver_of = {name: self.team_topic(f'{name}/driver') for name in self._robots}
+        self._driver_of = {
+            name: self.team_topic(f'{name}/{self.robot_node}') for name in self._robots
+        }
         self._robot_of = {node: name for name, node in self._driver_of.items()}
         step_topics = [self._step_publisher.topic_name] if lockstep else []
         self._expected = {
@@ -313,14 +334,15 @@ class SimNode(SearchNode[SimNodeSettings]):
                 self.create_subscription(
                     TwistStamped,
                     f'{name}/cmd_vel',
-                    partial(self._take, partial(self._on_command, name)),
+                    partial(self.take, partial(self._on_command, name)),
                     RELIABLE if lockstep else 10,
                 )
             )
+        self._entities += self.connect()
         if lockstep:
             self._entities.append(
                 self.create_subscription(
-                    LockstepDone, 'lockstep/done', partial(self._take, self._on_done), RELIABLE
+                    LockstepDone, 'lockstep/done', partial(self.take, self._on_done), RELIABLE
                 )
             )
             self._urgent = [item for item in self._entities if isinstance(item, Subscription)]
@@ -370,7 +392,7 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._close_links()
         self._ready_since = None
         self.step = -1
-        self.simulation = Simulation(self.scenario, self.settings.seed)
+        self.simulation = self.simulate()
 
     def destroy_node(self) -> None:
         """Leave, once robots with a link of their own have been told to stop."""
@@ -522,6 +544,7 @@ class SimNode(SearchNode[SimNodeSettings]):
                 robot = self._robot_of.get(node)
                 if robot is None or robot not in self.simulation.away:
                     self._await(node)
+        self.on_new_step()
         self._publish(present)
 
     def _publish(self, robots: list[str]) -> None:
@@ -540,7 +563,7 @@ class SimNode(SearchNode[SimNodeSettings]):
             )
         )
 
-    def _take(self, handle: Callable[[Any], None], message: Any) -> None:
+    def take(self, handle: Callable[[Any], None], message: Any) -> None:
         """Take a message from the executor, and in lockstep those that follow without it.
 
         For each message the executor looks at all timers, services and events, which takes longer

@@ -10,6 +10,7 @@ from typing import Any
 import maasi_filter
 import maasi_planner
 from maasi_drivers.warm_up import warm_up as warm_up_drivers
+from maasi_sim.cuboid_scenario import CuboidScenario, load_any_scenario, mission_of
 from maasi_sim.scenario import load_scenario
 from maasi_sim.simulation import simulated_robot
 
@@ -25,6 +26,9 @@ def warm_up() -> None:
             robot = simulated_robot(robot_name, scenario, world, scenario.seed)
             robot.warm_up()
             robot.step(1, scenario.step)
+    scenario_of_buildings = load_any_scenario('buildings_four')
+    if isinstance(scenario_of_buildings, CuboidScenario):
+        mission_of(scenario_of_buildings).run(1)
 
 
 def warm_up_all() -> None:

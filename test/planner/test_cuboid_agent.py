@@ -38,6 +38,7 @@ def heard_from(agent, **others):
         flight_steps=1,
         plan={},
         hazard=agent.hazard,
+        predicted=np.array([185.0, 235.0, 5.0]),
     )
     return replace(message, **others)
 

@@ -13,7 +13,11 @@ from maasi_sim.node_plan import NodePlan, plan_nodes
 from maasi_sim.scenario import ScenarioError, config_folder, load_scenario
 from maasi_sim.sim_settings import SimNodeSettings
 
-SCENARIOS = sorted(path.stem for path in (config_folder() / 'scenarios').glob('*.yaml'))
+SCENARIOS = sorted(
+    path.stem
+    for path in (config_folder() / 'scenarios').glob('*.yaml')
+    if 'cuboid_mpc' not in path.read_text()
+)
 
 
 def plans_of(scenario, **changes):

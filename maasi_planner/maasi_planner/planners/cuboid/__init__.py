@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from maasi_planner.planners.cuboid.agent import Activity, Broadcast, Choice, SearchAgent, Snapshot
+from maasi_planner.planners.cuboid.agent import (
+    Activity,
+    Broadcast,
+    Choice,
+    SearchAgent,
+    Snapshot,
+    decision_stream,
+)
 from maasi_planner.planners.cuboid.centralized import JointPlan, solve_jointly
 from maasi_planner.planners.cuboid.dynamics import Dynamics
 from maasi_planner.planners.cuboid.preplanning import Mission, plan_mission
@@ -33,6 +40,7 @@ __all__ = [
     'Problem',
     'SearchAgent',
     'Snapshot',
+    'decision_stream',
     'plan_mission',
     'solve_jointly',
 ]

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,6 +60,8 @@ class Broadcast:
         Steps from now until the visit by cuboid, of its plan of the step before.
     hazard : Hazard
         Of its battery.
+    predicted : (3,) array
+        Where its plan of the step before has it at t + tau* + 1 [m].
     """
 
     robot: str
@@ -70,6 +73,7 @@ class Broadcast:
     flight_steps: int
     plan: Mapping[int, int]
     hazard: Hazard
+    predicted: FloatArray
 
 
 @dataclass(frozen=True)
@@ -144,6 +148,12 @@ def make_objective(settings: CuboidSettings) -> Objective:
     )
 
 
+def decision_stream(seed: int, robot: str, step: int) -> np.random.Generator:
+    """Return the generator of a robot's decision at a step: the same in every process."""
+    key = (seed, crc32(robot.encode()), step, crc32(b'cuboid'))
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
+
+
 def inflated(boxes: FloatArray, clearance: float) -> FloatArray:
     """Return boxes (n, 3, 2) with a clearance [m] on all sides."""
     return boxes + np.array([-clearance, clearance])
@@ -207,6 +217,7 @@ class SearchAgent:
         self.flight_steps = 0
         self.plan: Plan | None = None
         self.failed = 0
+        self.put_off = 0
         self._recharge_left = 0
         self.step = -1
         self.position = self.home
@@ -283,6 +294,7 @@ class SearchAgent:
             self.flight_steps,
             plan,
             self.hazard,
+            self.predicted(),
         )
 
     def _snapshot(self, n: int) -> Snapshot:
@@ -354,13 +366,17 @@ class SearchAgent:
             self.settings.between_samples,
             True,
             [(k - 1, n) for k, n in self.plan.visits if k > 2] if self.plan else [],
+            self.put_off,
         )
 
     def _target(self, heard: Sequence[Broadcast]) -> FloatArray:
         """Return x*: the cuboid nearest to where it will be, or the one assigned to it (10)."""
         unvisited = np.flatnonzero(~self.visited)
         if heard:
-            places = np.stack([self.position, *(message.position for message in heard)])
+            if self.settings.assignment == 'predicted':
+                places = np.stack([self.predicted(), *(message.predicted for message in heard)])
+            else:
+                places = np.stack([self.position, *(message.position for message in heard)])
             order = sorted(
                 range(len(places)), key=lambda i: self.name if i == 0 else heard[i - 1].robot
             )
@@ -387,6 +403,10 @@ class SearchAgent:
             how = 'shifted'
             if plan is None:
                 plan, how = self._stop(), 'brake'
+        before = [k - 1 for k, _ in self.plan.visits if k > 1] if self.plan else []
+        now = [k for k, _ in plan.visits]
+        # Else a robot can plan to visit later for ever.
+        self.put_off = self.put_off + 1 if before and now and min(now) > min(before) else 0
         self.plan = plan
         if self.activity is not Activity.RECHARGING:
             self.flight_steps += 1

@@ -74,10 +74,16 @@ class Objective:
         """Index of the guided position, tau* + 1."""
         return min(self.guidance_step, self.horizon - 1) + 1
 
-    def rewards(self) -> FloatArray:
-        """Return the reward of a visit at P_0 to P_T, (T + 1,) [1]."""
+    def rewards(self, put_off: int = 0) -> FloatArray:
+        """Return the reward of a visit at P_0 to P_T, (T + 1,) [1].
+
+        Parameters
+        ----------
+        put_off : int
+            How often in a row the first visit was put off: as many times more is discounted.
+        """
         steps = np.maximum(np.arange(self.horizon + 1) - 1, 0)
-        return np.asarray(self.visit * self.discount**steps)
+        return np.asarray(self.visit * self.discount ** ((1 + put_off) * steps))
 
 
 @dataclass
@@ -105,6 +111,8 @@ class Problem:
         after the horizon.
     hint : list of (int, int)
         Visits (step, cuboid) of the plan before, as of now.
+    put_off : int
+        How often in a row the first visit was put off; nothing where rewards are not discounted.
     """
 
     position: FloatArray
@@ -118,6 +126,7 @@ class Problem:
     between: bool = True
     brakes: bool = True
     hint: list[tuple[int, int]] = field(default_factory=list)
+    put_off: int = 0
 
 
 @dataclass
@@ -276,7 +285,7 @@ class PlanSolver:
         chosen, wanted = self._due(problem, positions[1])
         visits = self._visits(problem, positions, wanted)
         steps, cuboids, boxes, clipped, fall, climb = visits
-        rewards = SCALE * objective.rewards()
+        rewards = SCALE * objective.rewards(problem.put_off)
         reward = rewards[steps] if len(steps) else np.zeros(0)
         follows, ahead = bb.longest_chains(
             steps, cuboids, reward, clipped[:, :, 0].copy(), clipped[:, :, 1].copy(), fall, climb

@@ -97,11 +97,9 @@ class HazardSettings(Settings):
         return self
 
 
-class CuboidSettings(Settings):
-    """The distributed model predictive control of 004 and its mission."""
+class CuboidMethodSettings(Settings):
+    """The distributed model predictive control of 004, without what is searched."""
 
-    objects: list[ObjectSettings] = Field(default_factory=list, description='To be searched')
-    obstacles: list[BoxSettings] = Field(default_factory=list, description='To be kept away from')
     detection_probability: float = Field(
         default=0.88, gt=0.0, le=1.0, description='p_d that each snapshot must have, (4) [1]'
     )
@@ -123,8 +121,13 @@ class CuboidSettings(Settings):
         default=0.95,
         gt=0.0,
         le=1.0,
-        description='Of the reward, for each step that a visit comes later; 1 is the paper, in '
-        'which robots may hover for ever [1]',
+        description='Of the reward, for each step that a visit comes later, the more the more '
+        'often it was put off; 1 is the paper, in which robots may hover for ever [1]',
+    )
+    assignment: Literal['predicted', 'printed'] = Field(
+        default='predicted',
+        description='Distances of the assignment (10): from where the plans have the robots at '
+        'tau* + 1, as (10) has it for a robot alone, or from where they are, as printed',
     )
     around_corners: bool = Field(
         default=True,
@@ -150,3 +153,10 @@ class CuboidSettings(Settings):
         ge=1,
         description='Nodes of a solve; then the best plan so far, the same on every machine [1]',
     )
+
+
+class CuboidSettings(CuboidMethodSettings):
+    """The distributed model predictive control of 004 and its mission."""
+
+    objects: list[ObjectSettings] = Field(default_factory=list, description='To be searched')
+    obstacles: list[BoxSettings] = Field(default_factory=list, description='To be kept away from')

@@ -1,0 +1,145 @@
+"""Searches of buildings: a planner process for each robot, and a link of limited range."""
+
+import os
+import signal
+import subprocess
+
+import numpy as np
+import pytest
+import yaml
+from scenario_runs import PATIENCE, command, processes_with, run_scenario
+
+from maasi_sim.bag import Bag
+from maasi_sim.cuboid_scenario import load_any_scenario, mission_of
+from maasi_sim.replay import plain
+
+pytestmark = pytest.mark.system
+
+
+def of_topic(run, topic):
+    with Bag(run.bag) as bag:
+        return [plain(item.message) for item in bag.messages([topic])]
+
+
+def small(tmp_path, **changes):
+    """Return the file of a search of one building by two robots, 16 cuboids."""
+    content = load_any_scenario('buildings_four').content()
+    content['robots'] = {name: content['robots'][name] for name in ('blue', 'green')}
+    content['planner']['objects'] = content['planner']['objects'][:1]
+    content['planner'].update(horizon=6, time_limit=1e9)
+    content.update(changes)
+    file = tmp_path / 'small.yaml'
+    file.write_text(yaml.safe_dump(content))
+    return file
+
+
+def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path):
+    file = small(tmp_path)
+    run = run_scenario(file, tmp_path / 'run', '--lockstep', '--seed', 3)
+    assert run.code == 0, run.output
+    report = run.report
+    assert report['cuboids']['visited'] == report['cuboids']['total'] == 16
+    assert report['end_reason'] == 'all_found'
+    assert report['collisions'] == 0
+    assert set(report['choices']) == {'optimal'}
+    assert report['most_heard'] == 1
+    assert all(number > 0 for number in report['measurements'].values())
+    assert (run.folder / 'report.png').stat().st_size > 20_000
+    # Nobody but sim and planners takes part.
+    logs = sorted(path.stem for path in run.folder.glob('*.log'))
+    assert logs == ['blue_cuboid_planner', 'green_cuboid_planner', 'sim_node']
+
+    mission = mission_of(load_any_scenario(file, {'seed': (('seed',), 3)}))
+    record = mission.run(200)
+    assert report['time_to_find_all'] == record.steps
+    for name, path in record.paths.items():
+        states = of_topic(run, f'/{name}/state')
+        flown = [state['pose']['pose']['position'] for state in states]
+        ours = np.array([[place[axis] for axis in 'xyz'] for place in flown])
+        assert ours == pytest.approx(path[: len(ours)], abs=1e-6)
+        assert len(ours) >= record.steps
+    assert [(shot['cuboid'], shot['agent'], shot['time']) for shot in report['snapshots']] == [
+        (shot.cuboid, shot.robot, shot.step) for shot in record.snapshots
+    ]
+
+
+def test_the_link_has_a_range_and_batteries_fail(tmp_path):
+    content = load_any_scenario('buildings_four').content()
+    robots = {name: content['robots'][name] for name in ('blue', 'green')}
+    for robot in robots.values():
+        robot['hazard'].update(alpha=14.0, recharge_steps=[2, 4])
+    planner = {**content['planner'], 'objects': content['planner']['objects'][:1]}
+    planner.update(horizon=6, time_limit=1e9, communication_range=40.0)
+    file = small(
+        tmp_path,
+        robots=robots,
+        planner=planner,
+        stop='planner_done',
+        events=[
+            {'at': 4.0, 'robot': 'green', 'do': 'leave'},
+            {'at': 9.0, 'robot': 'green', 'do': 'back'},
+        ],
+    )
+    run = run_scenario(file, tmp_path / 'run', '--lockstep', '--time-limit', 300)
+    assert run.code == 0, run.output
+    report = run.report
+    assert report['end_reason'] == 'planner_done' and report['missed'] == 0
+    assert report['collisions'] == 0
+    words = {(event['agent'], event['event']) for event in report['events']}
+    assert {('green', 'lost'), ('green', 'joined')} <= words
+    assert any(word == 'returning' for _, word in words)
+    assert any(word == 'recharging' for _, word in words)
+    assert any(word == 'searching' for _, word in words)
+    places = {
+        name: {
+            state['step']: np.array([state['pose']['pose']['position'][axis] for axis in 'xyz'])
+            for state in of_topic(run, f'/{name}/state')
+        }
+        for name in ('blue', 'green')
+    }
+    heard = 0
+    for item in of_topic(run, '/blue/link/rx'):
+        if item['messages']:
+            heard += 1
+            step = item['step']
+            assert np.linalg.norm(places['blue'][step] - places['green'][step]) <= 40.0
+            assert not 4 <= step < 9
+    assert heard > 2
+
+
+def test_a_killed_planner_stops_nobody_and_takes_up_its_work(tmp_path):
+    file = small(tmp_path, on_exit='respawn')
+    folder = tmp_path / 'run'
+    process = subprocess.Popen(
+        command(file, folder, '--rate', 4),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        for line in process.stdout:
+            if 'visited of' in line and ' 0 visited' not in line:
+                break
+        (victim,) = processes_with(f'{folder}/parameters/green_cuboid_planner.yaml')
+        os.kill(victim, signal.SIGKILL)
+        output, _ = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    assert process.returncode == 0, output
+    assert 'started again' in output
+    with Bag(folder / 'bag') as bag:
+        decisions = {
+            name: [plain(item.message) for item in bag.messages([f'/{name}/decision'])]
+            for name in ('blue', 'green')
+        }
+    steps = [item['step'] for item in decisions['green']]
+    gaps = np.diff(steps)
+    # It was away for a while, the other one went on, and it came back.
+    assert gaps.max() > 1
+    lost = steps[int(np.argmax(gaps))]
+    between = [
+        item['step'] for item in decisions['blue'] if lost < item['step'] < lost + gaps.max()
+    ]
+    assert len(between) >= gaps.max() - 1
+    assert steps[-1] > lost
