@@ -30,6 +30,7 @@ STYLES: dict[str, tuple[str, str]] = {
     'recommended': ('#7B3294', '-'),
 }
 _OTHERS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')
+_FEWEST_SHADED = 4
 _TRUE, _FOUND, _PALE = '#222222', '#D62728', '#9A9A9A'
 
 
@@ -60,7 +61,7 @@ def curves(
     label: str = 'measurements',
     end: float | None = None,
 ) -> None:
-    """Draw the mean number of targets found with its 95 % confidence.
+    """Draw the mean number of targets found, of four or more runs with its 95 % confidence.
 
     Parameters
     ----------
@@ -96,7 +97,9 @@ def curves(
         mean = np.array([span.mean for span in spans])
         half = np.nan_to_num(np.array([span.half_width for span in spans]))
         axes.plot(grid, mean, line, color=colour, lw=1.8, label=name)
-        axes.fill_between(grid, mean - half, mean + half, color=colour, alpha=0.15, lw=0)
+        # Of two or three runs it would fill the picture.
+        if len(runs) >= _FEWEST_SHADED:
+            axes.fill_between(grid, mean - half, mean + half, color=colour, alpha=0.15, lw=0)
         targets = max(targets, *(run.value('targets') or 0.0 for run in runs))
     axes.axhline(targets, color=_TRUE, lw=0.8, ls='--')
     axes.set_xlim(0.0, grid[-1])
