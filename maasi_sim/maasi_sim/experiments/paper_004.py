@@ -674,7 +674,7 @@ def experiments() -> list[Experiment]:
                     'Uniformly, says the paper; heights are part of the area.',
                 ),
             ),
-            causes='Climbing: 35 N lift a robot of 3.35 kg by 0.64 m/s^2 at most, and air resistance '
+            causes='Climbing: 35 N lift 3.35 kg by 0.64 m/s^2 at most, and air resistance '
             'ends that at 3.2 m/s. Without gravity, or with 70 N, the same planner comes out at '
             "the paper's times. As printed, the distances of the assignment cost more than that.",
             runs=50,
