@@ -207,7 +207,7 @@ def _e1() -> Experiment:
             for quantity in (FOUND, MEASUREMENTS)
         ),
         choices=(*CUBE_CHOICES, _LENGTH_CHOICE),
-        causes='330 steps of 12 m are a quarter of what a lawnmower needs to come by everywhere.',
+        causes=_LONG_TAIL,
         seconds=3.0,
         maps='001, uniform',
         note='The paper finds no significant difference of the three.',
@@ -479,6 +479,7 @@ def _e7() -> Experiment:
             ),
             Choice('runs', '10', 'The paper has one; one says little about a difference of 50.'),
         ),
+        causes=_LONG_TAIL,
         seconds=5.0,
         maps='001, obstacles',
         note='Distances are those of straight ways from one measurement to the next. A target that '
