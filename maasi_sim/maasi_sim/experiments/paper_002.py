@@ -171,8 +171,7 @@ def _homogeneous(small: bool) -> list[Case]:
 
 _CAUSE = (
     'pi = 0.98 exp(-d / 50 m), or 120 m, has a long tail: most targets are seen from afar, so that '
-    'all are found well before the number of steps that the paper shows. False targets of the '
-    'paper are second finds of one target, whose detections are only removed within T_z.'
+    'all are found well before the number of steps that the paper shows.'
 )
 
 
