@@ -1137,9 +1137,9 @@ class TeamObjective:
         self.settings = settings
         self.weights = resolve(settings)
         self.names = [name for name in team.planning() if len(candidates[name])]
-        self.start = np.concatenate(
-            [[0], np.cumsum([len(candidates[name]) for name in self.names])]
-        ).astype(np.int64)
+        counts = np.array([len(candidates[name]) for name in self.names], np.int64)
+        self.start = _starts(counts)
+        self.robot = np.repeat(np.arange(len(counts)), counts)
         self._alone: FloatArray | None = None
         self._build(candidates, trajectories, allowed)
 
@@ -1231,7 +1231,7 @@ class TeamObjective:
             if weights.beta > 0.0:
                 entries = self._entries(kernels, planned, settled, first)
                 if len(names) > 1:
-                    rows = _rows(planned, number)
+                    rows = _rows(planned)
         pairs = number if len(entries[1]) and len(names) > 1 else 0
         longest = int(np.diff(entries[0]).max(initial=0)) if pairs else 0
         parameters = np.zeros((len(names), PARAMETERS))
@@ -1239,7 +1239,7 @@ class TeamObjective:
             parameters[index] = kernel[1]
         self.joint = Joint(
             start=self.start,
-            robot=np.repeat(np.arange(len(names)), np.diff(self.start)).astype(np.int64),
+            robot=self.robot,
             allowed=_joined(
                 [allowed[name] & (trajectories[name].lengths > 0) for name in names], np.bool_
             ),
@@ -1327,9 +1327,8 @@ class TeamObjective:
             value_parts.append(entry_value)
             node_parts.append(entry_node)
             time_parts.append(entry_time)
-        start = np.concatenate([[0], np.cumsum(_joined(counts, np.int64))]).astype(np.int64)
         return (
-            start,
+            _starts(_joined(counts, np.int64)),
             _joined(value_parts, float),
             _stacked(node_parts, 3),
             _joined(time_parts, np.int64),
@@ -1634,11 +1633,10 @@ def _probabilities(
                 )
 
 
-def _rows(planned: list[Events], number: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+def _rows(planned: list[Events]) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     """Return the events of all candidates one after the other."""
     totals = _joined([item.total for item in planned], np.int64)
-    start = np.zeros(number + 1, np.int64)
-    start[1:] = np.cumsum(totals)
+    start = _starts(totals)
     keep = [np.arange(item.times.shape[1])[None, :] < item.total[:, None] for item in planned]
     return (
         start,
@@ -1646,6 +1644,13 @@ def _rows(planned: list[Events], number: int) -> tuple[IntArray, IntArray, Float
         _stacked([item.places[mask] for item, mask in zip(planned, keep)], 3),
         _stacked([item.turns[mask] for item, mask in zip(planned, keep)], 2),
     )
+
+
+def _starts(counts: IntArray) -> IntArray:
+    """Return where each of several parts begins, one after the other, and where the last ends."""
+    start = np.zeros(len(counts) + 1, np.int64)
+    np.cumsum(counts, out=start[1:])
+    return start
 
 
 def _joined(parts: list, dtype: type) -> NDArray:

@@ -188,7 +188,9 @@ class MotionModel(ABC):
         """Return the steps after which a waypoint counts as out of reach."""
         offset = waypoints - state.pose.position
         farthest = math.sqrt(float((offset * offset).sum(axis=1).max())) if len(offset) else 0.0
-        around = 2.0 * math.pi * float(self.keep_out.circles[:, 3].sum())
+        around = 0.0
+        if len(self.keep_out.circles):
+            around = 2.0 * math.pi * float(self.keep_out.circles[:, 3].sum())
         seconds = 2.0 * (farthest + around) / self.settings.speed + 30.0
         return min(math.ceil(seconds / step), STEPS_LIMIT)
 

@@ -176,10 +176,10 @@ def usable_candidates(
     view = team.robots[name]
     points = np.ascontiguousarray(view.candidates, dtype=float).reshape(-1, 3)
     dropped: list[str] = []
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        dropped.append(f'{int((~finite).sum())} not finite')
-        points = points[finite]
+    if not np.isfinite(points).all():
+        good = np.isfinite(points).all(axis=1)
+        dropped.append(f'{int((~good).sum())} not finite')
+        points = points[good]
     inside = in_bounds(points, team.bounds)
     if not inside.all():
         dropped.append(f'{int((~inside).sum())} outside the bounds')
