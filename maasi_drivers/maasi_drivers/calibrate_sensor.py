@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.rosbag2 import ReaderError
 from rosbags.typesys import Stores, get_typestore
 
 from maasi_drivers.camera_settings import load_calibration
@@ -222,7 +223,7 @@ class RecordedRobot:
     def _open(self) -> AnyReader:
         try:
             return AnyReader([self._bag], default_typestore=self._store)
-        except AnyReaderError as error:
+        except (AnyReaderError, ReaderError, OSError) as error:
             raise CalibrationError(f'{self._bag}: cannot be read: {error}') from error
 
     def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:

@@ -291,7 +291,8 @@ def test_a_wrong_parameter_file_is_said(recording, tmp_path, capsys, content, wo
     assert main([str(recording[0]), '--parameters', str(file)]) == 2
     assert words in capsys.readouterr().err
     assert main([str(recording[0]), '--parameters', str(tmp_path / 'none.yaml')]) == 2
-    assert main([str(tmp_path / 'none'), '--parameters', str(recording[0] / 'driver.yaml')]) == 2
+    for bag in (tmp_path / 'none', tmp_path):
+        assert main([str(bag), '--parameters', str(recording[0] / 'driver.yaml')]) == 2
 
 
 def test_detections_of_a_driver_do_as_well(tmp_path, capsys):
