@@ -19,7 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from robot_team import DOMAIN, KINDS, TURTLEBOT, Team, parameters_of
+from robot_team import KINDS, TURTLEBOT, Team, parameters_of
 
 from maasi_drivers.camera_settings import CameraSettings
 from maasi_drivers.driver_settings import DriverSettings
@@ -29,6 +29,7 @@ from maasi_filter.parameters import flatten
 from maasi_filter.pose import Pose, quaternion_product
 from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.processes import Domain
 from maasi_sim.world import TargetSettings, World
 
 BOX = 0.2
@@ -174,12 +175,17 @@ def hard_score() -> Callable[[str, int, int], Score]:
 
 @pytest.fixture
 def context(monkeypatch):
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN, signal_handler_options=SignalHandlerOptions.NO)
-    yield context
-    rclpy.shutdown(context=context)
+    with Domain() as domain:
+        for name, value in domain.environment().items():
+            monkeypatch.setenv(name, value)
+        context = Context()
+        rclpy.init(
+            context=context,
+            domain_id=domain.number,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        yield context
+        rclpy.shutdown(context=context)
 
 
 @pytest.fixture

@@ -35,7 +35,6 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
 from maasi_sim.world import TargetSettings, World
 
-DOMAIN = 74
 STEP = 0.05
 NANOSECONDS = round(STEP * 1e9)
 # Longest wait for anything; the machine may be busy.

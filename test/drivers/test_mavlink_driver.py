@@ -295,7 +295,7 @@ def test_a_cancelled_goal_stops_it(fly):
 
 @pytest.mark.parametrize('firmware', ['arducopter', 'ardusub'])
 def test_a_cut_link(fly, firmware):
-    flight = fly(firmware, link={'link_timeout': 0.6}).fly()
+    flight = fly(firmware, link={'link_timeout': 1.0}).fly()
     result = flight.under_way([1.0, -6.0, flight.driver.settings.start[2]])
     flight.vehicle.cut()
     flight.gives_up(result, 'link: nothing heard from system 1')
@@ -304,7 +304,7 @@ def test_a_cut_link(fly, firmware):
 
 
 def test_a_link_that_comes_back(fly):
-    flight = fly(link={'link_timeout': 0.6}, autopilot={'parameters': {'FS_GCS_TIMEOUT': 60}})
+    flight = fly(link={'link_timeout': 1.0}, autopilot={'parameters': {'FS_GCS_TIMEOUT': 60}})
     result = flight.fly().under_way()
     flight.vehicle.cut()
     flight.gives_up(result, 'link: nothing heard from system 1')
