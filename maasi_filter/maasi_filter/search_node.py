@@ -412,8 +412,15 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
     """
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
 
+    # While messages are taken a signal is only noted: an exception in the middle of a call into
+    # rclpy's C++ comes out as another one. A second signal does not wait.
+    spinning, asked = False, False
+
     def interrupt(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
+        nonlocal asked
+        if not spinning or asked:
+            raise KeyboardInterrupt
+        asked = True
 
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
@@ -427,7 +434,8 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
         # What was made so far stays: the collector need not look at it in every round.
         gc.collect()
         gc.freeze()
-        while rclpy.ok():
+        spinning = True
+        while rclpy.ok() and not asked:
             executor.spin_for(_SIGNAL_PERIOD)
     except SettingsError as error:
         print(f'error: {error}', file=sys.stderr)

@@ -317,7 +317,8 @@ class ScenarioRun:
 
         for plan in self.plans:
             self.processes[plan.full_name].main = main_of(plan.package, plan.executable)
-        warm_up_all()
+        if any(process.main is not None for process in self.processes.values()):
+            warm_up_all()
 
     def _execute(self, domain: Domain) -> int:
         from maasi_sim.processes import stop
