@@ -287,7 +287,9 @@ def test_nav2_drives_to_the_waypoints(driven):
     heard(team, said, 'goal')
     nav2.kill()
     team.until(lambda: stand(team) or result.done())
-    assert 'Nav2 is gone' in result.result().result.reason
+    # The publisher of odometry may wait for the dead one, too: then that is missed first.
+    reason = result.result().result.reason
+    assert 'Nav2 is gone' in reason or 'no odometry for' in reason
     assert_array_equal(team.command, np.zeros(4))
     assert not send(team, [0.7, 0.8, 0.0]).accepted
 
