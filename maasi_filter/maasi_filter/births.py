@@ -261,6 +261,41 @@ def births_worth_drawing(
 
 
 @njit(cache=True, error_model='numpy')
+def _worth_keeping(totals, scale, starts, per_target, least_mass, mass, number):  # type: ignore[no-untyped-def]  # pragma: no cover
+    total = 0
+    for m in range(totals.shape[0]):
+        mass[m] = totals[m] * scale[m]
+        number[m] = 0
+        if mass[m] > least_mass:
+            wanted = min(math.ceil(per_target * mass[m]), starts[m + 1] - starts[m])
+            number[m] = wanted
+        total += number[m]
+    return total
+
+
+def births_worth_keeping(
+    births: MeasurementBirths, scale: FloatArray, per_target: int, least_mass: float
+) -> tuple[FloatArray, IntArray, int]:
+    """Return the posterior mass of each measurement's births, how many to keep, and their sum.
+
+    Parameters
+    ----------
+    scale : (m,) array
+        1 / C(z) of each measurement.
+    per_target : int
+        Particles for each expected target; never more than were drawn.
+    least_mass : float
+        Births of a smaller posterior mass are left out.
+    """
+    mass = np.empty(len(scale))
+    number = np.empty(len(scale), np.int64)
+    total = _worth_keeping(
+        births.totals, scale, births.starts, float(per_target), least_mass, mass, number
+    )
+    return mass, number, total
+
+
+@njit(cache=True, error_model='numpy')
 def _thin(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     particles, intensity, starts, mass, number, offset, first_group, out, weights, group
 ):

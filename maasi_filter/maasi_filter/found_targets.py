@@ -135,11 +135,47 @@ def _information(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                 out[m, a, b] = total
 
 
-def detection_information(
-    positions: FloatArray, measurements: MeasurementSet, pose: Pose
+@njit(cache=True, error_model='numpy')
+def _inherit(group_share, own_mass, information):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add, in place, to each new group's information that of the group it mostly comes from."""
+    groups, number = group_share.shape
+    for m in range(number):
+        if groups == 0 or not own_mass[m] > 0.5:
+            continue
+        source = 0
+        for g in range(1, groups):
+            if group_share[g, m] > group_share[source, m]:
+                source = g
+        information[groups + m] += information[source]
+
+
+def extended_information(
+    information: FloatArray,
+    positions: FloatArray,
+    group_share: FloatArray,
+    own_mass: FloatArray,
+    measurements: MeasurementSet,
+    pose: Pose,
 ) -> FloatArray:
-    """Return H^T R^-1 H (m, d, d) of each detection, with H at `positions` (m, d)."""
-    out = np.empty((len(measurements), positions.shape[1], positions.shape[1]))
+    """Return the information (g + m, d, d) of groups and of the m groups of detections.
+
+    A detection tells H^T R^-1 H, with H at `positions`. Where particles mostly explain it, what
+    was known of the group that they mostly are of is added.
+
+    Parameters
+    ----------
+    information : (g, d, d) array
+        Of the groups there were, 1 / m^2.
+    positions : (m, d) array
+        Means of what the detections explain, metres.
+    group_share : (g, m) array
+        How much each group explains of each detection.
+    own_mass : (m,) array
+        How much all particles explain of it.
+    """
+    groups, d = information.shape[:2]
+    out = np.empty((groups + len(measurements), d, d))
+    out[:groups] = information
     _information(
         positions,
         pose.position,
@@ -147,8 +183,9 @@ def detection_information(
         measurements.cartesian,
         measurements.centres,
         measurements.information,
-        out,
+        out[groups:],
     )
+    _inherit(group_share, own_mass, out)
     return out
 
 

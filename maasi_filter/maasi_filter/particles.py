@@ -105,6 +105,27 @@ def _select_evenly_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover -
             point += 1
 
 
+@njit(cache=True, error_model='numpy')
+def _evenly_limits(sums, number, offset, bases, limits):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill which points (k + offset) total / number fall into each chunk, and sums up to it.
+
+    The last chunk that holds any weight takes what rounding puts at the very end.
+    """
+    chunks = sums.shape[0]
+    end = 0
+    bases[0] = 0.0
+    for chunk in range(chunks):
+        bases[chunk + 1] = bases[chunk] + sums[chunk]
+        if sums[chunk] > 0.0:
+            end = chunk + 1
+    rate = number / bases[chunks]
+    limits[0] = 0
+    for chunk in range(1, chunks + 1):
+        limit = np.int64(np.ceil(bases[chunk] * rate - offset))
+        limits[chunk] = number if chunk >= end else min(max(limit, 0), number)
+    return rate
+
+
 def resampling_points(
     scheme: str, number: int, total: float, generator: np.random.Generator
 ) -> FloatArray:
@@ -147,27 +168,26 @@ def resample(
     sums = np.empty(chunks)
 
     run_chunks(lambda c, e: _sum_chunks(c, e, weights, sums), n, pool)
-    bases = np.zeros(chunks + 1)
-    np.cumsum(sums, out=bases[1:])
-    total = float(bases[-1])
+    total = sum(sums.tolist())
     if not (math.isfinite(total) and total > 0.0):
         raise ValueError(f'weights: got a sum of {total}, allowed is a finite number above 0')
     index = np.empty(number, np.int64)
-    # The last chunk that holds any weight takes what rounding puts at the very end.
-    end = int(np.nonzero(sums > 0.0)[0][-1]) + 1
+    bases = np.empty(chunks + 1)
     if scheme == 'systematic':
         offset = generator.random()
-        rate = number / total
-        limits = np.clip(np.ceil(bases * rate - offset), 0, number).astype(np.int64)
-        limits[0] = 0
-        limits[end:] = number
+        limits = np.empty(chunks + 1, np.int64)
+        rate = _evenly_limits(sums, number, offset, bases, limits)
         run_chunks(
             lambda c, e: _select_evenly_chunks(c, e, weights, bases, rate, offset, limits, index),
             n,
             pool,
         )
         return index
-    points = resampling_points(scheme, number, total, generator)
+    bases[0] = 0.0
+    np.cumsum(sums, out=bases[1:])
+    # The last chunk that holds any weight takes what rounding puts at the very end.
+    end = int(np.nonzero(sums > 0.0)[0][-1]) + 1
+    points = resampling_points(scheme, number, float(bases[-1]), generator)
     limits = np.searchsorted(points, bases, side='left')
     limits[0] = 0
     limits[end:] = number
@@ -187,14 +207,9 @@ def _mix(state):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 def _count_chunks(first_chunk, last_chunk, index, group, counts):  # type: ignore[no-untyped-def]  # pragma: no cover
     for chunk in range(first_chunk, last_chunk):
         part = index[chunk * CHUNK : (chunk + 1) * CHUNK]
-        k = 0
-        while k < len(part):
-            # A run of one group.
-            g = group[part[k]]
-            first = k
-            while k < len(part) and group[part[k]] == g:
-                k += 1
-            counts[chunk, g] += k - first
+        here = counts[chunk]
+        for k in range(len(part)):
+            here[group[part[k]]] += 1
 
 
 @njit(cache=True, error_model='numpy')
@@ -224,33 +239,23 @@ def _gather_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     flat = particles.reshape(particles.size)
     flat_out = out.reshape(out.size)
     for chunk in range(first_chunk, last_chunk):
-        k = chunk * CHUNK
-        stop = min(index.shape[0], k + CHUNK)
-        before = index[k - 1] if k > 0 else -1
-        while k < stop:
-            # A run of one group.
-            g = group[index[k]]
-            first = k
-            while k < stop and group[index[k]] == g:
-                k += 1
-            place = places[chunk, g]
-            places[chunk, g] = place + k - first
+        first = chunk * CHUNK
+        stop = min(index.shape[0], first + CHUNK)
+        before = index[first - 1] if first > 0 else -1
+        here = places[chunk]
+        for k in range(first, stop):
+            chosen = index[k]
+            g = group[chosen]
+            place = here[g]
+            here[g] = place + 1
+            copy[place] = chosen == before
+            before = chosen
+            source = d * chosen
+            target = d * place
+            flat_out[target] = flat[source]
+            flat_out[target + 1] = flat[source + 1]
             if d == 3:
-                for j in range(first, k):
-                    source = 3 * index[j]
-                    target = 3 * (place + j - first)
-                    flat_out[target] = flat[source]
-                    flat_out[target + 1] = flat[source + 1]
-                    flat_out[target + 2] = flat[source + 2]
-            else:
-                for j in range(first, k):
-                    source = 2 * index[j]
-                    target = 2 * (place + j - first)
-                    flat_out[target] = flat[source]
-                    flat_out[target + 1] = flat[source + 1]
-            for j in range(first, k):
-                copy[place + j - first] = index[j] == before
-                before = index[j]
+                flat_out[target + 2] = flat[source + 2]
 
 
 def gather(
@@ -461,6 +466,77 @@ def _draw_in_solid(source, mean, share, number, target):  # type: ignore[no-unty
         target[i, 2] = z + share * (source[i, 2] - z)
 
 
+@njit(cache=True, error_model='numpy')
+def _copies(copy, first, last, copies):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fill which particles of [first, last) are copies; return their number."""
+    number = np.int64(0)
+    for k in range(first, last):
+        copies[number] = k
+        number += np.int64(copy[k])
+    return number
+
+
+@njit(cache=True, error_model='numpy')
+def _move(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    source, copies, number, ones, others, noise, scale, width, drawn, target
+):
+    d = source.shape[1]
+    flat = source.reshape(source.size)
+    moved = target.reshape(target.size)
+    for j in range(number):
+        k = d * copies[j]
+        a = d * ones[j]
+        b = d * others[j]
+        moved[k] += drawn * (scale * (flat[a] - flat[b]) + width * noise[0, j])
+        moved[k + 1] += drawn * (scale * (flat[a + 1] - flat[b + 1]) + width * noise[1, j])
+        if d == 3:
+            moved[k + 2] += drawn * (scale * (flat[a + 2] - flat[b + 2]) + width * noise[2, j])
+
+
+@njit(cache=True, error_model='numpy')
+def _random_moves(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    seed, copies, number, first, stop, ones, others, noise
+):
+    """Fill for the first `number` of `copies` two random particles of [first, stop), and noise.
+
+    The noise (3, number) is on (-1, 1), of triangular density.
+    """
+    low_half = np.uint64(0xFFFFFFFF)
+    fifth = np.uint64(0x3FF)
+    size = np.uint64(stop - first)
+    for j in range(number):
+        bits = _mix(seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(copies[j] + 1))
+        ones[j] = first + np.int64(((bits & low_half) * size) >> np.uint64(32))
+        others[j] = first + np.int64(((bits >> np.uint64(32)) * size) >> np.uint64(32))
+        bits = _mix(bits)
+        # Two numbers of ten bits for each axis.
+        for axis in range(3):
+            total = (bits & fifth) + ((bits >> np.uint64(10)) & fifth)
+            bits = bits >> np.uint64(20)
+            noise[axis, j] = (np.float64(np.int64(total)) + 1.0) * 2.0**-10 - 1.0
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _any_outside(positions, lower, upper):  # type: ignore[no-untyped-def]  # pragma: no cover
+    x0, x1 = lower[0], upper[0]
+    y0, y1 = lower[1], upper[1]
+    z0, z1 = lower[2], upper[2]
+    # How far beyond the bounds any is, negative inside: no branch for each particle.
+    most = -np.inf
+    if positions.shape[1] == 3:
+        for i in range(positions.shape[0]):
+            x = max(x0 - positions[i, 0], positions[i, 0] - x1)
+            y = max(y0 - positions[i, 1], positions[i, 1] - y1)
+            z = max(z0 - positions[i, 2], positions[i, 2] - z1)
+            most = max(most, max(x, max(y, z)))
+    else:
+        for i in range(positions.shape[0]):
+            x = max(x0 - positions[i, 0], positions[i, 0] - x1)
+            y = max(y0 - positions[i, 1], positions[i, 1] - y1)
+            most = max(most, max(x, y))
+    return most > 0.0
+
+
 @njit(cache=True, nogil=True, error_model='numpy')
 def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk,
@@ -481,46 +557,36 @@ def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     d = source.shape[1]
     # The sum of two uniform numbers on (-1/2, 1/2) has variance 1/6.
     width = deviation * math.sqrt(6.0)
-    low_half = np.uint64(0xFFFFFFFF)
     quarter = np.uint64(0xFFFF)
-    fifth = np.uint64(0x3FF)
-    x0 = bounds[0, 0]
-    x1 = bounds[0, 1]
-    y0 = bounds[1, 0]
-    y1 = bounds[1, 1]
+    lower = np.zeros(3)
+    upper = np.zeros(3)
+    for axis in range(d):
+        lower[axis] = bounds[axis, 0]
+        upper[axis] = bounds[axis, 1]
+    copies = np.empty(CHUNK, np.int64)
+    ones = np.empty(CHUNK, np.int64)
+    others = np.empty(CHUNK, np.int64)
+    noise = np.empty((3, CHUNK))
     i = first_chunk * CHUNK
     stop = min(source.shape[0], last_chunk * CHUNK)
     g = np.searchsorted(starts, i, side='right') - 1
     while i < stop:
-        first = starts[g]
-        last = min(starts[g + 1], stop)
-        size = np.uint64(starts[g + 1] - first)
+        begin = i
+        last = min(starts[g + 1], stop, begin + CHUNK)
         scale = differential[g] / math.sqrt(2.0)
         drawn = shrink[g]
-        begin = i
         here = source[begin:last]
         there = target[begin:last]
         if d == 3:
             _draw_in_solid(here, means[g], drawn, last - begin, there)
         else:
             _draw_in(here, means[g], drawn, last - begin, there)
-        for i in range(begin, last):
-            if not copy[i]:
-                continue
-            bits = _mix(seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1))
-            a = first + np.int64(((bits & low_half) * size) >> np.uint64(32))
-            b = first + np.int64(((bits >> np.uint64(32)) * size) >> np.uint64(32))
-            bits = _mix(bits)
-            for axis in range(d):
-                # Two numbers of ten bits.
-                total = (bits & fifth) + ((bits >> np.uint64(10)) & fifth)
-                bits = bits >> np.uint64(20)
-                noise = (np.float64(np.int64(total)) + 1.0) * 2.0**-10 - 1.0
-                moved = scale * (source[a, axis] - source[b, axis]) + width * noise
-                target[i, axis] += drawn * moved
+        number = _copies(copy, begin, last, copies)
+        _random_moves(seed, copies, number, starts[g], starts[g + 1], ones, others, noise)
+        _move(source, copies, number, ones, others, noise, scale, width, drawn, target)
         if filled[g]:
-            for i in range(begin, last):
-                bits = _mix(~(seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1)))
+            for k in range(begin, last):
+                bits = _mix(~(seed + np.uint64(0x9E3779B97F4A7C15) * np.uint64(k + 1)))
                 for axis in range(d):
                     # The sum of four uniform numbers on (-1/2, 1/2) has variance 1/3.
                     bits = _mix(bits + np.uint64(axis + 1))
@@ -528,16 +594,18 @@ def _jitter_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
                     total += ((bits >> np.uint64(32)) & quarter) + (bits >> np.uint64(48))
                     normal = (np.float64(np.int64(total)) * 2.0**-16 - 2.0) * math.sqrt(3.0)
                     for other in range(d):
-                        target[i, other] += fill[g, other, axis] * normal
-        for i in range(begin, last):
-            inside = x0 <= target[i, 0] <= x1 and y0 <= target[i, 1] <= y1
-            if d == 3:
-                inside = inside and bounds[2, 0] <= target[i, 2] <= bounds[2, 1]
-            if not inside:
+                        target[k, other] += fill[g, other, axis] * normal
+        if _any_outside(there, lower, upper):
+            for k in range(begin, last):
+                inside = True
                 for axis in range(d):
-                    target[i, axis] = source[i, axis]
+                    inside = inside and lower[axis] <= target[k, axis] <= upper[axis]
+                if not inside:
+                    for axis in range(d):
+                        target[k, axis] = source[k, axis]
         i = last
-        g += 1
+        if i == starts[g + 1]:
+            g += 1
 
 
 def jitter(
@@ -585,9 +653,11 @@ def jitter(
     shrink = np.ones(groups)
     if keep_covariance:
         _shrinkage(copy, starts, differential, shrink)
+    filled = np.zeros(groups, np.bool_)
     if fill is None:
         fill = np.zeros((groups, d, d))
-    filled = fill.reshape(groups, d * d).any(axis=1)
+    else:
+        fill.reshape(groups, d * d).any(axis=1, out=filled)
     out = np.empty_like(particles)
     run_chunks(
         lambda c, e: _jitter_chunks(

@@ -23,8 +23,8 @@ from maasi_filter.detection_model import (
 from maasi_filter.exploration import Exploration, check_bounds
 from maasi_filter.found_targets import (
     FoundTarget,
-    detection_information,
     exclusive,
+    extended_information,
     found_intensity,
     missing_spread,
     narrow_clouds,
@@ -688,15 +688,15 @@ class SearchFilter:
         self, born: birth_models.MeasurementBirths, scale: FloatArray, groups: int
     ) -> None:
         """Add births with their posterior weights b / C(z), where they are worth having."""
-        mass = born.totals * scale
         per_target = self._numbers.particles_per_target
         assert per_target is not None
-        number = np.minimum(np.ceil(per_target * mass), np.diff(born.starts))
-        number[mass <= LEAST_BIRTH_MASS] = 0.0
-        if not number.any():
+        mass, number, total = birth_models.births_worth_keeping(
+            born, scale, per_target, LEAST_BIRTH_MASS
+        )
+        if total == 0:
             return
         self._append(
-            *birth_models.thin_births(born, mass, number.astype(np.int64), groups, self.generator),
+            *birth_models.thin_births(born, mass, number, groups, self.generator),
             self._groups,
         )
 
@@ -775,22 +775,25 @@ class SearchFilter:
             workspace=self._workspace,
         )
         explained = np.isfinite(update.log_normaliser)
-        if not explained.all():
+        used = int(np.count_nonzero(explained))
+        if used < count:
             self._count_unexplained(prepared, ~explained, dropped)
         groups = self._groups
         self.weights = update.weights
         self._group = update.group
         self._groups = groups + count
-        information = detection_information(update.means, prepared, member.pose)
-        if groups:
-            source = update.group_share.argmax(axis=0)
-            inherits = update.own_mass > 0.5
-            information[inherits] += self._information[source[inherits]]
-        self._information = np.concatenate([self._information, information])
+        self._information = extended_information(
+            self._information,
+            update.means,
+            update.group_share,
+            update.own_mass,
+            prepared,
+            member.pose,
+        )
         if born is not None:
             self._append_born(born, update.other_scale, groups)
         moved = False
-        claims = kappa * update.other_scale
+        claims = kappa * update.other_scale if len(kappa) else kappa
         if numbers.refine_found and len(claims):
             moved = self._refine(member, prepared, claims)
         if numbers.extraction == 'measurement':
@@ -805,7 +808,7 @@ class SearchFilter:
                 time,
             )
         self.exploration.update(detection, member.pose)
-        return int(explained.sum()), moved
+        return used, moved
 
     def _births(
         self,
@@ -909,7 +912,6 @@ class SearchFilter:
         numbers = self._numbers
         assert numbers.found_mass is not None
         radius = self._found_radius(member.sensor)
-        own = member.pose_error**2 * np.eye(self.dimension)
         known = len(claims)
         candidates, bounded = narrow_clouds(
             own_mass,
@@ -927,7 +929,7 @@ class SearchFilter:
             target = FoundTarget(
                 len(self.found_targets) + 1,
                 means[m].copy(),
-                covariance + own,
+                covariance + member.pose_error**2 * np.eye(self.dimension),
                 member.robot,
                 member.index,
                 time,
