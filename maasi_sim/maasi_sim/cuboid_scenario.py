@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import Field
 
 from maasi_filter.settings import EnvironmentSettings, Finite, Settings
@@ -35,7 +34,7 @@ from maasi_sim.scenario import (
     read_scenario,
 )
 from maasi_sim.world import TargetSettings, World
-from maasi_sim.yaml_files import Key, Layer, ScenarioError, dotted, validate
+from maasi_sim.yaml_files import Key, Layer, ScenarioError, dotted, to_yaml, validate
 
 NAME = 'cuboid_mpc'
 
@@ -122,7 +121,7 @@ class CuboidScenario(Settings):
 
     def text(self) -> str:
         """Return all settings as a scenario file that needs no other layer."""
-        return yaml.safe_dump(self.content(), sort_keys=False, default_flow_style=None, width=100)
+        return to_yaml(self.content())
 
 
 AnyScenario = Scenario | CuboidScenario

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from maasi_sim.cuboid_scenario import AnyScenario, CuboidScenario
 from maasi_sim.observer import BATCH, DECISIONS, FOUND, STEP, UPDATE, within
 from maasi_sim.scenario import RobotSettings, Scenario, planner_settings
+from maasi_sim.yaml_files import to_yaml
 
 CLOCK = '/clock'
 # The time is that of the sim.
@@ -66,7 +65,7 @@ class NodePlan:
     def parameter_text(self) -> str:
         """Return its parameter file."""
         content = {'/**': {'ros__parameters': dict(self.parameters)}}
-        return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
+        return to_yaml(content)
 
     def command(self, executable: Path, parameter_file: Path) -> list[str]:
         """Return the command line of its process; what it says goes to its standard output."""

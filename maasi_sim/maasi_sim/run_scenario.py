@@ -330,7 +330,6 @@ class ScenarioRun:
             if not self.interruption:
                 for process in self.processes.values():
                     process.start()
-            threading.Thread(target=self._warn, daemon=True).start()
             from maasi_sim.bag import BagWriter, load_types
             from maasi_sim.recorder_node import Recorder
 
@@ -340,7 +339,9 @@ class ScenarioRun:
                 bag = BagWriter(self.folder / 'bag', types, self.scenario.record.images)
                 bag.write_scenario(self._facts_text(), {'seed': str(self.seed)})
             recorder = Recorder(domain.number, observer, bag)
-            ending = self._wait_until_ready(recorder) or self._follow(recorder, observer)
+            ready = self._wait_until_ready(recorder)
+            threading.Thread(target=self._warn, daemon=True).start()
+            ending = ready or self._follow(recorder, observer)
             self._ended = time.monotonic()
             self._end(recorder, ending)
         finally:
@@ -361,7 +362,7 @@ class ScenarioRun:
 
     def _facts_text(self) -> str:
         """Return all that a replay needs, as YAML."""
-        import yaml
+        from maasi_sim.yaml_files import to_yaml
 
         facts = {
             'name': self.name,
@@ -378,7 +379,7 @@ class ScenarioRun:
                 for plan in self.plans
             },
         }
-        return yaml.safe_dump(facts, sort_keys=False, default_flow_style=None, width=100)
+        return to_yaml(facts)
 
     def _wait_until_ready(self, recorder: Recorder) -> Ending | None:
         """Wait until every node takes part, the recorder last; return an ending if one does not."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import Field
 
 from maasi_drivers.camera_settings import CameraSettings
@@ -41,6 +40,7 @@ from maasi_sim.yaml_files import (
     override,
     place,
     read_layer,
+    to_yaml,
     unknown,
     validate,
 )
@@ -241,7 +241,7 @@ class Scenario(Settings):
 
     def text(self) -> str:
         """Return all settings as a scenario file that needs no other layer."""
-        return yaml.safe_dump(self.content(), sort_keys=False, default_flow_style=None, width=100)
+        return to_yaml(self.content())
 
 
 def config_folder() -> Path:
