@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from rosbags.typesys.store import Typestore
 
 from maasi_planner.planners.cuboid import Mission
-from maasi_sim.bag import Bag
 from maasi_sim.cuboid_scenario import CuboidScenario
 from maasi_sim.observer import STEP, seconds
 
@@ -282,11 +281,3 @@ class CuboidObserver:
             record.events + self.events + (events or []), key=lambda event: float(event['time'])
         )
         return record
-
-
-def observe_cuboid_bag(bag: Bag, name: str, scenario: CuboidScenario, seed: int) -> CuboidObserver:
-    """Return the observer of a recorded run, having seen all of it."""
-    observer = CuboidObserver(name, scenario, seed, bag.store)
-    for topic, _, _, data in bag.raw(observer.topics):
-        observer.add(topic, data)
-    return observer

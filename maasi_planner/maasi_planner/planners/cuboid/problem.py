@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from maasi_planner.planners.cuboid import branch_and_bound as bb
 from maasi_planner.planners.cuboid.axis_problem import SCALE, AxisRows, axis_rows
@@ -424,8 +424,3 @@ class PlanSolver:
             status,
             int(tree.counts[2]),
         )
-
-
-def as_boxes(corners: ArrayLike) -> FloatArray:
-    """Return boxes as an (n, 3, 2) array, also where there are none."""
-    return np.asarray(corners, dtype=float).reshape(-1, 3, 2)
