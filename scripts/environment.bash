@@ -116,7 +116,7 @@ maasi_compile() {
     | xargs cat | maasi_hash)"
   export NUMBA_CACHE_DIR="$maasi_workspace/numba/${key:0:16}"
   [ ! -e "$NUMBA_CACHE_DIR/complete" ] || return 0
-  echo "Compiling (a minute, once) ..." >&2
+  echo "Compiling (a few minutes, once) ..." >&2
   if ! python "$maasi_root/scripts/compile_kernels.py" > "$maasi_workspace/compile.log" 2>&1; then
     tail -n 15 "$maasi_workspace/compile.log" >&2
     maasi_fail "compiling failed; the whole log: $maasi_workspace/compile.log"
