@@ -132,12 +132,11 @@ class Sim(Fake):
         self.missing.discard(message.node)
 
     def look(self):
-        """Begin once all that are ready are connected too; repeat steps for who comes back."""
+        """Begin once all that are ready are connected; repeat a step for who came back."""
         others = len(self.taking_part) - 1
         if self.step < 0 and not self.missing and self.is_heard(self.steps, others):
             self.advance()
-        self.returned &= self.waiting
-        if self.returned:
+        if self.returned and self.waiting:
             self.publish_step()
 
     def tick(self):
@@ -149,6 +148,7 @@ class Sim(Fake):
         if self.misbehave(self.step):
             return
         self.waiting = set(self.taking_part)
+        self.returned.clear()
         self.publish_step()
 
     def publish_step(self):

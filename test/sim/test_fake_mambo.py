@@ -320,6 +320,7 @@ def test_the_command_runs_a_fake_that_a_link_finds():
     finally:
         link.close()
         process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=LIMIT)
+        output = process.stdout.read()
+        process.wait(LIMIT)
     assert process.returncode == 0
     assert address in lines[0] and 'landed' in output
