@@ -260,8 +260,13 @@ class RunObserver:
         self._history: list[_Update] = []
         self._team: list[str] | None = None
         self.events: list[dict[str, Any]] = []
-        # Why the planners think that nothing is left, and since which step.
+        # Which planners think that nothing is left, since which step, and why.
         self._settled: dict[str, tuple[int, str]] = {}
+        self._robots_of = {
+            within(space, DECISIONS): names for space, names in scenario.namespaces().items()
+        }
+        # Step at which all had come to that, and the last one's reason.
+        self._ending: tuple[int, str] | None = None
         self._explored: dict[str, float] = {}
         self.news = False
 
@@ -292,17 +297,15 @@ class RunObserver:
 
     @property
     def settled(self) -> str | None:
-        """Why nothing is left to gain, once every planner says so."""
-        if len(self._settled) < len(self._decision_topics):
-            return None
-        return max(self._settled.values())[1]
+        """Why nothing is left to gain, once every planner says so that has a robot."""
+        return None if self._ending is None else self._ending[1]
 
     @property
     def end_step(self) -> int | None:
         """Step at which the run came to its end by itself, if it has."""
         if self.completed is not None:
             return self.completed.step
-        return max(self._settled.values())[0] if self.settled is not None else None
+        return None if self._ending is None else self._ending[0]
 
     @property
     def found(self) -> int:
@@ -335,6 +338,8 @@ class RunObserver:
             self._kept[topic].append(data)
             if topic in self._decision_topics:
                 self._note_decision(topic, self._decode(data, 'PlanDecision'))
+            elif topic in self._state_topics and self._settled and self._team is None:
+                self._note_ending(int(self._decode(data, 'AgentState').step))
         elif topic in self._update_topics:
             self._updates.append((self._update_topics[topic], self._decode(data, 'FilterUpdate')))
         elif topic in self._found_topics:
@@ -381,13 +386,37 @@ class RunObserver:
         self._explored[topic] = float(decision.explored)
         if decision.reason and not decision.robots:
             self._settled.setdefault(topic, (int(decision.step), decision.reason))
+            self._note_ending(int(decision.step))
+
+    def _note_ending(self, step: int) -> None:
+        """Note the end of the search: of the planners with a robot, all see nothing left."""
+        if self._ending is not None:
+            return
+        searching = {
+            topic
+            for topic, names in self._robots_of.items()
+            if any(self._takes_part(name) for name in names)
+        }
+        # When all robots are gone, nobody says any more that the rest of the search is in vain.
+        if self._settled.keys() >= (searching or self._robots_of.keys()):
+            last, reason = max(self._settled.values())
+            self._ending = max(step, last), reason
+
+    def _takes_part(self, name: str) -> bool:
+        if self._team is not None:
+            return name in self._team
+        states = self._kept[f'/{name}/state']
+        return not states or self._decode(states[-1], 'AgentState').goal_status != UNAVAILABLE
 
     def _note_team(self, step: Any) -> None:
         team = list(step.robots)
         if self._team is not None and team != self._team:
             time = seconds(step.stamp)
             self._note_changes(self.events, time, self._team, team)
+        changed = team != self._team
         self._team = team
+        if changed and self._settled:
+            self._note_ending(int(step.step))
 
     @staticmethod
     def _note_changes(

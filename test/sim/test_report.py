@@ -337,24 +337,61 @@ def test_targets_of_several_filters_count_once_whoever_speaks_first(two_filters,
     assert report['measurements_to_find_all'] == 3
 
 
+def give_up(run, time):
+    run.send(
+        within(run.namespace, '/decisions'),
+        'PlanDecision',
+        header=run.header(time),
+        step=round(time / run.scenario.step),
+        planner='maas',
+        batch_id=1,
+        objective=0.0,
+        explored=0.99,
+        reason=f'nothing left for {run.namespace}',
+        robots=[],
+    )
+
+
 def test_planners_of_several_robots_are_done_together(two_filters):
     one, two = two_filters
     for run, time in ((one, 1.0), (two, 1.5)):
         assert run.observer.settled is None
-        run.send(
-            within(run.namespace, '/decisions'),
-            'PlanDecision',
-            header=run.header(time),
-            step=round(time / run.scenario.step),
-            planner='maas',
-            batch_id=1,
-            objective=0.0,
-            explored=0.99,
-            reason=f'nothing left for {run.namespace}',
-            robots=[],
-        )
+        give_up(run, time)
     assert one.observer.settled == 'nothing left for second'
     assert one.observer.end_step == 30
+
+
+def test_planner_without_a_robot_is_not_waited_for(two_filters):
+    one, two = two_filters
+    one.step(0.0, ['mambo', 'second'])
+    give_up(one, 1.0)
+    one.step(1.2, ['mambo', 'second'])
+    assert one.observer.settled is None
+    one.step(1.5, ['mambo'])
+    assert one.observer.settled == 'nothing left for mambo'
+    # A robot that comes back does not take the ending back.
+    one.step(2.0, ['mambo', 'second'])
+    give_up(two, 2.5)
+    assert one.observer.end_step == 30
+
+
+def test_team_without_robots_has_not_searched_everything(two_filters):
+    one, _ = two_filters
+    one.step(0.0, ['mambo', 'second'])
+    give_up(one, 1.0)
+    one.step(1.5, [])
+    assert one.observer.settled is None
+
+
+def test_planner_of_a_robot_that_cannot_go_on_is_not_waited_for(two_filters):
+    one, two = two_filters
+    two.state(0.9, 'second', [0.0, 0.0])
+    give_up(one, 1.0)
+    two.state(1.5, 'second', [0.0, 0.0])
+    assert one.observer.settled is None
+    two.state(1.6, 'second', [0.0, 0.0], status=5, reason='its battery is empty')
+    assert one.observer.settled == 'nothing left for mambo'
+    assert one.observer.end_step == 32
 
 
 def test_what_comes_after_the_end_does_not_count(run):
