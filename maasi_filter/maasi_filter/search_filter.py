@@ -31,6 +31,7 @@ from maasi_filter.found_targets import (
     refine,
     remove_measurements,
 )
+from maasi_filter.lost_targets import LostTargets
 from maasi_filter.particles import (
     clear,
     gather,
@@ -221,6 +222,13 @@ class SearchFilter:
         self._birth_budget = 0
         self._moments: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._expected: float | None = None
+        # Only detections that last for good prove that there is a target.
+        self._lost: LostTargets | None = None
+        if self._numbers.extraction == 'measurement' and self._numbers.survival_probability == 1.0:
+            assert self._numbers.expected_targets is not None
+            self._lost = LostTargets(
+                self.dimension, self._numbers.expected_targets / self.volume, LEAST_CLUSTER_MASS
+            )
         self._workspace = Workspace()
         self._pool: ThreadPoolExecutor | None = None
 
@@ -305,6 +313,8 @@ class SearchFilter:
             'cluster_radii': np.array([c.radius for c in self.clusters], float),
             'cluster_masses': np.array([c.mass for c in self.clusters], float),
         }
+        if self._lost is not None:
+            state.update(self._lost.arrays())
         write_state(path, state)
 
     @classmethod
@@ -355,6 +365,8 @@ class SearchFilter:
                     state['cluster_masses'],
                 )
             ]
+            if search._lost is not None:
+                search._lost.restore(state)
         except (KeyError, ValueError, TypeError) as error:
             raise StateFileError(f'{path}: does not hold a usable state: {error}') from None
         return search
@@ -778,6 +790,8 @@ class SearchFilter:
         used = int(np.count_nonzero(explained))
         if used < count:
             self._count_unexplained(prepared, ~explained, dropped)
+        if self._lost is not None and used:
+            self._lost.add(prepared, explained, member.pose, detection, sensor.clutter)
         groups = self._groups
         self.weights = update.weights
         self._group = update.group
@@ -1029,16 +1043,25 @@ class SearchFilter:
         self._moments = mass, means, covariances
 
     def _extract_groups(self, members: Sequence[_Member]) -> None:
-        if self._groups == 0 or len(self.weights) == 0:
-            self.clusters = []
-            return
-        if self._moments is None:
-            self._moments = group_moments(
-                self.particles, self.weights, self._group, self._groups, self._threads()
-            )
-        mass, means, covariances = self._moments
         least = min((self._found_radius(member.sensor) for member in members), default=0.0)
-        self.clusters = group_clusters(mass, means, covariances, LEAST_CLUSTER_MASS, least)
+        self.clusters = []
+        if self._groups and len(self.weights):
+            if self._moments is None:
+                self._moments = group_moments(
+                    self.particles, self.weights, self._group, self._groups, self._threads()
+                )
+            self.clusters = group_clusters(*self._moments, LEAST_CLUSTER_MASS, least)
+        if self._lost is not None and len(self._lost) and (not self.clusters or self._lost.crowded):
+            d = self.dimension
+            found = self.found_targets
+            lost = self._lost.clusters(
+                np.array([target.position for target in found]).reshape(-1, d),
+                np.array([target.covariance for target in found]).reshape(-1, d, d),
+                self.exploration,
+                least,
+            )
+            # While particles stand for potential targets, detections may be theirs.
+            self.clusters = self.clusters or lost
 
     def _extract_kmeans(
         self, members: Sequence[_Member], newly_found: list[FoundTarget], time: float
@@ -1151,5 +1174,19 @@ def warm_up() -> None:
                 positions = np.full((1, 3), 3.0)
                 search.exploration.expected_new(sensor.detection, positions, np.zeros(1), 1.0)
                 search.exploration.at(positions)
+                lost = LostTargets(dimension, 1e-3, LEAST_CLUSTER_MASS)
+                pose = Pose(positions[0])
+                seen = prepare_measurements(
+                    sensor.measurement.measure(positions[:, :dimension] + 1.0, pose),
+                    sensor.covariance[None],
+                    pose,
+                )
+                lost.add(seen, np.ones(1, np.bool_), pose, sensor.detection, 0.0)
+                lost.clusters(
+                    np.zeros((0, dimension)),
+                    np.zeros((0, dimension, dimension)),
+                    search.exploration,
+                    0.0,
+                )
     origin = np.zeros(3)
     detection_probability(0, np.zeros(PARAMETERS), origin, origin, 0.0)
