@@ -143,6 +143,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._ended: dict[bytes, Goal] = {}
         self._queue: MeasurementQueue[DataT] = MeasurementQueue(self._history)
         self._unseen: Counter[str] = Counter()
+        self._answer: DetectionArray | None = None
         self._battery = -1.0
         # Why the robot cannot go on, by kind; empty where it can.
         self._troubles: dict[str, str] = {}
@@ -335,6 +336,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     def _begin_anew(self) -> None:
         self._history.clear()
         self._queue.clear()
+        self._answer = None
         self._follower = WaypointFollower(self._motion)
         self._awaited = self._answered = self._unusable = None
         self._sensed_at = None
@@ -718,6 +720,15 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     def _on_batch(self, message: MeasurementBatch) -> None:
         if not self.active:
             return
+        answer = self._answer
+        if (
+            answer is not None
+            and answer.batch_id == message.id
+            and stamp_from_ros(answer.header.stamp) >= stamp_from_ros(message.stamp)
+        ):
+            # It comes again where somebody may have missed it, and so may the answer have been.
+            self._detections_publisher.publish(answer)
+            return
         for member in message.members:
             if member.robot == self.robot:
                 request = MeasurementRequest(
@@ -809,3 +820,4 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         answer.pose.pose = pose_to_ros(pose.pose)
         answer.pose.covariance = pose.covariance.ravel()
         self._detections_publisher.publish(answer)
+        self._answer = answer

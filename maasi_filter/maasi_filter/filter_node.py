@@ -138,8 +138,10 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         )
         self._pending: dict[int, PendingBatch] = {}
         self._early: dict[tuple[int, str], DetectionArray] = {}
-        self._last_stamp: dict[str, int] = {}
+        # Of each robot's last detections: batch, measurement, stamp [ns].
+        self._last_heard: dict[str, tuple[int, int, int]] = {}
         self._last_batch = 0
+        self._last_batch_stamp = -1
         self._last_step: int | None = None
         self._settled_by: dict[int, int] = {}
         self._found_published = False
@@ -221,7 +223,13 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         if not self.active:
             return
         number = int(batch.id)
-        if number <= self._last_batch or number in self._pending:
+        stamp = stamp_from_ros(batch.stamp)
+        known = {key: item.stamp for key, item in self._pending.items()}
+        known[self._last_batch] = self._last_batch_stamp
+        if known.get(number) == stamp:
+            # A planner says again what may have been missed.
+            return
+        if number <= self._last_batch or (number in self._pending and not self.settings.lockstep):
             self.drop('old batch', f'measurement_batch.id: read {number}, allowed is a new one')
             return
         unknown = [item.robot for item in batch.members if item.robot not in self._sensors]
@@ -233,16 +241,21 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         pending = PendingBatch(
             number,
             int(batch.step),
-            stamp_from_ros(batch.stamp),
+            stamp,
             sorted(
                 (item for item in batch.members if item.robot in self._sensors),
                 key=lambda item: item.robot,
             ),
         )
+        if self.settings.lockstep:
+            # A planner waits for what it asks for: these are of one that is gone.
+            for item in self._pending.values():
+                item.failed.update(item.missing)
         self._pending[number] = pending
-        for item in pending.members:
-            early = self._early.pop((number, item.robot), None)
-            if early is not None:
+        for member in pending.members:
+            early = self._early.pop((number, member.robot), None)
+            # One before the batch answered another planner's of that number.
+            if early is not None and stamp_from_ros(early.header.stamp) >= stamp:
                 self._take(pending, early)
         self._process_complete()
 
@@ -259,7 +272,11 @@ class FilterNode(SearchNode[FilterNodeSettings]):
                 pending.failed.add(name)
                 self._process_complete()
             return
-        self._last_stamp[name] = stamp_from_ros(message.header.stamp)
+        key = (number, int(message.measurement), stamp_from_ros(message.header.stamp))
+        if self._last_heard.get(name) == key:
+            # A driver too.
+            return
+        self._last_heard[name] = key
         if pending is not None and expected:
             self._take(pending, message)
             self._process_complete()
@@ -279,8 +296,8 @@ class FilterNode(SearchNode[FilterNodeSettings]):
                 f'{self.settings.frame!r}'
             )
         stamp = stamp_from_ros(message.header.stamp)
-        last = self._last_stamp.get(name)
-        if last is not None and stamp < last:
+        last = self._last_heard[name][2] if name in self._last_heard else stamp
+        if stamp < last:
             return (
                 f'header.stamp: read {stamp * 1e-9:.6f} s, allowed is from the last one, '
                 f'{last * 1e-9:.6f} s'
@@ -388,6 +405,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
                 return
             del self._pending[first.id]
             self._last_batch = first.id
+            self._last_batch_stamp = first.stamp
             for key in [key for key in self._early if key[0] <= first.id]:
                 del self._early[key]
             self._process(first)

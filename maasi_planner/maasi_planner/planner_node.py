@@ -58,6 +58,8 @@ FloatArray = NDArray[np.float64]
 
 _ENDED = (AgentState.IDLE, AgentState.REACHED, AgentState.CANCELED, AgentState.ABORTED)
 _LOOK_PERIOD = 0.1
+# In lockstep: longest wait for an update until its batch is published once more [s].
+_ANSWER_PATIENCE = 1.0
 # Poses of measurements that are kept for updates that come late.
 _POSES_KEPT = 1000
 
@@ -122,7 +124,10 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self._goal_handles: dict[str, Any] = {}
         self._refused: dict[str, int] = {}
         self._waiting_batch = 0
+        self._batch_message = MeasurementBatch()
+        self._batch_at = time.monotonic()
         self._batch = 0
+        self._batch_before = 0
         self._used_batch = 0
         self._found = 0
         self._expected_number = 0.0
@@ -235,9 +240,32 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
     # ---- what comes in -----------------------------------------------------------------------
 
     def on_step(self, message: LockstepStep) -> None:
-        """Plan when the states of this step are all there."""
+        """Plan when the states of this step are all there.
+
+        A step comes again when a node was started anew: what it may have missed is said again.
+        """
+        before = self._expected
+        if before is None and message.step == self._taken_step:
+            self._repeat_step()
+            return
+        if before is not None and message.step == before.step:
+            message.imaging = sorted({*before.imaging, *message.imaging})
         self._expected = message
         self._try_step()
+
+    def _ask_again(self) -> None:
+        """Publish the batch that is waited for once more; who has it already does nothing."""
+        if self._waiting_batch:
+            self._batch_at = time.monotonic()
+            self._batch_publisher.publish(self._batch_message)
+
+    def _repeat_step(self) -> None:
+        self._ask_again()
+        # Whoever is asked and answers after all is sent elsewhere.
+        for key in sorted(self._waiting_goals):
+            self._refuse(*key)
+        self._waiting_goals.clear()
+        self._try_done()
 
     def _in_frame(self, reason: str, topic: str, header: Header) -> bool:
         """Return whether a message is in the frame of the map; drop it otherwise."""
@@ -384,8 +412,9 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             self.drop('bad update', f'filter_update.{error}')
             return
         if int(message.batch_id) > self._batch:
+            self._batch = self._batch_before = int(message.batch_id)
+        if int(message.batch_id) <= self._batch_before:
             # Of a planner before this one: go on after its batches.
-            self._batch = int(message.batch_id)
             for member in message.members:
                 self.coordinator.skip_measurements(member.robot, int(member.measurement) + 1)
             return
@@ -440,6 +469,8 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                 if silent > self.settings.state_timeout:
                     self._leave(name, f'no {name}/state for {silent:.1f} s')
             self._try_free_step()
+        elif time.monotonic() - self._batch_at > _ANSWER_PATIENCE:
+            self._ask_again()
         self._look_at_search()
 
     # ---- a step ------------------------------------------------------------------------------
@@ -496,10 +527,13 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                 continue
             heard = self._heard[name]
             goal = self.coordinator.decision_index(name) + 1
-            free = self._refused.get(name) == goal or (
-                heard.goal == goal and heard.status in _ENDED
-            )
-            robots[name] = PresentRobot(heard.state, free or self.coordinator.is_idle(name))
+            free = self.coordinator.is_idle(name) or self._refused.get(name) == goal
+            if self.settings.lockstep and not free and heard.goal < goal:
+                self.get_logger().warning(f'{name} knows nothing of goal {goal} any more')
+                self._refuse(name, goal)
+                free = True
+            free = free or (heard.goal == goal and heard.status in _ENDED)
+            robots[name] = PresentRobot(heard.state, free)
         header = Header(stamp=stamp_to_ros(stamp), frame_id=self.settings.frame)
         if not self.searching:
             self._publish_destinations(header, robots)
@@ -515,19 +549,19 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         if members:
             self._batch += 1
             self._waiting_batch = self._batch
-            self._batch_publisher.publish(
-                MeasurementBatch(
-                    id=self._batch,
-                    step=step,
-                    stamp=header.stamp,
-                    members=[
-                        BatchMember(
-                            robot=item.robot, decision=item.decision, measurement=item.measurement
-                        )
-                        for item in members
-                    ],
-                )
+            self._batch_message = MeasurementBatch(
+                id=self._batch,
+                step=step,
+                stamp=header.stamp,
+                members=[
+                    BatchMember(
+                        robot=item.robot, decision=item.decision, measurement=item.measurement
+                    )
+                    for item in members
+                ],
             )
+            self._batch_at = time.monotonic()
+            self._batch_publisher.publish(self._batch_message)
         self._publish_views(header, stamp * 1e-9, robots)
 
     def _publish_destinations(self, header: Header, robots: dict[str, PresentRobot]) -> None:
@@ -572,14 +606,17 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self._waiting_goals.discard(key)
         handle = future.result()
         if handle is None or not handle.accepted:
-            self._refused[name] = number
-            self.coordinator.refuse(name)
+            self._refuse(name, number)
             self.warn_throttled(f'{name} refused', f'{name} refused goal {number}')
         elif self.searching:
             self._goal_handles[name] = handle
         else:
             handle.cancel_goal_async()
         self._try_done()
+
+    def _refuse(self, name: str, number: int) -> None:
+        self._refused[name] = number
+        self.coordinator.refuse(name)
 
     def _try_done(self) -> None:
         if (

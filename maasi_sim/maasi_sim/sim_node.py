@@ -548,7 +548,10 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._publish(present)
 
     def _publish(self, robots: list[str]) -> None:
-        """Publish what some robots have at this step, the clock, and that the step is there."""
+        """Publish what some robots have at this step, the clock, and that the step is there.
+
+        Where a step comes twice, images of the other robots have been taken the first time.
+        """
         stamp = stamp_to_ros(self._stamp)
         for name in robots:
             self._robots[name].publish(stamp)
@@ -559,7 +562,7 @@ class SimNode(SearchNode[SimNodeSettings]):
                 step=self.step,
                 stamp=stamp,
                 robots=present,
-                imaging=[name for name in present if self.simulation.images_due(name)],
+                imaging=[name for name in robots if self.simulation.images_due(name)],
             )
         )
 

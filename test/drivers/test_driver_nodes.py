@@ -348,6 +348,20 @@ def test_in_lockstep_a_batch_is_answered_by_the_image_of_the_step(play):
         assert team.answer(k + 1).step == k
 
 
+def test_a_batch_that_comes_again_is_answered_again(play):
+    """Whoever was to hear the answer may have been started again."""
+    _, team = play(lockstep=True)
+    lockstep_step(team, 0)
+    team.until_done(1)
+    image = rendered(team, [[2.0, 2.0]], team.body.robot_state().pose)
+    team.images.publish(stamped(image, 0))
+    team.ask(0)
+    first = team.answer()
+    team.batch -= 1
+    team.ask(0)
+    assert team.answer(2) == first
+
+
 def test_in_lockstep_a_robot_that_is_left_out_gives_its_goal_up(play):
     _, team = play(lockstep=True)
     lockstep_step(team, 0)

@@ -156,6 +156,21 @@ def test_a_missing_robot_is_named_and_its_late_answer_is_a_batch_of_its_own(worl
     assert [item.robot for item in team.updates[1].members] == ['b']
 
 
+def test_what_is_said_again_counts_once():
+    """Planner and drivers do so where a node was started again."""
+    with running(batch_timeout=PATIENCE) as (node, team, until):
+        seen = [(0.3, 0.5)]
+        team.measure(1, ['a', 'b'], {'a': seen})
+        team.counts['a'] = 0
+        team.measure(1, ['a', 'b'], {'a': seen, 'b': seen})
+        until(lambda: team.updates)
+        team.measure(2, ['a'], {'a': []})
+        until(lambda: len(team.updates) == 2)
+        assert [update.batch_id for update in team.updates] == [1, 2]
+        assert [item.robot for item in team.updates[0].members] == ['a', 'b']
+        assert not node.dropped
+
+
 @pytest.mark.parametrize(
     ('changes', 'reason'),
     [

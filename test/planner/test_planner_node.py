@@ -2,6 +2,7 @@
 
 import math
 import time
+from contextlib import contextmanager
 
 import pytest
 import rclpy
@@ -25,6 +26,8 @@ from maasi_msgs.msg import (
     Cluster,
     DetectionArray,
     FilterUpdate,
+    LockstepDone,
+    LockstepStep,
     MeasurementBatch,
     PlanDecision,
 )
@@ -73,8 +76,9 @@ def changed(message, changes):
 class Team:
     """The rest of the team: drivers, filter and users."""
 
-    def __init__(self, context):
+    def __init__(self, context, others):
         self.node = Node('team', context=context)
+        self.others = others
         self.decisions, self.batches, self.warnings, self.diagnostics = [], [], [], []
         self.goals = {name: [] for name in ROBOTS}
         node = self.node
@@ -103,6 +107,9 @@ class Team:
         node.create_subscription(
             MeasurementBatch, 'measurement_batch', self.batches.append, RELIABLE
         )
+        self.steps = node.create_publisher(LockstepStep, 'lockstep/step', RELIABLE)
+        self.done = []
+        node.create_subscription(LockstepDone, 'lockstep/done', self.done.append, RELIABLE)
         node.create_subscription(Log, '/rosout', self._take_log, 50)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, 10)
 
@@ -145,26 +152,28 @@ class Team:
             *self.states.values(),
             *self.detections.values(),
             self.updates,
-            self.destination,
         ]
         return (
             all(item.get_subscription_count() == 1 for item in publishers)
+            and self.destination.get_subscription_count() == self.others
             and self.node.count_publishers('/decisions') == 1
             and self.node.count_publishers('/measurement_batch') == 1
             and self.search.server_is_ready()
         )
 
 
-@pytest.fixture
-def world():
+@contextmanager
+def running(**changes):
+    """Run a node with the team around it; yield both, and how to wait for something."""
     with Domain(None) as domain:
         context = Context()
         rclpy.init(context=context, domain_id=domain.number)
-        parameters = [Parameter(name, value=value) for name, value in flatten(SETTINGS).items()]
+        settings = SETTINGS.model_copy(update=changes)
+        parameters = [Parameter(name, value=value) for name, value in flatten(settings).items()]
         node = PlannerNode(context=context, parameter_overrides=parameters)
         node.trigger_configure()
         node.trigger_activate()
-        team = Team(context)
+        team = Team(context, len(settings.others))
         lean = LeanExecutor(node, context=context)
         other = SingleThreadedExecutor(context=context)
         other.add_node(team.node)
@@ -184,6 +193,12 @@ def world():
         node.destroy_node()
         team.node.destroy_node()
         rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def world():
+    with running() as everything:
+        yield everything
 
 
 def begin(node, team, until):
@@ -273,6 +288,35 @@ def test_wrong_detections_and_updates_change_nothing(world):
     team.update(batch, members, clusters=[right])
     until(lambda: node.coordinator.clusters)
     assert node.coordinator.exploration.explored_fraction() > before
+
+
+def test_a_step_that_comes_again_brings_the_batch_again_and_no_other():
+    """The filter that was to answer it may be gone, and another one in its place."""
+    with running(lockstep=True, others={}) as (node, team, until):
+        until(lambda: team.steps.get_subscription_count() == 1)
+        until(lambda: team.node.count_publishers('/lockstep/done') == 1)
+        step = LockstepStep(step=0, robots=list(ROBOTS), imaging=list(ROBOTS))
+        for name in ROBOTS:
+            team.state(name, 0, goal_id=1)
+        team.steps.publish(step)
+        until(lambda: team.batches and all(team.goals.values()) and not node._waiting_goals)
+        step.imaging = []
+        team.steps.publish(step)
+        until(lambda: len(team.batches) == 2)
+        assert team.batches[0] == team.batches[1]
+        assert len(team.decisions) == 1 and team.done == []
+        for name in ROBOTS:
+            team.detect(name, 0)
+        team.update(team.batches[0].id, ROBOTS)
+        until(lambda: team.done)
+        assert [(item.node, item.step) for item in team.done] == [('/planner_node', 0)]
+        # Who knows nothing of its goal, as a driver that was started again, is sent anew.
+        team.state('a', 20, goal_id=1, goal_status=AgentState.MOVING)
+        team.state('b', 20, goal_id=0)
+        step.step = 20
+        team.steps.publish(step)
+        until(lambda: len(team.goals['b']) == 2)
+        assert len(team.goals['a']) == 1
 
 
 def test_destinations_that_are_wrong_are_dropped(world):

