@@ -77,7 +77,9 @@ class MeasurementQueue(Generic[DataT]):
         self.latest = frame.stamp
 
     def add_request(self, request: MeasurementRequest) -> list[MeasurementRequest]:
-        """Add a request; return those that are given up for it."""
+        """Add a request, unless it waits already; return those that are given up for it."""
+        if request in self._requests:
+            return []
         self._requests.append(request)
         dropped = []
         while len(self._requests) > self._capacity:

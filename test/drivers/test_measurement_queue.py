@@ -66,6 +66,15 @@ def test_an_image_answers_one_batch():
     assert answers(queue) == [(2, 40, 40)]
 
 
+def test_a_batch_that_comes_twice_is_answered_once():
+    queue = queue_of(0, 100)
+    for _ in range(2):
+        assert queue.add_request(MeasurementRequest(1, 20, 0)) == []
+    for stamp in (20, 30):
+        queue.add_frame(Frame(stamp, None))
+    assert answers(queue) == [(1, 20, 20)]
+
+
 def test_an_image_that_turns_out_bad_is_replaced_by_the_next():
     queue = queue_of(0, 100)
     queue.add_request(MeasurementRequest(1, 10, 0))
