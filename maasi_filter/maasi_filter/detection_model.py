@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.elementary import exponentials
+from maasi_filter.elementary import exponential
 from maasi_filter.pose import Pose
 
 FloatArray = NDArray[np.float64]
@@ -86,31 +86,29 @@ def detection_probability_at(
 
 @njit(cache=True, error_model='numpy')
 def fill_probabilities(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    kind, parameters, x, y, z, number, cos_yaw, sin_yaw, out, scratch, bits
+    kind, parameters, x, y, z, number, cos_yaw, sin_yaw, out
 ):
-    """Fill pi for the first `number` offsets (x, y, z) [m, map axes] from the sensor.
-
-    `scratch` is as long as `out`, and `bits` is a view of it as int64.
-    """
+    """Fill pi for the first `number` offsets (x, y, z) [m, map axes] from the sensor."""
     if kind == BOX:
         for i in range(number):
             out[i] = detection_probability_at(kind, parameters, x[i], y[i], z[i], cos_yaw, sin_yaw)
         return
     gain = parameters[0]
-    for i in range(number):
-        u = x[i] * parameters[1]
-        v = y[i] * parameters[2]
-        w = z[i] * parameters[3]
-        out[i] = u * u + v * v + w * w
+    p = parameters[1]
+    q = parameters[2]
+    r = parameters[3]
     if kind == GAUSSIAN:
         for i in range(number):
-            out[i] = -0.5 * out[i]
+            u = x[i] * p
+            v = y[i] * q
+            w = z[i] * r
+            out[i] = gain * exponential(-0.5 * (u * u + v * v + w * w))
     else:
         for i in range(number):
-            out[i] = -0.5 * math.sqrt(out[i])
-    exponentials(out, number, scratch, bits)
-    for i in range(number):
-        out[i] = gain * out[i]
+            u = x[i] * p
+            v = y[i] * q
+            w = z[i] * r
+            out[i] = gain * exponential(-0.5 * math.sqrt(u * u + v * v + w * w))
 
 
 @njit(cache=True, error_model='numpy')
@@ -151,8 +149,6 @@ def _probabilities(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     x = np.empty(size)
     y = np.empty(size)
     z = np.empty(size)
-    scratch = np.empty(size)
-    bits = scratch.view(np.int64)
     for start in range(0, number, 512):
         part = min(512, number - start)
         offsets(positions, start, part, sensor_position, x, y, z)
@@ -166,8 +162,6 @@ def _probabilities(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
             cos_yaw,
             sin_yaw,
             out[start : start + part],
-            scratch,
-            bits,
         )
     return out
 

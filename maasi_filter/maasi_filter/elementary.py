@@ -6,8 +6,10 @@ Multiplications and additions may be fused, so that the last bit depends on the 
 from __future__ import annotations
 
 import math
+from typing import Any
 
-from numba import njit
+from numba import njit, types
+from numba.extending import intrinsic
 
 # exp(x) = 2^k exp(r): adding MAGIC to x / log(2) leaves k in the low bits of the sum.
 MAGIC = 6755399441055744.0
@@ -20,6 +22,39 @@ HALF_PI_MIDDLE = 6.07710050630396597660e-11
 HALF_PI_LOW = 2.02226624879595063154e-21
 # Below this exp(x) is taken as 0.
 LEAST_EXPONENT = -708.0
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _bits_of(context: Any, x: Any) -> Any:  # pragma: no cover - compiled
+    """Return the 64 bits of a float as an integer."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], context.get_value_type(types.int64))
+
+    return types.int64(types.float64), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _float_of(context: Any, bits: Any) -> Any:  # pragma: no cover - compiled
+    """Return the float that has these 64 bits."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], context.get_value_type(types.float64))
+
+    return types.float64(types.int64), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def lesser(context: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
+    """Return the smaller of two numbers, in a form that makes a running minimum vectors."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        flags = ['nnan', 'nsz']
+        first, second = arguments
+        smaller = builder.fcmp_ordered('<', first, second, flags=flags)
+        return builder.select(smaller, first, second, flags=flags)
+
+    return types.float64(types.float64, types.float64), generate
 
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})
@@ -89,33 +124,24 @@ def sines(x, number, sine, cosine):  # type: ignore[no-untyped-def]  # pragma: n
 
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})
-def exponentials(x, number, scratch, bits):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Replace the first `number` of `x`, none above 700, by exp(x), to a unit in the last place.
-
-    `scratch` is as long as `x`, and `bits` is a view of it as int64. Below -708 the result is 0.
-    """
-    for i in range(number):
-        exponent = max(x[i], LEAST_EXPONENT)
-        shifted = exponent * LOG2_E + MAGIC
-        k = shifted - MAGIC
-        r = (exponent - k * LOG_2_HIGH) - k * LOG_2_LOW
-        value = 1.0 / 479001600.0
-        value = value * r + 1.0 / 39916800.0
-        value = value * r + 1.0 / 3628800.0
-        value = value * r + 1.0 / 362880.0
-        value = value * r + 1.0 / 40320.0
-        value = value * r + 1.0 / 5040.0
-        value = value * r + 1.0 / 720.0
-        value = value * r + 1.0 / 120.0
-        value = value * r + 1.0 / 24.0
-        value = value * r + 1.0 / 6.0
-        value = value * r + 0.5
-        value = value * r + 1.0
-        value = value * r + 1.0
-        # An exponent of -1023 has the bits of 0.
-        scratch[i] = shifted if x[i] >= LEAST_EXPONENT else MAGIC - 1023.0
-        x[i] = value
-    for i in range(number):
-        bits[i] = (bits[i] + 1023) << 52
-    for i in range(number):
-        x[i] *= scratch[i]
+def exponential(x: float) -> float:  # pragma: no cover - compiled
+    """Return exp(x), x not above 700, to a unit in the last place; 0 below -708."""
+    exponent = max(x, LEAST_EXPONENT)
+    shifted = exponent * LOG2_E + MAGIC
+    k = shifted - MAGIC
+    r = (exponent - k * LOG_2_HIGH) - k * LOG_2_LOW
+    value = 1.0 / 479001600.0
+    value = value * r + 1.0 / 39916800.0
+    value = value * r + 1.0 / 3628800.0
+    value = value * r + 1.0 / 362880.0
+    value = value * r + 1.0 / 40320.0
+    value = value * r + 1.0 / 5040.0
+    value = value * r + 1.0 / 720.0
+    value = value * r + 1.0 / 120.0
+    value = value * r + 1.0 / 24.0
+    value = value * r + 1.0 / 6.0
+    value = value * r + 0.5
+    value = value * r + 1.0
+    value = value * r + 1.0
+    scaled = value * _float_of((_bits_of(shifted) + 1023) << 52)
+    return scaled if x >= LEAST_EXPONENT else 0.0

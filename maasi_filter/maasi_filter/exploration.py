@@ -93,8 +93,6 @@ def _decrease(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     y = np.empty(size)
     z = np.zeros(size)
     probability = np.empty(size)
-    scratch = np.empty(size)
-    bits = scratch.view(np.int64)
     for j in range(values.shape[1]):
         for k in range(values.shape[2]):
             y[j * values.shape[2] + k] = lower[1] + j * step[1] - sensor_position[1]
@@ -102,9 +100,7 @@ def _decrease(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                 z[j * values.shape[2] + k] = lower[2] + k * step[2] - sensor_position[2]
     for i in range(values.shape[0]):
         x[:] = lower[0] + i * step[0] - sensor_position[0]
-        fill_probabilities(
-            kind, parameters, x, y, z, size, cos_yaw, sin_yaw, probability, scratch, bits
-        )
+        fill_probabilities(kind, parameters, x, y, z, size, cos_yaw, sin_yaw, probability)
         plane = values[i].reshape(size)
         for j in range(size):
             plane[j] *= 1.0 - probability[j]

@@ -18,8 +18,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.detection_model import PARAMETERS, fill_probabilities, offsets
-from maasi_filter.elementary import arctan2, exponentials
+from maasi_filter.detection_model import (
+    EXPONENTIAL,
+    GAUSSIAN,
+    PARAMETERS,
+    detection_probability_at,
+)
+from maasi_filter.elementary import arctan2, exponential, lesser
 from maasi_filter.measurement_model import TWO_PI, wrap
 from maasi_filter.pose import Pose
 
@@ -29,6 +34,11 @@ IntArray = NDArray[np.int64]
 CHUNK = 2048
 TILE = 128
 TILES = CHUNK // TILE
+# Rows of what is worked out of a tile. They lie in one array: of one array and fixed distances it
+# is known that a loop writes nothing that it has still to read.
+SEEN, UNSEEN, DISTANCE, BEARING, ELEVATION = (TILE * k for k in range(5))
+WEIGHT, FACTOR, SHARE, COMPONENT = (TILE * k for k in range(4))
+OWN = 5 * TILE
 BLOCK = 16
 # The probability of detection is given, not a model's.
 GIVEN = -1
@@ -335,71 +345,65 @@ def position_measurements(values: FloatArray, covariances: FloatArray) -> Measur
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _lowest(values, number):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return the smallest of the first `number` values, which are used up; inf if there is none.
-
-    By halves: loops over pairs become vector instructions, a running minimum does not.
-    """
-    if number == 0:
-        return np.inf
-    while number > 1:
-        half = (number + 1) // 2
-        other = values[number - half : number]
-        for i in range(half):
-            values[i] = other[i] if other[i] < values[i] else values[i]
-        number = half
-    return values[0]
-
-
-@njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _halve(values, other, number, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _range_of(values, number):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return the smallest and the largest of the first `number` values."""
+    low = np.inf
+    high = np.inf
     for i in range(number):
-        low[i] = other[i] if other[i] < values[i] else values[i]
-    for i in range(number):
-        high[i] = other[i] if other[i] > values[i] else values[i]
-
-
-@njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _halve_again(low, high, number, offset):  # type: ignore[no-untyped-def]  # pragma: no cover
-    low_other = low[offset:]
-    high_other = high[offset:]
-    for i in range(number):
-        low[i] = low_other[i] if low_other[i] < low[i] else low[i]
-    for i in range(number):
-        high[i] = high_other[i] if high_other[i] > high[i] else high[i]
+        low = lesser(low, values[i])
+        high = lesser(high, -values[i])
+    return low, -high
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _box_chunks(first_chunk, last_chunk, particles, boxes):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill lower and upper bounds (tiles, 2, d) of the particles of each tile.
+def _arrange_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    first_chunk, last_chunk, first_tile, particles, axes, boxes
+):
+    """Fill the axes (tiles, 3 * TILE) of the particles of each tile, and their bounds.
 
-    By halves: loops over pairs become vector instructions, a running minimum does not.
+    Boxes (tiles, 2, d) are lower and upper bounds. In two dimensions z is 0.
     """
     n, d = particles.shape
     flat = particles.reshape(n * d)
-    low = np.empty(TILE * d)
-    high = np.empty(TILE * d)
-    for tile in range(first_chunk * TILES, last_chunk * TILES):
-        size = min(TILE, n - tile * TILE)
+    for tile in range(max(first_chunk * TILES, first_tile), last_chunk * TILES):
+        start = tile * TILE
+        size = min(TILE, n - start)
         if size <= 0:
             break
-        part = flat[tile * TILE * d : (tile * TILE + size) * d]
-        half = (size + 1) // 2
-        _halve(part, part[(size - half) * d :], half * d, low, high)
-        size = half
-        while size > 1:
-            half = (size + 1) // 2
-            _halve_again(low, high, half * d, (size - half) * d)
-            size = half
+        part = flat[start * d : (start + size) * d]
+        out = axes[tile]
+        # All axes in one loop: whole rows are read, and sorted in registers.
+        if d == 3:
+            for i in range(size):
+                out[i] = part[3 * i]
+                out[TILE + i] = part[3 * i + 1]
+                out[2 * TILE + i] = part[3 * i + 2]
+        else:
+            for i in range(size):
+                out[i] = part[2 * i]
+                out[TILE + i] = part[2 * i + 1]
+            out[2 * TILE :] = 0.0
         for axis in range(d):
-            boxes[tile, 0, axis] = low[axis]
-            boxes[tile, 1, axis] = high[axis]
+            low, high = _range_of(out[axis * TILE :], size)
+            boxes[tile, 0, axis] = low
+            boxes[tile, 1, axis] = high
 
 
 @njit(cache=True, error_model='numpy')
-def _least_square(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    box, sensor_position, solid, c0, c1, c2, z0, cartesian, gate
-):
+def _distances(box, sensor_position):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return bounds of the distance between the sensor and what lies in a box."""
+    near = 0.0
+    far = 0.0
+    for axis in range(box.shape[1]):
+        low = box[0, axis] - sensor_position[axis]
+        high = box[1, axis] - sensor_position[axis]
+        near += max(max(low, -high), 0.0) ** 2
+        far += max(-low, high) ** 2
+    return math.sqrt(near), math.sqrt(far)
+
+
+@njit(cache=True, error_model='numpy')
+def _least_square(box, near, far, centre, z0, cartesian, gate):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return a number that q is nowhere below in a tile, but for rounding.
 
     Particles of the tile lie in `box`. With u the smallest eigenvalue of the inverse correlation,
@@ -408,19 +412,12 @@ def _least_square(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
     s^2 - (r - z)^2 <= r z (a^2 + b^2).
     """
     apart = 0.0
-    near = 0.0
-    far = 0.0
-    for axis in range(3 if solid else 2):
-        low = box[0, axis] - sensor_position[axis]
-        high = box[1, axis] - sensor_position[axis]
-        centre = c0 if axis == 0 else (c1 if axis == 1 else c2)
-        apart += max(max(low - centre, centre - high), 0.0) ** 2
-        near += max(max(low, -high), 0.0) ** 2
-        far += max(-low, high) ** 2
+    for axis in range(box.shape[1]):
+        low = box[0, axis] - centre[axis]
+        high = centre[axis] - box[1, axis]
+        apart += max(max(low, high), 0.0) ** 2
     if cartesian:
         return gate[1] * apart
-    near = math.sqrt(near)
-    far = math.sqrt(far)
     square = gate[0] * max(max(near - z0, z0 - far), 0.0) ** 2
     if z0 > 0.0 and far > 0.0:
         widest = max(abs(near - z0), abs(far - z0))
@@ -480,138 +477,157 @@ def add_moments(weights, x, y, z, number, centre, solid, moments):  # type: igno
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _polar_squares(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    z, information, distance, bearing, elevation, number, row
+def _look(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    kind,
+    parameters,
+    cos_yaw,
+    sin_yaw,
+    sensor_position,
+    solid,
+    axes,
+    weights,
+    number,
+    probability,
+    own,
 ):
-    """Fill the squared normalised errors of a detection in range and angles."""
+    """Fill pi of a tile, unless it is given, and what the first rows of `own` are.
+
+    The loops here have many inputs but few outputs: that these are apart is checked, once for
+    each pair, before vector instructions are used.
+    """
+    x0 = sensor_position[0]
+    y0 = sensor_position[1]
+    z0 = sensor_position[2] if solid else 0.0
+    gain = parameters[0]
+    p = parameters[1]
+    q = parameters[2]
+    r = parameters[3]
+    if kind == EXPONENTIAL:
+        for i in range(number):
+            u = (axes[i] - x0) * p
+            v = (axes[TILE + i] - y0) * q
+            w = (axes[2 * TILE + i] - z0) * r
+            probability[i] = gain * exponential(-0.5 * math.sqrt(u * u + v * v + w * w))
+    elif kind == GAUSSIAN:
+        for i in range(number):
+            u = (axes[i] - x0) * p
+            v = (axes[TILE + i] - y0) * q
+            w = (axes[2 * TILE + i] - z0) * r
+            probability[i] = gain * exponential(-0.5 * (u * u + v * v + w * w))
+    elif kind != GIVEN:
+        for i in range(number):
+            probability[i] = detection_probability_at(
+                kind,
+                parameters,
+                axes[i] - x0,
+                axes[TILE + i] - y0,
+                axes[2 * TILE + i] - z0,
+                cos_yaw,
+                sin_yaw,
+            )
+    for i in range(number):
+        seen = probability[i] * weights[i]
+        own[SEEN + i] = seen
+        own[UNSEEN + i] = 0.0 if seen > 0.0 else np.inf
+
+
+@njit(cache=True, error_model='numpy')
+def _turn(axes, sensor_position, solid, number, own):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill range and angles of a tile in `own`."""
+    x0 = sensor_position[0]
+    y0 = sensor_position[1]
+    z0 = sensor_position[2] if solid else 0.0
+    for i in range(number):
+        x = axes[i] - x0
+        y = axes[TILE + i] - y0
+        z = axes[2 * TILE + i] - z0
+        own[DISTANCE + i] = math.sqrt(x * x + y * y + z * z)
+        own[BEARING + i] = arctan2(y, x)
+    if solid:
+        for i in range(number):
+            x = axes[i] - x0
+            y = axes[TILE + i] - y0
+            own[ELEVATION + i] = arctan2(axes[2 * TILE + i] - z0, math.sqrt(x * x + y * y))
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _polar_squares(z, information, own, number, row):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the squared normalised errors of a detection in range and angles; return the smallest.
+
+    They are infinite where a particle cannot have caused it.
+    """
     i00 = information[0, 0]
     i11 = information[1, 1]
     i01 = 2.0 * information[0, 1]
     z0 = z[0]
     z1 = wrap(z[1])
-    for i in range(number):
-        e0 = z0 - distance[i]
-        e1 = z1 - bearing[i]
-        e1 = e1 - TWO_PI if e1 >= math.pi else e1
-        e1 = e1 + TWO_PI if e1 < -math.pi else e1
-        row[i] = e0 * (e0 * i00 + e1 * i01) + e1 * e1 * i11
+    z2 = 0.0
+    i22 = 0.0
+    i02 = 0.0
+    i12 = 0.0
     if len(z) == 3:
         z2 = z[2]
         i22 = information[2, 2]
         i02 = 2.0 * information[0, 2]
         i12 = 2.0 * information[1, 2]
-        if i02 == 0.0 and i12 == 0.0:
-            for i in range(number):
-                e2 = z2 - elevation[i]
-                row[i] += e2 * e2 * i22
-            return
-        for i in range(number):
-            e0 = z0 - distance[i]
-            e1 = z1 - bearing[i]
-            e1 = e1 - TWO_PI if e1 >= math.pi else e1
-            e1 = e1 + TWO_PI if e1 < -math.pi else e1
-            e2 = z2 - elevation[i]
-            row[i] += e2 * (e0 * i02 + e1 * i12 + e2 * i22)
+    low = np.inf
+    for i in range(number):
+        e0 = z0 - own[DISTANCE + i]
+        e1 = z1 - own[BEARING + i]
+        e1 = e1 - TWO_PI if e1 >= math.pi else e1
+        e1 = e1 + TWO_PI if e1 < -math.pi else e1
+        e2 = z2 - own[ELEVATION + i]
+        square = e0 * (e0 * i00 + e1 * i01) + e1 * e1 * i11
+        square += e2 * (e0 * i02 + e1 * i12 + e2 * i22) + own[UNSEEN + i]
+        row[i] = square
+        low = lesser(low, square)
+    return low
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _cartesian_squares(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    c0, c1, c2, information, x, y, height, number, row
-):
-    """Fill the squared normalised distances from where a detection points at."""
+def _cartesian_squares(centre, information, axes, own, number, row):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the squared normalised distances from where a detection points at, as above."""
     i00 = information[0, 0]
     i11 = information[1, 1]
     i01 = 2.0 * information[0, 1]
-    for i in range(number):
-        e0 = c0 - x[i]
-        e1 = c1 - y[i]
-        row[i] = e0 * (e0 * i00 + e1 * i01) + e1 * e1 * i11
-    if information.shape[0] == 3:
+    c0 = centre[0]
+    c1 = centre[1]
+    c2 = 0.0
+    i22 = 0.0
+    i02 = 0.0
+    i12 = 0.0
+    if len(centre) == 3:
+        c2 = centre[2]
         i22 = information[2, 2]
         i02 = 2.0 * information[0, 2]
         i12 = 2.0 * information[1, 2]
-        for i in range(number):
-            e2 = c2 - height[i]
-            row[i] += e2 * ((c0 - x[i]) * i02 + (c1 - y[i]) * i12 + e2 * i22)
-
-
-@njit(cache=True, error_model='numpy')
-def _angles(x, y, height, solid, number, bearing, elevation):  # type: ignore[no-untyped-def]  # pragma: no cover
+    low = np.inf
     for i in range(number):
-        bearing[i] = arctan2(y[i], x[i])
-    if solid:
-        for i in range(number):
-            elevation[i] = arctan2(height[i], math.sqrt(x[i] * x[i] + y[i] * y[i]))
-
-
-@njit(cache=True, error_model='numpy')
-def _smallest(row, seen, number, scratch):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    for i in range(number):
-        scratch[i] = row[i] if seen[i] > 0.0 else np.inf
-    return _lowest(scratch, number)
+        e0 = c0 - axes[i]
+        e1 = c1 - axes[TILE + i]
+        e2 = c2 - axes[2 * TILE + i]
+        square = e0 * (e0 * i00 + e1 * i01) + e1 * e1 * i11
+        square += e2 * (e0 * i02 + e1 * i12 + e2 * i22) + own[UNSEEN + i]
+        row[i] = square
+        low = lesser(low, square)
+    return low
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _likelihoods(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    row, least, seen, probability, number, scratch, bits
-):
+def _likelihoods(row, least, own, probability, number):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Replace squares by pi exp(-(q - least) / 2), 0 beyond the gate; return the weighted sum."""
-    for i in range(number):
-        gap = row[i] - least
-        row[i] = -0.5 * gap if gap < RELATIVE_GATE and seen[i] > 0.0 else -1e4
-    exponentials(row, number, scratch, bits)
     total = 0.0
     for i in range(number):
-        total += row[i] * seen[i]
-    for i in range(number):
-        row[i] *= probability[i]
+        gap = row[i] - least
+        value = exponential(-0.5 * gap if gap < RELATIVE_GATE else -1e4)
+        total += value * own[SEEN + i]
+        row[i] = value * probability[i]
     return total
 
 
 @njit(cache=True, error_model='numpy')
-def _products(a, b, number, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    for i in range(number):
-        out[i] = a[i] * b[i]
-
-
-@njit(cache=True, error_model='numpy')
-def _norms(x, y, z, number, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    for i in range(number):
-        out[i] = math.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
-
-
-@njit(cache=True, error_model='numpy')
-def _squares(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    z,
-    cartesian,
-    c0,
-    c1,
-    c2,
-    information,
-    x,
-    y,
-    height,
-    distance,
-    bearing,
-    elevation,
-    turned,
-    solid,
-    number,
-    row,
-):
-    """Fill squared normalised errors; range and angles of the particles first, unless `turned`."""
-    if cartesian:
-        _cartesian_squares(c0, c1, c2, information, x, y, height, number, row)
-        return
-    if not turned:
-        _norms(x, y, height, number, distance)
-        _angles(x, y, height, solid, number, bearing, elevation)
-    _polar_squares(z, information, distance, bearing, elevation, number, row)
-
-
-@njit(cache=True, error_model='numpy')
-def _fill_references(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    particles,
+def _fill_bounds(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    axes,
     weights,
     boxes,
     kind,
@@ -625,88 +641,69 @@ def _fill_references(  # type: ignore[no-untyped-def]  # pragma: no cover - comp
     centres,
     information,
     gates,
+    bounds,
     references,
 ):
-    """Fill for each detection the smallest square in the tile that promises it.
+    """Fill lower bounds of squares in each tile, and the smallest square in the lowest one's.
 
-    The smallest of all is not above it, so that it rules out most tiles before they are looked at.
+    The smallest of all is not above that, so that it rules out most tiles before they are looked
+    at.
     """
-    solid = particles.shape[1] == 3
-    n = particles.shape[0]
-    x = np.empty(TILE)
-    y = np.empty(TILE)
-    height = np.empty(TILE)
-    distance = np.empty(TILE)
-    bearing = np.empty(TILE)
-    elevation = np.zeros(TILE)
+    number, d = values.shape
+    n = weights.shape[0]
+    own = np.zeros(OWN)
     chance = np.empty(TILE)
-    seen = np.empty(TILE)
     row = np.empty(TILE)
-    scratch = np.empty(TILE)
-    bits = scratch.view(np.int64)
     tiles = (n + TILE - 1) // TILE
-    for m in range(values.shape[0]):
-        c0 = centres[m, 0] - sensor_position[0]
-        c1 = centres[m, 1] - sensor_position[1]
-        c2 = centres[m, 2] - sensor_position[2] if solid else 0.0
-        best = -1
-        lowest = np.inf
-        for tile in range(tiles):
+    lowest = np.full(number, np.inf)
+    best = np.full(number, -1)
+    for tile in range(tiles):
+        near, far = _distances(boxes[tile], sensor_position)
+        for m in range(number):
             lower = _least_square(
-                boxes[tile],
-                sensor_position,
-                solid,
-                c0,
-                c1,
-                c2,
-                values[m, 0],
-                cartesian[m],
-                gates[m],
+                boxes[tile], near, far, centres[m], values[m, 0], cartesian[m], gates[m]
             )
-            if lower < lowest:
-                lowest = lower
-                best = tile
+            bounds[m, tile] = lower
+            if lower < lowest[m]:
+                lowest[m] = lower
+                best[m] = tile
+    for m in range(number):
         references[m] = np.inf
-        if best < 0:
+        tile = best[m]
+        if tile < 0:
             continue
-        start = best * TILE
+        start = tile * TILE
         size = min(TILE, n - start)
-        offsets(particles, start, size, sensor_position, x, y, height)
         if kind == GIVEN:
             chance[:size] = probability[start : start + size]
-        else:
-            fill_probabilities(
-                kind, parameters, x, y, height, size, cos_yaw, sin_yaw, chance, scratch, bits
-            )
-        _products(chance, weights[start : start + size], size, seen)
-        _squares(
-            values[m],
-            cartesian[m],
-            c0,
-            c1,
-            c2,
-            information[m],
-            x,
-            y,
-            height,
-            distance,
-            bearing,
-            elevation,
-            False,
-            solid,
+        _look(
+            kind,
+            parameters,
+            cos_yaw,
+            sin_yaw,
+            sensor_position,
+            d == 3,
+            axes[tile],
+            weights[start : start + size],
             size,
-            row,
+            chance,
+            own,
         )
-        references[m] = _smallest(row, seen, size, scratch)
+        if cartesian[m]:
+            references[m] = _cartesian_squares(
+                centres[m], information[m], axes[tile], own, size, row
+            )
+        else:
+            _turn(axes[tile], sensor_position, d == 3, size, own)
+            references[m] = _polar_squares(values[m], information[m], own, size, row)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk,
     last_chunk,
-    particles,
+    axes,
     weights,
-    boxes,
     kind,
     parameters,
     cos_yaw,
@@ -717,7 +714,7 @@ def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
     cartesian,
     centres,
     information,
-    gates,
+    bounds,
     references,
     likelihood,
     active,
@@ -729,106 +726,69 @@ def _explain_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
     Neighbours among the particles are mostly neighbours in space. A tile of them that a bound
     shows to be beyond the gate is not worked out: `active` (m, tiles) tells which were.
     """
-    solid = particles.shape[1] == 3
-    number = values.shape[0]
+    number, d = values.shape
     # Coordinates apart, and short loops without branches: they become vector instructions.
-    x = np.empty((TILES, TILE))
-    y = np.empty((TILES, TILE))
-    height = np.empty((TILES, TILE))
-    distance = np.empty((TILES, TILE))
-    bearing = np.empty((TILES, TILE))
-    elevation = np.zeros((TILES, TILE))
-    seen = np.empty((TILES, TILE))
-    scratch = np.empty(TILE)
-    bits = scratch.view(np.int64)
+    all_own = np.zeros((TILES, OWN))
     least_here = np.empty(TILES)
     turned = np.empty(TILES, np.bool_)
     for chunk in range(first_chunk, last_chunk):
         first = chunk * CHUNK
-        stop = min(particles.shape[0], first + CHUNK)
+        stop = min(weights.shape[0], first + CHUNK)
         tiles = (stop - first + TILE - 1) // TILE
         for tile in range(tiles):
             start = first + tile * TILE
             size = min(TILE, stop - start)
-            chance = probability[start : start + size]
             turned[tile] = False
-            offsets(particles, start, size, sensor_position, x[tile], y[tile], height[tile])
-            if kind != GIVEN:
-                fill_probabilities(
-                    kind,
-                    parameters,
-                    x[tile],
-                    y[tile],
-                    height[tile],
-                    size,
-                    cos_yaw,
-                    sin_yaw,
-                    chance,
-                    scratch,
-                    bits,
-                )
-            _products(chance, weights[start : start + size], size, seen[tile])
+            _look(
+                kind,
+                parameters,
+                cos_yaw,
+                sin_yaw,
+                sensor_position,
+                d == 3,
+                axes[chunk * TILES + tile],
+                weights[start : start + size],
+                size,
+                probability[start : start + size],
+                all_own[tile],
+            )
         for m in range(number):
-            c0 = centres[m, 0] - sensor_position[0]
-            c1 = centres[m, 1] - sensor_position[1]
-            c2 = centres[m, 2] - sensor_position[2] if solid else 0.0
             bound = references[m]
             least = np.inf
             for tile in range(tiles):
                 least_here[tile] = np.inf
-                lower = _least_square(
-                    boxes[chunk * TILES + tile],
-                    sensor_position,
-                    solid,
-                    c0,
-                    c1,
-                    c2,
-                    values[m, 0],
-                    cartesian[m],
-                    gates[m],
-                )
+                lower = bounds[m, chunk * TILES + tile]
                 if lower * (1.0 - 1e-9) > bound + 1.01 * RELATIVE_GATE:
                     continue
                 start = first + tile * TILE
                 size = min(TILE, stop - start)
                 row = likelihood[m, start : start + size]
-                _squares(
-                    values[m],
-                    cartesian[m],
-                    c0,
-                    c1,
-                    c2,
-                    information[m],
-                    x[tile],
-                    y[tile],
-                    height[tile],
-                    distance[tile],
-                    bearing[tile],
-                    elevation[tile],
-                    turned[tile],
-                    solid,
-                    size,
-                    row,
-                )
-                turned[tile] |= not cartesian[m]
-                least_here[tile] = _smallest(row, seen[tile], size, scratch)
+                here = axes[chunk * TILES + tile]
+                own = all_own[tile]
+                if cartesian[m]:
+                    least_here[tile] = _cartesian_squares(
+                        centres[m], information[m], here, own, size, row
+                    )
+                else:
+                    if not turned[tile]:
+                        _turn(here, sensor_position, d == 3, size, own)
+                        turned[tile] = True
+                    least_here[tile] = _polar_squares(values[m], information[m], own, size, row)
                 least = min(least, least_here[tile])
                 bound = min(bound, least)
             total = 0.0
             for tile in range(tiles):
-                here = least_here[tile] < bound + RELATIVE_GATE
-                active[m, chunk * TILES + tile] = here
-                if here:
+                within = least_here[tile] < bound + RELATIVE_GATE
+                active[m, chunk * TILES + tile] = within
+                if within:
                     start = first + tile * TILE
                     size = min(TILE, stop - start)
                     total += _likelihoods(
                         likelihood[m, start : start + size],
                         least,
-                        seen[tile],
+                        all_own[tile],
                         probability[start : start + size],
                         size,
-                        scratch,
-                        bits,
                     )
             all_smallest[chunk, m] = least if total > 0.0 else np.inf
             all_sums[chunk, m] = total
@@ -884,30 +844,82 @@ def _normalise(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model='numpy')
-def _begin(probability, factor, share, component, number):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _begin(probability, weights, number, own):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(number):
-        factor[i] = 1.0 - probability[i]
-    for i in range(number):
-        share[i] = 0.0
-    for i in range(number):
-        component[i] = -1
+        own[WEIGHT + i] = weights[i]
+        own[FACTOR + i] = 1.0 - probability[i]
+        own[SHARE + i] = 0.0
+        own[COMPONENT + i] = -1.0
 
 
 @njit(cache=True, error_model='numpy')
-def _shares(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    row, multiple, weights, detection, number, held, factor, share, component
-):
-    """Fill W_i(z) of a detection, and what it changes in `factor`, `share` and `component`."""
+def _go_on(factor, share, component, weights, number, own):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(number):
-        held[i] = row[i] * multiple
+        own[WEIGHT + i] = weights[i]
+        own[FACTOR + i] = factor[i]
+        own[SHARE + i] = share[i]
+        own[COMPONENT + i] = component[i]
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _take(row, multiple, detection, centre, axes, number, own, held, moments):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill W_i(z) of a detection in `held`, and what it changes in `own`.
+
+    Add it, and its first and second moments about `centre`, to `moments`; return its sum.
+    """
+    c0 = centre[0]
+    c1 = centre[1]
+    c2 = centre[2] if len(centre) == 3 else 0.0
+    t0 = 0.0
+    tx = 0.0
+    ty = 0.0
+    tz = 0.0
+    txx = 0.0
+    txy = 0.0
+    tyy = 0.0
+    txz = 0.0
+    tyz = 0.0
+    tzz = 0.0
     for i in range(number):
-        factor[i] += held[i]
-    for i in range(number):
-        held[i] *= weights[i]
-    for i in range(number):
-        component[i] = detection if held[i] > share[i] else component[i]
-    for i in range(number):
-        share[i] = held[i] if held[i] > share[i] else share[i]
+        part = row[i] * multiple
+        own[FACTOR + i] += part
+        part *= own[WEIGHT + i]
+        held[i] = part
+        most = own[SHARE + i]
+        own[COMPONENT + i] = detection if part > most else own[COMPONENT + i]
+        own[SHARE + i] = part if part > most else most
+        a = axes[i] - c0
+        b = axes[TILE + i] - c1
+        c = axes[2 * TILE + i] - c2
+        u = part * a
+        v = part * b
+        w = part * c
+        t0 += part
+        tx += u
+        ty += v
+        tz += w
+        txx += u * a
+        txy += u * b
+        tyy += v * b
+        txz += u * c
+        tyz += v * c
+        tzz += w * c
+    moments[0] += t0
+    moments[1] += tx
+    moments[2] += ty
+    if len(centre) == 3:
+        moments[3] += tz
+        moments[4] += txx
+        moments[5] += txy
+        moments[6] += tyy
+        moments[7] += txz
+        moments[8] += tyz
+        moments[9] += tzz
+    else:
+        moments[3] += txx
+        moments[4] += txy
+        moments[5] += tyy
+    return t0
 
 
 @njit(cache=True, error_model='numpy')
@@ -920,25 +932,33 @@ def _one_group(group, number):  # type: ignore[no-untyped-def]  # pragma: no cov
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _finish(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    weights, factor, share, component, group, groups, number, updated, owner
-):
+def _finish(own, group, groups, number, updated, owner):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill updated weights and the group each particle would join; return the sum."""
     total = 0.0
     for i in range(number):
-        updated[i] = weights[i] * factor[i]
-    for i in range(number):
+        updated[i] = own[WEIGHT + i] * own[FACTOR + i]
         total += updated[i]
     for i in range(number):
-        owner[i] = groups + component[i] if share[i] > 0.5 * updated[i] else group[i]
+        joins = own[SHARE + i] > 0.5 * updated[i]
+        owner[i] = groups + np.int64(own[COMPONENT + i]) if joins else group[i]
     return total
+
+
+@njit(cache=True, error_model='numpy')
+def _keep(own, number, factor, share, component):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(number):
+        factor[i] = own[FACTOR + i]
+    for i in range(number):
+        share[i] = own[SHARE + i]
+    for i in range(number):
+        component[i] = np.int64(own[COMPONENT + i])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk,
     last_chunk,
-    particles,
+    axes,
     all_weights,
     all_probability,
     likelihood,
@@ -963,15 +983,13 @@ def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
     (m, 1 + d + d (d + 1) / 2) are taken about `centres`. With the last detections the updated
     weights are filled, and the group that each particle would join by itself.
     """
-    n, d = particles.shape
+    n = all_weights.shape[0]
     number = likelihood.shape[0]
     groups = group_mass.shape[1]
-    held = np.empty(TILE)
-    x = np.empty(TILE)
-    y = np.empty(TILE)
-    z = np.empty(TILE)
+    own = np.empty(OWN)
+    held = np.empty((number, TILE))
     before = np.empty(TILE, np.int64)
-    origin = np.zeros(3)
+    taking = np.empty(number, np.int64)
     for chunk in range(first_chunk, last_chunk):
         all_moments[chunk] = 0.0
         for tile in range(chunk * TILES, (chunk + 1) * TILES):
@@ -984,62 +1002,57 @@ def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
             factor = all_factor[start:stop]
             share = all_share[start:stop]
             component = all_component[start:stop]
+            updated = all_updated[start:stop]
             for i in range(size):
                 before[i] = all_group[start + i]
             single = _one_group(before, size)
             if first_detection == 0:
-                _begin(all_probability[start:stop], factor, share, component, size)
-            apart = False
+                _begin(all_probability[start:stop], weights, size, own)
+            else:
+                _go_on(factor, share, component, weights, size, own)
+            takers = 0
             for m in range(number):
                 if not active[m, tile] or scale[chunk, m] == 0.0:
                     continue
-                if not apart:
-                    apart = True
-                    offsets(particles, start, size, origin, x, y, z)
-                _shares(
+                total = _take(
                     likelihood[m, start:stop],
                     scale[chunk, m],
-                    weights,
-                    first_detection + m,
+                    np.float64(first_detection + m),
+                    centres[m],
+                    axes[tile],
                     size,
-                    held,
-                    factor,
-                    share,
-                    component,
+                    own,
+                    held[takers],
+                    all_moments[chunk, m],
                 )
-                total = add_moments(held, x, y, z, size, centres[m], d == 3, all_moments[chunk, m])
+                taking[takers] = m
+                takers += 1
                 if single:
                     group_share[chunk, before[0], m] += total
-                else:
-                    for i in range(size):
-                        group_share[chunk, before[i], m] += held[i]
+            _keep(own, size, factor, share, component)
             if finish:
-                updated = all_updated[start:stop]
-                total = _finish(
-                    weights,
-                    factor,
-                    share,
-                    component,
-                    before,
-                    groups,
-                    size,
-                    updated,
-                    all_owner[start:stop],
-                )
+                total = _finish(own, before, groups, size, updated, all_owner[start:stop])
                 if single:
                     group_mass[chunk, before[0]] += total
                 else:
                     for i in range(size):
                         group_mass[chunk, before[i]] += updated[i]
+            if not single:
+                for i in range(size):
+                    for k in range(takers):
+                        group_share[chunk, before[i], taking[k]] += held[k, i]
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
 def _taken(group_mass, group_share, taken):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Fill for each group (g,) the detection's group that what is left of it belongs to.
+    """Fill for each group (g + m,) the detection's group that what is left of it belongs to.
 
-    A detection that mostly took a group takes the rest of it too.
+    A detection that mostly took a group takes the rest of it too. Return whether any did.
     """
     groups, number = group_share.shape
+    some = False
+    for m in range(number):
+        taken[groups + m] = groups + m
     for g in range(groups):
         mass = 0.0
         for chunk in range(group_mass.shape[0]):
@@ -1050,15 +1063,15 @@ def _taken(group_mass, group_share, taken):  # type: ignore[no-untyped-def]  # p
             if group_share[g, m] > best:
                 best = group_share[g, m]
                 taken[g] = groups + m
+                some = True
+    return some
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _regroup_chunks(first_chunk, last_chunk, taken, owner):  # type: ignore[no-untyped-def]  # pragma: no cover
-    groups = taken.shape[0]
     part = owner[first_chunk * CHUNK : last_chunk * CHUNK]
     for i in range(len(part)):
-        g = part[i]
-        part[i] = taken[g] if g < groups else g
+        part[i] = taken[part[i]]
 
 
 @njit(cache=True, error_model='numpy')
@@ -1127,6 +1140,12 @@ class Workspace:
             self._arrays[name] = array
         return array[:size].reshape(shape)
 
+    def keep(self, name: str, shape: tuple[int, ...]) -> tuple[FloatArray, bool]:
+        """Return an array, and whether it begins with what the one taken before did."""
+        before = self._arrays.get(name)
+        array = self.take(name, shape)
+        return array, before is self._arrays[name]
+
     def released(self, array: NDArray[Any]) -> NDArray[Any]:
         """Return an array that later takes leave alone: a copy if it is one that was taken."""
         taken = any(array.base is own for own in self._arrays.values())
@@ -1187,7 +1206,7 @@ class Association:
 
 
 def _explain(
-    particles: FloatArray,
+    axes: FloatArray,
     denominator: FloatArray,
     boxes: FloatArray,
     kernel: tuple[int, FloatArray],
@@ -1199,35 +1218,35 @@ def _explain(
     pool: ThreadPoolExecutor | None,
 ) -> tuple[FloatArray, NDArray[np.bool_], FloatArray, FloatArray, FloatArray]:
     """Return likelihoods, active tiles, smallest squares, sums, and log of the particles' C(z)."""
-    n = len(particles)
+    n = len(denominator)
     chunks = max(1, -(-n // CHUNK))
     width = block.stop - block.start
     likelihood = workspace.take('likelihood', (width, n))
     active = workspace.take('active', (width, chunks * TILES), np.bool_)
-    smallest = np.empty((chunks, width))
-    sums = np.empty((chunks, width))
-    references = np.empty(width)
+    bounds = workspace.take('bounds', (width, chunks * TILES))
+    smallest, sums = np.empty((2, chunks, width))
+    references, log_own = np.empty((2, width))
     yaw = pose.yaw
-    work = (
-        particles,
-        denominator,
-        boxes,
-        *kernel,
-        math.cos(yaw),
-        math.sin(yaw),
-        probability,
-        pose.position,
+    look = (*kernel, math.cos(yaw), math.sin(yaw), probability, pose.position)
+    detections = (
         measurements.values[block],
         measurements.cartesian[block],
         measurements.centres[block],
         measurements.information[block],
+    )
+    _fill_bounds(
+        axes,
+        denominator,
+        boxes,
+        *look,
+        *detections,
         measurements.gates[block],
+        bounds,
         references,
     )
-    _fill_references(*work)
+    work = (axes, denominator, *look, *detections, bounds, references)
     out = (likelihood, active, smallest, sums)
     run_chunks(lambda c, e: _explain_chunks(c, e, *work, *out), n, pool)
-    log_own = np.empty(width)
     _log_sums(smallest, sums, measurements.log_norm[block], log_own)
     return likelihood, active, smallest, sums, log_own
 
@@ -1244,6 +1263,7 @@ def associate(
     groups: int = 1,
     pool: ThreadPoolExecutor | None = None,
     workspace: Workspace | None = None,
+    known: int = 0,
 ) -> Association:
     """Return the update of particle weights by one robot's detections (000, eq. (13), (16)).
 
@@ -1273,6 +1293,9 @@ def associate(
         For large sets; the result is the same.
     workspace : Workspace, optional
         The arrays of n in the result are its own: the next update with it overwrites them.
+    known : int
+        How many of the particles, the first ones, are the same as at the last update with the
+        workspace.
     """
     n, d = particles.shape
     number = len(measurements)
@@ -1285,9 +1308,12 @@ def associate(
         probability = workspace.take('probability', (n,))
     blocks = [slice(first, min(number, first + BLOCK)) for first in range(0, number, BLOCK)]
     blocks = blocks or [slice(0, 0)]
-    boxes = workspace.take('boxes', (max(1, -(-n // CHUNK)) * TILES, 2, d))
-    run_chunks(lambda c, e: _box_chunks(c, e, particles, boxes), n, pool)
-    parts = (particles, denominator, boxes, kernel, probability, measurements)
+    chunks = max(1, -(-n // CHUNK))
+    axes, kept = workspace.keep('axes', (chunks * TILES, 3 * TILE))
+    boxes, kept_too = workspace.keep('boxes', (chunks * TILES, 2, d))
+    first_tile = known // TILE if kept and kept_too else 0
+    run_chunks(lambda c, e: _arrange_chunks(c, e, first_tile, particles, axes, boxes), n, pool)
+    parts = (axes, denominator, boxes, kernel, probability, measurements)
     explained = _explain(*parts, blocks[0], pose, workspace, pool)
     if callable(other):
         own = [explained[4]]
@@ -1306,7 +1332,6 @@ def associate(
     means = np.empty((number, d))
     covariances = np.empty((number, d, d))
     group_share = np.zeros((groups, number))
-    chunks = max(1, -(-n // CHUNK))
     group_mass = np.zeros((chunks, groups))
     for block in blocks:
         width = block.stop - block.start
@@ -1328,7 +1353,7 @@ def associate(
         moments = np.empty((chunks, width, 1 + d + d * (d + 1) // 2))
         shares = np.zeros((chunks, groups, width))
         work = (
-            particles,
+            axes,
             weights,
             probability,
             likelihood,
@@ -1353,9 +1378,9 @@ def associate(
         )
         for chunk in range(chunks):
             group_share[:, block] += shares[chunk]
-    taken = np.empty(groups, np.int64)
-    _taken(group_mass, group_share, taken)
-    run_chunks(lambda c, e: _regroup_chunks(c, e, taken, owner), n, pool)
+    taken = np.empty(groups + number, np.int64)
+    if _taken(group_mass, group_share, taken):
+        run_chunks(lambda c, e: _regroup_chunks(c, e, taken, owner), n, pool)
     return Association(
         factor,
         updated,

@@ -230,6 +230,8 @@ class SearchFilter:
                 self.dimension, self._numbers.expected_targets / self.volume, LEAST_CLUSTER_MASS
             )
         self._workspace = Workspace()
+        # How many particles are the same as at the last update of the present step.
+        self._arranged = 0
         self._pool: ThreadPoolExecutor | None = None
 
     @property
@@ -449,6 +451,7 @@ class SearchFilter:
         self._predicted = self.weights.copy() if numbers.corrector == 'predicted' else None
         total = sum(len(member.values) for member in members)
         self._birth_budget = numbers.particles // (2 * max(total, 1))
+        self._arranged = 0
         for member in members:
             used, refined = self._correct(member, newly_found, dropped, time)
             detections += used
@@ -785,7 +788,9 @@ class SearchFilter:
             groups=self._groups,
             pool=self._threads(),
             workspace=self._workspace,
+            known=self._arranged,
         )
+        self._arranged = len(self.particles)
         explained = np.isfinite(update.log_normaliser)
         used = int(np.count_nonzero(explained))
         if used < count:

@@ -38,9 +38,9 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 CACHE_ROWS = 8000
-# Room for so many offsets at a time: x, y, z, pi and scratch.
+# Room for so many offsets at a time: x, y, z and pi.
 ROOM = 1024
-ROOM_ROWS = 5
+ROOM_ROWS = 4
 # Above this many pairs of a candidate and another robot, values of candidates that were not
 # chosen are reported as without the other planning robots.
 REPORT_LIMIT = 600
@@ -268,21 +268,8 @@ def _together(kind: int) -> bool:  # pragma: no cover - compiled
 def _fill(
     kind: int, parameters: FloatArray, number: int, room: FloatArray
 ) -> FloatArray:  # pragma: no cover - compiled
-    """Return pi at the first `number` offsets in room (rows x, y, z and two more)."""
-    scratch = room[4]
-    fill_probabilities(
-        kind,
-        parameters,
-        room[0],
-        room[1],
-        room[2],
-        number,
-        1.0,
-        0.0,
-        room[3],
-        scratch,
-        scratch.view(np.int64),
-    )
+    """Return pi at the first `number` offsets in room (rows x, y, z and one more)."""
+    fill_probabilities(kind, parameters, room[0], room[1], room[2], number, 1.0, 0.0, room[3])
     return room[3]
 
 
