@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.detection_model import DetectionModel
+from maasi_filter.detection_model import DetectionModel, probabilities
 from maasi_filter.elementary import sines
 from maasi_filter.exploration import Exploration, interpolate_at
 from maasi_filter.phd import MeasurementSet
@@ -112,6 +112,71 @@ def _weigh(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             totals[m] += weight
 
 
+@njit(cache=True, error_model='numpy')
+def _starts(number, starts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fill where each measurement's births start, and the end; return the end."""
+    starts[0] = 0
+    for m in range(number.shape[0]):
+        starts[m + 1] = starts[m] + number[m]
+    return starts[-1]
+
+
+@njit(cache=True, error_model='numpy')
+def _bear(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    values,
+    cartesian,
+    centres,
+    roots,
+    volume,
+    sensor_position,
+    bounds,
+    noise,
+    starts,
+    particles,
+    jacobian,
+    inside,
+    kind,
+    parameters,
+    yaw,
+    prior,
+    unexplored,
+    grid,
+    lower,
+    step,
+    least,
+    totals,
+):
+    """Do all of it in one call, with a detection model's kernel."""
+    _draw(
+        values,
+        cartesian,
+        centres,
+        roots,
+        volume,
+        sensor_position,
+        bounds,
+        noise,
+        starts,
+        particles,
+        jacobian,
+        inside,
+    )
+    probability = probabilities(kind, parameters, particles, sensor_position, yaw)
+    _weigh(
+        particles,
+        starts,
+        jacobian,
+        probability,
+        prior,
+        unexplored,
+        grid,
+        lower,
+        step,
+        least,
+        totals,
+    )
+
+
 @dataclass
 class MeasurementBirths:
     """Births at each of m measurements.
@@ -162,15 +227,14 @@ def measurement_births(
     d = measurements.values.shape[1]
     count = len(measurements)
     bounds = exploration.bounds
-    starts = np.zeros(count + 1, np.int64)
-    starts[1:] = number
-    starts = starts.cumsum()
-    total = int(starts[-1])
+    starts = np.empty(count + 1, np.int64)
+    total = _starts(np.full(count, number) if isinstance(number, int) else number, starts)
     noise = generator.standard_normal((total, d))
     particles = np.empty((total, d))
     jacobian = np.empty(total)
     inside = np.empty(count, np.bool_)
-    _draw(
+    totals = np.empty(count)
+    drawn = (
         measurements.values,
         measurements.cartesian,
         measurements.centres,
@@ -184,23 +248,14 @@ def measurement_births(
         jacobian,
         inside,
     )
-    probability = detection.probability(particles, pose)
-    values, lower, step = exploration.kernel()
     prior = expected_targets / exploration.volume
-    totals = np.empty(count)
-    _weigh(
-        particles,
-        starts,
-        jacobian,
-        probability,
-        prior,
-        unexplored,
-        values,
-        lower,
-        step,
-        LEAST_UNEXPLORED,
-        totals,
-    )
+    weighed = (prior, unexplored, *exploration.kernel(), LEAST_UNEXPLORED, totals)
+    kernel = detection.kernel()
+    if kernel is None:
+        _draw(*drawn)
+        _weigh(particles, starts, jacobian, detection.probability(particles, pose), *weighed)
+    else:
+        _bear(*drawn, *kernel, pose.yaw, *weighed)
     return MeasurementBirths(particles, jacobian, starts, totals, inside)
 
 
@@ -329,6 +384,7 @@ def thin_births(
     births: MeasurementBirths,
     mass: FloatArray,
     number: IntArray,
+    total: int,
     first_group: int,
     generator: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -343,10 +399,11 @@ def thin_births(
         Posterior mass of each measurement's births.
     number : (m,) int array
         Particles for each.
+    total : int
+        Their sum.
     first_group : int
         Group of the first measurement's births; the next ones have the next numbers.
     """
-    total = int(number.sum())
     out = np.empty((total, births.particles.shape[1]))
     weights = np.empty(total)
     group = np.empty(total, np.int64)

@@ -138,9 +138,10 @@ def offsets(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _probabilities(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def probabilities(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     kind, parameters, positions, sensor_position, yaw
 ):
+    """Return pi(x, q) at positions (n, d)."""
     number = positions.shape[0]
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
@@ -210,7 +211,7 @@ class _KernelDetection(DetectionModel):
         return self._kind, self._parameters
 
     def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        return _probabilities(
+        return probabilities(
             self._kind, self._parameters, _positions(positions), pose.position, pose.yaw
         )
 

@@ -116,10 +116,39 @@ def _noise(roots, out):  # type: ignore[no-untyped-def]  # pragma: no cover - co
 
 
 @njit(cache=True, error_model='numpy')
-def _information(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    positions, sensor_position, values, cartesian, centres, information, out
+def _inherit(group_share, own_mass, information):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add, in place, to each new group's information that of the group it mostly comes from."""
+    groups, number = group_share.shape
+    for m in range(number):
+        if groups == 0 or not own_mass[m] > 0.5:
+            continue
+        source = 0
+        for g in range(1, groups):
+            if group_share[g, m] > group_share[source, m]:
+                source = g
+        information[groups + m] += information[source]
+
+
+@njit(cache=True, error_model='numpy')
+def _extend(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    known,
+    positions,
+    sensor_position,
+    values,
+    cartesian,
+    centres,
+    information,
+    group_share,
+    own_mass,
+    out,
 ):
+    """Fill the information of groups and of detections."""
     number, d = positions.shape
+    groups = known.shape[0]
+    for g in range(groups):
+        for a in range(d):
+            for b in range(d):
+                out[g, a, b] = known[g, a, b]
     error = np.empty(d)
     jacobian = np.empty((d, d))
     for m in range(number):
@@ -132,21 +161,8 @@ def _information(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                 for i in range(d):
                     for j in range(d):
                         total += jacobian[i, a] * information[m, i, j] * jacobian[j, b]
-                out[m, a, b] = total
-
-
-@njit(cache=True, error_model='numpy')
-def _inherit(group_share, own_mass, information):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add, in place, to each new group's information that of the group it mostly comes from."""
-    groups, number = group_share.shape
-    for m in range(number):
-        if groups == 0 or not own_mass[m] > 0.5:
-            continue
-        source = 0
-        for g in range(1, groups):
-            if group_share[g, m] > group_share[source, m]:
-                source = g
-        information[groups + m] += information[source]
+                out[groups + m, a, b] = total
+    _inherit(group_share, own_mass, out)
 
 
 def extended_information(
@@ -175,17 +191,18 @@ def extended_information(
     """
     groups, d = information.shape[:2]
     out = np.empty((groups + len(measurements), d, d))
-    out[:groups] = information
-    _information(
+    _extend(
+        information,
         positions,
         pose.position,
         measurements.values,
         measurements.cartesian,
         measurements.centres,
         measurements.information,
-        out[groups:],
+        group_share,
+        own_mass,
+        out,
     )
-    _inherit(group_share, own_mass, out)
     return out
 
 

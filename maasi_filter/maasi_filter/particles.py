@@ -375,13 +375,28 @@ def group_moments(
 def _clear_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     first_chunk, last_chunk, particles, weights, group, centre, square, here, groups
 ):
-    d = particles.shape[1]
-    for i in range(first_chunk * CHUNK, min(weights.shape[0], last_chunk * CHUNK)):
-        apart = 0.0
-        for a in range(d):
-            apart += (particles[i, a] - centre[a]) ** 2
-        gone = group[i] == here or (apart <= square and group[i] < groups)
-        weights[i] = 0.0 if gone else weights[i]
+    first = first_chunk * CHUNK
+    stop = min(weights.shape[0], last_chunk * CHUNK)
+    part = weights[first:stop]
+    groups_here = group[first:stop]
+    x = centre[0]
+    y = centre[1]
+    if particles.shape[1] == 3:
+        z = centre[2]
+        flat = particles[first:stop].reshape(3 * (stop - first))
+        for i in range(stop - first):
+            a = flat[3 * i] - x
+            b = flat[3 * i + 1] - y
+            c = flat[3 * i + 2] - z
+            near = (a * a + b * b + c * c <= square) & (groups_here[i] < groups)
+            part[i] = 0.0 if near | (groups_here[i] == here) else part[i]
+    else:
+        flat = particles[first:stop].reshape(2 * (stop - first))
+        for i in range(stop - first):
+            a = flat[2 * i] - x
+            b = flat[2 * i + 1] - y
+            near = (a * a + b * b <= square) & (groups_here[i] < groups)
+            part[i] = 0.0 if near | (groups_here[i] == here) else part[i]
 
 
 def clear(

@@ -390,38 +390,40 @@ def _arrange_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compi
 
 
 @njit(cache=True, error_model='numpy')
-def _distances(box, sensor_position):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return bounds of the distance between the sensor and what lies in a box."""
+def _distances(boxes, tile, sensor_position):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return bounds of the distance between the sensor and what lies in a tile's box."""
     near = 0.0
     far = 0.0
-    for axis in range(box.shape[1]):
-        low = box[0, axis] - sensor_position[axis]
-        high = box[1, axis] - sensor_position[axis]
+    for axis in range(boxes.shape[2]):
+        low = boxes[tile, 0, axis] - sensor_position[axis]
+        high = boxes[tile, 1, axis] - sensor_position[axis]
         near += max(max(low, -high), 0.0) ** 2
         far += max(-low, high) ** 2
     return math.sqrt(near), math.sqrt(far)
 
 
 @njit(cache=True, error_model='numpy')
-def _least_square(box, near, far, centre, z0, cartesian, gate):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return a number that q is nowhere below in a tile, but for rounding.
+def _least_square(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    boxes, tile, near, far, centres, m, z0, cartesian, gates
+):
+    """Return a number that q of detection m is nowhere below in a tile, but for rounding.
 
-    Particles of the tile lie in `box`. With u the smallest eigenvalue of the inverse correlation,
+    With u the smallest eigenvalue of the inverse correlation,
     q is at least u times the sum of squared errors over variances; and for angles a and b, and
     distance r from the sensor, the distance s between particle and detection has
     s^2 - (r - z)^2 <= r z (a^2 + b^2).
     """
     apart = 0.0
-    for axis in range(box.shape[1]):
-        low = box[0, axis] - centre[axis]
-        high = centre[axis] - box[1, axis]
+    for axis in range(boxes.shape[2]):
+        low = boxes[tile, 0, axis] - centres[m, axis]
+        high = centres[m, axis] - boxes[tile, 1, axis]
         apart += max(max(low, high), 0.0) ** 2
     if cartesian:
-        return gate[1] * apart
-    square = gate[0] * max(max(near - z0, z0 - far), 0.0) ** 2
+        return gates[m, 1] * apart
+    square = gates[m, 0] * max(max(near - z0, z0 - far), 0.0) ** 2
     if z0 > 0.0 and far > 0.0:
         widest = max(abs(near - z0), abs(far - z0))
-        square += gate[1] * max(apart - widest * widest, 0.0) / (z0 * far)
+        square += gates[m, 1] * max(apart - widest * widest, 0.0) / (z0 * far)
     return square
 
 
@@ -658,10 +660,10 @@ def _fill_bounds(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     lowest = np.full(number, np.inf)
     best = np.full(number, -1)
     for tile in range(tiles):
-        near, far = _distances(boxes[tile], sensor_position)
+        near, far = _distances(boxes, tile, sensor_position)
         for m in range(number):
             lower = _least_square(
-                boxes[tile], near, far, centres[m], values[m, 0], cartesian[m], gates[m]
+                boxes, tile, near, far, centres, m, values[m, 0], cartesian[m], gates
             )
             bounds[m, tile] = lower
             if lower < lowest[m]:
@@ -932,26 +934,39 @@ def _one_group(group, number):  # type: ignore[no-untyped-def]  # pragma: no cov
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
-def _finish(own, group, groups, number, updated, owner):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill updated weights and the group each particle would join; return the sum."""
+def _finish(own, number, factor, updated):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill factors and updated weights; return the sum."""
     total = 0.0
     for i in range(number):
-        updated[i] = own[WEIGHT + i] * own[FACTOR + i]
-        total += updated[i]
+        changed = own[WEIGHT + i] * own[FACTOR + i]
+        factor[i] = own[FACTOR + i]
+        updated[i] = changed
+        total += changed
+    return total
+
+
+@njit(cache=True, error_model='numpy')
+def _join(own, updated, groups, group, number, owner):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the group that each particle would join by itself."""
     for i in range(number):
         joins = own[SHARE + i] > 0.5 * updated[i]
         owner[i] = groups + np.int64(own[COMPONENT + i]) if joins else group[i]
-    return total
+
+
+@njit(cache=True, error_model='numpy')
+def _join_from_one(own, updated, groups, group, number, owner):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill the same where all are of one group."""
+    for i in range(number):
+        joins = own[SHARE + i] > 0.5 * updated[i]
+        owner[i] = groups + np.int64(own[COMPONENT + i]) if joins else group
 
 
 @njit(cache=True, error_model='numpy')
 def _keep(own, number, factor, share, component):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(number):
         factor[i] = own[FACTOR + i]
-    for i in range(number):
         share[i] = own[SHARE + i]
-    for i in range(number):
-        component[i] = np.int64(own[COMPONENT + i])
+        component[i] = own[COMPONENT + i]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -979,7 +994,8 @@ def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
 ):
     """Add psi_z / C(z) to `factor`, and sum moments of W_i(z) = psi_z(x_i) w_i / C(z).
 
-    `share` and `component` keep the largest W_i(z) of each particle, and its z. `moments`
+    `share` and `component` keep, between blocks of detections, the largest W_i(z) of each
+    particle, and its z. `moments`
     (m, 1 + d + d (d + 1) / 2) are taken about `centres`. With the last detections the updated
     weights are filled, and the group that each particle would join by itself.
     """
@@ -1003,9 +1019,10 @@ def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
             share = all_share[start:stop]
             component = all_component[start:stop]
             updated = all_updated[start:stop]
-            for i in range(size):
-                before[i] = all_group[start + i]
-            single = _one_group(before, size)
+            single = _one_group(all_group[start:stop], size)
+            here = all_group[start]
+            if not single:
+                before[:size] = all_group[start:stop]
             if first_detection == 0:
                 _begin(all_probability[start:stop], weights, size, own)
             else:
@@ -1028,19 +1045,35 @@ def _apply_chunks(  # type: ignore[no-untyped-def]  # pragma: no cover - compile
                 taking[takers] = m
                 takers += 1
                 if single:
-                    group_share[chunk, before[0], m] += total
-            _keep(own, size, factor, share, component)
-            if finish:
-                total = _finish(own, before, groups, size, updated, all_owner[start:stop])
+                    group_share[chunk, here, m] += total
+            if not finish:
+                _keep(own, size, factor, share, component)
+            else:
+                total = _finish(own, size, factor, updated)
+                owner = all_owner[start:stop]
                 if single:
-                    group_mass[chunk, before[0]] += total
+                    group_mass[chunk, here] += total
+                    if takers == 0:
+                        owner[:] = here
+                    else:
+                        _join_from_one(own, updated, groups, here, size, owner)
                 else:
+                    _join(own, updated, groups, before, size, owner)
                     for i in range(size):
                         group_mass[chunk, before[i]] += updated[i]
             if not single:
                 for i in range(size):
                     for k in range(takers):
                         group_share[chunk, before[i], taking[k]] += held[k, i]
+
+
+@njit(cache=True, error_model='numpy')
+def _add_chunks(shares, group_share, first):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Add what chunks have of the shares (g, m) of detections from `first` on, in order."""
+    for chunk in range(shares.shape[0]):
+        for g in range(shares.shape[1]):
+            for m in range(shares.shape[2]):
+                group_share[g, first + m] += shares[chunk, g, m]
 
 
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
@@ -1130,15 +1163,20 @@ class Workspace:
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[Any]] = {}
+        self._taken: dict[str, NDArray[Any]] = {}
 
     def take(self, name: str, shape: tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
         """Return an array whose content is arbitrary; the one taken before by that name is void."""
+        taken = self._taken.get(name)
+        if taken is not None and taken.shape == shape:
+            return taken
         size = math.prod(shape)
         array = self._arrays.get(name)
         if array is None or array.size < size:
             array = np.empty(size + size // 4, dtype)
             self._arrays[name] = array
-        return array[:size].reshape(shape)
+        taken = self._taken[name] = array[:size].reshape(shape)
+        return taken
 
     def keep(self, name: str, shape: tuple[int, ...]) -> tuple[FloatArray, bool]:
         """Return an array, and whether it begins with what the one taken before did."""
@@ -1178,10 +1216,6 @@ class Association:
         Share of a detection that the given particles explain, in [0, 1].
     other_scale : (m,) array
         1 / C(z): what an intensity outside the particles is multiplied with for its share.
-    share : (n,) array
-        Largest W_i(z) of each particle over z.
-    component : (n,) array
-        That z, or -1.
     means, covariances : (m, d), (m, d, d) arrays
         Of the particles weighted with W_i(z), metres; covariance 0 where there is no mass.
     group_share : (g, m) array
@@ -1197,8 +1231,6 @@ class Association:
     log_normaliser: FloatArray
     own_mass: FloatArray
     other_scale: FloatArray
-    share: FloatArray
-    component: IntArray
     means: FloatArray
     covariances: FloatArray
     group_share: FloatArray
@@ -1224,8 +1256,10 @@ def _explain(
     likelihood = workspace.take('likelihood', (width, n))
     active = workspace.take('active', (width, chunks * TILES), np.bool_)
     bounds = workspace.take('bounds', (width, chunks * TILES))
-    smallest, sums = np.empty((2, chunks, width))
-    references, log_own = np.empty((2, width))
+    smallest = np.empty((chunks, width))
+    sums = np.empty((chunks, width))
+    references = np.empty(width)
+    log_own = np.empty(width)
     yaw = pose.yaw
     look = (*kernel, math.cos(yaw), math.sin(yaw), probability, pose.position)
     detections = (
@@ -1322,7 +1356,7 @@ def associate(
         other = other(np.concatenate(own))
     factor = workspace.take('factor', (n,))
     share = workspace.take('share', (n,))
-    component = workspace.take('component', (n,), np.int64)
+    component = workspace.take('component', (n,))
     updated = workspace.take('weights', (n,))
     owner = workspace.take('group', (n,), np.int64)
     log_normaliser = np.empty(number)
@@ -1376,8 +1410,7 @@ def associate(
         finish_moments(
             moments, measurements.centres[block], mass[block], means[block], covariances[block]
         )
-        for chunk in range(chunks):
-            group_share[:, block] += shares[chunk]
+        _add_chunks(shares, group_share, block.start)
     taken = np.empty(groups + number, np.int64)
     if _taken(group_mass, group_share, taken):
         run_chunks(lambda c, e: _regroup_chunks(c, e, taken, owner), n, pool)
@@ -1387,8 +1420,6 @@ def associate(
         log_normaliser,
         own_mass,
         other_scale,
-        share,
-        component,
         means,
         covariances,
         group_share,

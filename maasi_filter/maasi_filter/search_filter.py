@@ -711,7 +711,7 @@ class SearchFilter:
         if total == 0:
             return
         self._append(
-            *birth_models.thin_births(born, mass, number, groups, self.generator),
+            *birth_models.thin_births(born, mass, number, total, groups, self.generator),
             self._groups,
         )
 
@@ -879,11 +879,14 @@ class SearchFilter:
     ) -> FloatArray:
         positions = np.array([target.position for target in self.found_targets])
         covariances = np.array([target.covariance for target in self.found_targets])
+        probability = detection.probability(
+            np.concatenate([positions, prepared.centres]), member.pose
+        )
         kappa = found_intensity(
             positions,
             covariances,
-            detection.probability(positions, member.pose),
-            detection.probability(prepared.centres, member.pose),
+            probability[: len(positions)],
+            probability[len(positions) :],
             prepared,
             member.pose,
         )
@@ -892,14 +895,13 @@ class SearchFilter:
     def _refine(self, member: _Member, prepared: MeasurementSet, claims: FloatArray) -> bool:
         """Update found targets with the detections that most probably are theirs."""
         moved = False
-        own = member.pose_error**2 * np.eye(self.dimension)
-        best = claims.argmax(axis=1)
+        best = claims.argmax(axis=1).tolist()
         for f, target in enumerate(self.found_targets):
             # What another robot found is its to refine.
             if target.origin or claims[f, best[f]] <= 0.5:
                 continue
             position, covariance = refine(
-                target.position, self._covariances[f], prepared, int(best[f]), member.pose
+                target.position, self._covariances[f], prepared, best[f], member.pose
             )
             if not (np.isfinite(position).all() and np.isfinite(covariance).all()):
                 continue
@@ -908,7 +910,7 @@ class SearchFilter:
             self.found_targets[f] = FoundTarget(
                 target.id,
                 position,
-                covariance + own,
+                covariance + member.pose_error**2 * np.eye(self.dimension),
                 target.robot,
                 target.measurement,
                 target.time,

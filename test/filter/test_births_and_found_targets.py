@@ -75,7 +75,7 @@ def test_thinned_births_keep_the_mass_and_the_place():
     )
     mass = np.array([0.3, 0.9])
     particles, weights, group = thin_births(
-        births, mass, np.array([300, 900]), 7, np.random.default_rng(0)
+        births, mass, np.array([300, 900]), 1200, 7, np.random.default_rng(0)
     )
     for m in range(2):
         mine = group == 7 + m
