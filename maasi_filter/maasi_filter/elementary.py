@@ -24,8 +24,7 @@ HALF_PI_LOW = 2.02226624879595063154e-21
 LEAST_EXPONENT = -708.0
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _bits_of(context: Any, x: Any) -> Any:  # pragma: no cover - compiled
+def _generate_bits_of(context: Any, x: Any) -> Any:  # pragma: no cover - compiled
     """Return the 64 bits of a float as an integer."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -34,8 +33,10 @@ def _bits_of(context: Any, x: Any) -> Any:  # pragma: no cover - compiled
     return types.int64(types.float64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _float_of(context: Any, bits: Any) -> Any:  # pragma: no cover - compiled
+_bits_of: Any = intrinsic(_generate_bits_of)
+
+
+def _generate_float_of(context: Any, bits: Any) -> Any:  # pragma: no cover - compiled
     """Return the float that has these 64 bits."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -44,8 +45,10 @@ def _float_of(context: Any, bits: Any) -> Any:  # pragma: no cover - compiled
     return types.float64(types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def lesser(context: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
+_float_of: Any = intrinsic(_generate_float_of)
+
+
+def _generate_lesser(context: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
     """Return the smaller of two numbers, in a form that makes a running minimum vectors."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -55,6 +58,9 @@ def lesser(context: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
         return builder.select(smaller, first, second, flags=flags)
 
     return types.float64(types.float64, types.float64), generate
+
+
+lesser: Any = intrinsic(_generate_lesser)
 
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})

@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from maasi_filter import ExponentialDetection, Pose, RangeBearing, RangeBearingElevation
 from maasi_filter.elementary import arctan2, exponential, sines
-from maasi_filter.phd import associate, position_measurements, prepare_measurements
+from maasi_filter.phd import Workspace, associate, position_measurements, prepare_measurements
 
 ORIGIN = Pose([0.0, 0.0, 0.0])
 MODELS = {2: RangeBearing(), 3: RangeBearingElevation()}
@@ -273,7 +273,7 @@ def test_more_detections_than_fit_in_a_block_and_threads_change_nothing():
     alone = associate(positions, weights, probability, prepared, ORIGIN, other)
     with ThreadPoolExecutor(3) as pool:
         together = associate(positions, weights, probability, prepared, ORIGIN, other, pool=pool)
-    for name in ('factor', 'log_normaliser', 'share', 'component', 'means', 'covariances'):
+    for name in ('factor', 'log_normaliser', 'weights', 'group', 'means', 'covariances'):
         np.testing.assert_array_equal(getattr(alone, name), getattr(together, name))
     likelihood = np.exp(MODELS[3].log_density(values, positions, ORIGIN, prepared.covariances[0]))
     expected = dense_update(positions, weights, probability, likelihood, other)
@@ -341,6 +341,26 @@ def test_own_sines_are_the_librarys():
     sines(x, len(x), sine, cosine)
     np.testing.assert_allclose(sine, np.sin(x), rtol=0.0, atol=3e-16)
     np.testing.assert_allclose(cosine, np.cos(x), rtol=0.0, atol=3e-16)
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+@pytest.mark.parametrize('more', [1, 300, 5000])
+def test_particles_that_stay_are_not_looked_at_anew(dimension, more):
+    """What is kept of the particles before births gives the same as all of it anew."""
+    generator = np.random.default_rng(8)
+    kernel = ExponentialDetection(0.9, [10.0] * dimension).kernel()
+    positions = generator.normal(0.0, 10.0, (1000 + more, dimension))
+    weights = np.full(len(positions), 1e-3)
+    values = MODELS[dimension].measure(positions[[5, 900]], ORIGIN)
+    prepared = polar(values, np.diag([0.1, 0.01, 0.01][:dimension]))
+    other = np.full(2, 1e-4)
+    workspace = Workspace()
+    arguments = (kernel, prepared, ORIGIN, other)
+    associate(positions[:1000], weights[:1000], *arguments, workspace=workspace)
+    kept = associate(positions, weights, *arguments, workspace=workspace, known=1000)
+    anew = associate(positions, weights, *arguments)
+    for name in ('factor', 'weights', 'log_normaliser', 'means', 'covariances', 'group'):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(anew, name))
 
 
 def test_own_exponential_is_the_librarys_and_becomes_zero():
