@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -387,6 +388,172 @@ def _centre_sum(
 
 
 @njit(cache=True)
+def _own_products(
+    shared: IntArray,
+    time: IntArray,
+    nodes: FloatArray,
+    values: FloatArray,
+    places: FloatArray,
+    margin: int,
+    dimension: int,
+    kind: int,
+    parameters: FloatArray,
+    count: IntArray,
+    begin: IntArray,
+    rank: IntArray,
+    work: FloatArray,
+    room: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """Multiply entries by what a row of measurements leaves at their nodes, in place (21).
+
+    Entry q is of measurement time[q], which does not decrease; those of one node that follow each
+    other without a gap have the same number shared[q], so that what is left there is multiplied on.
+    Of the measurements at `places` (n, 3) those count that are at least `margin` before an entry's.
+
+    `count` and `begin` (n + 2,), `rank` (8 n,), `work` (4, 8 n) and `room` are scratch.
+    """
+    entries = shared.shape[0]
+    number = places.shape[0]
+    unique = 0
+    for q in range(entries):
+        # The last entry of a node stays.
+        rank[shared[q]] = time[q]
+        unique = max(unique, shared[q] + 1)
+    # Sorted by their last measurement, the nodes that a measurement concerns are one slice.
+    count[: number + 2] = 0
+    for u in range(unique):
+        count[rank[u] + 1] += 1
+    for m in range(number):
+        count[m + 1] += count[m]
+        begin[m] = count[m]
+    for u in range(unique):
+        last = rank[u]
+        rank[u] = count[last]
+        count[last] += 1
+    x, y, z = work[0, :unique], work[1, :unique], work[2, :unique]
+    left = work[3, :unique]
+    left[:] = 1.0
+    for q in range(entries):
+        u = rank[shared[q]]
+        x[u] = nodes[q, 0]
+        y[u] = nodes[q, 1]
+        z[u] = nodes[q, 2]
+    done = 0
+    filled = 0
+    entry = 0
+    for e in range(number + 1):
+        width = 0
+        if e + margin < number:
+            width = unique - begin[e + margin]
+        if width == 0 or filled + width > room.shape[1]:
+            chances = _fill(kind, parameters, filled, room)
+            for m in range(done, e):
+                later = left[begin[m + margin] :]
+                for i in range(later.shape[0]):
+                    later[i] *= 1.0 - chances[i]
+                chances = chances[later.shape[0] :]
+                while entry < entries and time[entry] < m + margin:
+                    entry += 1
+                while entry < entries and time[entry] == m + margin:
+                    values[entry] *= left[rank[shared[entry]]]
+                    entry += 1
+            done = e
+            filled = 0
+        if width == 0:
+            return
+        # Slices: an index that might be negative keeps loops from becoming vector instructions.
+        dx = room[0, filled : filled + width]
+        dy = room[1, filled : filled + width]
+        dz = room[2, filled : filled + width]
+        from_x, from_y, from_z = x[unique - width :], y[unique - width :], z[unique - width :]
+        x0 = places[e, 0]
+        y0 = places[e, 1]
+        z0 = places[e, 2]
+        for i in range(width):
+            dx[i] = from_x[i] - x0
+            dy[i] = from_y[i] - y0
+            dz[i] = from_z[i] - z0 if dimension == 3 else 0.0
+        filled += width
+
+
+@njit(cache=True, error_model='numpy')
+def _cell(position: float, lower: float, step: float, nodes: int) -> tuple[int, float]:
+    """Return the cell of a grid's axis that a position is in, and where in it, 0 to 1."""
+    u = min(max((position - lower) / step, 0.0), nodes - 1.0)
+    cell = min(np.int64(u), nodes - 2)
+    return cell, u - cell
+
+
+@njit(cache=True, error_model='numpy')
+def _nodes_around(
+    w: int,
+    begin: int,
+    places: FloatArray,
+    times: IntArray,
+    first: int,
+    own: IntArray,
+    dimension: int,
+    values: FloatArray,
+    lower: FloatArray,
+    step: FloatArray,
+    entry_value: FloatArray,
+    entry_node: FloatArray,
+    entry_time: IntArray,
+    shared: IntArray,
+    measurement: IntArray,
+    before: IntArray,
+) -> int:  # pragma: no cover - compiled
+    """Fill the nodes around the measurements of a trajectory: weight times e, if above 0.
+
+    `shared` and `measurement` are as in `_own_products`, `before` (2, 8) is scratch. Return how
+    many there are.
+    """
+    number = 0
+    unique = 0
+    depth = 2 if dimension == 3 else 1
+    before[:] = -1
+    ci, cj, ck = np.int64(-9), np.int64(-9), np.int64(0)
+    for m in range(first, own[w]):
+        pi, pj, pk = ci, cj, ck
+        fz = 0.0
+        ci, fx = _cell(places[w, m, 0], lower[0], step[0], values.shape[0])
+        cj, fy = _cell(places[w, m, 1], lower[1], step[1], values.shape[1])
+        if depth == 2:
+            ck, fz = _cell(places[w, m, 2], lower[2], step[2], values.shape[2])
+        time = times[w, m]
+        now = m & 1
+        for i in range(2):
+            x = lower[0] + (ci + i) * step[0]
+            wx = fx if i else 1.0 - fx
+            for j in range(2):
+                y = lower[1] + (cj + j) * step[1]
+                wy = wx * (fy if j else 1.0 - fy)
+                for k in range(depth):
+                    weight = wy * (fz if k else 1.0 - fz) * values[ci + i, cj + j, ck + k]
+                    corner = 4 * i + 2 * j + k
+                    before[now, corner] = -1
+                    if not weight > 0.0:
+                        continue
+                    # The corner of the place before that is the same node, if any; without
+                    # branches, as none could be foretold.
+                    a, b, c = i + ci - pi, j + cj - pj, k + ck - pk
+                    known = before[1 - now, (4 * a + 2 * b + c) & 7]
+                    new = (((a | b | c) & ~1) != 0) | (known < 0)
+                    same = unique if new else known
+                    unique += 1 if new else 0
+                    before[now, corner] = same
+                    shared[number] = same
+                    measurement[number] = m
+                    entry_value[begin + number] = weight
+                    entry_node[begin + number, 0] = x
+                    entry_node[begin + number, 1] = y
+                    entry_node[begin + number, 2] = lower[2] + (ck + k) * step[2]
+                    entry_time[begin + number] = time
+                    number += 1
+    return number
+
+
+@njit(cache=True)
 def _entries(
     times: IntArray,
     places: FloatArray,
@@ -406,84 +573,85 @@ def _entries(
     entry_time: IntArray,
 ) -> int:  # pragma: no cover - compiled
     """Fill the nodes of (22): weight times e times the robot's own product (21), if above 0."""
-    number = 0
-    corners = 4 if dimension == 2 else 8
-    index = np.zeros(3, np.int64)
-    part = np.zeros(3)
-    nodes = np.zeros((8, 3))
-    weights = np.zeros(8)
+    most = 0
+    for w in range(places.shape[0]):
+        most = max(most, own[w])
+    size = (4 if dimension == 2 else 8) * most
+    shared = np.empty(size, np.int64)
+    measurement = np.empty(size, np.int64)
+    before = np.empty((2, 8), np.int64)
     together = _together(kind)
+    number = 0
+    if together:
+        rank = np.empty(size, np.int64)
+        count = np.empty(most + 2, np.int64)
+        begin_at = np.empty(most + 2, np.int64)
+        work = np.empty((4, size))
+        room = np.empty((ROOM_ROWS, max(ROOM, size)))
     for w in range(places.shape[0]):
         begin = number
-        for m in range(first, own[w]):
-            for axis in range(dimension):
-                last = values.shape[axis] - 1
-                u = (places[w, m, axis] - lower[axis]) / step[axis]
-                u = min(max(u, 0.0), float(last))
-                cell = min(int(u), last - 1)
-                index[axis] = cell
-                part[axis] = u - cell
-            kept = 0
-            for corner in range(corners):
-                weight = 1.0
-                i = index[0] + (corner & 1)
-                j = index[1] + ((corner >> 1) & 1)
-                k = index[2] + ((corner >> 2) & 1)
-                for axis in range(dimension):
-                    if (corner >> axis) & 1:
-                        weight *= part[axis]
-                    else:
-                        weight *= 1.0 - part[axis]
-                weight *= values[i, j, k]
-                if weight > 0.0:
-                    weights[kept] = weight
-                    nodes[kept, 0] = lower[0] + i * step[0]
-                    nodes[kept, 1] = lower[1] + j * step[1]
-                    nodes[kept, 2] = lower[2] + k * step[2]
-                    kept += 1
-            before = -1 if together else (m if own_counts else m - 1)
-            # The latest first: with a sharp view it ends the product at once.
-            while before >= 0 and kept > 0:
-                x = places[w, before, 0]
-                y = places[w, before, 1]
-                z = places[w, before, 2] if dimension == 3 else 0.0
-                left = 0.0
-                for corner in range(kept):
-                    weights[corner] *= 1.0 - detection_probability_at(
-                        kind,
-                        parameters,
-                        nodes[corner, 0] - x,
-                        nodes[corner, 1] - y,
-                        (nodes[corner, 2] - z) if dimension == 3 else 0.0,
-                        turns[w, before, 0],
-                        turns[w, before, 1],
-                    )
-                    left += weights[corner]
-                if left <= 0.0:
-                    break
-                before -= 1
-            for corner in range(kept):
-                if weights[corner] > 0.0:
-                    entry_value[number] = weights[corner]
-                    entry_node[number, 0] = nodes[corner, 0]
-                    entry_node[number, 1] = nodes[corner, 1]
-                    entry_node[number, 2] = nodes[corner, 2]
-                    entry_time[number] = times[w, m]
-                    number += 1
-        entry_count[w] = number - begin
+        found = _nodes_around(
+            w,
+            begin,
+            places,
+            times,
+            first,
+            own,
+            dimension,
+            values,
+            lower,
+            step,
+            entry_value,
+            entry_node,
+            entry_time,
+            shared,
+            measurement,
+            before,
+        )
         if together:
-            _see(
-                entry_node[begin:number],
-                entry_time[begin:number],
-                0 if own_counts else 1,
-                times[w, : own[w]],
-                places[w],
-                turns[w],
-                dimension,
-                kind,
-                parameters,
-                entry_value[begin:number],
-            )
+            number += found
+            entry_count[w] = found
+            if found:
+                _own_products(
+                    shared[:found],
+                    measurement[:found],
+                    entry_node[begin:number],
+                    entry_value[begin:number],
+                    places[w, : own[w]],
+                    0 if own_counts else 1,
+                    dimension,
+                    kind,
+                    parameters,
+                    count,
+                    begin_at,
+                    rank,
+                    work,
+                    room,
+                )
+            continue
+        # What is seen already is left out, in place.
+        for q in range(begin, begin + found):
+            m = measurement[q - begin]
+            left = entry_value[q]
+            e = m if own_counts else m - 1
+            # The latest first: with a sharp view it ends the product at once.
+            while e >= 0 and left > 0.0:
+                left *= 1.0 - detection_probability_at(
+                    kind,
+                    parameters,
+                    entry_node[q, 0] - places[w, e, 0],
+                    entry_node[q, 1] - places[w, e, 1],
+                    (entry_node[q, 2] - places[w, e, 2]) if dimension == 3 else 0.0,
+                    turns[w, e, 0],
+                    turns[w, e, 1],
+                )
+                e -= 1
+            if left > 0.0:
+                entry_value[number] = left
+                entry_node[number] = entry_node[q]
+                entry_time[number] = entry_time[q]
+                number += 1
+        entry_count[w] = number - begin
     return number
 
 
@@ -1635,9 +1803,8 @@ def _rows(planned: list[Events]) -> tuple[IntArray, IntArray, FloatArray, FloatA
 
 def _starts(counts: IntArray) -> IntArray:
     """Return where each of several parts begins, one after the other, and where the last ends."""
-    start = np.zeros(len(counts) + 1, np.int64)
-    np.cumsum(counts, out=start[1:])
-    return start
+    # For the few that there are quicker than NumPy's sums.
+    return np.array([0, *accumulate(counts.tolist())], np.int64)
 
 
 def _joined(parts: list, dtype: type) -> NDArray:

@@ -186,8 +186,7 @@ class MotionModel(ABC):
 
     def steps_limit(self, state: RobotState, waypoints: FloatArray, step: float) -> int:
         """Return the steps after which a waypoint counts as out of reach."""
-        offset = waypoints - state.pose.position
-        farthest = math.sqrt(float((offset * offset).sum(axis=1).max())) if len(offset) else 0.0
+        farthest = _farthest(waypoints, state.pose.position)
         around = 0.0
         if len(self.keep_out.circles):
             around = 2.0 * math.pi * float(self.keep_out.circles[:, 3].sum())
@@ -221,7 +220,8 @@ def check_waypoints(waypoints: ArrayLike) -> FloatArray:
     array = np.ascontiguousarray(waypoints, dtype=float)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f'waypoints: got shape {array.shape}, allowed is (W, 3)')
-    if not np.isfinite(array).all():
+    # A sum that is finite saves to look at each number.
+    if not math.isfinite(array.sum()) and not np.isfinite(array).all():
         raise ValueError('waypoints: got a number that is not finite')
     return array
 
@@ -254,15 +254,23 @@ def check_step(step: float) -> float:
 
 
 @njit(cache=True)
-def _pad(
-    positions: FloatArray, yaws: FloatArray, lengths: IntArray, longest: int
-) -> None:  # pragma: no cover - compiled
+def _trim(
+    positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: NDArray[np.bool_]
+) -> int:  # pragma: no cover - compiled
+    """Fill what was reached, cut lengths, extend trajectories; return the longest length."""
+    limit = positions.shape[1] - 1
+    longest = 0
+    for w in range(positions.shape[0]):
+        reached[w] = lengths[w] <= limit
+        lengths[w] = min(lengths[w], limit)
+        longest = max(longest, lengths[w])
     for w in range(positions.shape[0]):
         last = lengths[w]
         for k in range(last + 1, longest + 1):
             for axis in range(3):
                 positions[w, k, axis] = positions[w, last, axis]
             yaws[w, k] = yaws[w, last]
+    return longest
 
 
 def trimmed(out: Trajectories) -> Trajectories:
@@ -270,18 +278,26 @@ def trimmed(out: Trajectories) -> Trajectories:
 
     A length that does not fit marks a waypoint that was not reached.
     """
-    limit = out.positions.shape[1] - 1
-    reached = out.lengths <= limit
-    lengths = np.minimum(out.lengths, limit)
-    longest = int(lengths.max()) if len(lengths) else 0
-    _pad(out.positions, out.yaws, lengths, longest)
+    longest = _trim(out.positions, out.yaws, out.lengths, out.reached)
     return Trajectories(
         out.positions[:, : longest + 1],
         out.yaws[:, : longest + 1],
-        lengths,
+        out.lengths,
         out.control_cost,
-        reached,
+        out.reached,
     )
+
+
+@njit(cache=True)
+def _farthest(points: FloatArray, place: FloatArray) -> float:  # pragma: no cover - compiled
+    """Return the largest distance of points (n, 3) from a place (3,)."""
+    most = 0.0
+    for i in range(points.shape[0]):
+        square = 0.0
+        for axis in range(3):
+            square += (points[i, axis] - place[axis]) ** 2
+        most = max(most, square)
+    return math.sqrt(most)
 
 
 @njit(cache=True)

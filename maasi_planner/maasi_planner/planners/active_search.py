@@ -61,7 +61,7 @@ class Sequences:
             longer = []
             for index, places in kept:
                 following = places[-1] + steps
-                keep = in_bounds(following, team.bounds)
+                keep, _ = in_bounds(following, team.bounds)
                 free = [
                     place
                     for place, inside in zip(following, keep)

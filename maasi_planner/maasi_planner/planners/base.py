@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.clusters import Cluster
@@ -75,6 +76,12 @@ class Planner(ABC):
 
 def finite(*arrays: FloatArray) -> bool:
     """Return whether all numbers in some small arrays are finite."""
+    # A sum that is finite saves to look at each number.
+    total = 0.0
+    for array in arrays:
+        total = sum(array.ravel().tolist(), total)
+    if math.isfinite(total):
+        return True
     return all(all(map(math.isfinite, array.ravel().tolist())) for array in arrays)
 
 
@@ -149,14 +156,34 @@ def state_problem(view: RobotView) -> str | None:
     return None
 
 
-def in_bounds(points: FloatArray, bounds: FloatArray) -> BoolArray:
-    """Return which points (n, 3) lie within the bounds (d, 2), with a little slack."""
-    d = len(bounds)
-    slack = 1e-9 * (1.0 + np.abs(bounds))
-    inside = (points[:, :d] >= bounds[:, 0] - slack[:, 0]) & (
-        points[:, :d] <= bounds[:, 1] + slack[:, 1]
-    )
-    return np.asarray(inside.all(axis=1))
+@njit(cache=True)
+def _in_bounds(
+    points: FloatArray, bounds: FloatArray, out: BoolArray
+) -> int:  # pragma: no cover - compiled
+    """Fill which points are finite and within the bounds; return how many are not finite."""
+    bad = 0
+    for i in range(points.shape[0]):
+        finite = True
+        inside = True
+        for axis in range(points.shape[1]):
+            finite &= math.isfinite(points[i, axis])
+        for axis in range(bounds.shape[0]):
+            lower = bounds[axis, 0]
+            upper = bounds[axis, 1]
+            inside &= points[i, axis] >= lower - 1e-9 * (1.0 + abs(lower))
+            inside &= points[i, axis] <= upper + 1e-9 * (1.0 + abs(upper))
+        out[i] = finite and inside
+        bad += not finite
+    return bad
+
+
+def in_bounds(points: FloatArray, bounds: FloatArray) -> tuple[BoolArray, int]:
+    """Return which points (n, 3) are within the bounds (d, 2), with a little slack.
+
+    And how many are not finite, which are not within.
+    """
+    inside = np.empty(len(points), np.bool_)
+    return inside, _in_bounds(np.ascontiguousarray(points), bounds, inside)
 
 
 def usable_candidates(
@@ -176,18 +203,18 @@ def usable_candidates(
     view = team.robots[name]
     points = np.ascontiguousarray(view.candidates, dtype=float).reshape(-1, 3)
     dropped: list[str] = []
-    if not np.isfinite(points).all():
-        good = np.isfinite(points).all(axis=1)
-        dropped.append(f'{int((~good).sum())} not finite')
-        points = points[good]
-    inside = in_bounds(points, team.bounds)
-    if not inside.all():
-        dropped.append(f'{int((~inside).sum())} outside the bounds')
+    inside, bad = in_bounds(points, team.bounds)
+    out = len(points) - int(np.count_nonzero(inside))
+    if out:
+        if bad:
+            dropped.append(f'{bad} not finite')
+        if out > bad:
+            dropped.append(f'{out - bad} outside the bounds')
         points = points[inside]
     position = view.state.pose.position
     number = len(points)
     if extra is not None and len(extra):
-        points = np.vstack([points, extra[in_bounds(extra, team.bounds)]])
+        points = np.vstack([points, extra[in_bounds(extra, team.bounds)[0]]])
     if len(view.motion.keep_out):
         moved = [view.motion.keep_out.moved_out(position, point) for point in points]
         lost = sum(point is None for point in moved[:number])

@@ -78,9 +78,10 @@ class Intermittent(Planner):
         rows = slice(int(objective.start[index]), int(objective.start[index + 1]))
         terms = objective.given(index, chosen)
         weights = objective.weights
-        gains = weights.alpha * terms[:, 0] + weights.beta * terms[:, 1]
-        possible = objective.joint.allowed[rows]
-        self._prospects[name] = float(gains[possible].max(initial=0.0))
+        if weights.information:
+            gains = weights.alpha * terms[:, 0] + weights.beta * terms[:, 1]
+            possible = objective.joint.allowed[rows]
+            self._prospects[name] = float(gains[possible].max(initial=0.0))
         if chosen[index] < 0:
             result = stay(team.robots[name], 'stays: another robot is sent to every candidate')
             best = -1
