@@ -222,7 +222,9 @@ def test_a_node_that_dies_is_started_again_where_the_scenario_says_so(tmp_path, 
     script = {
         'second/driver': {'trouble': 'die', 'trouble_step': 5, 'marker': str(marker)},
     }
-    run = Run(tmp_path / 'run', scenario(on_exit='respawn'), '--lockstep', script=script)
+    # To start again takes longer than a node may be silent otherwise.
+    path = scenario(on_exit='respawn', limits={'time': 20.0, 'start': 30.0, 'silence': 30.0})
+    run = Run(tmp_path / 'run', path, '--lockstep', script=script)
     code, output = run.wait()
     assert code == 0, output
     assert 'it is started again' in output
