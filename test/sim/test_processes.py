@@ -53,14 +53,20 @@ def started(process):
     return process
 
 
-def test_domains_are_not_shared(tmp_path):
+def test_domains_are_not_shared(tmp_path, monkeypatch):
+    profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+    monkeypatch.delenv(profiles, raising=False)
     with Domain(folder=tmp_path) as first, Domain(folder=tmp_path) as second:
         assert first.number != second.number
         assert 1 <= first.number <= 101
-        assert first.environment() == {
+        variables = first.environment()
+        assert Path(variables.pop(profiles)).exists()
+        assert variables == {
             'ROS_DOMAIN_ID': str(first.number),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         }
+        monkeypatch.setenv(profiles, 'of the user')
+        assert profiles not in first.environment()
 
 
 def test_a_domain_that_was_asked_for_is_given_once(tmp_path):
