@@ -130,7 +130,7 @@ maasi_set_up() {
   if maasi_has_jazzy "$python"; then mode=jazzy; else mode=wheels; fi
   key="$( (cat "$maasi_root"/requirements.txt "$maasi_root"/requirements-build.txt \
     "$maasi_root"/requirements-ros.txt "$maasi_root/scripts/mend_wheels.py"
-    "$python" -c 'import sys; print(sys.version, sys.prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
+    "$python" -c 'import sys; print(sys.version, sys.base_prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
   mkdir -p "$maasi_workspace"
   exec {maasi_lock}> "$maasi_workspace/lock"
   flock "$maasi_lock"
