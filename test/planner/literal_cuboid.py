@@ -11,6 +11,8 @@ import time
 import highspy
 import numpy as np
 
+from maasi_planner.planners.cuboid.problem import TOUCH
+
 BIG = 1000.0
 
 
@@ -243,10 +245,12 @@ class TightProblem(LiteralProblem):
             visits = []
             for k in range(1, T + 1):
                 low, high = self.reach[k].T
-                if (p.cuboids[n, :, 0] <= high).all() and (p.cuboids[n, :, 1] >= low).all():
+                # Where the next step leads is given: a visit on a face counts despite rounding.
+                box = p.cuboids[n] + [-TOUCH, TOUCH] if k == 1 else p.cuboids[n]
+                if (box[:, 0] <= high).all() and (box[:, 1] >= low).all():
                     beta = self.column(0, 1, True, -rewards[k])
                     visits.append(beta)
-                    at_step[k].append((beta, p.cuboids[n]))
+                    at_step[k].append((beta, box))
             if len(visits) > 1:
                 self.row(visits, [1] * len(visits), -np.inf, 1)
         for k, betas in at_step.items():
