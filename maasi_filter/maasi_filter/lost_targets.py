@@ -3,8 +3,8 @@
 A PHD takes each miss for a sign that nothing is there: the mass of a target that was detected falls
 by 1 - pi again and again, although its detection proves that it exists. What is known without
 doubt are the detections. One that no found target explains was caused by a target that is still to
-be found, first seen then: it has the intensity (N0 / V) e(x) pi / (1 - pi) N(z; g(x), R), with e
-the share that all other measurements have left unseen at x.
+be found, first seen then: it has the intensity (N0 / V) e(x) pi N(z; g(x), R), with e the share
+that the measurements without such a detection have left unseen at x.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from setproctitle import setproctitle
 DOMAINS = range(0, 102)
 _FIRST_PORT, _PORTS_PER_DOMAIN = 7400, 250
 _PR_SET_PDEATHSIG = 1
+# Where Fast DDS is told of profiles.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 # Loaded here: between fork and exec there is no safe place for it.
 _libc = ctypes.CDLL(None)
