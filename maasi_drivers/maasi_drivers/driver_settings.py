@@ -86,6 +86,12 @@ class DriverSettings(NodeSettings):
         description="Who drives a ground robot to its waypoints: the driver, or Nav2's "
         'NavigateToPose; not in lockstep',
     )
+    nav2_timeout: float = Field(
+        default=2.0,
+        gt=0.0,
+        description='Longest silence of Nav2 while it has a goal, answer or feedback: then the '
+        'goal is aborted and the robot stopped [s of wall time]',
+    )
     image_source: Literal['topic', 'video', 'feed'] = Field(
         default='topic',
         description='Where images come from: a topic, what `video` names, or blobs that the robot '

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -41,6 +42,9 @@ class Nav2Navigation:
         In the robot's namespace.
     frame : str
         Of the waypoints: Nav2's global frame.
+    timeout : float
+        Longest silence while Nav2 has a goal [s of wall time]: its feedback comes many times a
+        second, whatever the robot does.
     on_end : callable
         Told when Nav2 ended a goal by itself: goal, whether it was reached, and why if not.
 
@@ -50,7 +54,13 @@ class Nav2Navigation:
         If nav2_msgs is not installed.
     """
 
-    def __init__(self, node: Node, frame: str, on_end: Callable[[Goal, bool, str], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        frame: str,
+        timeout: float,
+        on_end: Callable[[Goal, bool, str], None],
+    ) -> None:
         try:
             from nav2_msgs.action import NavigateToPose
         except ImportError as error:
@@ -60,14 +70,16 @@ class Nav2Navigation:
             ) from error
         self._type = NavigateToPose
         self._frame = frame
+        self._timeout = timeout
         self._on_end = on_end
+        self._heard = 0.0
         self._client = ActionClient(node, NavigateToPose, 'navigate_to_pose')
         self._goal: Goal | None = None
         self._handle: Any = None
 
     @property
     def there(self) -> bool:
-        """Whether Nav2 answers."""
+        """Whether there is a Nav2; of one that was killed, DDS notices only after some 20 s."""
         return bool(self._client.server_is_ready())
 
     @property
@@ -75,18 +87,34 @@ class Nav2Navigation:
         """Whether it has a goal of ours."""
         return self._goal is not None
 
+    def problem(self) -> str | None:
+        """Return what is wrong with Nav2 while it drives; None if nothing is."""
+        if not self.driving:
+            return None
+        if not self.there:
+            return 'Nav2 is gone'
+        silence = time.monotonic() - self._heard
+        if silence > self._timeout:
+            return f'Nav2 has said nothing for {silence:.1f} s'
+        return None
+
     def go(self, goal: Goal, heading: float) -> None:
         """Send the robot to a waypoint, to face `heading` there [rad]; the goal before is over."""
         self._goal, self._handle = goal, None
+        self._heard = time.monotonic()
         pose = PoseStamped()
         pose.header.frame_id = self._frame
         pose.pose.position = point_to_ros([goal.waypoint[0], goal.waypoint[1], 0.0])
         pose.pose.orientation.z = float(np.sin(0.5 * heading))
         pose.pose.orientation.w = float(np.cos(0.5 * heading))
-        future = self._client.send_goal_async(self._type.Goal(pose=pose))
+        future = self._client.send_goal_async(self._type.Goal(pose=pose), self._on_feedback)
         future.add_done_callback(lambda answer: self._answered(goal, answer.result()))
 
+    def _on_feedback(self, _: Any) -> None:
+        self._heard = time.monotonic()
+
     def _answered(self, goal: Goal, handle: Any) -> None:
+        self._heard = time.monotonic()
         if handle is None or not handle.accepted:
             self._ended(goal, False, 'Nav2 refuses the waypoint')
             return
@@ -156,7 +184,9 @@ class TurtlebotDriver(CameraDriver):
         # The goal on the way, the least distance that was left to it, and when that was.
         self._nearest: tuple[Goal, float, int] | None = None
         if self.settings.navigation == 'nav2':
-            self._nav2 = Nav2Navigation(self, self.settings.frame, self._nav2_ended)
+            self._nav2 = Nav2Navigation(
+                self, self.settings.frame, self.settings.nav2_timeout, self._nav2_ended
+            )
 
     def make_motion(self) -> MotionModel:
         """Return the controller, which sees the scan where there is one."""
@@ -320,8 +350,8 @@ class TurtlebotDriver(CameraDriver):
     def watch_robot(self) -> None:
         """Look after the link, and after Nav2."""
         super().watch_robot()
-        if self._nav2 is not None and self._nav2.driving and not self._nav2.there:
-            self._end_goal(GoalStatus.ABORTED, 'Nav2 is gone')
+        if self._nav2 is not None and (problem := self._nav2.problem()):
+            self._end_goal(GoalStatus.ABORTED, problem)
             self.hold_robot()
 
 

@@ -1,6 +1,8 @@
 """
 Plays Nav2's `navigate_to_pose`, and prints a line for each goal and what becomes of it.
 
+As Nav2 does, it gives feedback all the time that it has a goal.
+
 A goal with x below 0.5 is reached, one below 1 goes on until it is cancelled, one below 1.5 is
 given up with an error, one beyond is refused.
 """
@@ -28,6 +30,7 @@ def execute(handle):
     say('goal', pose)
     x = pose.pose.position.x
     while 0.5 <= x < 1.0 and not handle.is_cancel_requested:
+        handle.publish_feedback(NavigateToPose.Feedback())
         time.sleep(0.02)
     if handle.is_cancel_requested:
         handle.canceled()
