@@ -23,6 +23,11 @@ LEAST_MISS = 0.02
 LARGEST_ANGLE = 0.25
 # Squared normalised innovation beyond which a detection is of something else.
 LARGEST_INNOVATION = 25.0
+# Gauss and Hermite's rule for the standard normal distribution.
+NODES, NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
+NODE_WEIGHTS = NODE_WEIGHTS / NODE_WEIGHTS.sum()
+# Smallest share of a likelihood that is taken in at a time.
+LEAST_SHARE = 1e-3
 # A share of the bound that a covariance may lack without being widened.
 LEAST_LACK = 0.05
 
@@ -489,14 +494,101 @@ def _intensity(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 
 
 @njit(cache=True, error_model='numpy')
+def _match_moments(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    position, covariance, sensor_position, z, cartesian, centre, information, out, out_covariance
+):
+    """Update one target with one detection by quadrature of its Gaussian times the likelihood.
+
+    The likelihood comes in by shares, powers of it, none of which takes more than half of the
+    nodes out. Return whether it was done: not for what is no measurement of it.
+    """
+    d = position.shape[0]
+    number = len(NODES) ** d
+    nodes = np.empty((number, d))
+    prior = np.empty(number)
+    fit = np.empty(number)
+    weight = np.empty(number)
+    error = np.empty(d)
+    jacobian = np.empty((d, d))
+    root = np.empty((d, d))
+    for a in range(d):
+        out[a] = position[a]
+        for b in range(d):
+            out_covariance[a, b] = covariance[a, b]
+    left = 1.0
+    while left > 0.0:
+        _root(out_covariance, root)
+        best = -math.inf
+        for i in range(number):
+            prior[i] = 1.0
+            for a in range(d):
+                nodes[i, a] = out[a]
+            rest = i
+            for b in range(d):
+                prior[i] *= NODE_WEIGHTS[rest % len(NODES)]
+                for a in range(b, d):
+                    nodes[i, a] += root[a, b] * NODES[rest % len(NODES)]
+                rest //= len(NODES)
+            _predict(nodes[i], sensor_position, z, cartesian, centre, error, jacobian)
+            square = 0.0
+            for a in range(d):
+                for b in range(d):
+                    square += error[a] * information[a, b] * error[b]
+            fit[i] = -0.5 * square
+            best = max(best, fit[i])
+        share = left
+        total = 0.0
+        while True:
+            total = 0.0
+            squares = 0.0
+            for i in range(number):
+                likelihood = math.exp(share * (fit[i] - best))
+                weight[i] = prior[i] * likelihood
+                total += weight[i]
+                squares += weight[i] * likelihood
+            if total * total >= 0.5 * squares or share < LEAST_SHARE:
+                break
+            share *= 0.5
+        left = left - share
+        for a in range(d):
+            out[a] = 0.0
+            for i in range(number):
+                out[a] += weight[i] * nodes[i, a] / total
+        for a in range(d):
+            for b in range(d):
+                out_covariance[a, b] = 0.0
+                for i in range(number):
+                    offset = (nodes[i, a] - out[a]) * (nodes[i, b] - out[b])
+                    out_covariance[a, b] += weight[i] * offset / total
+    # In a linear model this is the squared innovation.
+    _predict(out, sensor_position, z, cartesian, centre, error, jacobian)
+    _invert(covariance, root)
+    square = 0.0
+    for a in range(d):
+        for b in range(d):
+            square += error[a] * information[a, b] * error[b]
+            square += (out[a] - position[a]) * root[a, b] * (out[b] - position[b])
+    return square <= LARGEST_INNOVATION
+
+
+@njit(cache=True, error_model='numpy')
 def _update(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    position, covariance, sensor_position, z, cartesian, centre, root, out, out_covariance
+    position,
+    covariance,
+    sensor_position,
+    z,
+    cartesian,
+    centre,
+    root,
+    information,
+    out,
+    out_covariance,
 ):
     """Update one target with one detection; an iterated extended Kalman filter.
 
-    Return whether it was done: not where the measurement is far from linear over the target's
-    uncertainty, next to the robot or straight above or below it, nor for what is no measurement
-    of it.
+    Where the measurement is far from linear over the target's uncertainty, next to the robot or
+    straight above or below it, moments are matched instead. Return whether it was done: not for
+    what is no measurement of it.
     """
     d = position.shape[0]
     if not cartesian:
@@ -507,7 +599,17 @@ def _update(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
         for a in range(d):
             trace += covariance[a, a]
         if trace > LARGEST_ANGLE * LARGEST_ANGLE * level:
-            return False
+            return _match_moments(
+                position,
+                covariance,
+                sensor_position,
+                z,
+                cartesian,
+                centre,
+                information,
+                out,
+                out_covariance,
+            )
     error = np.empty(d)
     jacobian = np.empty((d, d))
     noise = np.empty((d, d))
@@ -666,6 +768,7 @@ def refine(
         measurements.cartesian[index],
         measurements.centres[index],
         measurements.roots[index],
+        measurements.information[index],
         new_position,
         new_covariance,
     )
