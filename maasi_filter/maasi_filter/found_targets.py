@@ -23,6 +23,10 @@ LEAST_MISS = 0.02
 LARGEST_ANGLE = 0.25
 # Squared normalised innovation beyond which a detection is of something else.
 LARGEST_INNOVATION = 25.0
+# Squared deviations that a target may be from where its detections have told that it is.
+LARGEST_SHIFT = 16.0
+# Of a place that is taken for certain, 1 / m^2.
+UNLIMITED_INFORMATION = 1e12
 # Gauss and Hermite's rule for the standard normal distribution.
 NODES, NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
 NODE_WEIGHTS = NODE_WEIGHTS / NODE_WEIGHTS.sum()
@@ -121,9 +125,13 @@ def _noise(roots, out):  # type: ignore[no-untyped-def]  # pragma: no cover - co
 
 
 @njit(cache=True, error_model='numpy')
-def _inherit(group_share, own_mass, information):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add, in place, to each new group's information that of the group it mostly comes from."""
+def _inherit(group_share, own_mass, information, places):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add, in place, to each new group's information that of the group it mostly comes from.
+
+    Not where it lies so far from that one's place that the information is of another target.
+    """
     groups, number = group_share.shape
+    d = places.shape[1]
     for m in range(number):
         if groups == 0 or not own_mass[m] > 0.5:
             continue
@@ -131,12 +139,22 @@ def _inherit(group_share, own_mass, information):  # type: ignore[no-untyped-def
         for g in range(1, groups):
             if group_share[g, m] > group_share[source, m]:
                 source = g
-        information[groups + m] += information[source]
+        square = 0.0
+        for a in range(d):
+            for b in range(d):
+                square += (
+                    (places[groups + m, a] - places[source, a])
+                    * information[source, a, b]
+                    * (places[groups + m, b] - places[source, b])
+                )
+        if square <= LARGEST_SHIFT or information[source, 0, 0] >= UNLIMITED_INFORMATION:
+            information[groups + m] += information[source]
 
 
 @njit(cache=True, error_model='numpy')
 def _extend(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     known,
+    known_places,
     positions,
     sensor_position,
     values,
@@ -146,47 +164,55 @@ def _extend(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     group_share,
     own_mass,
     out,
+    places,
 ):
-    """Fill the information of groups and of detections."""
+    """Fill information and places of groups and of detections."""
     number, d = positions.shape
     groups = known.shape[0]
     for g in range(groups):
         for a in range(d):
+            places[g, a] = known_places[g, a]
             for b in range(d):
                 out[g, a, b] = known[g, a, b]
     error = np.empty(d)
     jacobian = np.empty((d, d))
     for m in range(number):
-        _predict(
-            positions[m], sensor_position, values[m], cartesian[m], centres[m], error, jacobian
-        )
+        # Particles that explain little are no place of what else does.
+        place = positions[m] if own_mass[m] > 0.5 else centres[m]
+        _predict(place, sensor_position, values[m], cartesian[m], centres[m], error, jacobian)
         for a in range(d):
+            places[groups + m, a] = place[a]
             for b in range(d):
                 total = 0.0
                 for i in range(d):
                     for j in range(d):
                         total += jacobian[i, a] * information[m, i, j] * jacobian[j, b]
                 out[groups + m, a, b] = total
-    _inherit(group_share, own_mass, out)
+    _inherit(group_share, own_mass, out, places)
 
 
 def extended_information(
     information: FloatArray,
+    places: FloatArray,
     positions: FloatArray,
     group_share: FloatArray,
     own_mass: FloatArray,
     measurements: MeasurementSet,
     pose: Pose,
-) -> FloatArray:
-    """Return the information (g + m, d, d) of groups and of the m groups of detections.
+) -> tuple[FloatArray, FloatArray]:
+    """Return information (g + m, d, d) and places (g + m, d) of groups and m detections' groups.
 
     A detection tells H^T R^-1 H, with H at `positions`. Where particles mostly explain it, what
-    was known of the group that they mostly are of is added.
+    was known of the group that they mostly are of is added, unless that speaks against the place:
+    a few stray particles of a group may stand for another target, of which its detections tell
+    nothing.
 
     Parameters
     ----------
     information : (g, d, d) array
         Of the groups there were, 1 / m^2.
+    places : (g, d) array
+        Where they were when their last detections were taken in, metres.
     positions : (m, d) array
         Means of what the detections explain, metres.
     group_share : (g, m) array
@@ -196,8 +222,10 @@ def extended_information(
     """
     groups, d = information.shape[:2]
     out = np.empty((groups + len(measurements), d, d))
+    new_places = np.empty((groups + len(measurements), d))
     _extend(
         information,
+        places,
         positions,
         pose.position,
         measurements.values,
@@ -207,8 +235,9 @@ def extended_information(
         group_share,
         own_mass,
         out,
+        new_places,
     )
-    return out
+    return out, new_places
 
 
 @njit(cache=True, error_model='numpy')

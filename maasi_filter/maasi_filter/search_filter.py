@@ -22,6 +22,7 @@ from maasi_filter.detection_model import (
 )
 from maasi_filter.exploration import Exploration, check_bounds
 from maasi_filter.found_targets import (
+    UNLIMITED_INFORMATION,
     FoundTarget,
     exclusive,
     extended_information,
@@ -80,7 +81,6 @@ SAME_TARGET = 16.0
 LEAST_BIRTHS = 20
 # Draws of a birth where particles explain the detection.
 LEAST_DRAWS = 32
-UNLIMITED_INFORMATION = 1e12
 # Births that explain less of a detection than this are not worth their particles.
 LEAST_BIRTH_MASS = 1e-3
 
@@ -216,6 +216,7 @@ class SearchFilter:
         self._groups = 0
         # What the detections that a group explains tell about where it is.
         self._information: FloatArray = np.empty((0, self.dimension, self.dimension))
+        self._places: FloatArray = np.empty((0, self.dimension))
         self._covariances: list[FloatArray] = []
         self._centres: FloatArray | None = None
         self._predicted: FloatArray | None = None
@@ -278,6 +279,7 @@ class SearchFilter:
         # What they are known from is not known, so nothing is held against their spread.
         self._information = np.zeros((self._groups, self.dimension, self.dimension))
         self._information[:] = UNLIMITED_INFORMATION * np.eye(self.dimension)
+        self._places = np.zeros((self._groups, self.dimension))
 
     # The state in a file.
 
@@ -299,6 +301,7 @@ class SearchFilter:
             'group': self._group,
             'groups': np.array(self._groups),
             'information': self._information,
+            'places': self._places,
             'centres': np.empty((0, d)) if self._centres is None else self._centres,
             'robots': text(json.dumps([target.robot for target in targets])),
             'found_ids': np.array([target.id for target in targets], np.int64),
@@ -342,6 +345,7 @@ class SearchFilter:
             search._group = state['group']
             search._groups = int(state['groups'])
             search._information = state['information']
+            search._places = state['places']
             search._centres = state['centres'] if len(state['centres']) else None
             search._covariances = list(state['own_covariances'])
             search.found_targets = [
@@ -580,6 +584,7 @@ class SearchFilter:
         self._group = group.astype(np.int64).reshape(-1)
         self._groups = len(present)
         self._information = self._information[present]
+        self._places = self._places[present]
 
     def _checked(self, measurement: AgentMeasurement) -> _Member:
         """Return a measurement whose arrays fit, its detections in a fixed order."""
@@ -685,6 +690,7 @@ class SearchFilter:
             )
         if self._groups == 0:
             self._information = np.zeros((1, self.dimension, self.dimension))
+            self._places = np.zeros((1, self.dimension))
         self._append(particles, weights, np.zeros(len(particles), np.int64), max(self._groups, 1))
 
     def _append(
@@ -801,8 +807,9 @@ class SearchFilter:
         self.weights = update.weights
         self._group = update.group
         self._groups = groups + count
-        self._information = extended_information(
+        self._information, self._places = extended_information(
             self._information,
+            self._places,
             update.means,
             update.group_share,
             update.own_mass,
@@ -1004,6 +1011,7 @@ class SearchFilter:
             self._group = np.empty(0, np.int64)
             self._groups = 0
             self._information = np.empty((0, self.dimension, self.dimension))
+            self._places = np.empty((0, self.dimension))
             self._expected = 0.0
             return
         assert numbers.particles_per_target is not None and numbers.particles_minimum is not None
@@ -1017,6 +1025,7 @@ class SearchFilter:
         group = groups_of(starts, pool)
         self._groups = len(starts) - 1
         self._information = self._information[present]
+        self._places = self._places[present]
         weights = np.full(number, expected / number)
         mass, means, covariances = group_moments(particles, weights, group, self._groups, pool)
         # Resampling leaves few ancestors where the noise is narrow; their spread is no posterior.
