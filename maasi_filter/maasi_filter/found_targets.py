@@ -28,10 +28,10 @@ LARGEST_SHIFT = 16.0
 # Of a place that is taken for certain, 1 / m^2.
 UNLIMITED_INFORMATION = 1e12
 # Gauss and Hermite's rule for the standard normal distribution.
-NODES, NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
+NODES, NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(4)
 NODE_WEIGHTS = NODE_WEIGHTS / NODE_WEIGHTS.sum()
-# Smallest share of a likelihood that is taken in at a time.
-LEAST_SHARE = 1e-3
+# Smallest share of a likelihood that is taken in at a time; with less, nodes are too far apart.
+LEAST_SHARE = 1.0 / 64.0
 # A share of the bound that a covariance may lack without being widened.
 LEAST_LACK = 0.05
 
@@ -529,7 +529,8 @@ def _match_moments(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     """Update one target with one detection by quadrature of its Gaussian times the likelihood.
 
     The likelihood comes in by shares, powers of it, none of which takes more than half of the
-    nodes out. Return whether it was done: not for what is no measurement of it.
+    nodes out. Return whether it was done: not for what is no measurement of it, nor where the
+    noise is so much narrower than the Gaussian that its nodes miss the likelihood.
     """
     d = position.shape[0]
     number = len(NODES) ** d
@@ -575,9 +576,11 @@ def _match_moments(  # type: ignore[no-untyped-def]  # pragma: no cover - compil
                 weight[i] = prior[i] * likelihood
                 total += weight[i]
                 squares += weight[i] * likelihood
-            if total * total >= 0.5 * squares or share < LEAST_SHARE:
+            if total * total >= 0.5 * squares:
                 break
             share *= 0.5
+            if share < LEAST_SHARE:
+                return False
         left = left - share
         for a in range(d):
             out[a] = 0.0
@@ -616,8 +619,8 @@ def _update(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Update one target with one detection; an iterated extended Kalman filter.
 
     Where the measurement is far from linear over the target's uncertainty, next to the robot or
-    straight above or below it, moments are matched instead. Return whether it was done: not for
-    what is no measurement of it.
+    straight above or below it, moments are matched instead, if the noise is wide enough for it.
+    Return whether it was done: not for what is no measurement of it.
     """
     d = position.shape[0]
     if not cartesian:

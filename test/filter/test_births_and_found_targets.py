@@ -13,7 +13,14 @@ from maasi_filter import (
 )
 from maasi_filter.births import gaussian_births, measurement_births, thin_births, uniform_births
 from maasi_filter.clusters import group_clusters, kmeans, kmeans_clusters
-from maasi_filter.found_targets import exclusive, found_intensity, refine, remove_measurements
+from maasi_filter.found_targets import (
+    exclusive,
+    extended_information,
+    found_intensity,
+    refine,
+    remove_measurements,
+)
+from maasi_filter.metrics import normalised_error
 from maasi_filter.phd import prepare_measurements
 
 POSE = Pose.from_yaw([40.0, 50.0, 45.0], 0.3)
@@ -153,14 +160,75 @@ def test_refinement_is_a_kalman_update_where_the_model_is_straight(dimension):
     np.testing.assert_allclose(new, position + gain @ np.full(dimension, 0.01), atol=1e-5)
 
 
-def test_refinement_leaves_targets_next_to_the_robot_and_strangers_alone():
-    near = POSE.position + np.array([0.5, 0.0, 0.0])
+@pytest.mark.parametrize('dimension', [2, 3])
+@pytest.mark.parametrize('offset', [(4.0, 3.0, 4.0), (5.0, -2.0, 0.0)])
+def test_refinement_next_to_the_robot_has_the_moments_of_the_posterior(dimension, offset):
+    """Against many draws with the likelihood as weight."""
+    model = MODELS[dimension]
+    position = POSE.position[:dimension] + np.array(offset[:dimension])
+    root = np.array([[1.2, 0.0, 0.0], [0.6, 1.0, 0.0], [-0.3, 0.4, 1.5]])[:dimension, :dimension]
+    truth = position + root @ np.array([0.8, -0.5, 0.6][:dimension])
+    z = model.measure(truth[None], POSE) + 0.1
+    new, spread = refine(position, root @ root.T, prepared(z, dimension), 0, POSE)
+    draws = np.random.default_rng(0).normal(size=(400_000, dimension))
+    draws = position + draws @ root.T
+    weights = np.exp(model.log_density(z[0], draws, POSE, NOISE[dimension]))
+    mean = np.average(draws, axis=0, weights=weights)
+    covariance = np.cov(draws.T, aweights=weights)
+    assert normalised_error(new - mean, covariance) < 0.3**2
+    np.testing.assert_allclose(spread, covariance, atol=0.15 * np.trace(covariance))
+
+
+def test_refinement_leaves_strangers_alone():
     spread = np.eye(3)
-    z = MODELS[3].measure(near[None], POSE)
-    assert refine(near, spread, prepared(z, 3), 0, POSE)[0] is near
     far = POSE.position + np.array([40.0, 0.0, 0.0])
-    stranger = prepared([[70.0, 1.0, 0.0]], 3)
-    assert refine(far, spread, stranger, 0, POSE)[0] is far
+    assert refine(far, spread, prepared([[70.0, 1.0, 0.0]], 3), 0, POSE)[0] is far
+    near = POSE.position + np.array([3.0, 0.0, 0.0])
+    assert refine(near, spread, prepared([[15.0, 1.0, 0.0]], 3), 0, POSE)[0] is near
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_a_detection_adds_to_what_is_known_of_its_target_and_of_no_other(dimension):
+    model = MODELS[dimension]
+    here = POSE.position[:dimension] + np.array([40.0, 10.0, 5.0][:dimension])
+    known = np.eye(dimension)[None]
+    for shift, inherits in ((3.0, True), (5.0, False)):
+        place = here + np.array([0.0, shift, 0.0][:dimension])
+        z = model.measure(place[None], POSE)
+        information, places = extended_information(
+            known,
+            here[None],
+            place[None],
+            np.array([[0.9]]),
+            np.array([0.9]),
+            prepared(z, dimension),
+            POSE,
+        )
+        jacobian = model.jacobian(place[None], POSE)[0]
+        own = jacobian.T @ np.linalg.inv(NOISE[dimension]) @ jacobian
+        np.testing.assert_allclose(information[1], own + inherits * known[0], atol=1e-9)
+        np.testing.assert_array_equal(information[0], known[0])
+        np.testing.assert_allclose(places, [here, place])
+
+
+def test_what_few_particles_explain_is_placed_by_its_detection():
+    model = MODELS[3]
+    place = POSE.position + np.array([40.0, 10.0, 5.0])
+    z = model.measure(place[None], POSE)
+    information, places = extended_information(
+        np.zeros((0, 3, 3)),
+        np.zeros((0, 3)),
+        POSE.position[None] - 100.0,
+        np.zeros((0, 1)),
+        np.array([0.01]),
+        prepared(z, 3),
+        POSE,
+    )
+    jacobian = model.jacobian(place[None], POSE)[0]
+    np.testing.assert_allclose(places, place[None])
+    np.testing.assert_allclose(
+        information[0], jacobian.T @ np.linalg.inv(NOISE[3]) @ jacobian, atol=1e-9
+    )
 
 
 def test_papers_remove_the_closest_and_003_every_detection():

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from searches import DEGREES, RADIANS, follow_one_target
+from searches import DEGREES, RADIANS, cube_sensor, follow_one_target
 
-from maasi_filter.found_targets import bounded_below, missing_spread
+from maasi_filter import Pose
+from maasi_filter.found_targets import bounded_below, missing_spread, refine
 from maasi_filter.metrics import normalised_error
+from maasi_filter.phd import prepare_measurements
 
 TARGETS = 200
 
@@ -60,6 +62,35 @@ def test_errors_of_the_position_that_the_robot_tells_of_do_not_make_it_bold():
         ]
         total = sum(normalised_error(*states[1]) for states, _ in runs)
         assert (total < upper) == told
+
+
+@pytest.mark.parametrize(('noise', 'gain'), [(DEGREES, 1.0), (RADIANS, 2.0)])
+def test_nees_of_targets_refined_from_nearby_is_within_its_chi_square_bounds(noise, gain):
+    """Five detections each from within some metres, where no measurement is near linear.
+
+    Errors become `gain` times smaller at least; those of narrow noise may be left as they are.
+    """
+    generator = np.random.default_rng(3)
+    sensor = cube_sensor(noise)
+    before = after = total = 0.0
+    for _ in range(TARGETS):
+        position = 130.0 + generator.normal(size=3)
+        root = np.diag([0.8, 1.2, 1.8])
+        covariance = root @ root.T
+        target = position + root @ generator.normal(size=3)
+        before += ((position - target) ** 2).sum()
+        for _ in range(5):
+            pose = Pose(target + generator.uniform(-5.0, 5.0, 3))
+            z = sensor.measurement.measure(target[None], pose)
+            z += generator.multivariate_normal(np.zeros(3), sensor.covariance)
+            z[0, 0] = max(z[0, 0], 1e-6)
+            seen = prepare_measurements(z, sensor.covariance[None], pose)
+            position, covariance = refine(position, covariance, seen, 0, pose)
+        total += normalised_error(position - target, covariance)
+        after += ((position - target) ** 2).sum()
+    lower, upper = chi2.ppf([0.005, 0.995], 3 * TARGETS)
+    assert lower < total < upper
+    assert after * gain**2 < before
 
 
 def test_a_covariance_is_widened_to_the_bound_and_no_further():
