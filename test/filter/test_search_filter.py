@@ -452,3 +452,27 @@ def test_a_covariance_of_the_position_that_is_none_is_refused(wrong):
     with pytest.raises(ValueError, match='drone: position_covariance'):
         search.step([drone(values, position_covariance=wrong)], 1, 0.0)
     assert len(search.particles) == 0
+
+
+def test_a_stray_particle_does_not_pass_for_another_target():
+    """Where a lone particle explains a detection, its group's detections are another target's."""
+    search = cube_search()
+    sensor = cube_sensor(RADIANS)
+    here = np.array([130.0, 130.0, 100.0])
+    other = np.array([130.0, 230.0, 160.0])
+    noise = np.random.default_rng(1)
+    # All around is seen, so that births explain next to nothing.
+    search.exploration.values[...] = 0.0
+    particles = np.vstack([here + noise.normal(size=(2000, 3)), other])
+    search.restore_particles(particles, np.full(2001, 5e-4))
+    search._information[0] = np.eye(3)
+    search._places[0] = here
+    pose = Pose([180.0, 230.0, 165.0])
+    values = sensor.measurement.measure(other[None] + 3.0, pose)
+    result = search.step([drone(values, pose.position, sensor=sensor)], 1, 0.0)
+    assert result.newly_found == []
+    heavy = [cluster for cluster in result.clusters if cluster.mass > 0.5]
+    near = min(heavy, key=lambda cluster: np.linalg.norm(cluster.position - other))
+    assert np.linalg.norm(near.position - other) < 10.0
+    # All that is known is the detection, whose angles are good to 9 and 15 m there.
+    assert near.radius > 10.0
