@@ -471,8 +471,5 @@ def test_a_stray_particle_does_not_pass_for_another_target():
     values = sensor.measurement.measure(other[None] + 3.0, pose)
     result = search.step([drone(values, pose.position, sensor=sensor)], 1, 0.0)
     assert result.newly_found == []
-    heavy = [cluster for cluster in result.clusters if cluster.mass > 0.5]
-    near = min(heavy, key=lambda cluster: np.linalg.norm(cluster.position - other))
-    assert np.linalg.norm(near.position - other) < 10.0
-    # All that is known is the detection, whose angles are good to 9 and 15 m there.
-    assert near.radius > 10.0
+    # All that is known of it is the detection, whose angles are good to 9 and 15 m there.
+    assert max(cluster.radius for cluster in result.clusters) > 15.0
