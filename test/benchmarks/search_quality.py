@@ -183,7 +183,8 @@ Whole searches of the scenario `{options.scenario}` in one process, for seeds
 measurements, or when its planner sees nothing left to gain; `to the cap` are the same searches
 with a planner that goes on. (A PHD holds a target that is missed again and again for gone, by
 1 - pi each time; the filter goes on to show where it may be, from the detections that no found
-target explains. A planner can still end early where a target is found too far from its true
+target explains. A planner can still end early: an environment explored to 99.9 % hides one of
+twelve targets about once in a hundred searches, and a target may be found too far from its true
 place.) Written by
 
     {command}
