@@ -19,22 +19,25 @@ from numpy.typing import NDArray
 from maasi_filter.births import LEAST_UNEXPLORED, _draw
 from maasi_filter.clusters import Cluster, group_clusters
 from maasi_filter.detection_model import DetectionModel
+from maasi_filter.elementary import arctan2
 from maasi_filter.exploration import Exploration
 from maasi_filter.found_targets import (
     LARGEST_INNOVATION,
     LEAST_MISS,
     LEAST_PROBABILITY,
-    _predict,
     exclusive,
     found_intensity,
 )
+from maasi_filter.measurement_model import TWO_PI, wrap
 from maasi_filter.phd import MeasurementSet
 from maasi_filter.pose import Pose
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-# Scans that may wait before they are looked through for what is explained by now.
+# Scans that may come in before all are looked through for what is explained by now.
 MOST_WAITING = 256
+# Detections that are looked at together; the time for it grows with the square.
+MOST_DETECTIONS = 256
 # Nodes of the quadrature over the noise: of range and of each angle.
 RANGE_NODES = 3
 ANGLE_NODES = 5
@@ -51,35 +54,150 @@ class _Scan:
 
 
 @njit(cache=True, error_model='numpy')
-def _see_again(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    points, unseen, scan, sensor_positions, values, cartesian, centres, information, miss
-):
-    """Undo, in place, what scans left of `unseen` where one of their detections may come from."""
-    d = points.shape[1]
-    error = np.empty(d)
-    jacobian = np.empty((d, d))
+def _as_seen(points, sensor_position, distance, bearing, elevation):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill range and angles of places (n, d) from a robot."""
+    solid = points.shape[1] == 3
     for i in range(points.shape[0]):
-        done = -1
-        for m in range(values.shape[0]):
-            if scan[m] == done:
-                continue
-            _predict(
-                points[i],
-                sensor_positions[m],
-                values[m],
-                cartesian[m],
-                centres[m],
-                error,
-                jacobian,
-            )
+        x = points[i, 0] - sensor_position[0]
+        y = points[i, 1] - sensor_position[1]
+        z = points[i, 2] - sensor_position[2] if solid else 0.0
+        level = math.sqrt(x * x + y * y)
+        distance[i] = math.sqrt(level * level + z * z)
+        bearing[i] = arctan2(y, x)
+        elevation[i] = arctan2(z, level)
+
+
+@njit(cache=True, error_model='numpy')
+def _fill_hits(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    points, starts, sensor_positions, values, cartesian, centres, information, reaches, near, hits
+):
+    """Fill which places (m, n, d) of detections other detections (m,) may come from, too.
+
+    `near` (m, m) tells where there may be any, `hits` (m, m, n) which; arbitrary where there are
+    none. Scans begin at `starts`.
+    """
+    number, nodes, d = points.shape
+    distance = np.empty(nodes)
+    bearing = np.empty(nodes)
+    elevation = np.empty(nodes)
+    middle = np.zeros(3)
+    z = np.zeros(3)
+    apart = np.zeros(3)
+    inverse = np.zeros((3, 3))
+    for m in range(number):
+        radius = 0.0
+        for a in range(d):
+            middle[a] = points[m, :, a].mean()
+        for i in range(nodes):
             square = 0.0
             for a in range(d):
-                for b in range(d):
-                    square += error[a] * information[m, a, b] * error[b]
-            if square < LARGEST_INNOVATION:
-                unseen[i] /= miss[m]
-                done = scan[m]
-        unseen[i] = min(unseen[i], 1.0)
+                square += (points[m, i, a] - middle[a]) ** 2
+            radius = max(radius, math.sqrt(square))
+        for scan in range(starts.shape[0] - 1):
+            sensor = sensor_positions[scan]
+            square = 0.0
+            for a in range(d):
+                square += (middle[a] - sensor[a]) ** 2
+            away = math.sqrt(square)
+            looked = False
+            for other in range(starts[scan], starts[scan + 1]):
+                # An error of the range alone may be too much, whatever the angles.
+                near[m, other] = abs(away - values[other, 0]) <= reaches[other] + radius
+                if not near[m, other]:
+                    continue
+                inverse[:d, :d] = information[other]
+                row = hits[m, other]
+                if cartesian[other]:
+                    for i in range(nodes):
+                        for a in range(d):
+                            apart[a] = points[m, i, a] - centres[other, a]
+                        square = 0.0
+                        for a in range(d):
+                            for b in range(d):
+                                square += apart[a] * inverse[a, b] * apart[b]
+                        row[i] = square < LARGEST_INNOVATION
+                    continue
+                if not looked:
+                    _as_seen(points[m], sensor, distance, bearing, elevation)
+                    looked = True
+                z[:d] = values[other]
+                z[1] = wrap(z[1])
+                for i in range(nodes):
+                    e0 = z[0] - distance[i]
+                    e1 = z[1] - bearing[i]
+                    e1 = e1 - TWO_PI if e1 >= math.pi else e1
+                    e1 = e1 + TWO_PI if e1 < -math.pi else e1
+                    e2 = z[2] - elevation[i]
+                    square = e0 * e0 * inverse[0, 0] + e1 * e1 * inverse[1, 1]
+                    square += 2.0 * e0 * e1 * inverse[0, 1] + e2 * e2 * inverse[2, 2]
+                    square += 2.0 * e2 * (e0 * inverse[0, 2] + e1 * inverse[1, 2])
+                    row[i] = square < LARGEST_INNOVATION
+
+
+@njit(cache=True, error_model='numpy')
+def _weigh(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    kept,
+    points,
+    factors,
+    unseen_now,
+    near,
+    hits,
+    scan,
+    miss,
+    explained,
+    least_unexplored,
+    mass,
+    means,
+    covariances,
+):
+    """Fill mass, mean and covariance of the target of each detection that is kept.
+
+    What the scans of the kept ones left unseen is undone where one of their detections may come
+    from.
+    """
+    nodes, d = points.shape[1:]
+    born = np.empty(nodes)
+    done = np.empty(nodes, np.int64)
+    for m in kept:
+        born[:] = unseen_now[m]
+        done[:] = -1
+        for other in kept:
+            if not near[m, other]:
+                continue
+            here = scan[other]
+            more = 1.0 / miss[other]
+            row = hits[m, other]
+            for i in range(nodes):
+                again = row[i] and done[i] != here
+                born[i] *= more if again else 1.0
+                done[i] = here if again else done[i]
+        total = 0.0
+        # A detection may be false, too, as births have it.
+        false = 0.0
+        for i in range(nodes):
+            born[i] = factors[m, i] * min(born[i], 1.0)
+            total += born[i]
+            false += factors[m, i] * least_unexplored
+        mass[m] = 0.0
+        if total <= 0.0:
+            continue
+        mass[m] = total / (total + explained[m] + false)
+        for a in range(d):
+            means[m, a] = 0.0
+            for i in range(nodes):
+                means[m, a] += born[i] / total * points[m, i, a]
+        for a in range(d):
+            for b in range(a + 1):
+                value = 0.0
+                for i in range(nodes):
+                    value += (
+                        born[i]
+                        / total
+                        * (points[m, i, a] - means[m, a])
+                        * (points[m, i, b] - means[m, b])
+                    )
+                covariances[m, a, b] = value
+                covariances[m, b, a] = value
 
 
 def _quadrature(dimension: int) -> tuple[FloatArray, FloatArray]:
@@ -97,6 +215,8 @@ def _quadrature(dimension: int) -> tuple[FloatArray, FloatArray]:
 
 class LostTargets:
     """Detections that no found target explains yet, and where their targets may be.
+
+    Where more than 256 of them wait, the oldest are forgotten.
 
     Parameters
     ----------
@@ -188,19 +308,22 @@ class LostTargets:
             ],
             shares,
         )
-        while self._scans:
-            mass, means, spreads = self._look(shares, exploration)
-            keep = mass >= self.least_mass
-            if keep.all():
-                # Several detections may be of the same target.
-                groups = group_clusters(mass, means, spreads, self.least_mass, least_distance)
-                return [
-                    Cluster(item.position, item.covariance, item.radius, min(item.mass, 1.0))
-                    for item in groups
-                ]
-            ends = np.cumsum([len(scan.measurements) for scan in self._scans])[:-1]
-            self._keep(np.split(keep, ends), shares)
-        return []
+        self._forget_oldest(shares)
+        if not self._scans:
+            return []
+        kept, mass, means, spreads = self._look(np.concatenate(shares), exploration)
+        keep = np.zeros(len(mass), np.bool_)
+        keep[kept] = True
+        ends = np.cumsum([len(scan.measurements) for scan in self._scans])[:-1]
+        self._keep(np.split(keep, ends), shares)
+        # Several detections may be of the same target.
+        groups = group_clusters(
+            mass[kept], means[kept], spreads[kept], self.least_mass, least_distance
+        )
+        return [
+            Cluster(item.position, item.covariance, item.radius, min(item.mass, 1.0))
+            for item in groups
+        ]
 
     def _keep(self, keep: list[NDArray[np.bool_]], shares: list[FloatArray]) -> None:
         """Forget detections, in `shares`, too."""
@@ -219,76 +342,93 @@ class LostTargets:
             scans.append(scan)
         self._scans = scans
         shares[:] = [shares[index] for index in kept]
-        self._room = 2 * len(scans) + MOST_WAITING
+        self._room = len(scans) + MOST_WAITING
+
+    def _forget_oldest(self, shares: list[FloatArray]) -> None:
+        """Forget the oldest scans where there are more detections than can be looked at."""
+        number = 0
+        for index in reversed(range(len(self._scans))):
+            number += len(self._scans[index].measurements)
+            # The latest scan is looked at however large it is.
+            if number > MOST_DETECTIONS and index < len(self._scans) - 1:
+                del self._scans[: index + 1], shares[: index + 1]
+                return
 
     def _look(
-        self, shares: list[FloatArray], exploration: Exploration
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return mass, mean and covariance of the target of each detection that is left."""
+        self, explained: FloatArray, exploration: Exploration
+    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+        """Return which detections still may be of lost targets, and mass, mean and covariance."""
         sets = [scan.measurements for scan in self._scans]
         joined = _joined(sets)
         counts = [len(item) for item in sets]
         scan = np.repeat(np.arange(len(sets)), counts)
-        sensors = np.repeat(np.stack([item.position for item in self._scans]), counts, axis=0)
         probability = np.concatenate([item.probability for item in self._scans])
-        miss = np.maximum(1.0 - probability, LEAST_MISS)
-        explained = np.concatenate(shares)
         d = self.dimension
         number = len(joined)
-        mass = np.zeros(number)
-        means = np.zeros((number, d))
-        covariances = np.zeros((number, d, d))
-        for m in range(number):
-            one = np.zeros(number, np.bool_)
-            one[m] = True
-            points, size = self._points(_chosen(joined, one), sensors[m], exploration.bounds)
-            unseen = exploration.at(points)
-            _see_again(
+        nodes = len(self._nodes)
+        places = [self._places(item, exploration.bounds) for item in self._scans]
+        points = np.concatenate([points for points, _ in places])
+        sizes = np.concatenate([size for _, size in places])
+        reaches = np.sqrt(LARGEST_INNOVATION * joined.covariances[:, 0, 0])
+        near = np.empty((number, number), np.bool_)
+        hits = np.empty((number, number, nodes), np.bool_)
+        _fill_hits(
+            points,
+            np.concatenate([[0], np.cumsum(counts)]),
+            np.stack([item.position for item in self._scans]),
+            joined.values,
+            joined.cartesian,
+            joined.centres,
+            joined.information,
+            np.where(joined.cartesian, np.inf, reaches),
+            near,
+            hits,
+        )
+        mass = np.empty(number)
+        means = np.empty((number, d))
+        covariances = np.empty((number, d, d))
+        kept = np.arange(number)
+        while True:
+            _weigh(
+                kept,
                 points,
-                unseen,
+                self.intensity * probability[:, None] * self._weights * sizes,
+                exploration.at(points.reshape(-1, d)).reshape(number, nodes),
+                near,
+                hits,
                 scan,
-                sensors,
-                joined.values,
-                joined.cartesian,
-                joined.centres,
-                joined.information,
-                miss,
+                np.maximum(1.0 - probability, LEAST_MISS),
+                explained,
+                LEAST_UNEXPLORED,
+                mass,
+                means,
+                covariances,
             )
-            factor = self.intensity * probability[m] * self._weights * size
-            born = factor * unseen
-            total = float(born.sum())
-            if total <= 0.0:
-                continue
-            # A detection may be false, too, as births have it.
-            false = LEAST_UNEXPLORED * float(factor.sum())
-            mass[m] = total / (total + float(explained[m]) + false)
-            means[m] = born @ points / total
-            offset = points - means[m]
-            covariances[m] = (born[:, None] * offset).T @ offset / total
-        return mass, means, covariances
+            keep = mass[kept] >= self.least_mass
+            if keep.all():
+                return kept, mass, means, covariances
+            kept = kept[keep]
 
-    def _points(
-        self, measurement: MeasurementSet, sensor: FloatArray, bounds: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return places (n, d) that a detection may come from, and |dx/dz|, 0 out of bounds."""
-        number = len(self._nodes)
-        points = np.empty((number, self.dimension))
-        size = np.empty(number)
+    def _places(self, scan: _Scan, bounds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return places (m, n, d) that detections may come from, and |dx/dz|, 0 out of bounds."""
+        number, nodes = len(scan.measurements), len(self._nodes)
+        points = np.empty((number * nodes, self.dimension))
+        size = np.empty(number * nodes)
         _draw(
-            measurement.values,
-            measurement.cartesian,
-            measurement.centres,
-            measurement.roots,
-            measurement.volume,
-            sensor,
+            scan.measurements.values,
+            scan.measurements.cartesian,
+            scan.measurements.centres,
+            scan.measurements.roots,
+            scan.measurements.volume,
+            scan.position,
             bounds,
-            self._nodes,
-            np.array([0, number]),
+            np.tile(self._nodes, (number, 1)),
+            nodes * np.arange(number + 1),
             points,
             size,
-            np.empty(1, np.bool_),
+            np.empty(number, np.bool_),
         )
-        return points, size
+        return points.reshape(number, nodes, -1), size.reshape(number, nodes)
 
     # The state as arrays.
 

@@ -223,13 +223,7 @@ class SearchFilter:
         self._birth_budget = 0
         self._moments: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._expected: float | None = None
-        # Only detections that last for good prove that there is a target.
-        self._lost: LostTargets | None = None
-        if self._numbers.extraction == 'measurement' and self._numbers.survival_probability == 1.0:
-            assert self._numbers.expected_targets is not None
-            self._lost = LostTargets(
-                self.dimension, self._numbers.expected_targets / self.volume, LEAST_CLUSTER_MASS
-            )
+        self._lost = self._nothing_lost()
         self._workspace = Workspace()
         # How many particles are the same as at the last update of the present step.
         self._arranged = 0
@@ -240,10 +234,20 @@ class SearchFilter:
         """Expected number of targets in the intensity, the mass of the particles."""
         return total_weight(self.weights)
 
+    def _nothing_lost(self) -> LostTargets | None:
+        """Return no lost targets; None where there never are any."""
+        numbers = self._numbers
+        # Only detections that last for good prove that there is a target.
+        if numbers.extraction != 'measurement' or numbers.survival_probability != 1.0:
+            return None
+        assert numbers.expected_targets is not None
+        intensity = numbers.expected_targets / self.volume
+        return LostTargets(self.dimension, intensity, LEAST_CLUSTER_MASS)
+
     def restore_particles(
         self, particles: ArrayLike, weights: ArrayLike, group: ArrayLike | None = None
     ) -> None:
-        """Put other particles in place of the present ones.
+        """Put other particles in place of the present ones; detections so far are forgotten.
 
         Parameters
         ----------
@@ -280,6 +284,7 @@ class SearchFilter:
         self._information = np.zeros((self._groups, self.dimension, self.dimension))
         self._information[:] = UNLIMITED_INFORMATION * np.eye(self.dimension)
         self._places = np.zeros((self._groups, self.dimension))
+        self._lost = self._nothing_lost()
 
     # The state in a file.
 

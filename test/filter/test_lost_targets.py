@@ -16,7 +16,7 @@ from maasi_filter import (
     SearchFilter,
 )
 from maasi_filter.births import LEAST_UNEXPLORED
-from maasi_filter.lost_targets import LostTargets
+from maasi_filter.lost_targets import MOST_DETECTIONS, LostTargets
 from maasi_filter.phd import prepare_measurements
 
 FLOOR = np.array([[0.0, 100.0]] * 2)
@@ -160,3 +160,20 @@ def test_detections_do_not_pile_up_while_there_are_potential_targets():
             values = far
         search.step([AgentMeasurement('drone', pose, sensor, values, None, step)], 1, step)
     assert len(search._lost) < 500
+
+
+def test_where_too_many_detections_wait_the_oldest_are_forgotten():
+    exploration = Exploration(FLOOR, 5.0)
+    lost = lost_targets()
+    places = np.random.default_rng(0).uniform(5.0, 95.0, (MOST_DETECTIONS + 40, 2))
+    for place in places:
+        pose = Pose([*(place - [3.0, 0.0]), 0.0])
+        values = RangeBearing().measure(place[None], pose)
+        seen = prepare_measurements(values, NOISE[None], pose)
+        lost.add(seen, np.ones(1, bool), pose, DETECTION, 0.0)
+    before = lost.arrays()
+    assert len(lost.clusters(*NOBODY, exploration, 1.0)) > 10
+    after = lost.arrays()
+    assert len(after['lost_values']) == MOST_DETECTIONS
+    np.testing.assert_array_equal(after['lost_values'], before['lost_values'][40:])
+    np.testing.assert_array_equal(after['lost_positions'], before['lost_positions'][40:])
