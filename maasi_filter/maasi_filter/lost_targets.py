@@ -233,11 +233,12 @@ class LostTargets:
         self.intensity = intensity
         self.least_mass = least_mass
         self._scans: list[_Scan] = []
+        self._new: list[tuple[MeasurementSet, Pose, DetectionModel, float]] = []
         self._room = MOST_WAITING
         self._nodes, self._weights = _quadrature(dimension)
 
     def __len__(self) -> int:
-        return len(self._scans)
+        return len(self._scans) + len(self._new)
 
     def add(
         self,
@@ -258,15 +259,21 @@ class LostTargets:
         """
         if not used.all():
             measurements = _chosen(measurements, used)
-        probability = np.maximum(
-            detection.probability(measurements.centres, pose), LEAST_PROBABILITY
-        )
-        self._scans.append(_Scan(measurements, pose.position.copy(), probability, clutter))
+        # Most steps never ask for them, so pi is not worked out before.
+        self._new.append((measurements, pose, detection, clutter))
+
+    def _take_new(self) -> None:
+        for measurements, pose, detection, clutter in self._new:
+            probability = np.maximum(
+                detection.probability(measurements.centres, pose), LEAST_PROBABILITY
+            )
+            self._scans.append(_Scan(measurements, pose.position, probability, clutter))
+        self._new.clear()
 
     @property
     def crowded(self) -> bool:
         """Whether so many detections wait that those explained by now are to be forgotten."""
-        return len(self._scans) > self._room
+        return len(self) > self._room
 
     def clusters(
         self,
@@ -286,6 +293,7 @@ class LostTargets:
         least_distance : float
             Nearer ones are one, metres.
         """
+        self._take_new()
         shares = []
         for scan in self._scans:
             kappa = found_intensity(
@@ -434,6 +442,7 @@ class LostTargets:
 
     def arrays(self) -> dict[str, NDArray]:
         """Return the state, for a file."""
+        self._take_new()
         d = self.dimension
         sets = [scan.measurements for scan in self._scans]
         joined = _joined(sets) if sets else _nothing(d)
@@ -455,6 +464,7 @@ class LostTargets:
         ends = np.cumsum(state['lost_scans'])
         self._room = int(state['lost_room'])
         self._scans = []
+        self._new.clear()
         for index, (count, end) in enumerate(zip(state['lost_scans'], ends)):
             part = slice(int(end - count), int(end))
             self._scans.append(
