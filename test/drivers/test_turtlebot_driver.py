@@ -333,7 +333,7 @@ def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, contex
     team.until(lambda: not said.empty())
     assert said.get()['event'] == 'cancelled'
     team.until(lambda: len(team.commands) >= known + 3)
-    assert_array_equal([numbers(item) for item in team.commands[known:]], np.zeros((3, 4)))
+    assert not np.any([numbers(item) for item in team.commands[known:]])
     guard.destroy_node()
 
 
