@@ -109,10 +109,12 @@ class Intermittent(Planner):
         wanted = self.settings.cluster_candidates
         if wanted is None:
             wanted = self.settings.objective == 'information'
+        if not wanted:
+            return None
         heavy = [
             cluster for cluster in team.clusters if cluster.mass >= self.settings.mass_threshold
         ]
-        if not wanted or not heavy:
+        if not heavy:
             return None
         view = team.robots[name]
         centres = np.zeros((len(heavy), 3))
