@@ -17,6 +17,9 @@ CommandType = Literal['auto', 'stamped', 'twist']
 LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mavlink']
 # A driver that is silent for so long is dead to its guard [s].
 LIVELINESS_LEASE = 0.5
+# The same in lockstep, where robots stand still until their drivers answer: a busy machine may keep
+# a driver waiting, and zeros in between would make the run another one [s].
+LOCKSTEP_LEASE = 20.0
 
 
 class ScanSettings(Settings):

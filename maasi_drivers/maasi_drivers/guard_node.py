@@ -12,7 +12,7 @@ from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from maasi_drivers.command_publisher import CommandPublisher
-from maasi_drivers.driver_settings import LIVELINESS_LEASE, GuardSettings
+from maasi_drivers.driver_settings import LIVELINESS_LEASE, LOCKSTEP_LEASE, GuardSettings
 from maasi_filter.search_node import SearchNode, run
 from maasi_msgs.msg import AgentState
 
@@ -54,11 +54,12 @@ class GuardNode(SearchNode[GuardSettings]):
         )
         self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
         self._look_timer = self.create_wall_timer(_LOOK_PERIOD, self._publisher.look)
+        lease = LOCKSTEP_LEASE if self.settings.lockstep else LIVELINESS_LEASE
         quality = QoSProfile(
             depth=1,
             reliability=ReliabilityPolicy.BEST_EFFORT,
             liveliness=LivelinessPolicy.AUTOMATIC,
-            liveliness_lease_duration=Duration(seconds=LIVELINESS_LEASE),
+            liveliness_lease_duration=Duration(seconds=lease),
         )
         # Of the messages only the last one matters, and that only when no other comes.
         self._subscription = self.create_subscription(

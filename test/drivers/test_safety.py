@@ -14,6 +14,7 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist
 from numpy.testing import assert_array_equal
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, image_message, numbers
 from sensor_msgs.msg import BatteryState
 
@@ -282,6 +283,30 @@ def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, t
     team.states.clear()
     team.awaken()
     drive_without_the_guard(team)
+    guard.destroy_node()
+
+
+@pytest.mark.parametrize('lockstep', [False, True])
+def test_in_lockstep_the_guard_waits_for_a_driver_that_is_slow(context, process, team, lockstep):
+    guard = GuardNode(
+        context=context,
+        namespace='/rover',
+        parameter_overrides=[Parameter('lockstep', value=lockstep)],
+    )
+    team.executor_used.add_node(guard)
+    assert guard.trigger_configure().name == 'SUCCESS'
+    assert guard.trigger_activate().name == 'SUCCESS'
+    driver = process()
+    team.connect()
+    team.awaken()
+    team.until(lambda: guard._last and not guard.status()['stopping'])
+    driver.send_signal(signal.SIGSTOP)
+    end = time.monotonic() + 3.0
+    while time.monotonic() < end and not guard.status()['stopping']:
+        team.executor_used.spin_once(timeout_sec=0.05)
+    stopped = guard.status()['stopping']
+    driver.send_signal(signal.SIGCONT)
+    assert stopped != lockstep
     guard.destroy_node()
 
 
