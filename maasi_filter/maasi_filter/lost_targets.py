@@ -353,14 +353,11 @@ class LostTargets:
         self._room = len(scans) + MOST_WAITING
 
     def _forget_oldest(self, shares: list[FloatArray]) -> None:
-        """Forget the oldest scans where there are more detections than can be looked at."""
-        number = 0
-        for index in reversed(range(len(self._scans))):
-            number += len(self._scans[index].measurements)
-            # The latest scan is looked at however large it is.
-            if number > MOST_DETECTIONS and index < len(self._scans) - 1:
-                del self._scans[: index + 1], shares[: index + 1]
-                return
+        """Forget the oldest detections where there are more than can be looked at."""
+        counts = [len(scan.measurements) for scan in self._scans]
+        keep = np.arange(sum(counts)) >= sum(counts) - MOST_DETECTIONS
+        if not keep.all():
+            self._keep(np.split(keep, np.cumsum(counts)[:-1]), shares)
 
     def _look(
         self, explained: FloatArray, exploration: Exploration
@@ -392,6 +389,9 @@ class LostTargets:
             near,
             hits,
         )
+        factors = self.intensity * probability[:, None] * self._weights * sizes
+        unseen = exploration.at(points.reshape(-1, d)).reshape(number, nodes)
+        miss = np.maximum(1.0 - probability, LEAST_MISS)
         mass = np.empty(number)
         means = np.empty((number, d))
         covariances = np.empty((number, d, d))
@@ -400,12 +400,12 @@ class LostTargets:
             _weigh(
                 kept,
                 points,
-                self.intensity * probability[:, None] * self._weights * sizes,
-                exploration.at(points.reshape(-1, d)).reshape(number, nodes),
+                factors,
+                unseen,
                 near,
                 hits,
                 scan,
-                np.maximum(1.0 - probability, LEAST_MISS),
+                miss,
                 explained,
                 LEAST_UNEXPLORED,
                 mass,

@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, CameraInfo, Image
 
 from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.guard_node import GuardNode
 from maasi_drivers.mambo_driver import MamboDriver
 from maasi_drivers.projection import Camera
 from maasi_drivers.ranging_driver import RangingDriver
@@ -76,6 +77,19 @@ KINDS = {
     'mambo': (MamboDriver, MAMBO),
     'ranging': (RangingDriver, RANGING),
 }
+
+
+def start_guard(context, team, lockstep=False):
+    """Return the active guard of the team's robot."""
+    guard = GuardNode(
+        context=context,
+        namespace='/rover',
+        parameter_overrides=[Parameter('lockstep', value=lockstep)],
+    )
+    team.executor_used.add_node(guard)
+    assert guard.trigger_configure().name == 'SUCCESS'
+    assert guard.trigger_activate().name == 'SUCCESS'
+    return guard
 
 
 class Team(Node):

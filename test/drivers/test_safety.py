@@ -14,13 +14,12 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist
 from numpy.testing import assert_array_equal
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, image_message, numbers
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, image_message, numbers, start_guard
 from sensor_msgs.msg import BatteryState
 
 from maasi_drivers.agent_driver import _WATCH_PERIOD
 from maasi_drivers.driver_settings import LIVELINESS_LEASE, DriverSettings
-from maasi_drivers.guard_node import _STOP_PERIOD, GuardNode
+from maasi_drivers.guard_node import _STOP_PERIOD
 from maasi_filter.conversions import stamp_to_ros
 from maasi_msgs.msg import AgentState
 
@@ -250,7 +249,7 @@ def test_it_is_said_that_nobody_listens(context, process, capfd):
 
 
 def drive_without_the_guard(team):
-    """Drive until the guard says nothing: a busy machine may leave it without the driver's life."""
+    """Drive until the guard is silent: on a busy machine it may miss the driver for a while."""
     for _ in range(10):
         known = len(team.commands)
         team.move(20)
@@ -261,10 +260,7 @@ def drive_without_the_guard(team):
 
 
 def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, team):
-    guard = GuardNode(context=context, namespace='/rover')
-    team.executor_used.add_node(guard)
-    assert guard.trigger_configure().name == 'SUCCESS'
-    assert guard.trigger_activate().name == 'SUCCESS'
+    guard = start_guard(context, team)
     driver = process()
     team.connect()
     team.awaken()
@@ -288,14 +284,7 @@ def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, t
 
 @pytest.mark.parametrize('lockstep', [False, True])
 def test_in_lockstep_the_guard_waits_for_a_driver_that_is_slow(context, process, team, lockstep):
-    guard = GuardNode(
-        context=context,
-        namespace='/rover',
-        parameter_overrides=[Parameter('lockstep', value=lockstep)],
-    )
-    team.executor_used.add_node(guard)
-    assert guard.trigger_configure().name == 'SUCCESS'
-    assert guard.trigger_activate().name == 'SUCCESS'
+    guard = start_guard(context, team, lockstep)
     driver = process()
     team.connect()
     team.awaken()

@@ -15,11 +15,10 @@ import pytest
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_allclose, assert_array_equal
 from rclpy.executors import SingleThreadedExecutor
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers, start_guard
 from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.driver_settings import DriverSettings
-from maasi_drivers.guard_node import GuardNode
 from maasi_filter.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.qos import RELIABLE
 from maasi_filter.search_node import SettingsError
@@ -313,10 +312,7 @@ def test_nav2_drives_to_the_waypoints(driven):
 
 def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, context):
     team, said, _, driver = driven
-    guard = GuardNode(context=context, namespace='/rover')
-    team.executor_used.add_node(guard)
-    assert guard.trigger_configure().name == 'SUCCESS'
-    assert guard.trigger_activate().name == 'SUCCESS'
+    guard = start_guard(context, team)
     send_first(team, [0.7, 0.8, 0.0])
     heard(team, said, 'goal')
     # No odometry.

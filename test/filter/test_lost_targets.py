@@ -177,3 +177,15 @@ def test_where_too_many_detections_wait_the_oldest_are_forgotten():
     assert len(after['lost_values']) == MOST_DETECTIONS
     np.testing.assert_array_equal(after['lost_values'], before['lost_values'][40:])
     np.testing.assert_array_equal(after['lost_positions'], before['lost_positions'][40:])
+
+
+def test_of_a_scan_with_too_many_detections_some_are_looked_at():
+    exploration = Exploration(FLOOR, 5.0)
+    lost = lost_targets()
+    pose = Pose([50.0, 50.0, 0.0])
+    targets = np.random.default_rng(0).uniform(5.0, 95.0, (1000, 2))
+    values = RangeBearing().measure(targets, pose)
+    seen = prepare_measurements(values, np.stack([NOISE] * 1000), pose)
+    lost.add(seen, np.ones(1000, bool), pose, DETECTION, 0.0)
+    assert lost.clusters(*NOBODY, exploration, 1.0)
+    assert len(lost.arrays()['lost_values']) <= MOST_DETECTIONS
