@@ -75,6 +75,11 @@ maasi_install_tests() {
   echo "$key" > "$maasi_venv/.maasi_tests_key"
 }
 
+# The wheels have no tf2_msgs; one that is installed is used as it is.
+maasi_own_interfaces() {
+  "$maasi_venv/bin/python" -c 'import tf2_msgs.msg' 2> /dev/null || echo scripts/interfaces/tf2_msgs
+}
+
 maasi_build() {
   local key="$1" log="$maasi_workspace/build.log"
   command -v c++ > /dev/null || command -v g++ > /dev/null || command -v clang++ > /dev/null \
@@ -85,8 +90,10 @@ maasi_build() {
   if ! (
     cd "$maasi_root" || exit 1
     export COLCON_LOG_PATH="$maasi_workspace/log"
+    # shellcheck disable=SC2046
     "$maasi_venv/bin/python" -m colcon build --symlink-install \
       --base-paths maasi_msgs maasi_filter maasi_planner maasi_drivers maasi_sim config \
+      $(maasi_own_interfaces) \
       --build-base "$maasi_workspace/build" --install-base "$maasi_workspace/install" \
       --cmake-args "-DPython3_EXECUTABLE=$maasi_venv/bin/python" -DBUILD_TESTING=OFF \
       --no-warn-unused-cli
@@ -101,7 +108,7 @@ maasi_build() {
 maasi_build_key() {
   (
     cd "$maasi_root" || exit 1
-    find maasi_msgs maasi_*/setup.* maasi_*/package.xml config/setup.* config/package.xml \
+    find maasi_msgs scripts/interfaces maasi_*/setup.* maasi_*/package.xml config/setup.* config/package.xml \
       -type f -print0 | sort -z | xargs -0 sha256sum
     find maasi_*/launch config -type f -not -path "*__pycache__*" | sort
     echo "$1"

@@ -27,7 +27,7 @@ from maasi_filter.metrics import (
     restricted_mean,
 )
 from maasi_filter.pose import Pose, compose, inverse
-from maasi_filter.search_filter import AgentMeasurement, FilterResult, SearchFilter, warm_up
+from maasi_filter.search_filter import AgentMeasurement, FilterResult, SearchFilter
 from maasi_filter.sensor import Sensor
 from maasi_filter.settings import (
     DetectionSettings,
@@ -37,6 +37,7 @@ from maasi_filter.settings import (
     SensorSettings,
 )
 from maasi_filter.state_file import StateFileError
+from maasi_filter.warm_up import warm_up
 
 __all__ = [
     'AgentMeasurement',

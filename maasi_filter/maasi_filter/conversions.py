@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -26,6 +27,15 @@ from maasi_msgs.msg import FoundTarget as FoundTargetMessage
 
 FloatArray = NDArray[np.float64]
 
+#: Detections of one message that are used at most, the first ones. A step's time grows with their
+#: number; no sensor of a search sees so many targets at once.
+MOST_DETECTIONS = 200
+
+#: Coordinates beyond this are no place [m]: the circumference of the Earth.
+FARTHEST = 4e7
+#: Speeds beyond this are none of a robot [m/s, rad/s].
+FASTEST = 1e5
+
 # Relative, for what is called symmetric and positive.
 _ROUNDING = 1e-9
 
@@ -44,6 +54,21 @@ def stamp_from_ros(stamp: Time) -> int:
 def stamp_of_step(step: int, duration: float) -> int:
     """Return the time of a step of `duration` seconds in nanoseconds."""
     return round(step * duration * 1e9)
+
+
+def bounded(name: str, values: Iterable[float], limit: float) -> None:
+    """Refuse numbers that are not finite or so large that the arithmetic with them fails.
+
+    Raises
+    ------
+    ValueError
+        The message names `name`.
+    """
+    # Not so for NaN either.
+    if not all(abs(value) <= limit for value in values):
+        raise ValueError(
+            f'{name}: got {list(values)}, allowed are finite numbers up to {limit:g} in magnitude'
+        )
 
 
 def point_to_ros(position: Sequence[float] | FloatArray) -> Point:
@@ -71,9 +96,13 @@ def pose_from_ros(message: PoseMessage) -> Pose:
     Raises
     ------
     ValueError
-        If a number is not finite or the quaternion is zero.
+        If a number is not finite, the quaternion is zero, or the position is farther away than any
+        on Earth.
     """
     turn = message.orientation
+    place = message.position
+    bounded('position', (place.x, place.y, place.z), FARTHEST)
+    bounded('orientation', (turn.w, turn.x, turn.y, turn.z), 1e6)
     return Pose(point_from_ros(message.position), np.array([turn.w, turn.x, turn.y, turn.z]))
 
 
@@ -101,7 +130,19 @@ def cluster_to_ros(cluster: Cluster) -> ClusterMessage:
 
 
 def cluster_from_ros(message: ClusterMessage, dimension: int) -> Cluster:
-    """Return a cluster."""
+    """Return a cluster.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or absurdly large, or the mass is negative.
+    """
+    place = message.position
+    bounded('clusters: position', (place.x, place.y, place.z), FARTHEST)
+    bounded('clusters: covariance', message.covariance, FARTHEST**2)
+    bounded('clusters: radius, mass', (message.radius, message.mass), FARTHEST)
+    if message.mass < 0.0:
+        raise ValueError(f'clusters: mass: read {message.mass}, allowed is from 0')
     return Cluster(
         position=point_from_ros(message.position)[:dimension],
         covariance=covariance_from_ros(message.covariance, dimension),
@@ -184,10 +225,48 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
     return None
 
 
+def _usable(
+    detections: Sequence[Detection], dimension: int
+) -> tuple[list[Detection], dict[str, Counter[str]]]:
+    """Return the detections that are used; of the others reasons, texts and how many."""
+    kept: list[Detection] = []
+    problems: dict[str, Counter[str]] = {}
+
+    def leave_out(reason: str, text: str, number: int = 1) -> None:
+        problems.setdefault(reason, Counter())[text] += number
+
+    seen: set[tuple[float, ...]] = set()
+    for index, detection in enumerate(detections):
+        if len(kept) == MOST_DETECTIONS:
+            leave_out(
+                'too many detections',
+                f'detections: read {len(detections)}, allowed are {MOST_DETECTIONS} that can be '
+                'used',
+                len(detections) - index,
+            )
+            break
+        problem = detection_problem(detection, dimension)
+        if problem is not None:
+            leave_out('bad detection', f'detections[{index}].{problem}')
+            continue
+        key = (detection.range, detection.bearing, detection.elevation)
+        if key in seen:
+            leave_out(
+                'equal detection', f'detections[{index}]: read {key}, allowed is each one once'
+            )
+            continue
+        seen.add(key)
+        kept.append(detection)
+    return kept, problems
+
+
 def measurement_from_ros(
     message: DetectionArray, sensor: Sensor, dimension: int
-) -> tuple[AgentMeasurement, list[str]]:
+) -> tuple[AgentMeasurement, dict[str, Counter[str]]]:
     """Return what a robot measured, and what is wrong with the detections left out.
+
+    Detections that cannot be used, those that are equal to one before, and those beyond
+    `MOST_DETECTIONS` are left out: reason to texts and their numbers.
 
     Raises
     ------
@@ -198,14 +277,7 @@ def measurement_from_ros(
     position_covariance = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
     if not np.isfinite(position_covariance).all():
         raise ValueError(f'pose.covariance: read {position_covariance.tolist()}, allowed is finite')
-    problems = []
-    kept: list[Detection] = []
-    for index, detection in enumerate(message.detections):
-        problem = detection_problem(detection, dimension)
-        if problem is None:
-            kept.append(detection)
-        else:
-            problems.append(f'detections[{index}].{problem}')
+    kept, problems = _usable(message.detections, dimension)
     values = np.array(
         [[item.range, item.bearing, item.elevation][:dimension] for item in kept], dtype=float
     ).reshape(-1, dimension)
@@ -285,8 +357,7 @@ def filter_markers(
     clusters: Iterable[Cluster],
     found: Iterable[FoundTarget],
     size: float,
-    shown_clusters: int,
-) -> tuple[MarkerArray, int]:
+) -> MarkerArray:
     """Return markers of clusters (orange, as large as they are wide) and found targets (red).
 
     Parameters
@@ -297,16 +368,8 @@ def filter_markers(
         What to show.
     size : float
         Diameter of a found target [m].
-    shown_clusters : int
-        How many were shown last, so that those too many are taken away.
-
-    Returns
-    -------
-    MarkerArray, int
-        The markers, and how many clusters are shown now.
     """
     markers = []
-    number = 0
     for number, cluster in enumerate(clusters, start=1):
         markers.append(
             sphere_marker(
@@ -318,10 +381,8 @@ def filter_markers(
                 colour(1.0, 0.6, 0.0, 0.2 + 0.6 * min(cluster.mass, 1.0)),
             )
         )
-    for index in range(number + 1, shown_clusters + 1):
-        markers.append(Marker(header=header, ns='clusters', id=index, action=Marker.DELETE))
     for target in found:
         markers.append(
             sphere_marker(header, 'found', target.id, target.position, size, colour(0.8, 0.0, 0.1))
         )
-    return MarkerArray(markers=markers), number
+    return MarkerArray(markers=markers)

@@ -4,6 +4,10 @@ rclpy's own builds its wait set anew for each callback, with all event handlers 
 wakes itself twice per callback: about a millisecond. This one keeps its lists until an entity is
 added or removed, takes all messages that wait at once, and looks at events twenty times a second.
 In lockstep a node is woken only by what it has to answer: what else has come is taken then, too.
+
+CPU time of the spinning thread per step of two messages, four runs each on a machine under load:
+this one 373 to 920 us, rclpy's SingleThreadedExecutor 1072 to 2084 us, rclpy.experimental's
+EventsExecutor 256 to 601 us. The last has not been tried with whole runs.
 """
 
 from __future__ import annotations
@@ -77,18 +81,24 @@ class LeanExecutor(SingleThreadedExecutor):
             self._stale = True
 
     def _run_tasks(self) -> bool:
-        """Run what was scheduled; return whether something is left to run."""
+        """Run what was scheduled; return whether that has scheduled more.
+
+        A coroutine that awaits something is looked at again in the next round, which is no reason
+        not to wait for messages in between.
+        """
         with self._tasks_lock:
             tasks = [task for task, _, _ in self._tasks]
         if not tasks:
             return False
         for task in tasks:
             task()
-            if task.exception() is not None:
-                raise task.exception()
+            error = task.exception()
+            # Without its handle, it was of something that has been destroyed meanwhile.
+            if error is not None and not isinstance(error, InvalidHandle):
+                raise error
         with self._tasks_lock:
             self._tasks = [item for item in self._tasks if not item[0].done()]
-            return bool(self._tasks)
+            return any(item[0] not in tasks for item in self._tasks)
 
     def _collect(self) -> None:
         if not self._context.ok():

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from rclpy.duration import Duration
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -27,10 +28,15 @@ from maasi_filter.conversions import (
     stamp_from_ros,
     stamp_to_ros,
 )
+from maasi_filter.filter_memory import FilterMemory, Progress
+from maasi_filter.kept_found_targets import KeptFoundTargets, checked_found
+from maasi_filter.marker_board import MarkerBoard
 from maasi_filter.node_settings import FilterNodeSettings
 from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
 from maasi_filter.search_filter import AgentMeasurement, SearchFilter
 from maasi_filter.search_node import SearchNode, SettingsError, run
+from maasi_filter.silence import Silence
+from maasi_filter.stamps import batch_id_limit
 from maasi_filter.state_file import StateFileError
 from maasi_msgs.msg import (
     BatchMember,
@@ -42,6 +48,12 @@ from maasi_msgs.msg import (
 )
 
 _TIMEOUT_PERIOD = 0.05
+# How much later than its batch a measurement may be stamped [ns].
+_STAMP_AHEAD = 60_000_000_000
+# Detections that are kept until their batch comes.
+_MOST_EARLY = 64
+# Prediction over more steps than this is that over so many: a day at 10 steps a second.
+_MOST_STEPS = 864_000
 # Longest wait until the filters of other robots have what was found [s].
 _SHARING_PATIENCE = 0.5
 
@@ -56,7 +68,7 @@ class PendingBatch:
     members: list[BatchMember]
     measurements: dict[str, AgentMeasurement] = field(default_factory=dict)
     failed: set[str] = field(default_factory=set)
-    since: float = field(default_factory=time.monotonic)
+    silence: Silence | None = None
 
     @property
     def missing(self) -> list[str]:
@@ -80,6 +92,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
     ----------
     `measurement_batch` (maasi_msgs/MeasurementBatch): who measures;
     `<robot>/detections` (maasi_msgs/DetectionArray): what they see;
+    `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): what was found before a restart;
     `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with filters of their own
 
     Publishes
@@ -91,6 +104,9 @@ class FilterNode(SearchNode[FilterNodeSettings]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('filter_node', FilterNodeSettings, **options)
+
+    def prepare(self) -> None:
+        """Make the filter, or load it."""
         settings = self.settings
         self._dimension = settings.environment.dimension
         self._sensors = {
@@ -99,37 +115,18 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         }
         bounds = settings.environment.array()
         self._size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
-        self._begin_anew()
-        if self.settings.save_file and Path(self.settings.save_file).exists():
-            self._load()
-
-    def _load(self) -> None:
-        """Go on where the saved search was.
-
-        Raises
-        ------
-        SettingsError
-            If the file is damaged, or of another environment.
-        """
-        settings = self.settings
-        try:
-            saved = SearchFilter.load(settings.save_file)
-        except StateFileError as error:
-            raise SettingsError(f'parameter save_file: {error}') from None
-        bounds = settings.environment.array()
-        if not np.array_equal(saved.bounds, bounds):
-            raise SettingsError(
-                f'parameter save_file: {settings.save_file}: bounds: got {saved.bounds.tolist()}, '
-                f'allowed are those of the environment, {bounds.tolist()}'
-            )
-        if saved.settings != settings.filter:
-            self.get_logger().warning(
-                f'{settings.save_file} was saved with other settings of the filter; they go on'
-            )
-        self.filter = saved
-        self.get_logger().info(
-            f'state loaded from {settings.save_file}: {len(saved.found_targets)} found targets'
+        self._memory = (
+            FilterMemory(settings.save_file)
+            if settings.save_file and settings.save_batches
+            else None
         )
+        self._begin_anew()
+        self._kept = KeptFoundTargets()
+        self._restored = b''
+        if self._memory is not None:
+            self._restore(self._memory)
+        elif settings.save_file and Path(settings.save_file).exists():
+            self._load()
 
     def _begin_anew(self) -> None:
         settings = self.settings
@@ -145,12 +142,66 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         self._last_step: int | None = None
         self._settled_by: dict[int, int] = {}
         self._found_published = False
-        self._shown_clusters = 0
+        self._board = MarkerBoard()
         self._shared: dict[str, deque[FoundTargetArray]] = {
             name: deque() for name in sorted(settings.share_with)
         }
         self._particles_at = self._markers_at = -math.inf
         self._latency = 0.0
+
+    def _restore(self, memory: FilterMemory) -> None:
+        """Go on after the last batch of a process that died."""
+        try:
+            saved = memory.load()
+            if saved is not None:
+                self._check_bounds(saved[0])
+        except (StateFileError, SettingsError) as error:
+            # The rest of the team goes on meanwhile, so this node does, too.
+            self.get_logger().error(f'{error}; set aside as {memory.set_aside()}')
+            return
+        if saved is None:
+            return
+        self.filter, progress = saved
+        self._last_batch, self._last_batch_stamp = progress.batch, progress.stamp
+        self._last_step = progress.step
+        self._settled_by = dict(progress.settled_by)
+        self._last_heard = dict(progress.heard)
+        self._restored = progress.update
+        self.get_logger().warning(
+            f'restarted after batch {progress.batch} with {len(self.filter.found_targets)} found '
+            f'targets, from {memory.path}'
+        )
+
+    def _load(self) -> None:
+        """Go on where the saved search was.
+
+        Raises
+        ------
+        SettingsError
+            If the file is damaged, or of another environment.
+        """
+        settings = self.settings
+        try:
+            saved = SearchFilter.load(settings.save_file)
+        except StateFileError as error:
+            raise SettingsError(f'parameter save_file: {error}') from None
+        self._check_bounds(saved)
+        if saved.settings != settings.filter:
+            self.get_logger().warning(
+                f'{settings.save_file} was saved with other settings of the filter; they go on'
+            )
+        self.filter = saved
+        self.get_logger().info(
+            f'state loaded from {settings.save_file}: {len(saved.found_targets)} found targets'
+        )
+
+    def _check_bounds(self, saved: SearchFilter) -> None:
+        bounds = self.settings.environment.array()
+        if not np.array_equal(saved.bounds, bounds):
+            raise SettingsError(
+                f'parameter save_file: {self.settings.save_file}: bounds: got '
+                f'{saved.bounds.tolist()}, allowed are those of the environment, {bounds.tolist()}'
+            )
 
     def set_up(self) -> None:
         """Compile and connect."""
@@ -161,6 +212,10 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         self._found_publisher = self.create_publisher(FoundTargetArray, 'found_targets', LATCHED)
         self._particles_publisher = self.create_publisher(PointCloud2, 'particles', 2)
         self._markers_publisher = self.create_publisher(MarkerArray, 'markers', 10)
+        kept = self.create_subscription(
+            FoundTargetArray, 'found_targets/kept', self._on_kept, LATCHED
+        )
+        self._kept_topic = kept.topic_name
         self.create_subscription(MeasurementBatch, 'measurement_batch', self._on_batch, RELIABLE)
         self.hurry(self.step_subscription)
         for name in self._sensors:
@@ -182,11 +237,23 @@ class FilterNode(SearchNode[FilterNodeSettings]):
             )
             self.expect_publisher(topic)
         self.hurry(*self._sharing)
-        self.expect_subscribers(self._found_publisher, len(self._shared))
+        # The filters of the others, and the planner that keeps them.
+        self.expect_subscribers(self._found_publisher, len(self._shared) + 1 if self._shared else 0)
         if not settings.lockstep:
             self.create_wall_timer(_TIMEOUT_PERIOD, self._look_at_waiting)
         if settings.save_file and settings.save_period > 0.0:
             self.create_wall_timer(settings.save_period, self._save)
+
+    def start(self) -> None:
+        """Publish what was restored: what the dead process had latched is gone with it."""
+        self._kept.begin(time.monotonic())
+        if not self._restored:
+            return
+        update = deserialize_message(self._restored, FilterUpdate)
+        self._restored = b''
+        self._publish_found(update.header, self._last_batch)
+        # Its sender may have died before it was sent; who has it already drops it.
+        self._update_publisher.publish(update)
 
     def halt(self) -> None:
         """Save the state."""
@@ -194,7 +261,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
             self._save()
 
     def _save(self) -> None:
-        if not self.settings.save_file:
+        if not self.settings.save_file or self._memory is not None:
             return
         try:
             self.filter.save(self.settings.save_file)
@@ -205,6 +272,8 @@ class FilterNode(SearchNode[FilterNodeSettings]):
     def reset(self) -> None:
         """Begin a new search."""
         self._begin_anew()
+        if self._memory is not None:
+            self._memory.forget()
 
     def status(self) -> dict[str, Any]:
         """Return the state of the search."""
@@ -232,6 +301,13 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         if number <= self._last_batch or (number in self._pending and not self.settings.lockstep):
             self.drop('old batch', f'measurement_batch.id: read {number}, allowed is a new one')
             return
+        if number > batch_id_limit(self._last_batch):
+            self.drop(
+                'bad batch',
+                f'measurement_batch.id: read {number}, allowed is up to '
+                f'{batch_id_limit(self._last_batch)}',
+            )
+            return
         unknown = [item.robot for item in batch.members if item.robot not in self._sensors]
         for name in unknown:
             self.drop(
@@ -246,6 +322,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
                 (item for item in batch.members if item.robot in self._sensors),
                 key=lambda item: item.robot,
             ),
+            silence=Silence(self),
         )
         if self.settings.lockstep:
             # A planner waits for what it asks for: these are of one that is gone.
@@ -255,7 +332,10 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         for member in pending.members:
             early = self._early.pop((number, member.robot), None)
             # One before the batch answered another planner's of that number.
-            if early is not None and stamp_from_ros(early.header.stamp) >= stamp:
+            if (
+                early is not None
+                and 0 <= stamp_from_ros(early.header.stamp) - stamp <= _STAMP_AHEAD
+            ):
                 self._take(pending, early)
         self._process_complete()
 
@@ -266,6 +346,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         problem = self._problem(name, message)
         pending = self._pending.get(number)
         expected = pending is not None and name in pending.missing
+        problem = problem or self._stamp_problem(name, message, pending if expected else None)
         if problem is not None:
             self.drop('bad detections', f'{name}/detections.{problem}')
             if pending is not None and expected:
@@ -281,8 +362,12 @@ class FilterNode(SearchNode[FilterNodeSettings]):
             self._take(pending, message)
             self._process_complete()
         elif number > self._last_batch and pending is None:
-            # Its batch has not come yet; batches are few and small, so this stays small too.
+            # Its batch has not come yet.
             self._early[(number, name)] = message
+            if len(self._early) > _MOST_EARLY:
+                oldest = next(iter(self._early))
+                del self._early[oldest]
+                self.drop('no batch', f'{oldest[1]}/detections.batch_id: no batch {oldest[0]} came')
         else:
             self._take_late(name, message)
 
@@ -295,13 +380,8 @@ class FilterNode(SearchNode[FilterNodeSettings]):
                 f'header.frame_id: read {message.header.frame_id!r}, allowed is '
                 f'{self.settings.frame!r}'
             )
-        stamp = stamp_from_ros(message.header.stamp)
-        last = self._last_heard[name][2] if name in self._last_heard else stamp
-        if stamp < last:
-            return (
-                f'header.stamp: read {stamp * 1e-9:.6f} s, allowed is from the last one, '
-                f'{last * 1e-9:.6f} s'
-            )
+        if message.measurement > batch_id_limit(0):
+            return f'measurement: read {message.measurement}, allowed is up to {batch_id_limit(0)}'
         pose = message.pose.pose
         numbers = (
             *(pose.position.x, pose.position.y, pose.position.z),
@@ -310,6 +390,37 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         if not all(math.isfinite(number) for number in numbers):
             return f'pose: read {numbers}, allowed are finite numbers'
         return None
+
+    def _stamp_problem(
+        self, name: str, message: DetectionArray, expected: PendingBatch | None
+    ) -> str | None:
+        """Return what is wrong with the stamp of detections, if anything.
+
+        Parameters
+        ----------
+        name : str
+            Of the robot.
+        message : DetectionArray
+            From it.
+        expected : PendingBatch, optional
+            That it answers.
+        """
+        stamp = stamp_from_ros(message.header.stamp)
+        last = self._last_heard[name][2] if name in self._last_heard else 0
+        if expected is not None:
+            # One stamp from the future does not make those that follow late.
+            earliest, latest = min(last, expected.stamp), expected.stamp + _STAMP_AHEAD
+        elif message.batch_id > self._last_batch:
+            # Its batch may still come.
+            return None
+        else:
+            earliest, latest = last, max(self._last_batch_stamp, last) + _STAMP_AHEAD
+        if earliest <= stamp <= latest:
+            return None
+        return (
+            f'header.stamp: read {stamp * 1e-9:.6f} s, allowed is {earliest * 1e-9:.6f} to '
+            f'{latest * 1e-9:.6f} s'
+        )
 
     def _measurement(self, message: DetectionArray) -> AgentMeasurement | None:
         name = message.robot
@@ -320,8 +431,9 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         except ValueError as error:
             self.drop('bad detections', f'{name}/detections.pose.{error}')
             return None
-        for problem in problems:
-            self.drop('bad detection', f'{name}/detections.{problem}')
+        for reason, texts in problems.items():
+            for text, number in texts.items():
+                self.drop(reason, f'{name}/detections.{text}', number)
         return measurement
 
     def _take(self, pending: PendingBatch, message: DetectionArray) -> None:
@@ -387,7 +499,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         if not self._pending:
             return
         first = self._pending[min(self._pending)]
-        if time.monotonic() - first.since > self.settings.batch_timeout:
+        if first.silence is not None and first.silence.length > self.settings.batch_timeout:
             missing = [name for name in first.missing if name not in first.failed]
             self.warn_throttled(
                 'missing', f'batch {first.id}: no detections from {", ".join(missing)}, goes on'
@@ -399,6 +511,11 @@ class FilterNode(SearchNode[FilterNodeSettings]):
 
     def _process_complete(self) -> None:
         """Process the batches that are complete, in the order of their ids."""
+        # New ids must not be those of targets that were found before a restart.
+        if self._pending and self._kept.is_awaited(
+            self.count_publishers(self._kept_topic), time.monotonic()
+        ):
+            return
         while self._pending:
             first = self._pending[min(self._pending)]
             if not first.complete:
@@ -413,7 +530,7 @@ class FilterNode(SearchNode[FilterNodeSettings]):
     def _process(self, batch: PendingBatch) -> None:
         begin = time.perf_counter()
         last = self._last_step
-        steps = 1 if last is None else max(batch.step - last, 0)
+        steps = 1 if last is None else min(max(batch.step - last, 0), _MOST_STEPS)
         self._last_step = batch.step
         members = [item for item in batch.members if item.robot in batch.measurements]
         now = batch.stamp * 1e-9
@@ -435,37 +552,27 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         for target in result.newly_found:
             self._settled_by[target.id] = batch.id
         clusters = [cluster_to_ros(cluster) for cluster in result.clusters]
+        update = FilterUpdate(
+            header=header,
+            batch_id=batch.id,
+            step=batch.step,
+            members=members,
+            missing=batch.missing,
+            expected_number=float(result.expected_number),
+            found=len(self.filter.found_targets),
+            newly_found=[found_target_to_ros(target, batch.id) for target in result.newly_found],
+            clusters=clusters,
+        )
+        if self._memory is not None:
+            # Before anybody hears of it: what was published is not lost with this process.
+            self._remember(self._memory, update)
         # Found targets first, so that they are there for whoever hears of the update.
         if changed or result.found_changed or not self._found_published:
-            self._found_published = True
-            self._found_publisher.publish(
-                FoundTargetArray(
-                    header=header,
-                    batch_id=batch.id,
-                    targets=[
-                        found_target_to_ros(target, self._settled_by.get(target.id, 0))
-                        for target in self.filter.found_targets
-                    ],
-                )
-            )
+            self._publish_found(header, batch.id)
             if self._shared:
                 # With everybody before the step ends, so that it counts from the next one on.
                 self._found_publisher.wait_for_all_acked(Duration(seconds=_SHARING_PATIENCE))
-        self._update_publisher.publish(
-            FilterUpdate(
-                header=header,
-                batch_id=batch.id,
-                step=batch.step,
-                members=members,
-                missing=batch.missing,
-                expected_number=float(result.expected_number),
-                found=len(self.filter.found_targets),
-                newly_found=[
-                    found_target_to_ros(target, batch.id) for target in result.newly_found
-                ],
-                clusters=clusters,
-            )
-        )
+        self._update_publisher.publish(update)
         for target in result.newly_found:
             self.get_logger().info(
                 f'found target {target.id} at '
@@ -476,6 +583,60 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         )
         self._publish_views(header, batch.stamp * 1e-9)
         self._latency = time.perf_counter() - begin
+
+    def _publish_found(self, header: Header, batch: int) -> None:
+        self._found_published = True
+        self._found_publisher.publish(
+            FoundTargetArray(
+                header=header,
+                batch_id=batch,
+                targets=[
+                    found_target_to_ros(target, self._settled_by.get(target.id, 0))
+                    for target in self.filter.found_targets
+                ],
+            )
+        )
+
+    def _remember(self, memory: FilterMemory, update: FilterUpdate) -> None:
+        progress = Progress(
+            batch=self._last_batch,
+            stamp=self._last_batch_stamp,
+            step=self._last_step or 0,
+            settled_by=self._settled_by,
+            heard=self._last_heard,
+            update=serialize_message(update),
+        )
+        try:
+            memory.save(self.filter, progress)
+        except OSError as error:
+            # The search is worth more than its copy.
+            self.warn_throttled('state', f'{memory.path}: state not saved: {error.strerror}')
+
+    def _on_kept(self, message: FoundTargetArray) -> None:
+        """Take over what was found before a restart of this node without its state."""
+        if not self.active or not self._kept.take():
+            return
+        try:
+            if message.header.frame_id != self.settings.frame and message.targets:
+                raise ValueError(
+                    f'header.frame_id: read {message.header.frame_id!r}, allowed is '
+                    f'{self.settings.frame!r}'
+                )
+            targets = [found_target_from_ros(item, self._dimension) for item in message.targets]
+            new = self.filter.keep_found(checked_found(targets))
+        except ValueError as error:
+            self.drop('bad found targets', f'found_targets/kept.{error}')
+            new = []
+        if new:
+            known = {item.id: int(item.batch_id) for item in message.targets}
+            for target in new:
+                self._settled_by[target.id] = known.get(target.id, 0)
+            self.get_logger().warning(
+                f'restarted without the state of the search: {len(new)} found targets taken from '
+                'found_targets/kept; what was believed of others is lost'
+            )
+            self._publish_found(message.header, int(message.batch_id))
+        self._process_complete()
 
     def _publish_views(self, header: Header, now: float) -> None:
         """Publish what is for the eye, seldom enough."""
@@ -491,14 +652,10 @@ class FilterNode(SearchNode[FilterNodeSettings]):
             1.0 / settings.markers_rate
         ):
             self._markers_at = now
-            markers, self._shown_clusters = filter_markers(
-                header,
-                self.filter.clusters,
-                self.filter.found_targets,
-                self._size,
-                self._shown_clusters,
+            markers = filter_markers(
+                header, self.filter.clusters, self.filter.found_targets, self._size
             )
-            self._markers_publisher.publish(markers)
+            self._markers_publisher.publish(self._board.replace(markers))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field
+from typing_extensions import Self
 
 from maasi_filter.settings import EnvironmentSettings, FilterSettings, SensorSettings, Settings
+
+# A commanding node that has not asserted its liveliness for so long is dead to its guard [s].
+LIVELINESS_LEASE = 0.5
 
 
 class NodeSettings(Settings):
     """What every node of a search needs to know."""
+
+    #: Parameters that can be set while the node runs.
+    live: ClassVar[frozenset[str]] = frozenset()
 
     step: float = Field(default=0.05, gt=0.0, le=10.0, description='Duration of a step [s]')
     seed: int = Field(default=1, ge=0, description='Of all random numbers')
@@ -19,6 +28,10 @@ class NodeSettings(Settings):
     autostart: bool = Field(
         default=True, description='Whether the node configures and activates itself'
     )
+
+    def resolved(self) -> Self:
+        """Return a copy in which what is derived from other settings has its value."""
+        return self
 
 
 class SensorOfRobot(Settings):
@@ -32,6 +45,8 @@ class SensorOfRobot(Settings):
 class FilterNodeSettings(NodeSettings):
     """Settings of the filter node."""
 
+    live: ClassVar[frozenset[str]] = frozenset({'batch_timeout', 'particles_rate', 'markers_rate'})
+
     environment: EnvironmentSettings = Field(description='Where the targets are')
     filter: FilterSettings = Field(default_factory=FilterSettings, description='The filter')
     robots: dict[str, SensorOfRobot] = Field(min_length=1, description='Robots, by name')
@@ -43,8 +58,7 @@ class FilterNodeSettings(NodeSettings):
     batch_timeout: float = Field(
         default=1.0,
         gt=0.0,
-        description='Wall time after which a batch goes on without who is missing; not in lockstep '
-        '[s]',
+        description='Time after which a batch goes on without who is missing; not in lockstep [s]',
     )
     particles_rate: float = Field(
         default=2.0, ge=0.0, description='Most publications of particles; 0: none [1/s]'
@@ -58,3 +72,12 @@ class FilterNodeSettings(NodeSettings):
     save_period: float = Field(
         default=0.0, ge=0.0, description='Wall time between saves; 0: only at the end [s]'
     )
+    save_batches: bool = Field(
+        default=False,
+        description='Whether the state is saved after each batch, with the place in the run, where '
+        'a restarted node goes on; the file belongs to one run then',
+    )
+
+    def resolved(self) -> Self:
+        """Return a copy with the values of the preset."""
+        return self.model_copy(update={'filter': self.filter.resolved()})

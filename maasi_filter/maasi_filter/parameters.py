@@ -1,14 +1,15 @@
 """Settings as flat ROS parameters, and back. No ROS in here.
 
-Nested settings become names with dots, `None` is left out, and lists of lists (or of small
-settings) become lists of strings of numbers: `bounds: ['-0.3 2.4', '-0.3 2.4']`. Settings by name,
-`robots`, become the list `robots` and `robot.<name>.<key>`.
+Nested settings become names with dots, and `None` is left out. Lists of lists of one length become
+one list, `bounds: [-0.3, 2.4, -0.3, 2.4]`; other lists of lists, and of small settings, become
+lists of strings of numbers, `obstacles: ['0.8 1.2 0.1']`, which are read for the former as well.
+Settings by name, `robots`, become the list `robots` and `robot.<name>.<key>`.
 """
 
 from __future__ import annotations
 
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -32,12 +33,19 @@ class ParameterField:
         Meaning and unit.
     constraints : str
         What is allowed, in words.
+    number : type or None
+        float or int where it is a single number.
+    lowest, highest : float or None
+        Its bounds; whether they are allowed themselves is in `constraints`.
     """
 
     name: str
     default: ParameterValue | None
     description: str
     constraints: str
+    number: type | None = None
+    lowest: float | None = None
+    highest: float | None = None
 
 
 def flatten(settings: BaseModel, prefix: str = '') -> dict[str, ParameterValue]:
@@ -66,7 +74,7 @@ def flatten(settings: BaseModel, prefix: str = '') -> dict[str, ParameterValue]:
         elif not isinstance(value, (list, tuple)):
             flat[key] = value
         elif len(value):
-            flat[key] = [_as_text(item) for item in value]
+            flat[key] = _as_list(value, info.annotation)
     return flat
 
 
@@ -109,7 +117,49 @@ def parameter_fields(
             if not optional or any(item.startswith(f'{key}.') for item in given):
                 yield from parameter_fields(nested, given, f'{key}.')
         else:
-            yield ParameterField(key, _default(info), info.description or '', _constraints(info))
+            yield ParameterField(
+                key,
+                _default(info),
+                info.description or '',
+                _constraints(info),
+                _number(info.annotation),
+                _bound(info, 'ge', 'gt'),
+                _bound(info, 'le', 'lt'),
+            )
+
+
+def parameter_name(model: type[BaseModel], location: Iterable[int | str]) -> str:
+    """Return the parameter that a place in nested values belongs to.
+
+    Parameters
+    ----------
+    model : type
+        The settings.
+    location : iterable of str or int
+        Keys and indices on the way to the place, as pydantic has them.
+    """
+    parts: list[str] = []
+    current: type[BaseModel] | None = model
+    keys = iter(location)
+    for key in keys:
+        info = None
+        if current is not None:
+            info = next(
+                (item for name, item in current.model_fields.items() if key in (name, item.alias)),
+                None,
+            )
+        if info is None:
+            # An index, or a part of what is one parameter.
+            break
+        by_name = _model_by_name(info.annotation)
+        if by_name is None:
+            parts.append(str(key))
+            current = _nested(info.annotation)
+            continue
+        name = next(keys, None)
+        parts += [str(key)] if name is None else [_singular(str(key)), str(name)]
+        current = by_name
+    return '.'.join(parts)
 
 
 def _default(info: FieldInfo) -> ParameterValue | None:
@@ -117,8 +167,21 @@ def _default(info: FieldInfo) -> ParameterValue | None:
         return None
     value = info.get_default(call_default_factory=True)
     if isinstance(value, (list, tuple)):
-        return [_as_text(item) for item in value] or None
+        return _as_list(value, info.annotation) or None
     return value
+
+
+def _bound(info: FieldInfo, *kinds: str) -> float | None:
+    for item in info.metadata:
+        for kind in kinds:
+            if getattr(item, kind, None) is not None:
+                return float(getattr(item, kind))
+    return None
+
+
+def _number(annotation: Any) -> type | None:
+    kinds = [item for item in _choices(annotation) if item is not type(None)]
+    return kinds[0] if len(kinds) == 1 and kinds[0] in (int, float) else None
 
 
 def _constraints(info: FieldInfo) -> str:
@@ -153,10 +216,28 @@ def _nest(model: type[BaseModel], flat: Mapping[str, Any], prefix: str) -> dict[
                 nested[target] = _nest(inner, flat, f'{key}.')
         elif flat.get(key) is not None:
             value = flat[key]
-            if isinstance(value, (list, tuple)):
-                value = [_from_text(key, item, info.annotation) for item in value]
+            if not isinstance(value, (str, bool, int, float)):
+                value = _from_list(key, value, info.annotation)
             nested[target] = value
     return nested
+
+
+def _as_list(value: Sequence[Any], annotation: Any) -> list[Any]:
+    if _width(annotation) is not None:
+        return [float(number) for item in value for number in item]
+    return [_as_text(item) for item in value]
+
+
+def _from_list(key: str, value: Sequence[Any], annotation: Any) -> list[Any]:
+    width = _width(annotation)
+    if width is None or any(not isinstance(item, (int, float)) for item in value):
+        return [_from_text(key, item, annotation) for item in value]
+    if len(value) % width:
+        raise ValueError(
+            f'{key}: got {len(value)} numbers, allowed are multiples of {width}, as '
+            'x_min, x_max, y_min, y_max for bounds'
+        )
+    return [list(value[first : first + width]) for first in range(0, len(value), width)]
 
 
 def _as_text(item: Any) -> Any:
@@ -206,6 +287,25 @@ def _element(annotation: Any) -> Any:
     for choice in _choices(annotation):
         if get_origin(choice) is list:
             return _bare(get_args(choice)[0])
+    return None
+
+
+def _width(annotation: Any) -> int | None:
+    """Return the length of the lists in a list, if it is always the same."""
+    for choice in _choices(annotation):
+        if get_origin(choice) is list and get_origin(get_args(choice)[0]) is Annotated:
+            element, *metadata = get_args(get_args(choice)[0])
+            limits = [item for item in metadata if isinstance(item, FieldInfo)]
+            lengths = {
+                getattr(part, kind)
+                for item in limits
+                for part in item.metadata
+                for kind in ('min_length', 'max_length')
+                if hasattr(part, kind)
+            }
+            parts = [part for item in limits for part in item.metadata]
+            if get_origin(element) is list and len(lengths) == 1 and len(parts) == 2:
+                return int(lengths.pop())
     return None
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from rclpy.duration import Duration
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
+    LivelinessPolicy,
     QoSProfile,
     ReliabilityPolicy,
 )
+
+from maasi_filter.node_settings import LIVELINESS_LEASE
 
 # What nobody may miss: batches, detections, updates, states, decisions, lockstep.
 RELIABLE = QoSProfile(
@@ -35,6 +39,18 @@ LATCHED_ALL = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
+
+# States of robots. Liveliness is asserted by the executor thread: a process whose executor hangs
+# loses it, though its middleware goes on.
+LIVELY = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
+    liveliness_lease_duration=Duration(seconds=LIVELINESS_LEASE),
+)
+# How often it is asserted [s].
+LIVELINESS_PERIOD = 0.1
 
 # What sensors publish: each message replaces the one before.
 SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)

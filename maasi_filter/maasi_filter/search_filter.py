@@ -5,21 +5,18 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter import births as birth_models
 from maasi_filter.clusters import Cluster, group_clusters, kmeans, kmeans_clusters
-from maasi_filter.detection_model import (
-    PARAMETERS,
-    BoxDetection,
-    DetectionModel,
-    detection_probability,
-)
+from maasi_filter.credits import Credit, credit_of, from_arrays, to_arrays
+from maasi_filter.detection_model import BoxDetection, DetectionModel
 from maasi_filter.exploration import Exploration, check_bounds
 from maasi_filter.found_targets import (
     UNLIMITED_INFORMATION,
@@ -45,13 +42,8 @@ from maasi_filter.particles import (
 from maasi_filter.phd import MeasurementSet, Workspace, associate, prepare_measurements
 from maasi_filter.pose import Pose
 from maasi_filter.sensor import Sensor, is_covariance
-from maasi_filter.settings import (
-    DetectionSettings,
-    FilterSettings,
-    NoiseSettings,
-    Preset,
-    SensorSettings,
-)
+from maasi_filter.settings import FilterSettings
+from maasi_filter.state_check import check_exploration, check_state
 from maasi_filter.state_file import (
     StateFileError,
     generator_state,
@@ -61,6 +53,7 @@ from maasi_filter.state_file import (
     untext,
     write_state,
 )
+from maasi_filter.undetected_births import missed_before
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -81,6 +74,8 @@ SAME_TARGET = 16.0
 LEAST_BIRTHS = 20
 # Draws of a birth where particles explain the detection.
 LEAST_DRAWS = 32
+# A share of an intensity that changes no sum; the kernels leave out particles of weight 0.
+NEXT_TO_NOTHING = 1e-100
 # Births that explain less of a detection than this are not worth their particles.
 LEAST_BIRTH_MASS = 1e-3
 
@@ -214,12 +209,15 @@ class SearchFilter:
         self.clusters: list[Cluster] = []
         self._group: IntArray = np.empty(0, np.int64)
         self._groups = 0
+        self._credits: list[Credit | None] = []
         # What the detections that a group explains tell about where it is.
         self._information: FloatArray = np.empty((0, self.dimension, self.dimension))
         self._places: FloatArray = np.empty((0, self.dimension))
         self._covariances: list[FloatArray] = []
         self._centres: FloatArray | None = None
         self._predicted: FloatArray | None = None
+        # Who has measured in the present step already: 1 - pi of theirs is in D^{o-1} of (9).
+        self._before: list[tuple[DetectionModel, Pose]] = []
         self._birth_budget = 0
         self._moments: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._expected: float | None = None
@@ -280,6 +278,7 @@ class SearchFilter:
         self.weights = masses
         self._group = labels
         self._groups = int(labels.max()) + 1 if len(labels) else 0
+        self._credits = [None] * self._groups
         # What they are known from is not known, so nothing is held against their spread.
         self._information = np.zeros((self._groups, self.dimension, self.dimension))
         self._information[:] = UNLIMITED_INFORMATION * np.eye(self.dimension)
@@ -293,6 +292,10 @@ class SearchFilter:
 
         The file is replaced in one piece: a crash leaves the old one or the new one.
         """
+        write_state(path, self.state())
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return the whole state, random generator included, as arrays for a file."""
         targets = self.found_targets
         d = self.dimension
         state = {
@@ -323,9 +326,10 @@ class SearchFilter:
             'cluster_radii': np.array([c.radius for c in self.clusters], float),
             'cluster_masses': np.array([c.mass for c in self.clusters], float),
         }
+        state.update(to_arrays(self._credits))
         if self._lost is not None:
             state.update(self._lost.arrays())
-        write_state(path, state)
+        return state
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SearchFilter:
@@ -336,19 +340,34 @@ class SearchFilter:
         StateFileError
             If the file is missing, of another format or version, or damaged; it says which.
         """
-        state = read_state(path)
+        return cls.from_state(read_state(path), path)
+
+    @classmethod
+    def from_state(
+        cls, state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
+    ) -> SearchFilter:
+        """Return the filter of a state; `path` is named in errors.
+
+        Raises
+        ------
+        StateFileError
+            If an array is missing, or has a wrong shape or number.
+        """
         try:
+            check_state(state)
             search = cls(
                 FilterSettings.model_validate_json(untext(state['settings'])),
                 state['bounds'],
                 restored_generator(untext(state['generator'])),
             )
             search.exploration = Exploration(search.bounds, float(state['spacing']))
+            check_exploration(state['exploration'], search.exploration.values.shape)
             search.exploration.values[...] = state['exploration']
             search.particles = state['particles']
             search.weights = state['weights']
             search._group = state['group']
             search._groups = int(state['groups'])
+            search._credits = from_arrays(state)
             search._information = state['information']
             search._places = state['places']
             search._centres = state['centres'] if len(state['centres']) else None
@@ -361,7 +380,7 @@ class SearchFilter:
                     state['found_ids'],
                     state['found_positions'],
                     state['found_covariances'],
-                    json.loads(untext(state['robots'])),
+                    _names(untext(state['robots']), len(state['found_ids'])),
                     state['found_measurements'],
                     state['found_times'],
                     state['found_origins'],
@@ -377,8 +396,10 @@ class SearchFilter:
                 )
             ]
             if search._lost is not None:
-                search._lost.restore(state)
-        except (KeyError, ValueError, TypeError) as error:
+                search._lost.restore(dict(state))
+        except KeyError as error:
+            raise StateFileError(f'{path}: does not hold a usable state: no {error}') from None
+        except (ValueError, TypeError) as error:
             raise StateFileError(f'{path}: does not hold a usable state: {error}') from None
         return search
 
@@ -461,8 +482,10 @@ class SearchFilter:
         total = sum(len(member.values) for member in members)
         self._birth_budget = numbers.particles // (2 * max(total, 1))
         self._arranged = 0
+        self._before = []
         for member in members:
             used, refined = self._correct(member, newly_found, dropped, time)
+            self._before.append((self._detection(member), member.pose))
             detections += used
             moved |= refined
         self._predicted = None
@@ -529,7 +552,7 @@ class SearchFilter:
                     known = self.found_targets[f]
                     if (known.time, known.robot) <= (target.time, robot):
                         continue
-            number = self.found_targets[f].id if f >= 0 else len(self.found_targets) + 1
+            number = self.found_targets[f].id if f >= 0 else self._next_id()
             taken = FoundTarget(
                 number,
                 target.position.copy(),
@@ -551,6 +574,35 @@ class SearchFilter:
             changed = True
         return changed
 
+    def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
+        """Add targets that were found before this filter was made; return those that are new.
+
+        They keep their ids. Where another target has such an id already, the next free one is
+        used.
+
+        Parameters
+        ----------
+        targets : sequence of FoundTarget
+            With finite positions and covariances of this dimension.
+        """
+        own = {target.id: target for target in self.found_targets}
+        kept = {target.id for target in targets}
+        since = [target for target in self.found_targets if target.id not in kept]
+        new: list[FoundTarget] = []
+        for target in targets:
+            same_id = [own[target.id]] if target.id in own else []
+            if any(_distance(target, known) < SAME_TARGET for known in same_id or since):
+                continue
+            added = replace(target, id=self._next_id() if same_id else target.id)
+            self.found_targets.append(added)
+            self._covariances.append(added.covariance)
+            self._forget(added)
+            new.append(added)
+        return new
+
+    def _next_id(self) -> int:
+        return 1 + max((target.id for target in self.found_targets), default=0)
+
     def own_found_targets(self) -> list[FoundTarget]:
         """Return the found targets that this filter found itself."""
         return [target for target in self.found_targets if not target.origin]
@@ -559,9 +611,7 @@ class SearchFilter:
         """Return the nearest found target that may be the same, or -1."""
         best, nearest = -1, SAME_TARGET
         for f, known in enumerate(self.found_targets):
-            offset = target.position - known.position
-            total = target.covariance + known.covariance
-            distance = float(offset @ np.linalg.solve(total, offset))
+            distance = _distance(target, known)
             if distance < nearest:
                 best, nearest = f, distance
         return best
@@ -588,6 +638,7 @@ class SearchFilter:
         self.weights = self.weights[keep]
         self._group = group.astype(np.int64).reshape(-1)
         self._groups = len(present)
+        self._credits = [self._credits[g] for g in present.tolist()]
         self._information = self._information[present]
         self._places = self._places[present]
 
@@ -694,6 +745,7 @@ class SearchFilter:
                 self.generator,
             )
         if self._groups == 0:
+            self._credits = [None]
             self._information = np.zeros((1, self.dimension, self.dimension))
             self._places = np.zeros((1, self.dimension))
         self._append(particles, weights, np.zeros(len(particles), np.int64), max(self._groups, 1))
@@ -706,8 +758,9 @@ class SearchFilter:
         self.weights = space.extended('weights', self.weights, weights)
         self._group = space.extended('group', self._group, group)
         if self._predicted is not None:
-            # For the robots after this one, what is born by then is part of the prediction.
-            self._predicted = np.concatenate([self._predicted, weights])
+            # <psi, Y> of a later robot is the sum over the births at its own detections.
+            nothing = NEXT_TO_NOTHING * weights
+            self._predicted = np.concatenate([self._predicted, nothing])
         self._groups = groups
 
     def _append_born(
@@ -773,13 +826,18 @@ class SearchFilter:
         prepared = self._prepared(member)
         born = None
         kappa = np.zeros((0, count))
+        numerators: birth_models.MeasurementBirths | None = None
 
         def other(log_own: FloatArray) -> FloatArray:
             """Return what else explains each detection, once it is known what particles do."""
-            nonlocal born, kappa
+            nonlocal born, kappa, numerators
             intensity = np.full(count, sensor.clutter)
             if numbers.births == 'measurement':
                 born = self._births(member, detection, prepared, log_own)
+                numerators = born
+                if numbers.birth_prior == 'constant' and self._before:
+                    numerators = missed_before(born, self._before)
+                    born = born if self._predicted is not None else numerators
                 intensity += born.totals
             if numbers.removal == 'soft' and self.found_targets:
                 kappa = self._found_intensity(member, detection, prepared, intensity)
@@ -812,6 +870,8 @@ class SearchFilter:
         self.weights = update.weights
         self._group = update.group
         self._groups = groups + count
+        credit = Credit(member.robot, member.index, self._found_radius(sensor))
+        self._credits = [*self._credits, *[credit] * count]
         self._information, self._places = extended_information(
             self._information,
             self._places,
@@ -821,8 +881,8 @@ class SearchFilter:
             prepared,
             member.pose,
         )
-        if born is not None:
-            self._append_born(born, update.other_scale, groups)
+        if numerators is not None:
+            self._append_born(numerators, update.other_scale, groups)
         moved = False
         claims = kappa * update.other_scale if len(kappa) else kappa
         if numbers.refine_found and len(claims):
@@ -960,7 +1020,7 @@ class SearchFilter:
             if self._is_known(means[m], covariance, claims, known, m):
                 continue
             target = FoundTarget(
-                len(self.found_targets) + 1,
+                self._next_id(),
                 means[m].copy(),
                 covariance + member.pose_error**2 * np.eye(self.dimension),
                 member.robot,
@@ -1015,6 +1075,7 @@ class SearchFilter:
             self.weights = np.empty(0)
             self._group = np.empty(0, np.int64)
             self._groups = 0
+            self._credits = []
             self._information = np.empty((0, self.dimension, self.dimension))
             self._places = np.empty((0, self.dimension))
             self._expected = 0.0
@@ -1029,6 +1090,7 @@ class SearchFilter:
         )
         group = groups_of(starts, pool)
         self._groups = len(starts) - 1
+        self._credits = [self._credits[g] for g in np.flatnonzero(present).tolist()]
         self._information = self._information[present]
         self._places = self._places[present]
         weights = np.full(number, expected / number)
@@ -1107,25 +1169,27 @@ class SearchFilter:
         clusters, labels = kmeans_clusters(
             self.particles, self.weights, label, len(centres), largest
         )
-        member = members[-1]
+        last = members[-1]
+        otherwise = Credit(last.robot, last.index, self._found_radius(last.sensor))
         remaining = []
         alive = np.ones(len(self.weights), np.bool_)
         kept = []
         for cluster, number in zip(clusters, labels):
-            narrow = cluster.radius <= self._found_radius(member.sensor)
-            if narrow and cluster.mass >= numbers.found_mass:
+            own = label == number
+            credit = credit_of(self.weights[own], self._group[own], self._credits, otherwise)
+            if cluster.radius <= credit.found_radius and cluster.mass >= numbers.found_mass:
                 target = FoundTarget(
-                    len(self.found_targets) + 1,
+                    self._next_id(),
                     cluster.position,
                     cluster.covariance,
-                    member.robot,
-                    member.index,
+                    credit.robot,
+                    credit.measurement,
                     time,
                 )
                 self.found_targets.append(target)
                 self._covariances.append(cluster.covariance)
                 newly_found.append(target)
-                alive &= label != number
+                alive &= ~own
             else:
                 remaining.append(cluster)
                 kept.append(centres[number])
@@ -1135,6 +1199,21 @@ class SearchFilter:
             self._group = self._group[alive]
         self._centres = np.array(kept) if kept else None
         self.clusters = sorted(remaining, key=lambda cluster: -cluster.mass)
+
+
+def _names(content: str, number: int) -> list[str]:
+    """Return the robots' names in a state: JSON, one for each found target."""
+    names = json.loads(content)
+    valid = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not valid or len(names) != number:
+        raise ValueError(f'robots: got {content[:100]}, allowed are {number} names')
+    return list(names)
+
+
+def _distance(one: FoundTarget, other: FoundTarget) -> float:
+    """Return the squared normalised distance of two estimates."""
+    offset = one.position - other.position
+    return float(offset @ np.linalg.solve(one.covariance + other.covariance, offset))
 
 
 def _same_estimate(one: FoundTarget, other: FoundTarget) -> bool:
@@ -1161,53 +1240,3 @@ def _cartesian_noise(member: _Member, prepared: MeasurementSet, index: int) -> F
     jacobian = member.sensor.measurement.jacobian(centre, member.pose)[0]
     inverse = np.linalg.pinv(jacobian)
     return np.asarray(inverse @ noise @ inverse.T)
-
-
-def warm_up() -> None:
-    """Compile, or load from the cache, every kernel that a step uses.
-
-    A node calls this before it reports ready, so that no step waits for a compiler.
-    """
-    for dimension in (2, 3):
-        bounds = np.array([[0.0, 10.0]] * dimension)
-        for detection in (
-            DetectionSettings(kind='exponential', size=[5.0] * dimension),
-            DetectionSettings(kind='box', lower=[-5.0, -5.0], upper=[5.0, 5.0]),
-        ):
-            noise = NoiseSettings(range=0.5, bearing=0.1, elevation=0.1)
-            sensor = SensorSettings(detection=detection, noise=noise).build('warm_up', dimension)
-            presets: tuple[Preset, ...] = ('recommended', 'paper_000', 'paper_003')
-            for preset in presets:
-                settings = FilterSettings(
-                    preset=preset, particles=500, birth_particles=50, particles_minimum=50
-                )
-                search = SearchFilter(settings, bounds, np.random.default_rng(0))
-                for step in range(6):
-                    position = np.array([3.0 + 0.2 * step, 3.0, 3.0])
-                    pose = Pose.from_yaw(position, 0.1)
-                    targets = np.array([[5.0, 5.0, 5.0], [2.0, 4.0, 2.0]])[:, :dimension]
-                    values = sensor.measurement.measure(targets, pose)
-                    if step == 3:
-                        values = values[:0]
-                    search.step(
-                        [AgentMeasurement('warm_up', pose, sensor, values, None, step)], 1, step
-                    )
-                positions = np.full((1, 3), 3.0)
-                search.exploration.expected_new(sensor.detection, positions, np.zeros(1), 1.0)
-                search.exploration.at(positions)
-                lost = LostTargets(dimension, 1e-3, LEAST_CLUSTER_MASS)
-                pose = Pose(positions[0])
-                seen = prepare_measurements(
-                    sensor.measurement.measure(positions[:, :dimension] + 1.0, pose),
-                    sensor.covariance[None],
-                    pose,
-                )
-                lost.add(seen, np.ones(1, np.bool_), pose, sensor.detection, 0.0)
-                lost.clusters(
-                    np.zeros((0, dimension)),
-                    np.zeros((0, dimension, dimension)),
-                    search.exploration,
-                    0.0,
-                )
-    origin = np.zeros(3)
-    detection_probability(0, np.zeros(PARAMETERS), origin, origin, 0.0)

@@ -6,14 +6,15 @@ import gc
 import signal
 import sys
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Collection
-from typing import Any, Generic, TypeVar
+from functools import partial
+from typing import Any, Generic
 
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from pydantic import ValidationError
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException
@@ -23,19 +24,20 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.utilities import get_default_context
 
+from maasi_filter.bad_requests import survive_bad_requests
+from maasi_filter.clock_watch import ClockWatch
 from maasi_filter.executor import LeanExecutor
-from maasi_filter.node_settings import NodeSettings
-from maasi_filter.parameters import parameter_fields, unflatten
+from maasi_filter.node_entities import NodeEntities
+from maasi_filter.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.qos import LATCHED, RELIABLE
+from maasi_filter.stamps import stamp_problem
 from maasi_msgs.msg import LockstepDone, LockstepStep
 
-SettingsT = TypeVar('SettingsT', bound=NodeSettings)
+__all__ = ['SearchNode', 'SettingsError', 'run']
 
 # Between two looks at whether the peers are there [s].
 _PEERS_PERIOD = 0.02
 _DIAGNOSTICS_PERIOD = 1.0
-# Without /clock for so long the node says that it waits [s].
-_CLOCK_PATIENCE = 3.0
 _WARNING_PERIOD = 2.0
 # Longest time until a signal is noticed [s].
 _SIGNAL_PERIOD = 0.1
@@ -43,13 +45,8 @@ _SIGNAL_PERIOD = 0.1
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
-
 # Between the discovery of a subscription and its connection [s].
 _CONNECTION_PATIENCE = 5.0
-
-
-class SettingsError(Exception):
-    """Parameters that are not allowed; the text says which and why."""
 
 
 class SearchNode(LifecycleNode, Generic[SettingsT]):
@@ -76,6 +73,9 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         Whether it takes part in lockstep.
     """
 
+    #: Read in *configure*, and kept until the next one.
+    settings: SettingsT
+
     def __init__(
         self,
         name: str,
@@ -85,32 +85,37 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         lockstep_member: bool = True,
         **options: Any,
     ) -> None:
-        super().__init__(name, **options)
-        self._in_robot = in_robot
+        super().__init__(name, allow_undeclared_parameters=True, **options)
+        self._always_in_robot = self._in_robot = in_robot
         self._lockstep_member = lockstep_member
-        self.settings: SettingsT = self._read_settings(settings)
-        robots = getattr(self.settings, 'robots', None)
-        if robots is not None:
-            # One that works for a single robot, in its namespace, belongs to that robot.
-            self._in_robot = list(robots) == [self.get_namespace().rpartition('/')[2]]
+        self._parameters_read = NodeParameters(self, settings)
+        self._entities_made = NodeEntities(self)
+        #: Why it could not be configured; empty where it could.
+        self.problem = ''
         self.dropped: Counter[str] = Counter()
+        self._prepared = False
+        self.configured = False
         self.active = False
         self.step = -1
         self._warned: dict[str, float] = {}
         self._peers: list[Callable[[], bool]] = []
+        self._peer_timer: Any = None
         self._urgent_topics: set[str] = set()
         self.step_subscription: Subscription | None = None
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._clock_watch = ClockWatch(self, self.warn_throttled, self._on_restart)
         self.create_wall_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics)
-        self._started = time.monotonic()
-        self._clock_patience = _CLOCK_PATIENCE
-        if self.get_parameter('use_sim_time').value:
-            self.create_wall_timer(_CLOCK_PATIENCE, self._look_for_clock)
-        self.get_clock().create_jump_callback(_backward_threshold(), post_callback=self._on_jump)
+        survive_bad_requests(self, self.drop)
 
-    # ---- names, parameters -------------------------------------------------------------------
+    def destroy_node(self) -> None:
+        """Leave the graph."""
+        self._clock_watch.stop()
+        self._entities_made.clear()
+        super().destroy_node()
+
+    # ---- names -------------------------------------------------------------------------------
 
     def team_topic(self, name: str) -> str:
         """Return the full name of a topic of the team."""
@@ -119,39 +124,19 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
             parts = parts[:-1]
         return '/' + '/'.join([*parts, name])
 
-    def _read_settings(self, model: type[SettingsT]) -> SettingsT:
-        given = {name: parameter.value for name, parameter in self._parameter_overrides.items()}
-        values: dict[str, Any] = {}
-        for item in parameter_fields(model, given):
-            descriptor = ParameterDescriptor(
-                description=item.description,
-                additional_constraints=item.constraints,
-                read_only=True,
-                dynamic_typing=True,
-            )
-            values[item.name] = self.declare_parameter(item.name, item.default, descriptor).value
-        known = {*values, 'use_sim_time'}
-        unknown = sorted(
-            name for name in given if name not in known and not name.startswith('qos_overrides.')
-        )
-        if unknown:
-            raise SettingsError(f'parameter {unknown[0]}: is not known')
-        try:
-            return model.model_validate(unflatten(model, values))
-        except ValidationError as error:
-            lines = [
-                f'parameter {".".join(str(part) for part in item["loc"])}: {item["msg"]}, '
-                f'read {item["input"]!r}'
-                for item in error.errors()
-            ]
-            raise SettingsError('\n'.join(lines)) from error
-        except ValueError as error:
-            raise SettingsError(f'parameter {error}') from error
-
     # ---- life cycle --------------------------------------------------------------------------
 
+    def prepare(self) -> None:
+        """Make what the settings describe, before `set_up`. In *configure*.
+
+        Raises
+        ------
+        SettingsError
+            If a setting is not allowed after all.
+        """
+
     def set_up(self) -> None:
-        """Create publishers and subscriptions, compile and warm up. Once, in *configure*."""
+        """Create publishers and subscriptions, compile and warm up. In *configure*."""
 
     def start(self) -> None:
         """Begin to work, in *activate*."""
@@ -160,10 +145,38 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         """Stop what moves, in *deactivate* and at the end. May be called more than once."""
 
     def tear_down(self) -> None:
-        """Undo `set_up`, in *cleanup*."""
+        """Undo `prepare` and `set_up`, in *cleanup*: all but ROS entities, which go by themselves.
+
+        After a *configure* that failed it is called as well.
+        """
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Compile, warm up and connect."""
+        """Read the parameters, compile, warm up and connect."""
+        self.problem = ''
+        self._entities_made.mark()
+        try:
+            self._configure()
+        except SettingsError as error:
+            self.problem = str(error)
+        except Exception as error:
+            self.problem = f'configure failed: {error!r}'
+            self.get_logger().error(traceback.format_exc())
+        if self.problem:
+            self.get_logger().error(f'not configured: {self.problem}')
+            self._disconnect()
+            return TransitionCallbackReturn.FAILURE
+        self.configured = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def _configure(self) -> None:
+        self.settings = self._parameters_read.read()
+        robots = getattr(self.settings, 'robots', None)
+        # One that works for a single robot, in its namespace, belongs to that robot.
+        alone = robots is not None and list(robots) == [self.get_namespace().rpartition('/')[2]]
+        self._in_robot = self._always_in_robot or alone
+        self.step = -1
+        self._prepared = True
+        self.prepare()
         self._ready_publisher = self.create_publisher(
             LockstepDone, self.team_topic('lockstep/ready'), LATCHED
         )
@@ -176,7 +189,6 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
                 LockstepStep, self.team_topic('lockstep/step'), self._hear_step, RELIABLE
             )
         self.set_up()
-        return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to work."""
@@ -187,8 +199,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop what moves."""
-        self.halt()
-        self.active = False
+        self._stop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -198,27 +209,46 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop what moves, for good."""
-        self.halt()
-        self.active = False
+        self._stop()
         return TransitionCallbackReturn.SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop what moves after an error in a transition."""
-        self.halt()
-        return TransitionCallbackReturn.FAILURE
+        """Stop what moves after an error in a transition, and undo *configure*."""
+        self.get_logger().error('a transition failed: the node stops')
+        try:
+            self._stop()
+        finally:
+            self._disconnect()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _stop(self) -> None:
+        if self.configured:
+            self.halt()
+        self.active = False
+        self._end_peer_timer()
+
+    def _end_peer_timer(self) -> None:
+        if self._peer_timer is not None:
+            self._peer_timer.cancel()
+            self.destroy_timer(self._peer_timer)
+            self._peer_timer = None
 
     def _disconnect(self) -> None:
-        self.tear_down()
+        self.active = False
+        if self._prepared:
+            self._prepared = False
+            try:
+                self.tear_down()
+            except Exception:
+                # The rest is undone all the same.
+                self.get_logger().error(traceback.format_exc())
+        self.configured = False
         self._peers.clear()
-        if self._ready_publisher is not None:
-            self.destroy_publisher(self._ready_publisher)
-            self._ready_publisher = None
-        if self._done_publisher is not None:
-            self.destroy_publisher(self._done_publisher)
-            self._done_publisher = None
-        if self.step_subscription is not None:
-            self.destroy_subscription(self.step_subscription)
-            self.step_subscription = None
+        self._urgent_topics.clear()
+        self._entities_made.clear()
+        self._peer_timer = self._ready_publisher = self._done_publisher = None
+        self.step_subscription = None
+        self._parameters_read.release()
 
     # ---- readiness and lockstep --------------------------------------------------------------
 
@@ -283,8 +313,7 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
     def _look_for_peers(self) -> None:
         if not self.active or not all(condition() for condition in self._peers):
             return
-        self._peer_timer.cancel()
-        self.destroy_timer(self._peer_timer)
+        self._end_peer_timer()
         self.on_ready()
         if self._ready_publisher is not None:
             self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
@@ -323,25 +352,32 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         """Return a timer on the steady clock; `period` in seconds."""
         return self.create_timer(period, callback, clock=_STEADY)
 
-    def _on_jump(self, jump: Any) -> None:
-        if jump.delta.nanoseconds < 0 and self.active:
-            self.get_logger().warning(
-                f'the clock jumped back by {-jump.delta.nanoseconds * 1e-9:.3f} s: starting anew'
-            )
-            self.reset()
+    def _on_restart(self, jump: float) -> None:
+        text = f'the clock jumped back by {jump:.3f} s'
+        if not self.active or self.settings.lockstep:
+            # In lockstep the steps are the time.
+            self.warn_throttled('clock', text)
+            return
+        self.get_logger().warning(f'{text}: the search starts again')
+        self.reset()
 
-    def _look_for_clock(self) -> None:
-        waited = time.monotonic() - self._started
-        if (
-            self.active
-            and waited >= self._clock_patience
-            and not self.get_clock().now().nanoseconds
-        ):
-            # Said less and less often.
-            self._clock_patience = 2.0 * waited
-            self.get_logger().warning(
-                f'no /clock for {waited:.0f} s: waiting for it (use_sim_time is true)'
-            )
+    # ---- messages ----------------------------------------------------------------------------
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
+    ) -> Subscription:
+        """Return a subscription that drops messages whose stamp is no time."""
+        if not options.get('raw'):
+            callback = partial(self.check_stamp, topic, callback)
+        return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
+
+    def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
+        """Call back unless the stamp of a message is no time."""
+        problem = stamp_problem(message)
+        if problem is None:
+            callback(message)
+        else:
+            self.drop('bad stamp', f'{topic}.{problem}')
 
     # ---- diagnostics -------------------------------------------------------------------------
 
@@ -371,15 +407,28 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         """Return what the diagnostics show beside the counts."""
         return {}
 
+    def fault(self) -> str:
+        """Return what keeps the node from its work, for the diagnostics; empty where it works."""
+        return ''
+
+    def warnings(self) -> list[str]:
+        """Return what is wrong now, for the diagnostics."""
+        return []
+
     def _publish_diagnostics(self) -> None:
+        self._clock_watch.look()
         dropped = sum(self.dropped.values())
+        shown = self.status() if self.configured else {}
+        fault = self.fault() if self.active else ''
+        warnings = self.warnings() if self.active else []
+        level = DiagnosticStatus.WARN if dropped or warnings else DiagnosticStatus.OK
         status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if dropped else DiagnosticStatus.OK,
+            level=DiagnosticStatus.ERROR if fault else level,
             name=self.get_fully_qualified_name(),
-            message='active' if self.active else 'not active',
+            message='; '.join([fault or ('active' if self.active else 'not active'), *warnings]),
             hardware_id='',
             values=[
-                *(KeyValue(key=key, value=str(value)) for key, value in self.status().items()),
+                *(KeyValue(key=key, value=str(value)) for key, value in shown.items()),
                 *(
                     KeyValue(key=f'dropped: {reason}', value=str(number))
                     for reason, number in sorted(self.dropped.items())
@@ -387,8 +436,12 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
             ],
         )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = self.stamp_of_diagnostics()
         self._diagnostics.publish(message)
+
+    def stamp_of_diagnostics(self) -> Time:
+        """Return the present time of the run."""
+        return self.get_clock().now().to_msg()
 
 
 def _takes_part(name: str) -> bool:
@@ -396,13 +449,16 @@ def _takes_part(name: str) -> bool:
     return name not in ('recorder', 'guard', 'rosbag2_recorder') and not name.startswith('_')
 
 
-def _backward_threshold() -> Any:
-    from rclpy.clock import JumpThreshold
-    from rclpy.duration import Duration
+def _configure(node: SearchNode[Any]) -> bool:
+    """Configure a node; return whether it is configured."""
+    done = node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    if not done:
+        print(f'error: {node.problem}', file=sys.stderr)
+    return done
 
-    return JumpThreshold(
-        min_forward=None, min_backward=Duration(nanoseconds=-1_000_000), on_clock_change=False
-    )
+
+def _activate(node: SearchNode[Any]) -> bool:
+    return node.trigger_activate() == TransitionCallbackReturn.SUCCESS
 
 
 def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = None) -> int:
@@ -410,43 +466,40 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
 
     SIGINT and SIGTERM stop what moves before the node leaves the graph.
     """
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-
-    # While messages are taken a signal is only noted: an exception in the middle of a call into
-    # rclpy's C++ comes out as another one. A second signal does not wait.
-    spinning, asked = False, False
+    # A signal is only noted: an exception in the middle of a call into rclpy's C++ comes out as
+    # another one. A second signal does not wait.
+    asked = False
 
     def interrupt(number: int, frame: Any) -> None:
         nonlocal asked
-        if not spinning or asked:
+        if asked:
             raise KeyboardInterrupt
         asked = True
 
-    signal.signal(signal.SIGINT, interrupt)
-    signal.signal(signal.SIGTERM, interrupt)
     node: SearchNode[Any] | None = None
     try:
+        signal.signal(signal.SIGINT, interrupt)
+        signal.signal(signal.SIGTERM, interrupt)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
         executor = LeanExecutor(node, node.urgent)
-        if node.settings.autostart:
-            node.trigger_configure()
-            node.trigger_activate()
+        if node.get_parameter('autostart').value and not asked:
+            if not _configure(node):
+                return 2 if node.problem else 1
+            if not asked and not _activate(node):
+                return 1
         # What was made so far stays: the collector need not look at it in every round.
         gc.collect()
         gc.freeze()
-        spinning = True
         while rclpy.ok() and not asked:
             executor.spin_for(_SIGNAL_PERIOD)
-    except SettingsError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 2
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if node is not None:
-            if rclpy.ok():
+            if rclpy.ok() and node.configured:
                 node.halt()
             node.destroy_node()
         rclpy.try_shutdown()

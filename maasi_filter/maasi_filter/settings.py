@@ -175,7 +175,7 @@ class Obstacle(Settings):
 class EnvironmentSettings(Settings):
     """Where the targets are."""
 
-    bounds: list[list[Finite]] = Field(
+    bounds: list[Annotated[list[Finite], Field(min_length=2, max_length=2)]] = Field(
         min_length=2, max_length=3, description='Lower and upper bound on each map axis [m]'
     )
     obstacles: list[Obstacle] = Field(default_factory=list, description='Obstacles')
@@ -183,7 +183,7 @@ class EnvironmentSettings(Settings):
     @model_validator(mode='after')
     def _ordered(self) -> EnvironmentSettings:
         for axis, pair in enumerate(self.bounds):
-            if len(pair) != 2 or not pair[0] < pair[1]:
+            if not pair[0] < pair[1]:
                 raise ValueError(
                     f'bounds[{axis}]: got {pair}, allowed is [lower, upper] with lower < upper'
                 )
@@ -254,7 +254,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     'paper_000': _PAPER,
     'paper_001': {**_PAPER, 'particles': 5000, 'particles_per_target': 500},
-    'paper_002': {**_PAPER, 'corrector': 'predicted', 'found_radius': 1.2},
+    'paper_002': {**_PAPER, 'found_radius': 1.2},
     'paper_003': {
         **_PAPER,
         'births': 'gaussian',

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FORMAT = 'maasi_filter_state'
-VERSION = 1
+VERSION = 2
 BIT_GENERATORS = ('PCG64', 'PCG64DXSM', 'Philox', 'SFC64', 'MT19937')
 LONGEST_HEADER = 4096
 
@@ -26,8 +26,21 @@ class StateFileError(ValueError):
     """A state file cannot be used; the message says which file and why."""
 
 
-def write_state(path: str | os.PathLike[str], values: dict[str, NDArray[Any]]) -> None:
-    """Write arrays to `path`, replacing the file only once everything is on disk."""
+def write_state(
+    path: str | os.PathLike[str], values: dict[str, NDArray[Any]], *, durable: bool = True
+) -> None:
+    """Write arrays to `path`, replacing the file in one piece.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    values : dict of str to array
+        What is written.
+    durable : bool
+        Whether everything is on the disk before the old file is replaced: it then survives a power
+        failure as well.
+    """
     target = Path(path)
     buffer = io.BytesIO()
     np.savez(buffer, **values)  # type: ignore[arg-type]
@@ -44,7 +57,8 @@ def write_state(path: str | os.PathLike[str], values: dict[str, NDArray[Any]]) -
             stream.write(json.dumps(header).encode() + b'\n')
             stream.write(payload)
             stream.flush()
-            os.fsync(stream.fileno())
+            if durable:
+                os.fsync(stream.fileno())
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)

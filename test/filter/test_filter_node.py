@@ -13,12 +13,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from maasi_filter import FilterSettings, SearchFilter
+from maasi_filter.conversions import MOST_DETECTIONS
 from maasi_filter.executor import LeanExecutor
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.node_settings import FilterNodeSettings
 from maasi_filter.parameters import flatten
 from maasi_filter.qos import LATCHED, RELIABLE, UPDATES
-from maasi_filter.search_node import SettingsError
 from maasi_msgs.msg import (
     BatchMember,
     Detection,
@@ -98,7 +98,7 @@ def running(**changes):
         rclpy.init(context=context, domain_id=domain.number)
         settings = SETTINGS.model_copy(update=changes)
         node = FilterNode(context=context, parameter_overrides=overrides(settings))
-        node.trigger_configure()
+        assert node.trigger_configure().name == 'SUCCESS', node.problem
         node.trigger_activate()
         team = Team(context)
         lean = LeanExecutor(node, context=context)
@@ -211,21 +211,61 @@ def test_a_stamp_before_the_last_one_is_dropped(world):
     assert list(team.updates[1].missing) == ['a']
 
 
+def test_one_detection_from_the_future_does_not_silence_its_robot(world):
+    node, team, until = world
+    for number in (1, 2, 3):
+        future = {'header__stamp': rclpy.time.Time(seconds=40.0).to_msg()} if number == 2 else {}
+        team.measure(number, ['a'], {'a': [(0.3, 0.5)]}, **future)
+        until(lambda number=number: len(team.updates) == number)
+    far = rclpy.time.Time(seconds=1e6).to_msg()
+    team.measure(4, ['a'], {'a': [(0.3, 0.5)]}, header__stamp=far)
+    until(lambda: len(team.updates) == 4)
+    assert list(team.updates[3].missing) == ['a'] and node.dropped['bad detections'] == 1
+    team.measure(5, ['a'], {'a': [(0.3, 0.5)]})
+    until(lambda: len(team.updates) == 5)
+    assert not team.updates[2].missing and not team.updates[4].missing
+
+
+def test_detections_that_are_equal_or_too_many_are_counted_and_cost_no_time(world):
+    node, team, until = world
+    team.measure(1, ['a'], {'a': [(0.3, 0.5)] * 10_000})
+    until(lambda: len(team.updates) == 1)
+    assert node.dropped['equal detection'] == 9_999
+    assert team.updates[0].found == 0
+    many = [(0.3 + 1e-5 * k, 0.5) for k in range(10_000)]
+    begin = time.monotonic()
+    team.measure(2, ['a'], {'a': many})
+    until(lambda: len(team.updates) == 2)
+    assert node.dropped['too many detections'] == 10_000 - MOST_DETECTIONS
+    assert time.monotonic() - begin < 10.0
+
+
+@pytest.mark.parametrize('number', [2**64 - 1, 2**63])
+def test_an_absurd_batch_is_refused_and_the_next_one_is_not(world, number):
+    node, team, until = world
+    team.measure(1, ['a'], {'a': []})
+    until(lambda: len(team.updates) == 1)
+    team.batch.publish(MeasurementBatch(id=number, step=number))
+    until(lambda: node.dropped['bad batch'] == 1)
+    team.measure(2, ['a'], {'a': []})
+    until(lambda: len(team.updates) == 2)
+    assert team.updates[1].batch_id == 2
+
+
 def test_wrong_parameters_are_refused_by_name():
     flat = flatten(SETTINGS)
     with Domain(None) as domain:
         context = Context()
         rclpy.init(context=context, domain_id=domain.number)
         try:
-            for name, value in (('filter.particles', -3), ('filter.partikles', 10)):
-                wrong = {**flat, name: value}
-                with pytest.raises(SettingsError, match=name):
-                    FilterNode(
-                        context=context,
-                        parameter_overrides=[
-                            Parameter(key, value=item) for key, item in wrong.items()
-                        ],
-                    )
+            wrong = {**flat, 'filter.particles': -3}
+            node = FilterNode(
+                context=context,
+                parameter_overrides=[Parameter(key, value=item) for key, item in wrong.items()],
+            )
+            assert node.trigger_configure().name == 'FAILURE'
+            assert 'filter.particles: Input should be greater than' in node.problem
+            node.destroy_node()
         finally:
             rclpy.shutdown(context=context)
 
@@ -285,5 +325,8 @@ def test_a_file_that_cannot_be_used_is_refused_with_the_reason(tmp_path, wrong):
         content[len(content) // 2] ^= 1
         file.write_bytes(bytes(content))
     reason = 'checksum' if wrong == 'damaged' else 'bounds'
-    with pytest.raises(SettingsError, match=f'save_file: .*{reason}'), running(save_file=str(file)):
+    with (
+        pytest.raises(AssertionError, match=f'save_file: .*{reason}'),
+        running(save_file=str(file)),
+    ):
         pass

@@ -23,7 +23,7 @@ CONTENT = {
 def test_round_trip():
     settings = FilterNodeSettings.model_validate(CONTENT)
     flat = flatten(settings)
-    assert flat['environment.bounds'] == ['-0.3 2.4', '0.0 2.0']
+    assert flat['environment.bounds'] == [-0.3, 2.4, 0.0, 2.0]
     assert flat['environment.obstacles'] == ['0.8 1.2 0.1']
     assert flat['robots'] == ['a', 'b']
     assert flat['robot.a.sensor.noise.as'] == 'variance'
@@ -39,6 +39,19 @@ def test_every_field_is_a_parameter_with_a_description():
     assert fields['filter.particles'].constraints == 'at least 1 and at most 5000000'
     assert 'recommended' in fields['filter.preset'].constraints
     assert fields['filter.found_mass'].default is None
+
+
+def test_bounds_are_read_as_strings_of_numbers_too():
+    settings = FilterNodeSettings.model_validate(CONTENT)
+    flat = {**flatten(settings), 'environment.bounds': ['-0.3 2.4', '0.0 2.0']}
+    assert FilterNodeSettings.model_validate(unflatten(FilterNodeSettings, flat)) == settings
+
+
+def test_bounds_of_a_wrong_number_are_named():
+    flat = flatten(FilterNodeSettings.model_validate(CONTENT))
+    flat['environment.bounds'] = [0.0, 2.0, 0.0]
+    with pytest.raises(ValueError, match=r'environment\.bounds: got 3 numbers, .* of 2'):
+        unflatten(FilterNodeSettings, flat)
 
 
 def test_a_list_that_is_no_numbers_is_named():

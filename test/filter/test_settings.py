@@ -63,7 +63,7 @@ def test_presets_fill_in_what_is_not_given():
 
 
 def test_papers_differ_where_they_differ():
-    assert PRESETS['paper_002']['corrector'] == 'predicted'
+    assert PRESETS['paper_002']['corrector'] == 'running'
     assert PRESETS['paper_000']['corrector'] == 'running'
     assert PRESETS['paper_003']['removal'] == 'every'
     assert PRESETS['paper_001']['removal'] == 'closest'

@@ -7,7 +7,7 @@ import pytest
 from searches import CUBE, cube_sensor, observe, wander
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, SearchFilter, StateFileError
-from maasi_filter.state_file import generator_state, restored_generator
+from maasi_filter.state_file import generator_state, restored_generator, write_state
 
 
 def searched(steps=25, preset='recommended', generator=None):
@@ -124,10 +124,68 @@ def test_another_version_is_refused_by_number(tmp_path):
     header = json.loads(line)
     header['version'] = 99
     path.write_bytes(json.dumps(header).encode() + b'\n' + payload)
-    with pytest.raises(StateFileError, match='version: got 99, allowed is 1'):
+    with pytest.raises(StateFileError, match='version: got 99, allowed is 2'):
         SearchFilter.load(path)
 
 
 def test_a_missing_file_is_told(tmp_path):
     with pytest.raises(StateFileError, match='cannot be read'):
         SearchFilter.load(tmp_path / 'nothing')
+
+
+def _set(name, value):
+    def change(state):
+        state[name][...] = value
+
+    return change
+
+
+def _replace(name, make):
+    def change(state):
+        state[name] = make(state[name])
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ('change', 'reason'),
+    [
+        (_set('particles', np.nan), 'particles: got a number that is not finite'),
+        (_set('weights', np.inf), 'weights: got a number that is not finite'),
+        (_set('weights', -1.0), 'weights: got -1.0, allowed are numbers from 0'),
+        (_set('exploration', np.nan), 'exploration: got a number'),
+        (_replace('exploration', lambda a: a[:1]), 'exploration: got shape'),
+        (_replace('particles', lambda a: a[:, :2]), 'particles: got shape'),
+        (_replace('weights', lambda a: a[:-1]), 'weights: got shape'),
+        (_replace('weights', lambda a: a.astype(str)), 'weights: got type'),
+        (_set('group', 99), 'group: got 99 to 99'),
+        (_replace('information', lambda a: a[:-1]), 'got'),
+        (_set('found_positions', np.nan), 'found_positions: got a number that is not finite'),
+        (_set('found_covariances', -1.0), 'found_covariances: of target'),
+        (_set('found_ids', 1), 'found_ids: got'),
+        (_replace('found_times', lambda a: a[:-1]), 'found_times: got shape'),
+        (_replace('robots', lambda a: np.frombuffer(b'[1, 2]', np.uint8)), 'robots: got'),
+        (_replace('bounds', lambda a: a * np.nan), 'bounds: got'),
+        (lambda state: state.pop('weights'), "no 'weights'"),
+    ],
+)
+def test_a_state_with_a_right_checksum_and_wrong_content_is_refused(tmp_path, change, reason):
+    search, _ = searched(preset='paper_000')
+    assert len(search.weights) and len(search.found_targets) > 2
+    path = tmp_path / 'state'
+    state = {name: np.array(array) for name, array in search.state().items()}
+    change(state)
+    write_state(path, state)
+    with pytest.raises(StateFileError, match=f'does not hold a usable state: .*{reason}'):
+        SearchFilter.load(path)
+
+
+@pytest.mark.parametrize('name', ['lost_values', 'lost_scans', 'lost_gates', 'lost_room'])
+def test_wrong_detections_of_lost_targets_are_refused(tmp_path, name):
+    search, _ = searched(preset='recommended')
+    path = tmp_path / 'state'
+    state = search.state()
+    state[name] = np.append(state[name], 1.0)
+    write_state(path, state)
+    with pytest.raises(StateFileError, match=f'{name}: got'):
+        SearchFilter.load(path)

@@ -1,0 +1,68 @@
+"""Compiles what the filter uses before it is used."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from maasi_filter.detection_model import PARAMETERS, detection_probability
+from maasi_filter.lost_targets import LostTargets
+from maasi_filter.phd import prepare_measurements
+from maasi_filter.pose import Pose
+from maasi_filter.search_filter import LEAST_CLUSTER_MASS, AgentMeasurement, SearchFilter
+from maasi_filter.settings import (
+    DetectionSettings,
+    FilterSettings,
+    NoiseSettings,
+    Preset,
+    SensorSettings,
+)
+
+
+def warm_up() -> None:
+    """Compile, or load from the cache, every kernel that a step uses.
+
+    A node calls this before it reports ready, so that no step waits for a compiler.
+    """
+    for dimension in (2, 3):
+        bounds = np.array([[0.0, 10.0]] * dimension)
+        for detection in (
+            DetectionSettings(kind='exponential', size=[5.0] * dimension),
+            DetectionSettings(kind='box', lower=[-5.0, -5.0], upper=[5.0, 5.0]),
+        ):
+            noise = NoiseSettings(range=0.5, bearing=0.1, elevation=0.1)
+            sensor = SensorSettings(detection=detection, noise=noise).build('warm_up', dimension)
+            presets: tuple[Preset, ...] = ('recommended', 'paper_000', 'paper_003')
+            for preset in presets:
+                settings = FilterSettings(
+                    preset=preset, particles=500, birth_particles=50, particles_minimum=50
+                )
+                search = SearchFilter(settings, bounds, np.random.default_rng(0))
+                for step in range(6):
+                    position = np.array([3.0 + 0.2 * step, 3.0, 3.0])
+                    pose = Pose.from_yaw(position, 0.1)
+                    targets = np.array([[5.0, 5.0, 5.0], [2.0, 4.0, 2.0]])[:, :dimension]
+                    values = sensor.measurement.measure(targets, pose)
+                    if step == 3:
+                        values = values[:0]
+                    search.step(
+                        [AgentMeasurement('warm_up', pose, sensor, values, None, step)], 1, step
+                    )
+                positions = np.full((1, 3), 3.0)
+                search.exploration.expected_new(sensor.detection, positions, np.zeros(1), 1.0)
+                search.exploration.at(positions)
+                lost = LostTargets(dimension, 1e-3, LEAST_CLUSTER_MASS)
+                pose = Pose(positions[0])
+                seen = prepare_measurements(
+                    sensor.measurement.measure(positions[:, :dimension] + 1.0, pose),
+                    sensor.covariance[None],
+                    pose,
+                )
+                lost.add(seen, np.ones(1, np.bool_), pose, sensor.detection, 0.0)
+                lost.clusters(
+                    np.zeros((0, dimension)),
+                    np.zeros((0, dimension, dimension)),
+                    search.exploration,
+                    0.0,
+                )
+    origin = np.zeros(3)
+    detection_probability(0, np.zeros(PARAMETERS), origin, origin, 0.0)
