@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_filter.conversions import colour, point_to_ros, pose_from_ros
+from maasi_filter.conversions import FASTEST, bounded, colour, point_to_ros, pose_from_ros
 from maasi_filter.exploration import Exploration
 from maasi_msgs.msg import AgentState, Candidate, PlanDecision
 from maasi_msgs.msg import RobotDecision as RobotDecisionMessage
@@ -31,12 +31,14 @@ def robot_state_from_ros(message: AgentState) -> RobotState:
     Raises
     ------
     ValueError
-        If a number is not finite; the message names the field.
+        If a number is not finite or absurdly large; the message names the field.
     """
-    angular = message.twist.angular
+    linear, angular = message.twist.linear, message.twist.angular
+    bounded('twist.linear', (linear.x, linear.y, linear.z), FASTEST)
+    bounded('twist.angular', (angular.x, angular.y, angular.z), FASTEST)
     return RobotState(
         pose_from_ros(message.pose.pose),
-        np.array([message.twist.linear.x, message.twist.linear.y, message.twist.linear.z]),
+        np.array([linear.x, linear.y, linear.z]),
         np.array([angular.x, angular.y, angular.z]),
     )
 

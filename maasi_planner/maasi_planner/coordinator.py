@@ -61,6 +61,7 @@ class _Plan:
     candidates: CandidateSet
     period: int
     radius: float
+    exploration: Exploration | None = None
     decision: int = -1
     decided_at: int | None = None
     positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
@@ -104,6 +105,7 @@ class Coordinator:
         self.planner = make_planner(settings.planner.name, settings.planner)
         self.trigger = MeasurementTrigger(settings.planner)
         self._plans: dict[str, _Plan] = {}
+        own = settings.planner.own_explorations
         for name in sorted(settings.robots):
             robot = settings.robots[name]
             self._plans[name] = _Plan(
@@ -112,6 +114,7 @@ class Coordinator:
                 candidates=CandidateSet(robot.candidates, bounds, height=robot.start[2]),
                 period=max(1, round(robot.sensor.period / settings.step)),
                 radius=robot.radius,
+                exploration=self.exploration.copy() if own else None,
             )
 
     @property
@@ -159,6 +162,35 @@ class Coordinator:
         plan.yaws = np.zeros(0)
         plan.staying = True
         plan.due = False
+
+    def destined(self, name: str) -> bool:
+        """Return whether a robot has a plan, or has not measured since it had one."""
+        plan = self._plans[name]
+        return plan.decided_at is None or not plan.staying or len(plan.positions) > 0
+
+    def lend(self, name: str, step: int) -> None:
+        """Take note that a robot follows a goal of another client: it measures without a plan."""
+        plan = self._plans[name]
+        began = step if plan.decided_at is None else plan.decided_at
+        self.leave(name)
+        plan.decided_at = began
+        # Measurements have the index of a decision, which is not negative.
+        plan.decision = max(plan.decision, 0)
+
+    def begin_again(self) -> None:
+        """Begin a new search with nothing explored; indices of decisions go on."""
+        self.exploration.values[...] = 1.0
+        self.finished = None
+        self.planner = make_planner(self.settings.planner.name, self.settings.planner)
+        self.trigger.reset()
+        for name in self.names:
+            self.leave(name)
+
+    def next_number(self, name: str) -> int:
+        """Return the number of a goal that no decision of the planner led to."""
+        plan = self._plans[name]
+        plan.decision += 1
+        return plan.decision + 1
 
     def planning(self, step: int, robots: Mapping[str, PresentRobot]) -> list[str]:
         """Return P_k, the robots that plan at a step, in order of their names.
@@ -243,6 +275,7 @@ class Coordinator:
                 period_steps=plan.period,
                 planning=name in planning,
                 radius=plan.radius,
+                exploration=plan.exploration,
             )
             if not view.planning and plan.decided_at is not None:
                 gone = step - plan.decided_at
@@ -308,10 +341,13 @@ class Coordinator:
         Parameters
         ----------
         poses : mapping
-            Where the members measured, by name (000, eq. (20), (30)).
+            Where the members measured, by name (000, eq. (20), (30); 002, eq. (12)).
         clusters : list of Cluster
             After the batch.
         """
         for name in sorted(poses):
-            self.exploration.update(self._plans[name].sensor.detection, poses[name])
+            plan = self._plans[name]
+            self.exploration.update(plan.sensor.detection, poses[name])
+            if plan.exploration is not None:
+                plan.exploration.update(plan.sensor.detection, poses[name])
         self.clusters = clusters

@@ -13,15 +13,18 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from maasi_filter.conversions import (
+    FASTEST,
     point_to_ros,
     pose_from_ros,
     stamp_from_ros,
     stamp_of_step,
     stamp_to_ros,
 )
+from maasi_filter.marker_board import MarkerBoard
 from maasi_filter.pose import Pose, compose
-from maasi_filter.qos import LATCHED, RELIABLE, sensor_reader
+from maasi_filter.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
 from maasi_filter.search_node import SearchNode, SettingsError, run
+from maasi_filter.stamps import JUMP, StampGate
 from maasi_msgs.msg import AgentState, CuboidDecision, LockstepStep, SearchLink, SearchLinkArray
 from maasi_planner.conversions import path_to_ros
 from maasi_planner.planners.cuboid.agent import Activity, Broadcast, SearchAgent, decision_stream
@@ -37,6 +40,8 @@ from maasi_planner.planners.cuboid.conversions import (
 from maasi_planner.planners.cuboid.dynamics import Dynamics
 from maasi_planner.planners.cuboid.node_settings import CuboidPlannerSettings
 from maasi_planner.planners.cuboid.preplanning import plan_mission
+from maasi_planner.search_modes import Mode, SearchModes
+from maasi_planner.search_services import offer_services
 
 # How far an odometry's stamp may be from a step [ns].
 _STAMP_TOLERANCE = 1_000_000
@@ -64,10 +69,17 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
     velocity at the next step; `state` (maasi_msgs/AgentState); `decision`
     (maasi_msgs/CuboidDecision); `plan` (nav_msgs/Path); of the team: `markers`,
     `search_area` (visualization_msgs/MarkerArray)
+
+    Services
+    --------
+    `search/start`, `pause`, `resume`, `stop` (std_srvs/Trigger); `search/home` is refused
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__('cuboid_planner', CuboidPlannerSettings, in_robot=True, **options)
+
+    def prepare(self) -> None:
+        """Plan the mission."""
         self.name = self.get_namespace().rpartition('/')[2]
         if not self.name:
             raise SettingsError("namespace: read '', allowed is the name of the robot")
@@ -79,6 +91,9 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
             self.agent = self._make_agent()
         except ValueError as error:
             raise SettingsError(f'parameter {error}') from error
+        self.modes = SearchModes([self.name])
+        # Between two odometry messages there may be several steps [ns].
+        self._gate = StampGate(max(JUMP, round(3e9 * settings.step)))
         self._begin_anew()
 
     def _make_agent(self) -> SearchAgent:
@@ -95,7 +110,10 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
     def _begin_anew(self) -> None:
         self._state: tuple[int, Pose, np.ndarray] | None = None
         self._wanted_step = -1
+        self._board = MarkerBoard()
         self._told_step = -1
+        # Whether the agent observed the state of that step, and is to decide.
+        self._observed = False
         self._decided_step = -1
         self._link: SearchLink | None = None
         self._heard: SearchLinkArray | None = None
@@ -115,7 +133,8 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
         self._link_publisher = self.create_publisher(SearchLink, 'link/tx', RELIABLE)
         self.expect_subscribers(self._command_publisher)
         self.expect_subscribers(self._link_publisher)
-        self._state_publisher = self.create_publisher(AgentState, 'state', RELIABLE)
+        self._state_publisher = self.create_publisher(AgentState, 'state', LIVELY)
+        self.create_wall_timer(LIVELINESS_PERIOD, self._state_publisher.assert_liveliness)
         self._decision_publisher = self.create_publisher(CuboidDecision, 'decision', RELIABLE)
         self._path_publisher = self.create_publisher(Path, 'plan', 10)
         self._markers_publisher = self.create_publisher(MarkerArray, self.team_topic('markers'), 10)
@@ -131,6 +150,7 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
         link = self.create_subscription(SearchLinkArray, 'link/rx', self._on_heard, RELIABLE)
         self.hurry(self.step_subscription, self._odometry, link)
         self.expect_publisher(self._odometry.topic_name)
+        offer_services(self, [self.name], self.team_topic, self._take_command)
         if not lockstep:
             self.create_wall_timer(0.02, self._look_at_the_time)
         for cell, reason in self._mission.lost:
@@ -143,19 +163,50 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
         agent.observe(0, self.settings.start, np.zeros(3))
         agent.decide([], decision_stream(self.settings.seed, self.name, 0))
 
+    def start(self) -> None:
+        """Start the search, unless it waits for the service."""
+        if self.settings.search_on_start:
+            self.modes.command('start')
+
     def halt(self) -> None:
-        """Stop the robot."""
+        """End the search: the robot stops."""
+        self.modes.command('stop')
+        self._stop_robot()
+
+    def _stop_robot(self) -> None:
+        self._observed = False
         if self.active and self._decided_step >= 0:
             self._command_publisher.publish(TwistStamped(header=self._header(self._decided_step)))
 
+    @property
+    def _searching(self) -> bool:
+        return self.modes.of[self.name] is Mode.SEARCHING
+
+    def _take_command(self, word: str, _: list[str] | None) -> tuple[bool, str]:
+        """Follow a command; return whether, and an answer in words."""
+        if not self.active:
+            return False, 'the planner is not active'
+        if word == 'home':
+            return False, f'{self.name}: no home in a search of buildings, allowed is pause, stop'
+        if not self.modes.command(word):
+            return False, f'{self.name}: {self.modes.describe()}; {word} changes nothing'
+        if not self._searching and not self.settings.lockstep:
+            self._stop_robot()
+        answer = f'{word}: {self.name}'
+        self.get_logger().info(answer)
+        return True, answer
+
     def reset(self) -> None:
         """Begin a new search."""
+        if not self.settings.lockstep:
+            self._stop_robot()
         self.agent = self._make_agent()
         self._begin_anew()
 
     def status(self) -> dict[str, Any]:
         """Return the state of the search."""
         return {
+            'search': self.modes.describe(),
             'activity': self.agent.activity.name.lower(),
             'visited': f'{int(self.agent.visited.sum())} of {len(self.agent.visited)}',
             'solves without a plan': self.agent.failed,
@@ -188,8 +239,18 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
             self.drop('bad odometry', f'odom.pose.{error}')
             return
         velocity = vector_from_ros(message.twist.twist.linear)
-        if not np.isfinite(velocity).all():
-            self.drop('bad odometry', f'odom.twist: read {velocity}, allowed are finite numbers')
+        if not (np.abs(velocity) <= FASTEST).all():
+            self.drop(
+                'bad odometry',
+                f'odom.twist: read {velocity}, allowed are finite numbers up to {FASTEST:g} [m/s]',
+            )
+            return
+        if not (self.settings.lockstep or self._gate.accepts(stamp)):
+            self.drop(
+                'bad odometry',
+                f'odom.header.stamp: read {stamp * 1e-9:.6f} s, which is far from the one before; '
+                'allowed if the next one follows it',
+            )
             return
         # Odometry starts at zero.
         pose = compose(Pose.from_yaw(self.settings.start, self.settings.yaw), reading)
@@ -251,7 +312,8 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
         assert self._state is not None
         _, pose, velocity = self._state
         self._shots = len(self.agent.snapshots)
-        broadcast = self.agent.observe(step, pose.position, velocity)
+        self._observed = self._searching
+        broadcast = self.agent.observe(step, pose.position, velocity) if self._observed else None
         if broadcast is None:
             self._link = SearchLink(
                 header=self._header(step),
@@ -281,6 +343,9 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
 
     def _decide(self, heard: list[Broadcast]) -> None:
         step = self._told_step
+        if not self._observed:
+            self._stand(step)
+            return
         agent = self.agent
         begun = time.perf_counter()
         choice = agent.decide(heard, decision_stream(self.settings.seed, self.name, step))
@@ -304,7 +369,17 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
         )
         self._publish_state(step, header)
         self._path_publisher.publish(path_to_ros(choice.plan.positions, header))
-        self._markers_publisher.publish(agent_markers(agent, choice, header))
+        self._markers_publisher.publish(self._board.replace(agent_markers(agent, choice, header)))
+        self._command_publisher.publish(self._command)
+        self.done(step)
+
+    def _stand(self, step: int) -> None:
+        """Do a step without searching: the robot stands."""
+        self._decided_step = step
+        header = self._header(step)
+        self._command = TwistStamped(header=header)
+        self._command.header.frame_id = f'{self.name}/base_link'
+        self._publish_state(step, header)
         self._command_publisher.publish(self._command)
         self.done(step)
 
@@ -321,6 +396,8 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
             goal_status=AgentState.UNAVAILABLE if away else AgentState.MOVING,
             reason=_REASONS[agent.activity],
         )
+        if not self._observed:
+            message.goal_status, message.reason = AgentState.IDLE, self.modes.describe()
         message.pose.pose.position = point_to_ros(pose.position)
         w, x, y, z = (float(value) for value in pose.orientation)
         turn = message.pose.pose.orientation

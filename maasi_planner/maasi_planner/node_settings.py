@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from maasi_filter.node_settings import NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
+from maasi_planner.objective import resolve
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 
 
@@ -38,6 +40,18 @@ class OtherRobotSettings(Settings):
 class PlannerNodeSettings(NodeSettings):
     """Settings of the planner node."""
 
+    live: ClassVar[frozenset[str]] = frozenset(
+        {
+            'state_timeout',
+            'views_rate',
+            'planner.threshold',
+            'planner.gamma',
+            'planner.explored_threshold',
+            'planner.mass_threshold',
+            'planner.gain_threshold',
+        }
+    )
+
     environment: EnvironmentSettings = Field(description='Where the targets are')
     planner: PlannerSettings = Field(default_factory=PlannerSettings, description='The planner')
     robots: dict[str, PlannedRobotSettings] = Field(min_length=1, description='Robots, by name')
@@ -51,17 +65,39 @@ class PlannerNodeSettings(NodeSettings):
         description='Spacing of the exploration grid; none: as the filter has it [m]',
     )
     search_on_start: bool = Field(
-        default=True, description='Whether to search at once, without a goal of the action search'
+        default=False,
+        description='Whether the search starts as soon as the planner is active; otherwise with '
+        'the service search/start or a goal of the action search',
     )
     state_timeout: float = Field(
         default=1.0,
         gt=0.0,
-        description='Wall time without a state after which a robot is planned without; not in '
+        description='Time without a state after which a robot is planned without; not in '
         'lockstep [s]',
+    )
+    filter_timeout: float = Field(
+        default=4.0,
+        ge=0.0,
+        description='Wall time without a heartbeat of the filter, or without the update of a '
+        'batch, after which all robots are held; 0: never; not in lockstep [s]',
     )
     views_rate: float = Field(
         default=1.0, ge=0.0, description='Most publications of exploration and markers [1/s]'
     )
+
+    def resolved(self) -> Self:
+        """Return a copy with the values of the objective."""
+        planner, weights = self.planner, resolve(self.planner)
+        clusters = planner.cluster_candidates
+        values = {
+            'beta': weights.beta,
+            'control_weight': weights.control,
+            'measure_at_arrival': weights.arrival,
+            'count_present': weights.present,
+            'own_measurement': weights.own,
+            'cluster_candidates': weights.information if clusters is None else clusters,
+        }
+        return self.model_copy(update={'planner': planner.model_copy(update=values)})
 
     @model_validator(mode='after')
     def _others_are_others(self) -> PlannerNodeSettings:

@@ -5,7 +5,9 @@ predicted measurement, so the whole grid is never touched; the value is the same
 
 `information` has T = 1/2 sum_c m_c log det(I + P_c sum pi H' R^-1 H), the information that
 measurements give about the clusters, and E = (N0 / V) integral of e (1 - prod(1 - pi)), the
-expected number of new targets. Both are what a robot adds to what the others will do.
+expected number of new targets. Over the robots that plan jointly the terms sum to T and E of all
+their measurements together (the union): what two of them see counts once, for the one with the
+shorter way (the smaller K; of equals the first by name).
 
 With more than one robot the terms of one depend on the choices of the others. More robots never
 make a term larger, so the value of a candidate alone bounds it from above, and the joint search
@@ -748,10 +750,18 @@ def _log_det(matrix: FloatArray) -> float:  # pragma: no cover - compiled
 
 
 @njit(cache=True)
+def _credited(joint: Joint, other: int, g: int) -> bool:  # pragma: no cover - compiled
+    """Return whether what `other` and g both see counts for `other`: its way is shorter."""
+    if joint.norm[other] != joint.norm[g]:
+        return joint.norm[other] < joint.norm[g]
+    return joint.robot[other] < joint.robot[g]
+
+
+@njit(cache=True)
 def _gain(
     joint: Joint, g: int, chosen: IntArray, work: FloatArray
 ) -> float:  # pragma: no cover - compiled
-    """Return T of `information` for candidate g, given the others."""
+    """Return T of `information` for candidate g, given the others with a shorter way."""
     d = joint.dimension
     total = 0.0
     robot = joint.robot[g]
@@ -766,7 +776,7 @@ def _gain(
             for b in range(d):
                 work[0, a, b] = joint.base[c, a, b]
         for r in range(chosen.shape[0]):
-            if r != robot and chosen[r] >= 0:
+            if r != robot and chosen[r] >= 0 and _credited(joint, chosen[r], g):
                 for a in range(d):
                     for b in range(d):
                         work[0, a, b] += joint.gain[chosen[r], c, a, b]
@@ -787,12 +797,12 @@ def _gain(
 
 @njit(cache=True)
 def _new_targets(joint: Joint, g: int, chosen: IntArray) -> float:  # pragma: no cover - compiled
-    """Return E of `information` for candidate g, given the others."""
+    """Return E of `information` for candidate g, given the others with a shorter way."""
     robot = joint.robot[g]
     others = 0
     first = -1
     for r in range(chosen.shape[0]):
-        if r != robot and chosen[r] >= 0:
+        if r != robot and chosen[r] >= 0 and _credited(joint, chosen[r], g):
             others += 1
             first = chosen[r]
     total = 0.0
@@ -810,7 +820,7 @@ def _new_targets(joint: Joint, g: int, chosen: IntArray) -> float:  # pragma: no
             if seen > 0.0:
                 left = joint.unseen[node] * seen
                 for r in range(chosen.shape[0]):
-                    if r != robot and chosen[r] >= 0:
+                    if r != robot and chosen[r] >= 0 and _credited(joint, chosen[r], g):
                         left *= joint.miss[chosen[r], node]
                 total += left
     return total

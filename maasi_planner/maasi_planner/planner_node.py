@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import OccupancyGrid, Path
 from numpy.typing import NDArray
-from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -28,9 +28,12 @@ from maasi_filter.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
+from maasi_filter.marker_board import MarkerBoard
 from maasi_filter.pose import Pose
-from maasi_filter.qos import RELIABLE, UPDATES
+from maasi_filter.qos import LATCHED, RELIABLE, UPDATES
 from maasi_filter.search_node import SearchNode, run
+from maasi_filter.silence import Silence
+from maasi_filter.stamps import LAST_STAMP, StampGate, batch_id_limit
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,
@@ -50,30 +53,24 @@ from maasi_planner.conversions import (
     robot_state_from_ros,
 )
 from maasi_planner.coordinator import Coordinator, PresentRobot
-from maasi_planner.motion import RobotState
+from maasi_planner.filter_watch import FilterWatch
+from maasi_planner.found_keeper import FoundKeeper
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners.base import check_clusters
+from maasi_planner.search_action import Progress, SearchAction
+from maasi_planner.search_modes import Mode, SearchModes
+from maasi_planner.search_services import offer_services
+from maasi_planner.team_goals import Course, HeardState, TeamGoals
 
 FloatArray = NDArray[np.float64]
 
-_ENDED = (AgentState.IDLE, AgentState.REACHED, AgentState.CANCELED, AgentState.ABORTED)
 _LOOK_PERIOD = 0.1
+# At the end: rounds in which results are sent.
+_LAST_TASKS = 5
 # In lockstep: longest wait for an update until its batch is published once more [s].
 _ANSWER_PATIENCE = 1.0
 # Poses of measurements that are kept for updates that come late.
 _POSES_KEPT = 1000
-
-
-@dataclass
-class HeardState:
-    """The last state heard of a robot."""
-
-    step: int
-    state: RobotState
-    goal: int
-    status: int
-    reason: str
-    heard_at: float
 
 
 class PlannerNode(SearchNode[PlannerNodeSettings]):
@@ -93,36 +90,51 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
     ---------
     `measurement_batch` (maasi_msgs/MeasurementBatch): M_k;
     `decisions` (maasi_msgs/PlanDecision): every candidate with its terms;
-    `<robot>/plan` (nav_msgs/Path); `exploration` (2D: nav_msgs/OccupancyGrid, 3D:
+    `<robot>/plan` (nav_msgs/Path); `exploration` (latched; 2D: nav_msgs/OccupancyGrid, 3D:
     sensor_msgs/PointCloud2); `markers` (visualization_msgs/MarkerArray);
     `<robot>/destination` (geometry_msgs/PointStamped), each step, where others plan for themselves
 
     Actions
     -------
     `<robot>/go_to` (maasi_msgs/GoToWaypoint), client; `search` (maasi_msgs/SearchTargets), server
+
+    Services
+    --------
+    `search/start`, `pause`, `resume`, `home`, `stop` (std_srvs/Trigger) for the team, and the same
+    below `<robot>/search/` for one robot
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__('planner_node', PlannerNodeSettings, **options)
+
+    def prepare(self) -> None:
+        """Make the planner."""
         bounds = self.settings.environment.array()
         self._size = 0.02 * float((bounds[:, 1] - bounds[:, 0]).max())
         self._dimension = self.settings.environment.dimension
-        self.searching = False
-        self._search_goal: Any = None
+        self.modes = SearchModes(self.settings.robots)
+        # Steps between two states of a robot from which on one of them is not believed.
+        longest = max(1.0, 2.0 * self.settings.state_timeout)
+        self._jump = round(longest / self.settings.step)
         self._begin_anew()
 
     def _begin_anew(self) -> None:
         self.coordinator = Coordinator(self.settings)
         self._heard: dict[str, HeardState] = {}
+        self._gates: dict[str, StampGate] = {}
         self._away: set[str] = set(self.coordinator.names)
         self._poses: dict[tuple[str, int], Pose] = {}
         self._poses_order: deque[tuple[str, int]] = deque()
-        self._updates: deque[tuple[FilterUpdate, list[Cluster]]] = deque()
+        # Measurements whose updates were taken in.
+        self._used: set[tuple[str, int]] = set()
+        self._used_order: deque[tuple[str, int]] = deque()
+        self._updates: deque[tuple[FilterUpdate, list[Cluster], Silence]] = deque()
         self._taken_step = -1
         self._expected: LockstepStep | None = None
-        self._waiting_goals: set[tuple[str, int]] = set()
-        self._goal_handles: dict[str, Any] = {}
-        self._refused: dict[str, int] = {}
+        # Robots that follow a goal of another client, and its number.
+        self._lent: dict[str, int] = {}
+        # Robots that are on their way to their start, and the number of that goal; 0: there.
+        self._homing: dict[str, int] = {}
         self._waiting_batch = 0
         self._batch_message = MeasurementBatch()
         self._batch_at = time.monotonic()
@@ -133,14 +145,21 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self._expected_number = 0.0
         self._measurements = 0
         self._decisions = 0
+        # Free running: why no robot is sent anywhere, empty where they are.
+        self._held = ''
+        self._filter_watch = FilterWatch(self.settings.filter_timeout)
+        self._filter_names: set[str] = set()
+        self._names_at = -math.inf
+        self._looked_at = time.monotonic()
         self._views_at = -math.inf
+        self._board = MarkerBoard()
         self._planning_time = 0.0
         others = self.settings.others
         # Where they will stand, by step: the last two that were heard of.
         self._destinations: dict[str, dict[int, FloatArray]] = {
             name: {-1: np.array(others[name].start)} for name in sorted(others)
         }
-        self._others_at: dict[str, float] = {}
+        self._others_silence: dict[str, Silence] = {}
         self._others_before: set[str] = set()
 
     # ---- life cycle --------------------------------------------------------------------------
@@ -149,6 +168,8 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         """Compile and connect."""
         warm_up()
         names = self.coordinator.names
+        # Before the batches, so that a filter that hears these knows that targets are kept.
+        self._keeper = FoundKeeper(self)
         self._batch_publisher = self.create_publisher(
             MeasurementBatch, 'measurement_batch', RELIABLE
         )
@@ -156,17 +177,13 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self._decision_publisher = self.create_publisher(PlanDecision, 'decisions', RELIABLE)
         self._markers_publisher = self.create_publisher(MarkerArray, 'markers', 10)
         kind = OccupancyGrid if self._dimension == 2 else PointCloud2
-        self._exploration_publisher = self.create_publisher(kind, 'exploration', 2)
+        self._exploration_publisher = self.create_publisher(kind, 'exploration', LATCHED)
         self._path_publishers = {}
         self._destination_publishers = {}
-        self._go_to: dict[str, ActionClient] = {}
         for name in names:
             self._path_publishers[name] = self.create_publisher(
                 Path, self.team_topic(f'{name}/plan'), 10
             )
-            client = ActionClient(self, GoToWaypoint, self.team_topic(f'{name}/go_to'))
-            self._go_to[name] = client
-            self.expect(client.server_is_ready)
             self.hurry(
                 self.create_subscription(
                     AgentState,
@@ -198,44 +215,119 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         self.hurry(
             self.create_subscription(FilterUpdate, 'filter_update', self._on_update, UPDATES)
         )
-        self._search_server = ActionServer(
+        if not self.settings.lockstep and self.settings.filter_timeout:
+            self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+        self._goals = TeamGoals(
             self,
-            SearchTargets,
-            'search',
-            execute_callback=self._finish_search,
-            goal_callback=self._on_search_goal,
-            handle_accepted_callback=self._on_search_accepted,
-            cancel_callback=self._on_search_cancel,
+            {name: self.team_topic(f'{name}/go_to') for name in names},
+            self.settings.lockstep,
+            self._on_goal_answer,
         )
+        for client in self._goals.clients.values():
+            self.expect(client.server_is_ready)
+        self._action = SearchAction(
+            self,
+            lambda: '' if self.active else 'the planner is not active',
+            lambda: self._command('start', None),
+            self._stand,
+            self.drop,
+        )
+        offer_services(self, names, self.team_topic, self._command)
         self.create_wall_timer(_LOOK_PERIOD, self._look_around)
 
     def start(self) -> None:
-        """Begin to search, unless it waits for the action."""
-        self.searching = self.settings.search_on_start
+        """Start the search, unless it waits for a command."""
+        if self.settings.search_on_start:
+            self.modes.command('start')
 
     def halt(self) -> None:
-        """Cancel all goals: the robots stop."""
-        self.searching = False
-        for name in sorted(self._goal_handles):
-            self._goal_handles[name].cancel_goal_async()
-        self._goal_handles.clear()
+        """End the search: the robots stop."""
+        self._action.stop('the planner stops')
+        self._stand()
+
+    def _stand(self) -> None:
+        self.modes.command('stop')
+        self._homing.clear()
+        self._stop_robots(self.coordinator.names)
+
+    def _stop_robots(self, names: Iterable[str]) -> None:
+        """Cancel the goals of robots, which have no plan any more."""
+        for name in names:
+            self._goals.cancel(name)
+            self.coordinator.leave(name)
+
+    def destroy_node(self) -> None:
+        """Let a client know how its search ended, and leave."""
+        self.active = False
+        if self.configured and self.executor is not None:
+            for _ in range(_LAST_TASKS):
+                self.executor.spin_once(timeout_sec=0.0)
+        super().destroy_node()
 
     def reset(self) -> None:
         """Begin a new search."""
-        for name in sorted(self._goal_handles):
-            self._goal_handles[name].cancel_goal_async()
+        for name in self.coordinator.names:
+            self._goals.cancel(name)
+        self._goals.waiting.clear()
         self._begin_anew()
+        self._keeper.forget()
+
+    def fault(self) -> str:
+        """Return why the robots are held."""
+        return f'robots are held: {self._held}' if self._held else ''
+
+    def _command(self, word: str, names: list[str] | None) -> tuple[bool, str]:
+        """Follow a command for robots (None: all); return whether, and an answer in words."""
+        if not self.active:
+            return False, 'the planner is not active'
+        asked = self.coordinator.names if names is None else names
+        follow = self.modes.command(word, names)
+        if not follow:
+            modes = self.modes.describe(asked)
+            return False, f'{", ".join(asked)}: {modes}; {word} changes nothing'
+        if word == 'start' and self.coordinator.finished is not None:
+            self.coordinator.begin_again()
+        if word in ('pause', 'stop', 'home'):
+            self._stop_robots(follow)
+        for name in follow:
+            self._homing.pop(name, None)
+        if word == 'home':
+            self._homing.update(dict.fromkeys(follow, -1))
+        if not self.modes.under_way:
+            self._action.stop('stopped by search/stop')
+        answer = f'{word}: {", ".join(follow)}'
+        for name in follow:
+            if name in self._away:
+                heard = self._heard.get(name)
+                why = heard.reason if heard is not None else f'no {name}/state yet'
+                answer += f'; {name} does not take part now: {why or "it is silent"}'
+            if name in self._lent:
+                goal = self._lent[name]
+                answer += f'; {name} follows goal {goal} of another client, which goes on'
+        self.get_logger().info(answer)
+        return True, answer
 
     def status(self) -> dict[str, Any]:
         """Return the state of the search."""
         return {
-            'searching': self.searching,
+            'search': self.modes.describe(),
+            'finished': self.coordinator.finished or '',
+            'goals of other clients': ', '.join(
+                f'{name} (goal {goal})' for name, goal in sorted(self._lent.items())
+            ),
             'robots': ', '.join(name for name in self.coordinator.names if name not in self._away),
             'decisions': self._decisions,
             'batches': self._batch,
             'explored': f'{self.coordinator.exploration.explored_fraction():.3f}',
             'last planning [ms]': f'{1e3 * self._planning_time:.2f}',
         }
+
+    def warnings(self) -> list[str]:
+        """Return which robots follow goals of other clients."""
+        return [
+            f'{name} follows goal {goal} of another client'
+            for name, goal in sorted(self._lent.items())
+        ]
 
     # ---- what comes in -----------------------------------------------------------------------
 
@@ -261,10 +353,10 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
 
     def _repeat_step(self) -> None:
         self._ask_again()
-        # Whoever is asked and answers after all is sent elsewhere.
-        for key in sorted(self._waiting_goals):
-            self._refuse(*key)
-        self._waiting_goals.clear()
+        # One that answers after all is sent elsewhere.
+        for name, _ in sorted(self._goals.waiting):
+            self._refuse(name)
+        self._goals.waiting.clear()
         self._try_done()
 
     def _in_frame(self, reason: str, topic: str, header: Header) -> bool:
@@ -293,6 +385,20 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         except ValueError as error:
             self.drop('bad state', f'{name}/state.{error}')
             return
+        if message.step * self.settings.step >= LAST_STAMP:
+            self.drop(
+                'bad state',
+                f'{name}/state.step: read {message.step}, allowed are steps whose time is a stamp',
+            )
+            return
+        gate = self._gates.setdefault(name, StampGate(self._jump))
+        if not (self.settings.lockstep or gate.accepts(int(message.step))):
+            self.drop(
+                'bad state',
+                f'{name}/state.step: read {message.step}, which is far from the one before; '
+                'allowed if the next one follows it',
+            )
+            return
         before = self._heard.get(name)
         if before is not None and message.step < before.step:
             if not self.settings.lockstep and before.step - message.step > 1.0 / self.settings.step:
@@ -310,7 +416,7 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             int(message.goal_id),
             int(message.goal_status),
             message.reason,
-            time.monotonic(),
+            Silence(self),
         )
         if self.settings.lockstep:
             self._try_step()
@@ -358,7 +464,7 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         known[round(stamp_from_ros(message.header.stamp) * 1e-9 / self.settings.step)] = point
         while len(known) > 2:
             del known[min(known)]
-        self._others_at[name] = time.monotonic()
+        self._others_silence[name] = Silence(self)
         if self.settings.lockstep:
             self._try_step()
 
@@ -381,12 +487,11 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
     def _taken(self, step: int, robots: list[str] | None) -> list[tuple[FloatArray, float]]:
         """Return where robots that plan for themselves will stand, as far as it is known."""
         own = self.coordinator.names[0]
-        now = time.monotonic()
         taken = []
         for name, known in self._destinations.items():
             if robots is None:
-                heard = self._others_at.get(name)
-                there = heard is None or now - heard <= self.settings.state_timeout
+                silence = self._others_silence.get(name)
+                there = silence is None or silence.length <= self.settings.state_timeout
                 last = max(known)
             else:
                 there = name in robots
@@ -408,6 +513,7 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                     f'members: read {sorted(strangers)}, allowed are {self.coordinator.names}'
                 )
             check_clusters(clusters)
+            self._check_numbers(message)
         except ValueError as error:
             self.drop('bad update', f'filter_update.{error}')
             return
@@ -418,20 +524,52 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             for member in message.members:
                 self.coordinator.skip_measurements(member.robot, int(member.measurement) + 1)
             return
-        self._updates.append((message, clusters))
+        self._filter_watch.answered(int(message.batch_id))
+        self._updates.append((message, clusters, Silence(self)))
         self._take_updates()
+
+    def _check_numbers(self, message: FilterUpdate) -> None:
+        """Refuse numbers from which the planner could not go on."""
+        limit = batch_id_limit(self._batch)
+        if message.batch_id > limit:
+            raise ValueError(f'batch_id: read {message.batch_id}, allowed is up to {limit}')
+        limit = batch_id_limit(0)
+        for member in message.members:
+            if member.measurement > limit:
+                raise ValueError(
+                    f'members: {member.robot}: measurement: read {member.measurement}, allowed is '
+                    f'up to {limit}'
+                )
 
     def _take_updates(self) -> None:
         """Take in the updates whose measurements have been heard as well, in their order."""
         while self._updates:
-            update, clusters = self._updates[0]
+            update, clusters, silence = self._updates[0]
             keys = [(member.robot, int(member.measurement)) for member in update.members]
-            if not all(key in self._poses for key in keys):
-                return
+            if keys and all(key in self._used for key in keys):
+                # A restarted filter publishes its last update again.
+                self._updates.popleft()
+                continue
+            unknown = [key for key in keys if key not in self._poses]
+            if unknown:
+                if self.settings.lockstep or silence.length < self.settings.state_timeout:
+                    return
+                # It must not hold up those that follow.
+                self._updates.popleft()
+                self.drop(
+                    'bad update',
+                    f'filter_update.members: read {unknown}, allowed are measurements whose '
+                    f'detections come as well: none for {silence.length:.1f} s',
+                )
+                continue
             self._updates.popleft()
             self.coordinator.absorb(
                 {name: self._poses.pop((name, index)) for name, index in keys}, clusters
             )
+            self._used.update(keys)
+            self._used_order.extend(keys)
+            while len(self._used_order) > _POSES_KEPT:
+                self._used.discard(self._used_order.popleft())
             self._used_batch = max(self._used_batch, int(update.batch_id))
             self._found = int(update.found)
             self._expected_number = float(update.expected_number)
@@ -453,8 +591,10 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         if name in self._away:
             return
         self._away.add(name)
-        self._goal_handles.pop(name, None)
-        self._refused.pop(name, None)
+        self._goals.cancel(name)
+        self._lent.pop(name, None)
+        if name in self._homing:
+            self._homing[name] = -1
         self.coordinator.leave(name)
         self.get_logger().warning(f'{name} does not take part any more: {reason}')
 
@@ -465,13 +605,47 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
         if not self.settings.lockstep:
             now = time.monotonic()
             for name in sorted(self._heard):
-                silent = now - self._heard[name].heard_at
+                silent = self._heard[name].silence.length
                 if silent > self.settings.state_timeout:
                     self._leave(name, f'no {name}/state for {silent:.1f} s')
+            self._take_updates()
+            self._watch_filter(now)
             self._try_free_step()
         elif time.monotonic() - self._batch_at > _ANSWER_PATIENCE:
             self._ask_again()
         self._look_at_search()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        if any(status.name in self._filter_names for status in message.status):
+            self._filter_watch.beat(time.monotonic())
+
+    def _watch_filter(self, now: float) -> None:
+        """Hold the robots while the filter does not answer."""
+        since, self._looked_at = now - self._looked_at, now
+        if since > 2.0 * _LOOK_PERIOD:
+            self._filter_watch.stalled(since)
+        if now - self._names_at >= 1.0:
+            self._names_at = now
+            self._filter_names |= {
+                f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                for info in self.get_publishers_info_by_topic('filter_update')
+            }
+        problem = self._filter_watch.problem(now)
+        if problem and not self._held:
+            self.get_logger().error(f'{problem}: all robots are held')
+            self._hold()
+        elif self._held and not problem:
+            self.get_logger().warning('the filter answers again: the search goes on')
+        self._held = problem
+        if problem and now - self._batch_at > _ANSWER_PATIENCE:
+            self._ask_again()
+
+    def _hold(self) -> None:
+        """Stop all robots where they are; later decisions give them new goals."""
+        for name in self.coordinator.names:
+            if name not in self._homing:
+                self._goals.cancel(name)
+                self.coordinator.refuse(name)
 
     # ---- a step ------------------------------------------------------------------------------
 
@@ -526,16 +700,12 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             if name in self._away:
                 continue
             heard = self._heard[name]
-            goal = self.coordinator.decision_index(name) + 1
-            free = self.coordinator.is_idle(name) or self._refused.get(name) == goal
-            if self.settings.lockstep and not free and heard.goal < goal:
-                self.get_logger().warning(f'{name} knows nothing of goal {goal} any more')
-                self._refuse(name, goal)
-                free = True
-            free = free or (heard.goal == goal and heard.status in _ENDED)
-            robots[name] = PresentRobot(heard.state, free)
+            free = self._is_free(name, heard, step)
+            if free and name in self._homing:
+                self._send_home(name, stamp)
+            robots[name] = PresentRobot(heard.state, free and self.modes.of[name] is Mode.SEARCHING)
         header = Header(stamp=stamp_to_ros(stamp), frame_id=self.settings.frame)
-        if not self.searching:
+        if not self.modes.searching or self._held:
             self._publish_destinations(header, robots)
             return
         begin = time.perf_counter()
@@ -561,6 +731,7 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                 ],
             )
             self._batch_at = time.monotonic()
+            self._filter_watch.asked(self._batch, self._batch_at)
             self._batch_publisher.publish(self._batch_message)
         self._publish_views(header, stamp * 1e-9, robots)
 
@@ -591,31 +762,73 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             if robot.stays:
                 self.warn_throttled(f'{name} stays', f'{name} stays: {robot.reason}')
                 continue
-            goal = GoToWaypoint.Goal(goal_id=indices[name] + 1, step=decision.step)
-            goal.waypoint.header = header
-            goal.waypoint.pose.position = point_to_ros(robot.waypoint)
-            goal.waypoint.pose.orientation.w = 1.0
-            key = (name, indices[name] + 1)
-            self._waiting_goals.add(key)
-            future = self._go_to[name].send_goal_async(goal)
-            future.add_done_callback(partial(self._on_goal_answer, key))
+            self._send(name, indices[name] + 1, robot.waypoint, header)
             self._path_publishers[name].publish(path_to_ros(robot.positions, header))
 
-    def _on_goal_answer(self, key: tuple[str, int], future: Any) -> None:
-        name, number = key
-        self._waiting_goals.discard(key)
-        handle = future.result()
-        if handle is None or not handle.accepted:
-            self._refuse(name, number)
+    def _send(self, name: str, number: int, waypoint: FloatArray, header: Header) -> None:
+        goal = GoToWaypoint.Goal(goal_id=number, step=self._taken_step)
+        goal.waypoint.header = header
+        goal.waypoint.pose.position = point_to_ros(waypoint)
+        goal.waypoint.pose.orientation.w = 1.0
+        self._goals.send(name, goal)
+
+    def _is_free(self, name: str, heard: HeardState, step: int) -> bool:
+        """Return whether a robot can take a goal: none is under way, of any client."""
+        coordinator = self.coordinator
+        if not coordinator.is_idle(name):
+            number = coordinator.decision_index(name) + 1
+            course = self._goals.course(name, number, heard)
+            if course is Course.UNDER_WAY:
+                return False
+            if course is Course.ENDED:
+                self._goals.forget(name)
+                return True
+            self._goals.forget(name)
+            if course is Course.LOST:
+                self.get_logger().warning(f'{name} has not taken goal {number}, or lost it')
+                self._refuse(name)
+        number = self._homing.get(name, -1)
+        if number > 0:
+            course = self._goals.course(name, number, heard)
+            if course is Course.REPLACED:
+                self._homing[name] = -1
+            elif course is not Course.UNDER_WAY:
+                self._homing[name] = 0
+        if number >= 0:
+            return False
+        if self._goals.driven(heard):
+            if not self._goals.ends(name, heard):
+                self._lend(name, heard, step)
+            return False
+        if self._lent.pop(name, None) is not None:
+            self.get_logger().info(f'{name} takes goals of the planner again')
+        return True
+
+    def _lend(self, name: str, heard: HeardState, step: int) -> None:
+        new = self._lent.get(name) != heard.goal
+        self._lent[name] = heard.goal
+        if self.modes.of[name] is Mode.SEARCHING and self.coordinator.destined(name):
+            self.coordinator.lend(name, step)
+        if not new:
+            return
+        self.get_logger().warning(
+            f'{name} follows goal {heard.goal} of another client: it measures, and gets no goal '
+            'of the planner until that one has ended'
+        )
+
+    def _send_home(self, name: str, stamp: int) -> None:
+        number = self._homing[name] = self.coordinator.next_number(name)
+        header = Header(stamp=stamp_to_ros(stamp), frame_id=self.settings.frame)
+        self._send(name, number, np.array(self.settings.robots[name].start), header)
+
+    def _on_goal_answer(self, name: str, number: int, accepted: bool) -> None:
+        if not accepted:
+            self._refuse(name)
             self.warn_throttled(f'{name} refused', f'{name} refused goal {number}')
-        elif self.searching:
-            self._goal_handles[name] = handle
-        else:
-            handle.cancel_goal_async()
         self._try_done()
 
-    def _refuse(self, name: str, number: int) -> None:
-        self._refused[name] = number
+    def _refuse(self, name: str) -> None:
+        self._goals.forget(name)
         self.coordinator.refuse(name)
 
     def _try_done(self) -> None:
@@ -623,79 +836,27 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             self.settings.lockstep
             and self._expected is None
             and self._taken_step >= 0
-            and not self._waiting_goals
+            and not self._goals.waiting
             and not self._waiting_batch
         ):
             self.done(self._taken_step)
 
     # ---- the action --------------------------------------------------------------------------
 
-    def _on_search_goal(self, goal: SearchTargets.Goal) -> GoalResponse:
-        if not (math.isfinite(goal.time_limit) and goal.time_limit >= 0.0):
-            self.drop(
-                'bad goal',
-                f'search.time_limit: read {goal.time_limit}, allowed are finite numbers from 0 [s]',
-            )
-            return GoalResponse.REJECT
-        if self._search_goal is not None or not self.active:
-            self.get_logger().warning('search: refused, one is under way or the node is not active')
-            return GoalResponse.REJECT
-        return GoalResponse.ACCEPT
-
-    def _on_search_accepted(self, handle: Any) -> None:
-        self._search_goal = handle
-        self._search_began = self._taken_step
-        self.searching = True
-
-    def _on_search_cancel(self, handle: Any) -> CancelResponse:
-        return CancelResponse.ACCEPT
-
     def _look_at_search(self) -> None:
-        """Give feedback on the action, and end it when it is time."""
-        handle = self._search_goal
-        if handle is None:
-            return
-        request = handle.request
-        gone = (self._taken_step - max(self._search_began, 0)) * self.settings.step
-        result = SearchTargets.Result
-        if handle.is_cancel_requested:
-            self._end_search(result.CANCELED, 'cancelled')
-        elif self.coordinator.finished is not None:
-            self._end_search(result.DONE, self.coordinator.finished)
-        elif request.targets and self._found >= request.targets:
-            self._end_search(result.TARGETS_FOUND, f'{self._found} targets are found')
-        elif request.time_limit > 0.0 and gone >= request.time_limit:
-            self._end_search(result.TIME_LIMIT, f'{request.time_limit:g} s are over')
-        elif self._heard and len(self._away) == len(self.coordinator.names):
-            self._end_search(result.NO_ROBOT, 'no robot can go on')
-        else:
-            handle.publish_feedback(
-                SearchTargets.Feedback(
+        self._action.look(
+            Progress(
+                time=max(self._taken_step, 0) * self.settings.step,
+                feedback=SearchTargets.Feedback(
                     found=self._found,
                     measurements=self._measurements,
                     decisions=self._decisions,
                     expected_number=self._expected_number,
                     explored=self.coordinator.exploration.explored_fraction(),
-                )
+                ),
+                finished=self.coordinator.finished or '',
+                robots=not self._heard or len(self._away) < len(self.coordinator.names),
             )
-
-    def _end_search(self, reason: int, text: str) -> None:
-        self.halt()
-        self._search_outcome = (reason, text)
-        handle, self._search_goal = self._search_goal, None
-        handle.execute()
-
-    def _finish_search(self, handle: Any) -> SearchTargets.Result:
-        reason, text = self._search_outcome
-        if reason == SearchTargets.Result.CANCELED:
-            handle.canceled()
-        elif reason == SearchTargets.Result.NO_ROBOT:
-            handle.abort()
-        else:
-            handle.succeed()
-        self.get_logger().info(f'search ended: {text}')
-        return SearchTargets.Result(
-            end_reason=reason, message=text, found=self._found, measurements=self._measurements
         )
 
     # ---- views -------------------------------------------------------------------------------
@@ -717,7 +878,8 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             path = self.coordinator.path(name)
             place = np.asarray(robot.state.pose.position)
             shown[name] = (place, path[-1] if len(path) else place, path)
-        self._markers_publisher.publish(planner_markers(shown, header, self._size))
+        markers = planner_markers(shown, header, self._size)
+        self._markers_publisher.publish(self._board.replace(markers))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -140,7 +140,7 @@ class PlannerSettings(Settings):
     objective: Literal['paper', 'information'] = Field(
         default='information',
         description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
-        'expected new targets',
+        'expected new targets of all measurements of the team together',
     )
     alpha: float = Field(
         default=0.5, ge=0.0, description='Weight of target refinement T (001: of exploration) [1]'
@@ -227,6 +227,11 @@ class PlannerSettings(Settings):
         description='Gain of all candidates below which nothing is left, information only [1]',
     )
     horizon: int = Field(default=1, ge=1, le=3, description='maas: waypoints planned ahead [1]')
+    agent_exploration: Literal['own', 'shared'] = Field(
+        default='own',
+        description='maas: whether e of a robot has its own measurements only (002, eq. 12, 16) or '
+        'those of the whole team',
+    )
     refinement: Literal['centres', 'mutual_information'] = Field(
         default='centres', description='maas: T by centre probabilities or by mutual information'
     )
@@ -246,6 +251,11 @@ class PlannerSettings(Settings):
         ge=0.0,
         description='lawnmower: distance of the outer lanes from the bounds; none: half a lane [m]',
     )
+
+    @property
+    def own_explorations(self) -> bool:
+        """Whether each robot needs an exploration function of its own."""
+        return self.name in ('maas', 'as') and self.agent_exploration == 'own'
 
     @model_validator(mode='after')
     def _lanes_are_shared_out(self) -> PlannerSettings:

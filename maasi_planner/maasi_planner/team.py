@@ -50,6 +50,8 @@ class RobotView:
         that plans measures now.)
     radius : float
         Of a circle around the robot, metres; keeps waypoints apart.
+    exploration : Exploration, optional
+        e after the robot's own measurements only, iota of 002, eq. (12). None: that of the team.
     """
 
     state: RobotState
@@ -62,6 +64,7 @@ class RobotView:
     tail_yaws: FloatArray | None = None
     phase: int = 0
     radius: float = 0.0
+    exploration: Exploration | None = None
 
 
 @dataclass
@@ -136,6 +139,7 @@ class RobotDecision:
         Waypoints that were compared, after moving them out of obstacles.
     control_cost, target_refinement, exploration, objective : (W,) arrays
         C, T, E and J of each, given what the other robots do; J is -inf for what is not allowed.
+        With the objective `information`, T and E of the chosen ones sum to those of the team.
         In very large teams T, E and J of those not chosen are without the other planning robots.
     lengths, measurements : (W,) integer arrays
         Steps K and measurements M of each predicted trajectory.

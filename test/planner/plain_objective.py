@@ -152,11 +152,16 @@ def plain_information_terms(team, settings, trajectories, choice):
         for _, position, yaw, _ in steps:
             known.update(team.robots[name].sensor.detection, Pose.from_yaw(position, yaw))
     out = {}
+
+    def order(name):
+        return float(trajectories[name].lengths[choice[name]]), name
+
     for name in planning:
         explored = known.copy()
         others = base.copy()
+        # What two robots see counts for the one with the shorter way.
         for other in planning:
-            if other != name:
+            if order(other) < order(name):
                 others += own[other]
                 for _, position, yaw, _ in measured[other]:
                     explored.update(

@@ -18,7 +18,6 @@ from rclpy.parameter import Parameter
 from maasi_filter.executor import LeanExecutor
 from maasi_filter.parameters import flatten
 from maasi_filter.qos import RELIABLE, UPDATES
-from maasi_filter.search_node import SettingsError
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,
@@ -44,6 +43,7 @@ SETTINGS = PlannerNodeSettings.model_validate(
         'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
         'planner': {'name': 'maasi'},
         'state_timeout': 30.0,
+        'search_on_start': True,
         'robots': {
             name: {
                 'candidates': {'grid': [3, 3], 'spacing': 0.5, 'corner': [0.5, 0.5]},
@@ -186,7 +186,7 @@ def running(**changes):
                 other.spin_once(timeout_sec=0.01)
 
         until(lambda: team.connected)
-        until(lambda: all(client.server_is_ready() for client in node._go_to.values()))
+        until(lambda: all(client.server_is_ready() for client in node._goals.clients.values()))
         yield node, team, until
         lean.shutdown()
         other.shutdown()
@@ -277,6 +277,9 @@ def test_wrong_detections_and_updates_change_nothing(world):
             {'clusters': [Cluster(covariance=[math.nan] * 9)]},
             {'header__frame_id': 'odom'},
             {'members': [BatchMember(robot='nobody')]},
+            {'batch_id': 2**64 - 1},
+            {'members': [BatchMember(robot='a', measurement=2**64 - 1)]},
+            {'clusters': [Cluster(mass=1e308)]},
         ),
         start=1,
     ):
@@ -290,6 +293,32 @@ def test_wrong_detections_and_updates_change_nothing(world):
     assert node.coordinator.exploration.explored_fraction() > before
 
 
+def test_an_update_without_its_detections_holds_up_those_that_follow_for_a_while_only():
+    with running(state_timeout=1.0, others={}) as (node, team, until):
+        begin(node, team, until)
+        until(lambda: team.batches)
+        batch = team.batches[0].id
+        team.update(batch, [], members=[BatchMember(robot='a', measurement=99)])
+        right = Cluster(mass=0.5)
+        right.position.x = right.position.y = 1.0
+        team.update(batch, [], clusters=[right])
+        until(lambda: node.coordinator.clusters)
+        assert node.dropped['bad update'] == 1
+
+
+@pytest.mark.parametrize('step', [2**64 - 1, 10**9])
+def test_a_state_of_an_absurd_step_changes_nothing(world, step):
+    node, team, until = world
+    begin(node, team, until)
+    decisions = len(team.decisions)
+    team.state('a', step)
+    until(lambda: node.dropped['bad state'] == 1)
+    for name in ROBOTS:
+        team.state(name, 12)
+    until(lambda: [item.step for item in node._heard.values()] == [12, 12])
+    assert len(team.decisions) == decisions
+
+
 def test_a_step_that_comes_again_brings_the_batch_again_and_no_other():
     """The filter that was to answer it may be gone, and another one in its place."""
     with running(lockstep=True, others={}) as (node, team, until):
@@ -299,7 +328,7 @@ def test_a_step_that_comes_again_brings_the_batch_again_and_no_other():
         for name in ROBOTS:
             team.state(name, 0, goal_id=1)
         team.steps.publish(step)
-        until(lambda: team.batches and all(team.goals.values()) and not node._waiting_goals)
+        until(lambda: team.batches and all(team.goals.values()) and not node._goals.waiting)
         step.imaging = []
         team.steps.publish(step)
         until(lambda: len(team.batches) == 2)
@@ -345,7 +374,6 @@ def test_a_search_of_no_finite_time_is_refused(world):
     [
         ('planner.alpha', -1.0),
         ('planner.beta', math.nan),
-        ('planner.alfa', 0.5),
         ('environment.bounds', [0.0, 2.0, 0.0, math.inf]),
     ],
 )
@@ -355,10 +383,12 @@ def test_wrong_parameters_are_refused_by_name(name, value):
         context = Context()
         rclpy.init(context=context, domain_id=domain.number)
         try:
-            with pytest.raises(SettingsError, match=name):
-                PlannerNode(
-                    context=context,
-                    parameter_overrides=[Parameter(key, value=item) for key, item in flat.items()],
-                )
+            node = PlannerNode(
+                context=context,
+                parameter_overrides=[Parameter(key, value=item) for key, item in flat.items()],
+            )
+            assert node.trigger_configure().name == 'FAILURE'
+            assert f'parameter {name}' in node.problem
+            node.destroy_node()
         finally:
             rclpy.shutdown(context=context)

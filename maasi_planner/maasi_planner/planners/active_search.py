@@ -3,8 +3,9 @@
 Single robot, 001, eq. (9) to (13): sequences of `horizon` position changes, scored by
 T + alpha E with E the sum of e at the positions and T either the sum of pi at the cluster centres
 or the mutual information with the empty measurement set. Several robots, 002, section 4: jointly
-with the sum of T and the product of e (14) to (16), or each for itself (10), which is this planner
-once for each robot with a filter of its own. e and the clusters stay as they are at the decision.
+with the sum of T and the product of the robots' own e (12), (14) to (16), or each for itself (10),
+which is this planner once for each robot with a filter of its own. e and the clusters stay as they
+are at the decision.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ class Sequences:
         positions = np.array([sequence for _, sequence in kept]).reshape(len(kept), horizon, 3)
         self.places = positions
         flat = positions.reshape(-1, 3)
-        self.explored = team.exploration.at(flat).reshape(len(kept), horizon)
+        exploration = team.exploration if view.exploration is None else view.exploration
+        self.explored = exploration.at(flat).reshape(len(kept), horizon)
         before = np.concatenate(
             [np.broadcast_to(here, (len(kept), 1, 3)), positions[:, :-1]], axis=1
         )

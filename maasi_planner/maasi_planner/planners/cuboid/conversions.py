@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from geometry_msgs.msg import Vector3
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_filter.conversions import colour, point_from_ros, point_to_ros
+from maasi_filter.conversions import (
+    FARTHEST,
+    FASTEST,
+    bounded,
+    colour,
+    point_from_ros,
+    point_to_ros,
+)
 from maasi_msgs.msg import CuboidDecision, SearchLink
 from maasi_msgs.msg import Snapshot as SnapshotMessage
 from maasi_planner.planners.cuboid.agent import Broadcast, Choice, SearchAgent, Snapshot
@@ -18,6 +23,9 @@ from maasi_planner.planners.cuboid.battery import Hazard
 from maasi_planner.planners.cuboid.preplanning import Mission
 
 FloatArray = NDArray[np.float64]
+
+# Of a battery's parameters.
+_LARGEST_HAZARD = 1e9
 
 
 def vector_to_ros(values: FloatArray) -> Vector3:
@@ -81,9 +89,9 @@ def broadcast_from_ros(message: SearchLink, cuboids: int) -> Broadcast:
         raise ValueError(f'planned: read {max(message.planned)}, allowed is below {cuboids}')
     position, velocity = point_from_ros(message.position), vector_from_ros(message.velocity)
     predicted = point_from_ros(message.predicted)
-    numbers = [*position, *velocity, *predicted, message.alpha, message.beta]
-    if not all(math.isfinite(number) for number in numbers):
-        raise ValueError('position, velocity, predicted, alpha, beta: allowed are finite numbers')
+    bounded('position, predicted', [*position, *predicted], FARTHEST)
+    bounded('velocity', velocity, FASTEST)
+    bounded('alpha, beta', (message.alpha, message.beta), _LARGEST_HAZARD)
     if message.alpha <= 0.0 or message.beta <= 0.0:
         raise ValueError(
             f'alpha, beta: read {message.alpha}, {message.beta}, allowed are numbers above 0'

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -24,6 +24,13 @@ Box = Annotated[list[Finite], Field(min_length=6, max_length=6)]
 class CuboidPlannerSettings(NodeSettings):
     """Settings of the planner node of one robot."""
 
+    live: ClassVar[frozenset[str]] = frozenset({'link_patience'})
+
+    search_on_start: bool = Field(
+        default=False,
+        description='Whether the search starts as soon as the planner is active; otherwise with '
+        'the service search/start',
+    )
     step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT, duration of a step [s]')
     environment: EnvironmentSettings = Field(description='Where robots may be')
     start: list[Finite] = Field(

@@ -1,0 +1,164 @@
+"""The action `search`: a search that a client starts, follows and ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.node import Node
+from rclpy.task import Future
+
+from maasi_msgs.action import SearchTargets
+
+Result: TypeAlias = SearchTargets.Result
+
+
+@dataclass
+class Progress:
+    """How far a search is.
+
+    Attributes
+    ----------
+    time : float
+        Of the run [s].
+    feedback : SearchTargets.Feedback
+        For the client.
+    finished : str
+        Why nothing is left to gain; empty where something is.
+    robots : bool
+        Whether a robot can go on, as far as is known.
+    """
+
+    time: float
+    feedback: SearchTargets.Feedback
+    finished: str
+    robots: bool
+
+
+class SearchAction:
+    """
+    Server of `search`.
+
+    A goal begins a search, or takes over one that is under way. A newer goal preempts an older
+    one, which is aborted, while the robots go on, so that a dead client does not block the next.
+
+    Parameters
+    ----------
+    node : Node
+        Whose server it is.
+    problem : callable
+        Returns why no goal is taken now; empty where one is.
+    on_begin, on_end : callable
+        Called when a search begins, and when the robots are to stop.
+    on_refusal : callable
+        Called with the kind of a refusal, and why.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        problem: Callable[[], str],
+        on_begin: Callable[[], object],
+        on_end: Callable[[], None],
+        on_refusal: Callable[[str, str], None],
+    ) -> None:
+        self._logger = node.get_logger()
+        self._problem = problem
+        self._on_begin = on_begin
+        self._on_end = on_end
+        self._on_refusal = on_refusal
+        self._goal: Any = None
+        self._outcome: Future | None = None
+        self._feedback = SearchTargets.Feedback()
+        self._began: float | None = None
+        self._server = ActionServer(
+            node,
+            SearchTargets,
+            'search',
+            execute_callback=lambda _: Result(),
+            goal_callback=self._judge,
+            handle_accepted_callback=self._accept,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )
+
+    @property
+    def active(self) -> bool:
+        """Whether a client has a goal."""
+        return self._goal is not None
+
+    def look(self, progress: Progress) -> None:
+        """Give feedback, and end the goal when it is time."""
+        goal = self._goal
+        if goal is None:
+            return
+        if self._began is None:
+            self._began = progress.time
+        request, feedback = goal.request, progress.feedback
+        self._feedback = feedback
+        if goal.is_cancel_requested:
+            self._end(Result.CANCELED, 'cancelled')
+        elif request.targets and feedback.found >= request.targets:
+            self._end(Result.TARGETS_FOUND, f'{feedback.found} targets are found')
+        elif progress.finished:
+            self._end(Result.DONE, progress.finished)
+        elif 0.0 < request.time_limit <= progress.time - self._began:
+            self._end(Result.TIME_LIMIT, f'{request.time_limit:g} s are over')
+        elif not progress.robots:
+            self._end(Result.NO_ROBOT, 'no robot can go on')
+        else:
+            goal.publish_feedback(feedback)
+
+    def stop(self, reason: str) -> None:
+        """End the goal, as the robots are stopped."""
+        if self._goal is not None:
+            self._conclude(Result.CANCELED, reason)
+
+    def _judge(self, goal: SearchTargets.Goal) -> GoalResponse:
+        problem = self._problem()
+        if not (math.isfinite(goal.time_limit) and goal.time_limit >= 0.0):
+            problem = f'time_limit: read {goal.time_limit}, allowed are finite numbers from 0 [s]'
+        if problem:
+            self._on_refusal('bad goal', f'search: {problem}')
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
+
+    def _accept(self, handle: Any) -> None:
+        if self._goal is not None:
+            self._conclude(Result.CANCELED, 'replaced by another goal')
+        self._goal, self._outcome, self._began = handle, Future(), None
+        self._on_begin()
+        # It is EXECUTING until it is concluded.
+        handle.execute(partial(_conclusion, self._outcome))
+
+    def _end(self, reason: int, text: str) -> None:
+        self._conclude(reason, text)
+        self._on_end()
+
+    def _conclude(self, reason: int, text: str) -> None:
+        self._goal, outcome = None, self._outcome
+        self._logger.info(f'search ended: {text}')
+        assert outcome is not None
+        outcome.set_result(
+            Result(
+                end_reason=reason,
+                message=text,
+                found=self._feedback.found,
+                measurements=self._feedback.measurements,
+            )
+        )
+
+
+async def _conclusion(outcome: Future, handle: Any) -> Result:
+    result: Result = await outcome
+    if handle.is_cancel_requested:
+        handle.canceled()
+    elif result.end_reason in (Result.CANCELED, Result.NO_ROBOT):
+        handle.abort()
+    else:
+        handle.succeed()
+    return result

@@ -1,0 +1,122 @@
+"""Start, pause, resume, send home or stop a search, the team's or one robot's."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from maasi_planner.search_modes import COMMANDS
+
+DONE, REFUSED, ABSENT = 0, 1, 2
+_TRIGGER = 'std_srvs/srv/Trigger'
+# Services that come up later than this after the last one are not waited for [s].
+_SETTLED = 1.0
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='search_command',
+        description='Calls the planner; stop and release also reach the drivers themselves, so '
+        'that they work without a planner.',
+        epilog='Exit codes: 0 all followed, 1 one refused or did not answer, 2 wrong arguments '
+        'or no such service.',
+    )
+    parser.add_argument('command', choices=[*COMMANDS, 'release'])
+    parser.add_argument('--robot', metavar='NAME', help='one robot instead of the team')
+    parser.add_argument('--namespace', default='', metavar='NS', help='of the team')
+    parser.add_argument(
+        '--timeout', type=float, default=10.0, metavar='S', help='longest wait for answers [s]'
+    )
+    return parser
+
+
+def wanted(services: dict[str, list[str]], command: str, robot: str, namespace: str) -> set[str]:
+    """Return the services that a command calls, of those that there are."""
+    top = '/'.join(['', *[part for part in namespace.split('/') if part]])
+    known = {name for name, types in services.items() if _TRIGGER in types}
+    # A driver has both; a robot is one level below its team.
+    drivers = {
+        name.removesuffix('/release')
+        for name in known
+        if name.endswith('/release') and name.removesuffix('release') + 'stop' in known
+    }
+    drivers = {
+        name
+        for name in drivers
+        if name.rpartition('/')[0] == top and (not robot or name == f'{top}/{robot}')
+    }
+    chosen = {f'{name}/{command}' for name in drivers} if command in ('stop', 'release') else set()
+    if command == 'release':
+        return chosen
+    team = f'{top}/search/{command}'
+    each = {
+        name
+        for name in known
+        if name.startswith(f'{top}/')
+        and name.endswith(f'/search/{command}')
+        and name.removeprefix(f'{top}/').count('/') == 2
+        and (not robot or name == f'{top}/{robot}/search/{command}')
+    }
+    return chosen | ({team} if not robot and team in known else each)
+
+
+def call_all(node: Node, options: argparse.Namespace) -> dict[str, Any]:
+    """Call each service as soon as it is found; return the answers, None where there is none."""
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    calls: dict[str, Any] = {}
+    clients: dict[str, Any] = {}
+    deadline = time.monotonic() + options.timeout
+    changed = time.monotonic()
+    while time.monotonic() < deadline:
+        found = wanted(
+            dict(node.get_service_names_and_types()),
+            options.command,
+            options.robot or '',
+            options.namespace,
+        )
+        # Without the planner of the team, those of single robots may be only a part of it.
+        for name in sorted(found - set(clients)):
+            clients[name] = node.create_client(Trigger, name)
+            changed = time.monotonic()
+        for name, client in clients.items():
+            if name not in calls and client.service_is_ready():
+                calls[name] = client.call_async(Trigger.Request())
+        done = clients and all(name in calls and calls[name].done() for name in clients)
+        if done and time.monotonic() - changed > _SETTLED:
+            break
+        executor.spin_once(timeout_sec=0.05)
+    executor.shutdown()
+    return {
+        name: calls[name].result() if name in calls and calls[name].done() else None
+        for name in clients
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line."""
+    options = build_parser().parse_args(arguments)
+    rclpy.init()
+    node = rclpy.create_node('search_command', use_global_arguments=False)
+    try:
+        answers = call_all(node, options)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    if not answers:
+        print(f'no service for {options.command} within {options.timeout:g} s: is a planner there?')
+        return ABSENT
+    for name, answer in sorted(answers.items()):
+        print(f'{name}: ' + ('no answer' if answer is None else answer.message))
+    return DONE if all(answer and answer.success for answer in answers.values()) else REFUSED
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,88 @@
+"""The mode of each robot of a team in a search, and its commands. Without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from enum import Enum
+
+
+class Mode(Enum):
+    """The mode of a robot."""
+
+    WAITING = 'waiting for start'
+    SEARCHING = 'searching'
+    PAUSED = 'paused'
+    HOME = 'sent home'
+    STOPPED = 'stopped'
+
+
+COMMANDS = ('start', 'pause', 'resume', 'home', 'stop')
+
+# From which modes a command leads to which; None: from all.
+_ALLOWED: dict[str, tuple[frozenset[Mode] | None, Mode]] = {
+    'start': (None, Mode.SEARCHING),
+    'pause': (frozenset({Mode.SEARCHING, Mode.PAUSED, Mode.HOME}), Mode.PAUSED),
+    'resume': (frozenset({Mode.SEARCHING, Mode.PAUSED, Mode.HOME}), Mode.SEARCHING),
+    'home': (None, Mode.HOME),
+    'stop': (None, Mode.STOPPED),
+}
+
+
+class SearchModes:
+    """
+    The mode of each robot, and what commands make of it.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Robots.
+
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.of = dict.fromkeys(sorted(names), Mode.WAITING)
+
+    @property
+    def searching(self) -> bool:
+        """Whether a robot searches."""
+        return Mode.SEARCHING in self.of.values()
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a search has begun and not been stopped."""
+        return any(mode in (Mode.SEARCHING, Mode.PAUSED, Mode.HOME) for mode in self.of.values())
+
+    def command(self, word: str, names: Collection[str] | None = None) -> list[str]:
+        """
+        Give a command to robots.
+
+        Parameters
+        ----------
+        word : str
+            One of `COMMANDS`.
+        names : collection of str, optional
+            Robots; none: all.
+
+        Returns
+        -------
+        list of str
+            The robots that follow it, in order. The others keep their mode: one that was never
+            started cannot be paused or resumed.
+
+        """
+        allowed, mode = _ALLOWED[word]
+        follow = [
+            name
+            for name, before in self.of.items()
+            if (names is None or name in names) and (allowed is None or before in allowed)
+        ]
+        for name in follow:
+            self.of[name] = mode
+        return follow
+
+    def describe(self, names: Collection[str] | None = None) -> str:
+        """Return the modes of robots (None: all) in words."""
+        of = {name: mode for name, mode in self.of.items() if names is None or name in names}
+        if len(set(of.values())) == 1:
+            return next(iter(of.values())).value
+        return ', '.join(f'{name} {mode.value}' for name, mode in of.items())

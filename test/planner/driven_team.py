@@ -1,0 +1,248 @@
+"""A planner, two real drivers and the robots that they drive, over real topics."""
+
+import os
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+from test_planner_node import ROBOTS, SETTINGS, START
+
+from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.turtlebot_driver import TurtlebotDriver
+from maasi_filter.conversions import pose_to_ros, stamp_to_ros
+from maasi_filter.executor import LeanExecutor
+from maasi_filter.parameters import flatten
+from maasi_filter.pose import Pose, compose, inverse
+from maasi_filter.qos import LATCHED, RELIABLE
+from maasi_msgs.action import GoToWaypoint, SearchTargets
+from maasi_msgs.msg import AgentState, FilterUpdate, PlanDecision
+from maasi_planner.motion import RobotState, make_motion
+from maasi_planner.planner_node import PlannerNode
+from maasi_sim.processes import Domain
+
+PATIENCE = 60.0
+STEP = 0.05
+_DRIVER = {
+    'step': STEP,
+    'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+    'odometry_timeout': 30.0,
+    'sensor_timeout': 0.0,
+    'motion': {'model': 'unicycle', 'speed': 0.5, 'acceleration': 2.0},
+    'sensor': {'detection': {'kind': 'box', 'lower': [-0.1, -0.1], 'upper': [0.2, 0.2]}},
+    'camera': {
+        'focal_length': [120.0, 120.0],
+        'mount': {'position': [0.05, 0.05, 0.4], 'rpy': [0.0, 1.5708, 0.0]},
+    },
+}
+
+
+def parameters(settings):
+    return [Parameter(name, value=value) for name, value in flatten(settings).items()]
+
+
+class Robot:
+    """A robot that obeys `cmd_vel`, and what is heard of it."""
+
+    def __init__(self, node, name):
+        self.settings = DriverSettings.model_validate({**_DRIVER, 'start': [*START[name], 0.0]})
+        self.start = Pose.from_yaw(self.settings.start, 0.0)
+        motion = make_motion(self.settings.motion, radius=self.settings.radius)
+        self.body = motion.body(RobotState(self.start))
+        self.states, self.command = [], [0.0] * 4
+        self.odometry = node.create_publisher(Odometry, f'{name}/odom', RELIABLE)
+        node.create_subscription(AgentState, f'{name}/state', self.states.append, RELIABLE)
+        node.create_subscription(TwistStamped, f'{name}/cmd_vel', self._obey, RELIABLE)
+        self.go_to = ActionClient(node, GoToWaypoint, f'{name}/go_to')
+
+    def _obey(self, message):
+        twist = message.twist
+        self.command = [twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z]
+
+    def move(self, step):
+        self.body.step(self.command, STEP)
+        state = self.body.robot_state()
+        message = Odometry()
+        message.header.frame_id = 'odom'
+        message.header.stamp = stamp_to_ros(round(step * STEP * 1e9))
+        message.pose.pose = pose_to_ros(compose(inverse(self.start), state.pose))
+        velocity = state.pose.rotation().T @ state.velocity
+        message.twist.twist.linear.x = float(velocity[0])
+        message.twist.twist.angular.z = float(state.angular_velocity[2])
+        self.odometry.publish(message)
+
+    @property
+    def state(self):
+        return self.states[-1]
+
+    @property
+    def place(self):
+        return tuple(self.body.robot_state().pose.position)
+
+    @property
+    def stands(self):
+        speed = np.abs(self.body.robot_state().velocity).max()
+        return self.command == [0.0] * 4 and speed < 1e-9
+
+    @property
+    def moves(self):
+        return bool(self.states) and self.state.goal_status == AgentState.MOVING
+
+
+class World:
+    """The planner (`planner`), the robots (by name in `robots`), and a client of both."""
+
+    def __init__(self, domain, settings):
+        self.domain = domain
+        self.environment = dict(os.environ)
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.settings = settings
+        self.node = Node('world', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.robots = {name: Robot(self.node, name) for name in ROBOTS}
+        self.logs, self.status, self.decisions = [], {}, []
+        node = self.node
+        node.create_subscription(Log, '/rosout', self._take_log, 50)
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, 10)
+        node.create_subscription(PlanDecision, 'decisions', self.decisions.append, RELIABLE)
+        self.updates = node.create_publisher(FilterUpdate, 'filter_update', LATCHED)
+        self.search = ActionClient(node, SearchTargets, 'search')
+        self.step = 0
+        self.drivers = []
+        for name, robot in self.robots.items():
+            driver = TurtlebotDriver(
+                context=self.context,
+                namespace=f'/{name}',
+                parameter_overrides=parameters(robot.settings),
+            )
+            assert driver.trigger_configure().name == 'SUCCESS'
+            assert driver.trigger_activate().name == 'SUCCESS'
+            self.executor.add_node(driver)
+            self.drivers.append(driver)
+        self.planner = None
+        self.start_planner()
+
+    def start_planner(self):
+        self.planner = PlannerNode(
+            context=self.context, parameter_overrides=parameters(self.settings)
+        )
+        assert self.planner.trigger_configure().name == 'SUCCESS'
+        assert self.planner.trigger_activate().name == 'SUCCESS'
+        self.lean = LeanExecutor(self.planner, context=self.context)
+        goals = self.planner._goals.clients.values()
+        self.until(
+            lambda: (
+                all(client.server_is_ready() for client in goals)
+                and all(robot.go_to.server_is_ready() for robot in self.robots.values())
+                and self.search.server_is_ready()
+                and self.node.count_publishers('decisions') == 1
+                and set(self.planner._heard) == set(ROBOTS)
+            ),
+            'not connected',
+        )
+
+    def end_planner(self):
+        self.lean.shutdown()
+        self.planner.destroy_node()
+        self.planner = None
+
+    def _take_log(self, message):
+        self.logs.append(message.msg)
+
+    def _take_diagnostics(self, message):
+        for status in message.status:
+            if 'planner_node' in status.name:
+                self.status = {item.key: item.value for item in status.values}
+                self.status |= {'level': status.level, 'message': status.message}
+
+    def until(self, condition, what=''):
+        """Let the robots move until something is true."""
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end, what or 'nothing came of it'
+            self.turn()
+
+    def turn(self):
+        """Do one step of the robots, and what follows from it."""
+        self.step += 1
+        for robot in self.robots.values():
+            robot.move(self.step)
+        until = time.monotonic() + 0.02
+        while time.monotonic() < until:
+            if self.planner is not None:
+                self.lean.spin_for(0.002)
+            self.executor.spin_once(timeout_sec=0.002)
+
+    def pass_steps(self, steps):
+        """Let the robots do some steps, each heard by the planner."""
+        heard = self.planner._heard
+        last = min(item.step for item in heard.values()) + steps
+        self.until(lambda: min(item.step for item in self.planner._heard.values()) >= last)
+
+    def logged(self, text):
+        return any(text in line for line in self.logs)
+
+    def call(self, service):
+        """Return the answer of a service."""
+        client = self.node.create_client(Trigger, service)
+        self.until(client.service_is_ready, f'no service {service}')
+        future = client.call_async(Trigger.Request())
+        self.until(future.done, f'no answer of {service}')
+        self.node.destroy_client(client)
+        return future.result()
+
+    def send(self, name, position, number):
+        """Send a goal as another client; return its handle and the future of its result."""
+        goal = GoToWaypoint.Goal(goal_id=number)
+        goal.waypoint.header.frame_id = 'map'
+        goal.waypoint.pose.position.x, goal.waypoint.pose.position.y = position
+        future = self.robots[name].go_to.send_goal_async(goal)
+        self.until(future.done)
+        assert future.result().accepted
+        return future.result(), future.result().get_result_async()
+
+    def ask(self, **fields):
+        """Send a goal of the action search; return its handle and the future of its result."""
+        future = self.search.send_goal_async(SearchTargets.Goal(**fields))
+        self.until(future.done)
+        assert future.result().accepted
+        return future.result(), future.result().get_result_async()
+
+    def moving(self):
+        return all(robot.moves for robot in self.robots.values())
+
+    def standing(self):
+        return all(robot.stands and not robot.moves for robot in self.robots.values())
+
+    def close(self):
+        if self.planner is not None:
+            self.end_planner()
+        self.executor.shutdown()
+        for driver in self.drivers:
+            driver.destroy_node()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@contextmanager
+def driven(**changes):
+    """Run a planner with two drivers and their robots."""
+    with Domain(None) as domain:
+        settings = SETTINGS.model_copy(update={'others': {}, 'filter_timeout': 0.0, **changes})
+        world = World(domain.number, settings)
+        try:
+            yield world
+        finally:
+            world.close()

@@ -1,0 +1,146 @@
+"""The planner of buildings moves its robot only after `start`, and stops it by the services."""
+
+import time
+
+import rclpy
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from maasi_filter.conversions import stamp_to_ros
+from maasi_filter.executor import LeanExecutor
+from maasi_filter.parameters import flatten
+from maasi_filter.qos import RELIABLE
+from maasi_msgs.msg import AgentState, SearchLink, SearchLinkArray
+from maasi_planner.cuboid_planner_node import CuboidPlannerNode
+from maasi_planner.planners.cuboid.node_settings import CuboidPlannerSettings
+from maasi_sim.processes import Domain
+
+SETTINGS = CuboidPlannerSettings.model_validate(
+    {
+        'environment': {'bounds': [[0.0, 100.0], [0.0, 100.0], [0.0, 40.0]]},
+        'start': [20.0, 20.0, 5.0],
+        'objects': [[60.0, 60.0, 10.0, 20.0, 20.0, 20.0]],
+        'hazard': {'failures': False},
+    }
+)
+
+
+class Flight:
+    """A drone that flies as it is commanded, step by step, without other robots."""
+
+    def __init__(self, context):
+        self.node = Node('flight', context=context)
+        self.planner = CuboidPlannerNode(
+            context=context,
+            namespace='/rover',
+            parameter_overrides=[
+                Parameter(name, value=value) for name, value in flatten(SETTINGS).items()
+            ],
+        )
+        assert self.planner.trigger_configure().name == 'SUCCESS'
+        assert self.planner.trigger_activate().name == 'SUCCESS'
+        self.lean = LeanExecutor(self.planner, context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        self.commands, self.states, self.links = [], [], []
+        node = self.node
+        node.create_subscription(TwistStamped, 'rover/cmd_vel', self.commands.append, RELIABLE)
+        node.create_subscription(AgentState, 'rover/state', self.states.append, RELIABLE)
+        node.create_subscription(SearchLink, 'rover/link/tx', self.links.append, RELIABLE)
+        self.odometry = node.create_publisher(Odometry, 'rover/odom', RELIABLE)
+        self.heard = node.create_publisher(SearchLinkArray, 'rover/link/rx', RELIABLE)
+        self.step, self.place = 0, [0.0, 0.0, 0.0]
+        self.until(
+            lambda: (
+                self.odometry.get_subscription_count() == 1
+                and self.heard.get_subscription_count() == 1
+                and self.node.count_publishers('rover/cmd_vel') == 1
+                and self.node.count_publishers('rover/state') == 1
+                and self.node.count_publishers('rover/link/tx') == 1
+            )
+        )
+
+    def until(self, condition):
+        end = time.monotonic() + 60.0
+        while not condition():
+            assert time.monotonic() < end
+            self.lean.spin_for(0.005)
+            self.executor.spin_once(timeout_sec=0.005)
+
+    def fly(self, steps):
+        """Do steps with the last command; return the commands that came in them."""
+        given = []
+        for _ in range(steps):
+            self.step += 1
+            message = Odometry()
+            message.header.stamp = stamp_to_ros(self.step * 1_000_000_000)
+            velocity = self.command
+            self.place = [place + speed for place, speed in zip(self.place, velocity, strict=True)]
+            point, twist = message.pose.pose.position, message.twist.twist.linear
+            point.x, point.y, point.z = self.place
+            twist.x, twist.y, twist.z = velocity
+            message.pose.pose.orientation.w = 1.0
+            self.odometry.publish(message)
+            self.until(lambda: self.links and self.links[-1].step == self.step)
+            self.heard.publish(SearchLinkArray(step=self.step))
+            self.until(lambda: self.states and self.states[-1].step == self.step)
+            self.until(lambda: self.commands[-1].header.stamp.sec == self.step)
+            given.append(self.command)
+        return given
+
+    @property
+    def command(self):
+        if not self.commands:
+            return [0.0, 0.0, 0.0]
+        linear = self.commands[-1].twist.linear
+        return [linear.x, linear.y, linear.z]
+
+    def call(self, word):
+        client = self.node.create_client(Trigger, f'rover/search/{word}')
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        self.node.destroy_client(client)
+        return future.result()
+
+
+def test_a_robot_among_buildings_moves_only_while_it_searches():
+    still = [0.0, 0.0, 0.0]
+    with Domain(None) as domain:
+        context = Context()
+        rclpy.init(context=context, domain_id=domain.number)
+        flight = Flight(context)
+        try:
+            assert flight.fly(3) == [still] * 3
+            assert flight.states[-1].goal_status == AgentState.IDLE
+            assert flight.states[-1].reason == 'waiting for start'
+            assert not flight.call('pause').success
+            home = flight.call('home')
+            assert not home.success and 'no home' in home.message
+            assert flight.call('start').success
+            assert any(command != still for command in flight.fly(3))
+            assert flight.states[-1].goal_status == AgentState.MOVING
+            known = len(flight.commands)
+            assert flight.call('pause').success
+            # At once, not with the next step.
+            flight.until(lambda: len(flight.commands) > known)
+            assert flight.command == still
+            assert flight.fly(2) == [still] * 2
+            assert flight.states[-1].reason == 'paused'
+            assert flight.call('resume').success
+            assert any(command != still for command in flight.fly(3))
+            assert flight.call('stop').success
+            flight.until(lambda: flight.command == still)
+            assert flight.fly(2) == [still] * 2
+            assert not flight.call('resume').success
+        finally:
+            flight.lean.shutdown()
+            flight.executor.shutdown()
+            flight.planner.destroy_node()
+            flight.node.destroy_node()
+            rclpy.shutdown(context=context)
