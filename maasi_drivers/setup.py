@@ -19,14 +19,14 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'mambo_driver = maasi_drivers.mambo_driver:main',
-            'turtlebot_driver = maasi_drivers.turtlebot_driver:main',
-            'ranging_driver = maasi_drivers.ranging_driver:main',
-            'measurement_feed_sender = maasi_drivers.measurement_feed_sender:main',
-            'mavlink_driver = maasi_drivers.mavlink_driver:main',
-            'mavlink_camera_driver = maasi_drivers.mavlink_camera_driver:main',
-            'calibrate_sensor = maasi_drivers.calibrate_sensor:main',
-            'guard_node = maasi_drivers.guard_node:main',
+            'mambo_driver = maasi_entry:maasi_drivers.mambo_driver',
+            'turtlebot_driver = maasi_entry:maasi_drivers.turtlebot_driver',
+            'ranging_driver = maasi_entry:maasi_drivers.ranging_driver',
+            'measurement_feed_sender = maasi_entry:maasi_drivers.measurement_feed_sender',
+            'mavlink_driver = maasi_entry:maasi_drivers.mavlink_driver',
+            'mavlink_camera_driver = maasi_entry:maasi_drivers.mavlink_camera_driver',
+            'calibrate_sensor = maasi_entry:maasi_drivers.calibrate_sensor',
+            'guard_node = maasi_entry:maasi_drivers.guard_node',
         ],
     },
 )

@@ -13,17 +13,23 @@ import numpy as np
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
-from rclpy.duration import Duration
-from rclpy.qos import HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
 from sensor_msgs.msg import BatteryState
 
+from maasi_drivers.battery_gauge import BatteryGauge, BatteryReadings
 from maasi_drivers.command_publisher import CommandPublisher
-from maasi_drivers.driver_settings import LIVELINESS_LEASE, DriverSettings
+from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.measurement_queue import Frame, MeasurementQueue, MeasurementRequest
 from maasi_drivers.odometry import MapOdometry, PoseHistory, StampedPose
+from maasi_drivers.pose_speed import PoseSpeed
+from maasi_drivers.robot_frames import RobotFrames
+from maasi_drivers.robot_stop import STOPPED, RobotStop
 from maasi_drivers.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_filter.conversions import (
+    FARTHEST,
+    FASTEST,
+    MOST_DETECTIONS,
+    bounded,
     detections_to_ros,
     pose_from_ros,
     pose_to_ros,
@@ -31,8 +37,10 @@ from maasi_filter.conversions import (
     stamp_to_ros,
 )
 from maasi_filter.pose import Pose
-from maasi_filter.qos import RELIABLE, sensor_reader
+from maasi_filter.qos import LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
 from maasi_filter.search_node import SearchNode, SettingsError
+from maasi_filter.silence import Silence
+from maasi_filter.stamps import JUMP, StampGate, batch_id_limit
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState, DetectionArray, LockstepStep, MeasurementBatch
 from maasi_planner.motion import MotionModel, RobotState, make_motion
@@ -41,21 +49,17 @@ from maasi_planner.obstacles import Obstacles
 FloatArray = NDArray[np.float64]
 DataT = TypeVar('DataT')
 
-# What tells the guard that the driver lives.
-LIVELY = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    liveliness=LivelinessPolicy.AUTOMATIC,
-    liveliness_lease_duration=Duration(seconds=LIVELINESS_LEASE),
-)
-
 _WATCH_PERIOD = 0.1
 # Of those, from one state of a robot that has no odometry to the next.
 _WATCHES_PER_STATE = 2
 _PATIENCE = 3.0
-# Stamps that go back farther belong to another time [ns].
-_JUMP = 1_000_000_000
+# Without a charge for so long it warns that `battery_minimum` cannot act [s].
+_BATTERY_PATIENCE = 10.0
+# A robot whose odometry is silent for so much longer than its timeout, in wall time, is told to
+# stand, though its goal goes on: a simulated clock may be slow [s].
+_CLOCK_PATIENCE = 0.5
+# How far image or batch stamps may be ahead of the odometry [ns].
+_AHEAD = 2_000_000_000
 _FEEDBACK_PERIOD = 500_000_000
 # Longest wait for the last command and the last results to arrive [s].
 _FAREWELL = 0.3
@@ -65,6 +69,7 @@ _LAST_TASKS = 5
 _LEAST_SPEED, _LEAST_TURN = 0.02, 0.05
 # Kinds of trouble.
 ODOMETRY, _FROZEN_POSE, _SENSOR, BATTERY = 'odometry', 'frozen pose', 'sensor', 'battery'
+_STOP = 'stop'
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     Subscribes
     ----------
-    `odom` (nav_msgs/Odometry), `battery` (sensor_msgs/BatteryState);
+    `odom` (nav_msgs/Odometry), `battery_state` (sensor_msgs/BatteryState);
     `measurement_batch` of the team (maasi_msgs/MeasurementBatch)
 
     Publishes
@@ -109,11 +114,17 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     `state` (maasi_msgs/AgentState), with each odometry;
     `cmd_vel` (geometry_msgs/TwistStamped or Twist, as the robot listens), with each odometry, and
     zeros when it cannot go on and at the end;
-    `detections` (maasi_msgs/DetectionArray), for each batch that this robot is in
+    `detections` (maasi_msgs/DetectionArray), for each batch that this robot is in;
+    what `RobotFrames` publishes
 
     Actions
     -------
-    `go_to` (maasi_msgs/GoToWaypoint): the newest goal replaces the one before
+    `go_to` (maasi_msgs/GoToWaypoint): the newest goal replaces the one before; one that cannot be
+    taken is aborted at once, with the reason in its result
+
+    Services
+    --------
+    `stop`, `release` (std_srvs/Trigger): it stands, and takes no goals until it is released
     """
 
     # What its sensor delivers, in words.
@@ -123,14 +134,20 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('driver', DriverSettings, in_robot=True, **options)
+        self._namespace = self.get_namespace().strip('/')
+        self.robot = self._namespace.rpartition('/')[2]
+        self._ended: dict[bytes, Goal] = {}
+        self._command_publisher: CommandPublisher | None = None
+        self._stop_latch = RobotStop(self.stop_by_service, self._release)
+
+    def prepare(self) -> None:
+        """Make controller and sensor."""
         settings = self.settings
         if settings.link not in self.links:
             raise SettingsError(
                 f'parameter link: read {settings.link!r}, allowed with this driver is '
                 + ' or '.join(self.links)
             )
-        self._namespace = self.get_namespace().strip('/')
-        self.robot = self._namespace.rpartition('/')[2]
         self.dimension = settings.environment.dimension
         self.sensor = settings.sensor.build(self.robot, self.dimension)
         self.offset = 0
@@ -138,21 +155,28 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._motion = self.make_motion()
         self._start = Pose.from_yaw(settings.start, settings.yaw)
         self._history = PoseHistory()
+        # Robots whose odometry is rare are no exception.
+        self._gate = StampGate(max(JUMP, round(2e9 * settings.odometry_timeout)))
         self._odometry: MapOdometry | None = None
+        self._frames = RobotFrames(self, self.robot, self._take_transform)
+        self._pose_speed = PoseSpeed()
+        self._posed = 'odometry' if settings.pose_source == 'odometry' else 'pose on tf'
         self._follower = WaypointFollower(self._motion)
-        self._ended: dict[bytes, Goal] = {}
         self._queue: MeasurementQueue[DataT] = MeasurementQueue(self._history)
         self._unseen: Counter[str] = Counter()
         self._answer: DetectionArray | None = None
         self._battery = -1.0
         # Why the robot cannot go on, by kind; empty where it can.
-        self._troubles: dict[str, str] = {}
-        self._in_per_cent = False
+        self._troubles: dict[str, str] = {_STOP: STOPPED} if self._stop_latch.latched else {}
+        self._gauge = BatteryGauge()
+        self._charged_at = time.monotonic()
+        self._readings = BatteryReadings()
+        self._battery_subscription: Any = None
         self._moving = False
         self._changed_at = 0
         self._sensed_at: int | None = None
-        self._odometry_at = time.monotonic()
-        self._watched_at = self._odometry_at
+        self._silence = Silence(self)
+        self._watched_at = time.monotonic()
         self._stalled = False
         self._watches = 0
         self._feedback_at = 0
@@ -160,9 +184,6 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._answered: int | None = None
         self._unusable: int | None = None
         self._away = False
-        self._entities: list[Any] = []
-        self._command_publisher: CommandPublisher | None = None
-        self._server: ActionServer | None = None
         self._state = AgentState(robot=self.robot, battery=-1.0)
         self._state.header.frame_id = settings.frame
         self._state.pose.pose = pose_to_ros(self._start)
@@ -209,14 +230,15 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         commands = CommandPublisher(self, 'cmd_vel', settings.command_type, settings.lockstep)
         self._command_publisher = commands
         quality = sensor_reader(settings.lockstep)
-        self._entities += [
-            self.create_subscription(Odometry, 'odom', self._on_odometry, quality),
-            self.create_subscription(BatteryState, 'battery', self._on_battery, quality),
-        ]
+        if settings.pose_source == 'odometry':
+            self.create_subscription(Odometry, 'odom', self._on_odometry, quality)
+        self._battery_subscription = self.create_subscription(
+            BatteryState, 'battery_state', self._on_battery, quality
+        )
         self.expect_subscribers(lambda: commands.publisher)
 
     def disconnect_robot(self) -> None:
-        """Undo `connect_robot`; what is in `_entities` goes by itself."""
+        """Undo `connect_robot`; ROS entities go by themselves."""
         if self._command_publisher is not None:
             self._command_publisher.destroy()
             self._command_publisher = None
@@ -270,48 +292,42 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             MeasurementBatch, self.team_topic('measurement_batch'), self._on_batch, RELIABLE
         )
         self.hurry(self.step_subscription, batches)
-        self._entities = [self._state_publisher, self._detections_publisher, batches]
         self.connect_robot()
-        self._server = ActionServer(
+        ActionServer(
             self,
             GoToWaypoint,
             'go_to',
             self._conclude,
-            goal_callback=self._judge_goal,
-            handle_accepted_callback=self._take_goal,
+            # The protocol has no reason in a rejection: a goal that cannot be taken is accepted and
+            # aborted, with the reason in its result.
+            handle_accepted_callback=self._answer_goal,
             cancel_callback=self._cancel_goal,
         )
-        known = len(list(self.subscriptions))
+        self._stop_latch.offer(self)
+        self._frames.set_up()
         self.set_up_sensor()
-        self._entities += list(self.subscriptions)[known:]
+        self.create_wall_timer(LIVELINESS_PERIOD, self._state_publisher.assert_liveliness)
         if not settings.lockstep:
-            self._entities.append(self.create_wall_timer(_WATCH_PERIOD, self._watch))
+            self.create_wall_timer(_WATCH_PERIOD, self._watch)
         self.expect_subscribers(self._state_publisher, names={'planner_node'})
         self.expect_subscribers(self._detections_publisher, names={'filter_node', 'planner_node'})
 
     def start(self) -> None:
         """Begin to work."""
-        self._odometry_at = time.monotonic()
+        self._silence.end()
 
     def halt(self) -> None:
         """Give the goal up, and stop the robot."""
-        if not self._entities:
+        if not self.configured:
             return
         self._end_goal(GoalStatus.ABORTED, 'the driver stops')
         self.stop_robot()
 
     def tear_down(self) -> None:
         """Disconnect."""
-        if self._server is not None:
-            self._server.destroy()
-            self._server = None
+        # Results have been sent since *deactivate*; what is left goes with the server.
+        self._ended.clear()
         self.disconnect_robot()
-        for entity in self._entities:
-            for destroy in (self.destroy_publisher, self.destroy_subscription, self.destroy_timer):
-                if destroy(entity):
-                    break
-        self._entities = []
-        self._begin_anew()
 
     def destroy_node(self) -> None:
         """Let those who wait for a goal know how it ended, and leave."""
@@ -323,18 +339,20 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             # What was concluded is sent by tasks that come after.
             for _ in range(_LAST_TASKS):
                 self.executor.spin_once(timeout_sec=0.0)
-        if self._server is not None:
-            self._server.destroy()
-            self._server = None
         super().destroy_node()
 
     def reset(self) -> None:
         """Forget where the robot was."""
         self._end_goal(GoalStatus.ABORTED, 'the time jumped back')
+        if not self.settings.lockstep:
+            # Where it is now is not known: it stands until a new pose comes.
+            self.hold_robot()
+            self.begin_trouble(ODOMETRY, f'no {self._posed} since the time jumped back')
         self._begin_anew()
 
     def _begin_anew(self) -> None:
         self._history.clear()
+        self._frames.clear()
         self._queue.clear()
         self._answer = None
         self._follower = WaypointFollower(self._motion)
@@ -373,10 +391,17 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     def _is_new(self, what: str, stamp: int) -> bool:
         """Return whether a stamp [ns] of odometry is of use; one far back begins another time."""
+        if not (self.settings.lockstep or self._gate.accepts(stamp)):
+            self.drop(
+                'odometry stamp',
+                f'{what}: read {stamp} ns, which is far from the one before; allowed if the next '
+                'one follows it',
+            )
+            return False
         latest = self._history.latest
         if latest is None or stamp > latest.stamp:
             return True
-        if latest.stamp - stamp <= _JUMP:
+        if latest.stamp - stamp <= JUMP:
             if stamp < latest.stamp or not self.settings.lockstep:
                 self.drop(
                     'odometry stamp',
@@ -389,11 +414,15 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self.reset()
         return True
 
+    def _take_transform(self, stamp: int, pose: Pose) -> None:
+        if self.active and self._is_new('tf', stamp):
+            self.take_pose(self._pose_speed.place(stamp, pose))
+
     def take_pose(self, placed: StampedPose) -> None:
         """Take where the robot is, later than all before."""
-        self._odometry_at = time.monotonic()
+        self._silence.end()
         if self.end_trouble(ODOMETRY):
-            self.get_logger().info('odometry is back')
+            self.get_logger().info(f'{self._posed} is back')
             # The sensor may have been silent with it.
             self._sensed_at = None
         if not self.settings.lockstep:
@@ -420,6 +449,9 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             origin = pose if self.settings.odometry_origin == 'first' else None
             self._odometry = MapOdometry(self._start, origin)
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
+        bounded('twist.linear', (linear.x, linear.y, linear.z), FASTEST)
+        bounded('twist.angular', (angular.x, angular.y, angular.z), FASTEST)
+        bounded('pose.covariance', covariance, FARTHEST**2)
         # A negative variance in the first place stands for an unknown covariance.
         known = covariance.any() and covariance[0] >= 0.0
         return self._odometry.apply(
@@ -447,6 +479,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             self._finish(reached)
         self._fill_state(placed, step)
         self._state_publisher.publish(self._state)
+        origin = self._start if self._odometry is None else self._odometry.map_from_odom
+        self._frames.publish(placed, origin)
         self.send_command(placed, command.tolist())
         if (
             follower.status == GoalStatus.MOVING
@@ -512,6 +546,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             if self._command_publisher is not None:
                 self._command_publisher.publish(self._command)
         elif latest is not None and latest.stamp == stamp:
+            self._take_readings(stamp)
             self._control(latest)
         elif stamp == self._unusable:
             self._state.header.stamp = self._command.header.stamp = stamp_to_ros(stamp)
@@ -527,12 +562,16 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     # ---- goals -------------------------------------------------------------------------------
 
-    def _judge_goal(self, request: GoToWaypoint.Goal) -> GoalResponse:
-        problem = self._problem(request)
+    def _answer_goal(self, handle: ServerGoalHandle) -> None:
+        """Take a goal, or abort it with the reason."""
+        problem = self._problem(handle.request)
         if problem is None:
-            return GoalResponse.ACCEPT
+            self._take_goal(handle)
+            return
         self.drop('goal', f'go_to: {problem}')
-        return GoalResponse.REJECT
+        refused = _goal_of(handle)
+        refused.status, refused.reason = GoalStatus.ABORTED, problem
+        self._finish(refused)
 
     def _problem(self, request: GoToWaypoint.Goal) -> str | None:
         """Return what is wrong with a goal: field, what was read, what is allowed."""
@@ -542,11 +581,10 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             return 'the robot has left'
         if self.trouble:
             return f'the robot cannot go on: {self.trouble}'
-        if request.waypoint.header.frame_id != self.settings.frame:
-            return (
-                f'waypoint.header.frame_id: read {request.waypoint.header.frame_id!r}, '
-                f'allowed is {self.settings.frame!r}'
-            )
+        latest = self._history.latest
+        now = self.get_clock().now().nanoseconds if latest is None else latest.stamp
+        if problem := self._frames.to_map(request.waypoint, now):
+            return problem
         point = request.waypoint.pose.position
         position = np.array([point.x, point.y, point.z])
         if not np.isfinite(position).all():
@@ -565,17 +603,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         return None
 
     def _take_goal(self, handle: ServerGoalHandle) -> None:
-        request = handle.request
-        point = request.waypoint.pose.position
-        replaced = self._follower.take(
-            Goal(
-                id=int(request.goal_id),
-                step=int(request.step),
-                waypoint=np.array([point.x, point.y, point.z]),
-                tolerance=float(request.tolerance),
-                handle=handle,
-            )
-        )
+        replaced = self._follower.take(_goal_of(handle))
         if replaced is not None:
             self._finish(replaced)
 
@@ -600,7 +628,9 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         goal.handle.execute()
 
     def _conclude(self, handle: ServerGoalHandle) -> GoToWaypoint.Result:
-        goal = self._ended.pop(bytes(handle.goal_id.uuid))
+        goal = self._ended.pop(bytes(handle.goal_id.uuid), None)
+        if goal is None:
+            return GoToWaypoint.Result(reason='the driver was cleaned up')
         if goal.status == GoalStatus.REACHED:
             handle.succeed()
         elif goal.status == GoalStatus.CANCELED and handle.is_cancel_requested:
@@ -613,6 +643,19 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         return result
 
     # ---- when it cannot go on ----------------------------------------------------------------
+
+    def stop_by_service(self) -> None:
+        """Stop the robot until `release`, whichever client has a goal."""
+        if not self.configured:
+            return
+        if self.begin_trouble(_STOP, STOPPED):
+            self.get_logger().warning(STOPPED)
+        if self.active and not self.settings.lockstep:
+            self.hold_robot()
+
+    def _release(self) -> None:
+        if self.configured and self.end_trouble(_STOP):
+            self.get_logger().info('released: it takes goals')
 
     @property
     def trouble(self) -> str:
@@ -643,7 +686,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         return self._troubles.pop(kind, None) is not None
 
     def _watch(self) -> None:
-        """Stop a robot without odometry; on wall time, as a clock may stand still with it."""
+        """Stop a robot without odometry; looked at on wall time, as the clock may stand still."""
         if not self.active:
             return
         self._watches += 1
@@ -654,19 +697,29 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             # It was this process that stood still: the odometry may be waiting to be read.
             return
         self.watch_robot()
-        age = now - self._odometry_at
-        if self._history.latest is None:
-            if age > _PATIENCE:
-                self.warn_throttled('no odometry', f'odom: nothing yet, for {age:.0f} s')
-        elif age > self.settings.odometry_timeout:
-            text = f'no odometry for {age:.1f} s'
+        unknown = now - self._charged_at
+        if self.settings.battery_minimum and unknown > _BATTERY_PATIENCE:
+            self.warn_throttled(
+                'battery',
+                f'no charge of the battery for {unknown:.0f} s: battery_minimum cannot act',
+            )
+        age, timeout = self._silence.length, self.settings.odometry_timeout
+        if self._history.latest is None and ODOMETRY not in self._troubles:
+            wall = self._silence.wall
+            if wall > _PATIENCE:
+                self.warn_throttled('no odometry', f'no {self._posed} yet, for {wall:.0f} s')
+        elif age > timeout or ODOMETRY in self._troubles:
+            text = f'no {self._posed} for {age:.1f} s'
             if self.begin_trouble(ODOMETRY, text):
-                self.get_logger().warning(f'odom: {text}: the robot is stopped')
+                self.get_logger().warning(f'{text}: the robot is stopped')
                 self._watches = 0
             self.hold_robot()
             if self._watches % _WATCHES_PER_STATE == 0:
                 self._fill_status()
                 self._state_publisher.publish(self._state)
+        elif self._silence.wall > timeout + _CLOCK_PATIENCE:
+            # The simulated clock is slow or stands, which real robots do not.
+            self.hold_robot()
 
     def _watch_pose(self, placed: StampedPose) -> None:
         """Stop a robot whose pose stays the same to the bit while it is told to move."""
@@ -695,20 +748,31 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
                 self.get_logger().warning(f'{text}: the robot is stopped')
 
     def _on_battery(self, message: BatteryState) -> None:
-        charge = message.percentage
-        # Some robots say per cent.
-        self._in_per_cent |= 1.0 < charge <= 100.0
-        if self._in_per_cent:
-            charge *= 0.01
-        self.take_charge(charge)
+        if self.settings.lockstep:
+            self._readings.add(stamp_from_ros(message.header.stamp), message.percentage)
+        else:
+            self.take_charge(self._gauge.charge(message.percentage))
+
+    def _take_readings(self, stamp: int) -> None:
+        """In lockstep: take the readings of the steps before the one at `stamp` [ns]."""
+        if self._battery_subscription is not None:
+            handle = self._battery_subscription.handle
+            while (taken := handle.take_message(BatteryState, False)) is not None:
+                self._on_battery(taken[0])
+        for reading in self._readings.before(stamp):
+            self.take_charge(self._gauge.charge(reading))
 
     def take_charge(self, charge: float) -> None:
         """Take how full the battery is, 0 to 1; anything else is unknown."""
         self._battery = charge if 0.0 <= charge <= 1.0 else -1.0
         minimum = self.settings.battery_minimum
+        if self._battery < 0.0:
+            # What is not known changes nothing about what was.
+            return
+        self._charged_at = time.monotonic()
         if not minimum:
             return
-        if not 0.0 <= self._battery < minimum:
+        if self._battery >= minimum:
             self.end_trouble(BATTERY)
             return
         text = f'battery at {self._battery:.2f}, below {minimum:.2f}'
@@ -720,24 +784,43 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     def _on_batch(self, message: MeasurementBatch) -> None:
         if not self.active:
             return
+        stamp = stamp_from_ros(message.stamp)
+        if message.id > batch_id_limit(0):
+            self.drop('batch', f'measurement_batch.id: read {message.id}, allowed are small ones')
+            return
+        if self._is_ahead('batch', 'measurement_batch.stamp', stamp):
+            return
         answer = self._answer
         if (
             answer is not None
             and answer.batch_id == message.id
-            and stamp_from_ros(answer.header.stamp) >= stamp_from_ros(message.stamp)
+            and stamp_from_ros(answer.header.stamp) >= stamp
         ):
             # It comes again where somebody may have missed it, and so may the answer have been.
             self._detections_publisher.publish(answer)
             return
         for member in message.members:
             if member.robot == self.robot:
-                request = MeasurementRequest(
-                    int(message.id), stamp_from_ros(message.stamp), int(member.measurement)
-                )
+                request = MeasurementRequest(int(message.id), stamp, int(member.measurement))
                 for old in self._queue.add_request(request):
                     self.drop('batch', f'batch {old.batch}: no image for it, too many newer ones')
                 self._serve()
                 return
+
+    def _is_ahead(self, reason: str, what: str, stamp: int) -> bool:
+        """Return whether a stamp [ns] is far ahead of the odometry, and drop it then.
+
+        In lockstep the step decides, and nothing is ahead of it.
+        """
+        latest = self._history.latest
+        if self.settings.lockstep or latest is None or stamp <= latest.stamp + _AHEAD:
+            return False
+        self.drop(
+            reason,
+            f'{what}: read {stamp} ns, allowed is up to {_AHEAD * 1e-9:g} s after the odometry, '
+            f'{latest.stamp + _AHEAD} ns',
+        )
+        return True
 
     def take_frame(self, topic: str, stamp: int, data: DataT, *, repeated: bool = False) -> None:
         """
@@ -754,11 +837,11 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         repeated : bool
             Whether it is the one before over again, as of a sensor that hangs.
         """
-        if not self.active:
+        if not self.active or self._is_ahead('image stamp', f'{topic}.header.stamp', stamp):
             return
         latest = self._queue.latest
         if latest is not None and stamp <= latest:
-            if latest - stamp <= _JUMP:
+            if latest - stamp <= JUMP:
                 self.drop(
                     'image stamp',
                     f'{topic}.header.stamp: read {stamp} ns, allowed are stamps after {latest} ns',
@@ -806,6 +889,16 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
                 covariances = None if covariances is None else covariances[inside]
                 dropped += outside
                 self._unseen['outside the field of view'] += outside
+        beyond = len(values) - MOST_DETECTIONS
+        if beyond > 0:
+            self.drop(
+                'too many detections',
+                f'{self.sensed}: {len(values)} detections, allowed are {MOST_DETECTIONS}',
+                beyond,
+            )
+            values = values[:MOST_DETECTIONS]
+            covariances = None if covariances is None else covariances[:MOST_DETECTIONS]
+            dropped += beyond
         answer = DetectionArray(
             batch_id=request.batch,
             step=self._step_of(stamp),
@@ -821,3 +914,15 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         answer.pose.covariance = pose.covariance.ravel()
         self._detections_publisher.publish(answer)
         self._answer = answer
+
+
+def _goal_of(handle: ServerGoalHandle) -> Goal:
+    request = handle.request
+    point = request.waypoint.pose.position
+    return Goal(
+        id=int(request.goal_id),
+        step=int(request.step),
+        waypoint=np.array([point.x, point.y, point.z]),
+        tolerance=float(request.tolerance),
+        handle=handle,
+    )

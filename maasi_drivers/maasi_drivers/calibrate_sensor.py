@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import yaml
 from pydantic import ValidationError
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.rosbag2 import ReaderError
-from rosbags.typesys import Stores, get_typestore
 
+from maasi_drivers.bag_reader import BagError, BagReader
 from maasi_drivers.camera_settings import load_calibration
 from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.image_encoding import decode_image, image_to_array
@@ -158,6 +156,8 @@ class RecordedRobot:
         As found out.
     left_out : int
         Images and detections without a pose of their stamp, or that could not be used.
+    recovered : str
+        What is wrong with the recording, if not all of it can be read; else empty.
 
     Raises
     ------
@@ -177,11 +177,10 @@ class RecordedRobot:
         self.left_out = 0
         if not bag.exists():
             raise CalibrationError(f'{bag}: there is no such recording')
-        self._bag = bag / 'bag' if (bag / 'bag').is_dir() else bag
-        # Only for recordings that hold no definitions of their messages.
-        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._bag = bag
         with self._open() as reader:
-            self._types = {item.topic: item.msgtype for item in reader.connections}
+            self._types = reader.types
+            self.recovered = reader.recovered
         wanted = {'images': _IMAGES, 'detections': (_DETECTIONS,)}
         kinds = (use,) if use else ('images', 'detections')
         for kind in kinds:
@@ -220,20 +219,20 @@ class RecordedRobot:
     def _topic(self, name: str) -> str:
         return f'/{self.robot}/{name}' if self.robot else f'/{name}'
 
-    def _open(self) -> AnyReader:
+    def _open(self) -> BagReader:
         try:
-            return AnyReader([self._bag], default_typestore=self._store)
-        except (AnyReaderError, ReaderError, OSError) as error:
-            raise CalibrationError(f'{self._bag}: cannot be read: {error}') from error
+            return BagReader(self._bag)
+        except BagError as error:
+            raise CalibrationError(str(error)) from error
 
     def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
-        try:
-            with self._open() as reader:
-                chosen = [item for item in reader.connections if item.topic in topics]
-                for connection, _, data in reader.messages(chosen) if chosen else ():
-                    yield connection.topic, reader.deserialize(data, connection.msgtype)
-        except (AnyReaderError, KeyError) as error:
-            raise CalibrationError(f'{self._bag}: cannot be read: {error}') from error
+        with self._open() as reader:
+            try:
+                for item in reader.messages(topics):
+                    yield item.topic, item.message
+            except BagError as error:
+                # What comes before the damage is as good as ever.
+                self.recovered = f'{error}; what is before it is read'
 
     def looks(self) -> list[Look]:
         """Return what it saw, each with where it was then."""
@@ -368,14 +367,19 @@ def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code: 0, or 2 for wrong input."""
     options = build_parser().parse_args(arguments)
+    recorded: RecordedRobot | None = None
     try:
         settings = read_parameters(options.parameters)
         recorded = RecordedRobot(options.bag, settings, options.robot, options.use, options.poses)
         sensor = settings.sensor.build(recorded.robot, settings.environment.dimension)
         noise = sensor_noise(recorded.looks(), sensor, options.target, options.least_range)
     except ValueError as error:
+        if recorded is not None and recorded.recovered:
+            print(f'warning: {recorded.recovered}', file=sys.stderr)
         print(f'error: {error}', file=sys.stderr)
         return 2
+    if recorded.recovered:
+        print(f'warning: {recorded.recovered}', file=sys.stderr)
     print(report(recorded, noise, options.target is not None))
     if options.json is not None:
         content = {
@@ -390,7 +394,11 @@ def main(arguments: list[str] | None = None) -> int:
             'inside': noise.inside,
             'missed': noise.missed,
         }
-        options.json.write_text(json.dumps(content, indent=2) + '\n', encoding='utf-8')
+        try:
+            options.json.write_text(json.dumps(content, indent=2) + '\n', encoding='utf-8')
+        except OSError as error:
+            print(f'error: --json: {options.json}: {error.strerror}', file=sys.stderr)
+            return 2
     return 0
 
 

@@ -63,6 +63,12 @@ class CameraDriver(AgentDriver[Picture]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        self._video: VideoSource | None = None
+        self._feed: FeedReceiver | None = None
+
+    def prepare(self) -> None:
+        """Make the detector, and open where images come from."""
+        super().prepare()
         if self.settings.camera is None:
             raise SettingsError(
                 'parameter camera: got nothing, allowed are the settings of a camera '
@@ -72,8 +78,6 @@ class CameraDriver(AgentDriver[Picture]):
         self._checksum: int | None = None
         #: Stamps for what comes without one.
         self.arrivals = ArrivalClock()
-        self._video: VideoSource | None = None
-        self._feed: FeedReceiver | None = None
         self._counted: Counter[str] = Counter()
         if self.settings.image_source != 'topic':
             try:
@@ -90,12 +94,11 @@ class CameraDriver(AgentDriver[Picture]):
         self.offset = round(self.settings.camera.stamp_offset * 1e9)
 
     def _use(self, camera: CameraSettings) -> None:
-        self.camera = camera
-        self.detector = MarkerDetector(camera, self.dimension)
+        detector = MarkerDetector(camera, self.dimension)
         box = self.sensor.detection
         if isinstance(box, BoxDetection):
             margin = box_view_margin(
-                self.detector.camera,
+                detector.camera,
                 self.settings.sensor.detection.lower or [],
                 self.settings.sensor.detection.upper or [],
                 max(self.settings.start[2], 0.0),
@@ -105,6 +108,7 @@ class CameraDriver(AgentDriver[Picture]):
                     'sensor.detection: the box is not all inside what the camera sees'
                     + (f', by {-margin:.1f} px' if np.isfinite(margin) else '')
                 )
+        self.camera, self.detector = camera, detector
 
     def set_up_sensor(self) -> None:
         """Compile and connect."""
@@ -115,7 +119,7 @@ class CameraDriver(AgentDriver[Picture]):
         height = max(self.settings.start[2], 0.1)
         self.detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0), np.zeros((6, 6)))
         if self.settings.image_source != 'topic':
-            self._entities.append(self.create_wall_timer(_POLL_PERIOD, self._poll_source))
+            self.create_wall_timer(_POLL_PERIOD, self._poll_source)
         quality = sensor_reader(self.settings.lockstep)
         self.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
         if self.settings.image_source != 'topic':
@@ -136,17 +140,26 @@ class CameraDriver(AgentDriver[Picture]):
         if self.settings.image_source == 'video':
             self._video = VideoSource(self.settings.video)
             return
-        port = self.settings.feed_port
+        address, port = self.settings.feed_address, self.settings.feed_port
         try:
-            self._feed = FeedReceiver(port)
+            self._feed = FeedReceiver(port, address)
         except OSError as error:
             raise OSError(
-                f'feed_port: UDP port {port}: {error.strerror}, allowed is one that is free'
+                f'feed_address, feed_port: UDP port {port} of {address}: {error.strerror}, allowed '
+                'is a free port of an address of this host'
             ) from error
+
+    def tear_down(self) -> None:
+        """Disconnect, and let go of video or feed."""
+        super().tear_down()
+        self._close_source()
 
     def destroy_node(self) -> None:
         """Let go of video or feed, and leave."""
         super().destroy_node()
+        self._close_source()
+
+    def _close_source(self) -> None:
         for source in (self._video, self._feed):
             if source is not None:
                 source.close()
@@ -209,11 +222,9 @@ class CameraDriver(AgentDriver[Picture]):
             return
         self._calibration = calibration
         try:
-            camera = self.camera.with_calibration(*calibration)
-        except ValueError as error:
+            self._use(self.camera.with_calibration(*calibration))
+        except (ValueError, np.linalg.LinAlgError) as error:
             self.drop('calibration', f'camera/camera_info: {error}')
-            return
-        self._use(camera)
 
     def _on_image(self, message: Image) -> None:
         try:

@@ -10,6 +10,9 @@ from pydantic import Field, model_validator
 
 from maasi_filter.settings import Finite, Settings
 
+# Of a calibration: beyond these the camera cannot be one [px, px, -].
+_LARGEST_IMAGE, _LARGEST_INTRINSIC, _LARGEST_DISTORTION = 32_768, 1e6, 1e4
+
 
 class SegmentationSettings(Settings):
     """How marker pixels are told from the floor; see `maasi_drivers.segmentation`."""
@@ -209,6 +212,16 @@ class CameraSettings(Settings):
         matrix = [float(value) for value in k]
         if any(matrix[i] != 0 for i in (1, 3, 6, 7)) or matrix[8] != 1:
             raise ValueError(f'k: got {matrix}, allowed [fx, 0, cx, 0, fy, cy, 0, 0, 1]')
+        for name, numbers, limit in (
+            ('width, height', (width, height), _LARGEST_IMAGE),
+            ('k (focal_length, principal_point)', matrix, _LARGEST_INTRINSIC),
+            ('d (distortion)', d, _LARGEST_DISTORTION),
+        ):
+            if not all(abs(number) <= limit for number in numbers):
+                raise ValueError(
+                    f'{name}: got {list(numbers)}, allowed are finite numbers up to {limit:g} in '
+                    'magnitude'
+                )
         values = self.model_dump()
         values.update(
             width=width,

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from maasi_drivers.camera_settings import CameraSettings
 from maasi_drivers.mambo_settings import MamboSettings
 from maasi_drivers.mavlink.settings import MavlinkSettings
-from maasi_filter.node_settings import NodeSettings
+from maasi_drivers.ranging_mount import RangingSettings
+from maasi_filter.node_settings import LIVELINESS_LEASE, NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
 from maasi_planner.settings import MotionSettings
 
 CommandType = Literal['auto', 'stamped', 'twist']
 LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mavlink']
-# A driver that is silent for so long is dead to its guard [s].
-LIVELINESS_LEASE = 0.5
 # The same in lockstep, where robots stand still until their drivers answer: a busy machine may keep
 # a driver waiting, and zeros in between would make the run another one [s].
 LOCKSTEP_LEASE = 20.0
@@ -51,6 +50,17 @@ class ScanSettings(Settings):
 class DriverSettings(NodeSettings):
     """What the driver of a robot needs to know."""
 
+    live: ClassVar[frozenset[str]] = frozenset(
+        {
+            'odometry_timeout',
+            'frozen_pose_timeout',
+            'sensor_timeout',
+            'battery_minimum',
+            'scan.timeout',
+            'scan.blocked_timeout',
+        }
+    )
+
     environment: EnvironmentSettings = Field(description='Where the robot may go')
     link: LinkName = Field(
         default='topics',
@@ -79,6 +89,10 @@ class DriverSettings(NodeSettings):
         default_factory=SensorSettings, description='What it measures targets with'
     )
     camera: CameraSettings | None = Field(default=None, description='Its camera; none: it has none')
+    ranging: RangingSettings = Field(
+        default_factory=RangingSettings,
+        description='What the angles of `ranges` are relative to; of drivers with a ranging sensor',
+    )
     scan: ScanSettings | None = Field(
         default=None,
         description='How a ground robot uses its laser scan; none: it drives by the known '
@@ -93,7 +107,7 @@ class DriverSettings(NodeSettings):
         default=2.0,
         gt=0.0,
         description='Longest silence of Nav2 while it has a goal, answer or feedback: then the '
-        'goal is aborted and the robot stopped [s of wall time]',
+        'goal is aborted and the robot stopped [s]',
     )
     image_source: Literal['topic', 'video', 'feed'] = Field(
         default='topic',
@@ -106,6 +120,12 @@ class DriverSettings(NodeSettings):
     )
     feed_port: int = Field(
         default=14700, ge=1, le=65535, description='UDP port of the measurement feed'
+    )
+    feed_address: str = Field(
+        default='127.0.0.1',
+        min_length=1,
+        description='Address of this host on which the measurement feed is heard; 0.0.0.0: all, '
+        'from a robot on the network',
     )
     image_transport: Literal['raw', 'compressed'] = Field(
         default='raw',
@@ -130,11 +150,26 @@ class DriverSettings(NodeSettings):
         default='zero',
         description='What the odometry shows at the start: zero, or what its first message says',
     )
+    pose_source: Literal['odometry', 'tf'] = Field(
+        default='odometry',
+        description='Where poses come from: `odom`, or the transform from the frame map to '
+        '`base_frame` on /tf, with link topics and not in lockstep',
+    )
+    base_frame: str = Field(
+        default='', description="The robot's own frame on /tf; none: <robot>/base_link"
+    )
+    tf_rate: float = Field(
+        default=20.0,
+        ge=0.0,
+        le=1000.0,
+        description="How often the robot's pose is published on /tf, at most; 0: neither its "
+        'frames nor robot_description are published [Hz]',
+    )
     odometry_timeout: float = Field(
         default=0.5,
         ge=0.1,
-        description='Wall time without odometry after which the robot is stopped; not in lockstep '
-        '[s]',
+        description='Time without odometry, or without a pose on /tf, after which the robot is '
+        'stopped; not in lockstep [s]',
     )
     frozen_pose_timeout: float = Field(
         default=1.0,
@@ -170,6 +205,11 @@ class DriverSettings(NodeSettings):
 
     @model_validator(mode='after')
     def _consistent(self) -> DriverSettings:
+        if self.pose_source == 'tf' and (self.lockstep or self.link != 'topics'):
+            raise ValueError(
+                f"pose_source: got 'tf', allowed with link {self.link!r}"
+                f'{" in lockstep" if self.lockstep else ""} is odometry'
+            )
         if self.lockstep and self.link != 'topics':
             raise ValueError(
                 f'link: got {self.link!r}, which runs in real time; allowed is topics in lockstep'
@@ -209,6 +249,14 @@ class DriverSettings(NodeSettings):
 
 class GuardSettings(NodeSettings):
     """What the guard of a robot needs to know."""
+
+    lease: float = Field(
+        default=LIVELINESS_LEASE,
+        ge=LIVELINESS_LEASE,
+        le=60.0,
+        description='Time without an assertion of liveliness after which the driver is dead; not '
+        'in lockstep [s of wall time]',
+    )
 
     command_type: CommandType = Field(
         default='auto',

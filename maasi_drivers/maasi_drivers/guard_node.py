@@ -1,4 +1,4 @@
-"""The guard of a robot: a small process that stops the robot when its driver is gone."""
+"""The guard of a robot: a small process that stops the robot when its driver dies or hangs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from maasi_drivers.command_publisher import CommandPublisher
-from maasi_drivers.driver_settings import LIVELINESS_LEASE, LOCKSTEP_LEASE, GuardSettings
+from maasi_drivers.driver_settings import LOCKSTEP_LEASE, GuardSettings
 from maasi_filter.search_node import SearchNode, run
 from maasi_msgs.msg import AgentState
 
@@ -25,17 +25,18 @@ class GuardNode(SearchNode[GuardSettings]):
     """
     Publishes zeros while no driver is alive, and nothing while one is.
 
-    Ground robots need it: the last command goes on when nothing follows. Where Nav2 drives, its
-    goals are cancelled, or it would go on too.
+    Every robot that is commanded by a topic needs it: the last command goes on when nothing
+    follows. Where Nav2 drives, its goals are cancelled, or it would go on too.
 
     Subscribes
     ----------
-    `state` (maasi_msgs/AgentState), for the driver's liveliness
+    `state` (maasi_msgs/AgentState), for the driver's liveliness: asserted by its executor thread,
+    so that it is lost when the process dies, is stopped, or hangs in a callback
 
     Publishes
     ---------
-    `cmd_vel` (geometry_msgs/TwistStamped or Twist), 10 times a second from the driver's death until
-    it is back
+    `cmd_vel` (geometry_msgs/TwistStamped or Twist), 10 times a second from the loss of liveliness
+    until it is back
 
     Calls
     -----
@@ -53,16 +54,17 @@ class GuardNode(SearchNode[GuardSettings]):
             self, 'cmd_vel', self.settings.command_type, self.settings.lockstep
         )
         self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
-        self._look_timer = self.create_wall_timer(_LOOK_PERIOD, self._publisher.look)
-        lease = LOCKSTEP_LEASE if self.settings.lockstep else LIVELINESS_LEASE
+        self.create_wall_timer(_LOOK_PERIOD, self._publisher.look)
+        lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
         quality = QoSProfile(
             depth=1,
-            reliability=ReliabilityPolicy.BEST_EFFORT,
-            liveliness=LivelinessPolicy.AUTOMATIC,
+            # Liveliness without data comes with heartbeats, which only reliable readers get.
+            reliability=ReliabilityPolicy.RELIABLE,
+            liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
             liveliness_lease_duration=Duration(seconds=lease),
         )
         # Of the messages only the last one matters, and that only when no other comes.
-        self._subscription = self.create_subscription(
+        self.create_subscription(
             AgentState,
             'state',
             self._on_state,
@@ -74,10 +76,7 @@ class GuardNode(SearchNode[GuardSettings]):
     def tear_down(self) -> None:
         """Disconnect."""
         self._end_stop()
-        self.destroy_subscription(self._subscription)
-        self.destroy_timer(self._look_timer)
-        self._publisher.destroy()
-        self.destroy_client(self._nav2)
+        self._last = b''
 
     def halt(self) -> None:
         """Leave the robot alone."""
@@ -96,7 +95,7 @@ class GuardNode(SearchNode[GuardSettings]):
                 self.get_logger().info('the driver is back')
             self._end_stop()
         elif self.active and self._stop_timer is None:
-            self.get_logger().warning('the driver is gone: zeros on cmd_vel')
+            self.get_logger().warning('the driver is dead or hangs: zeros on cmd_vel')
             self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._stop)
             if self._nav2.service_is_ready():
                 # Without an id: all its goals.

@@ -40,10 +40,10 @@ class MamboDriver(CameraDriver):
     """
     A quadrotor with a camera that looks down; see `CameraDriver`.
 
-    With `link: mambo_wifi` or `mambo_ble` it is a Parrot Mambo that pyparrot talks to; `battery`
-    and `cmd_vel` are not used then. It takes off when the driver is active and `mambo.arm` is true,
-    flies by its own position events or by a topic of another system (`mambo.pose`), and lands at
-    the end, on a low battery, and when link or pose are lost for long.
+    With `link: mambo_wifi` or `mambo_ble` it is a Parrot Mambo that pyparrot talks to;
+    `battery_state` and `cmd_vel` are not used then. It takes off when the driver is active and
+    `mambo.arm` is true, flies by its own position events or by a topic of another system
+    (`mambo.pose`), and lands at the end, on a low battery, and when link or pose are lost for long.
 
     Subscribes
     ----------
@@ -55,10 +55,14 @@ class MamboDriver(CameraDriver):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        settings = self.settings
-        self._mambo = settings.mambo or MamboSettings()
         self._link: MamboLink | None = None
         self._pilot: MamboPilot | None = None
+
+    def prepare(self) -> None:
+        """Make controller, detector and geofence; check that the link can be had."""
+        super().prepare()
+        settings = self.settings
+        self._mambo = settings.mambo or MamboSettings()
         self._phase = Phase.CONNECTING
         self._fence = self._make_fence()
         if settings.link != 'topics':
@@ -80,6 +84,7 @@ class MamboDriver(CameraDriver):
             mambo.port,
             tilt_limit(self.settings.motion),
             mambo.climb,
+            mambo.land_after,
         )
 
     def _make_fence(self) -> FloatArray:
@@ -102,18 +107,12 @@ class MamboDriver(CameraDriver):
             return
         self._link = self._make_link()
         self._link.connect()
-        self._entities.append(
-            self.create_wall_timer(min(self.settings.step, _POLL_PERIOD), self._poll)
-        )
+        self.create_wall_timer(min(self.settings.step, _POLL_PERIOD), self._poll)
         quality = sensor_reader(self.settings.lockstep)
         if self._mambo.pose == 'odometry':
-            self._entities.append(
-                self.create_subscription(Odometry, 'odom', self._on_odometry, quality)
-            )
+            self.create_subscription(Odometry, 'odom', self._on_odometry, quality)
         elif self._mambo.pose == 'pose':
-            self._entities.append(
-                self.create_subscription(PoseStamped, 'pose', self._on_pose, quality)
-            )
+            self.create_subscription(PoseStamped, 'pose', self._on_pose, quality)
         self.expect(lambda: self._pilot is not None and self._pilot.phase is Phase.FLYING)
 
     def disconnect_robot(self) -> None:
@@ -158,6 +157,12 @@ class MamboDriver(CameraDriver):
                 break
             time.sleep(_FAREWELL_POLL)
 
+    def stop_by_service(self) -> None:
+        """Have the drone hover, then land as after a cancelled goal; from the ground it stays."""
+        super().stop_by_service()
+        if self._pilot is not None:
+            self._pilot.goal_cancelled(time.monotonic())
+
     def hold_robot(self) -> None:
         """Have the drone hover."""
         if self._link is None:
@@ -181,12 +186,15 @@ class MamboDriver(CameraDriver):
             status['flight'] = self._phase.value
             status['drone'] = self._link.flying_state
             status['bad position events'] = self._link.bad_events
+            status |= {f'datagrams dropped: {key}': n for key, n in self._link.dropped.items()}
         return status
 
     # ---- what comes in -----------------------------------------------------------------------
 
     def _poll(self) -> None:
         now, pilot, link = time.monotonic(), self._pilot, self._link
+        if link is not None:
+            link.keep_alive()
         self.arrivals.observe(now, self.get_clock().now().nanoseconds)
         if pilot is None or link is None or not self.active:
             return
@@ -197,7 +205,7 @@ class MamboDriver(CameraDriver):
         state, stamp = pilot.state, self.arrivals.stamp(now)
         if stamp is None:
             # A simulated time has not begun: nothing is late.
-            self._odometry_at = now
+            self._silence.end()
         latest = self._history.latest
         if (
             self._mambo.pose == 'events'

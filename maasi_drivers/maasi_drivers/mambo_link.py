@@ -7,17 +7,20 @@ that come with it (of speed, altitude or orientation) has changed.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import math
 import re
-import socket
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from maasi_drivers.mambo_socket import DroneSocket, guard
 
 FloatArray = NDArray[np.float64]
 
@@ -27,6 +30,8 @@ AIRBORNE = ('takingoff', 'hovering', 'flying', 'landing')
 _STAMPS = ('DroneSpeed_ts', 'DroneAltitude_ts', 'DroneQuaternion_ts')
 # Between two rounds of the thread [s]; what is handed over wakes it.
 _ROUND = 0.05
+# Silence of its caller after which the drone is told to hover [s].
+CALLER_TIMEOUT = 0.5
 # From one take-off or landing command to the next while the drone does not obey [s].
 _REPEAT = 0.7
 _RETRIES = 3
@@ -67,7 +72,9 @@ class MamboLink:
     A connection to one Mambo.
 
     All calls return at once; a thread of its own talks to pyparrot, which sleeps in its commands. A
-    piloting command is sent once: when the caller stands still, the drone hovers.
+    piloting command is sent once. That thread is a dead man's switch too: once the caller has not
+    called `keep_alive` for `CALLER_TIMEOUT`, the drone is told to hover, and to land after
+    `land_after` more.
 
     Parameters
     ----------
@@ -76,11 +83,13 @@ class MamboLink:
     address : str
         IP address, or Bluetooth address.
     port : int
-        UDP port on which the drone's events are heard, on all interfaces of this host.
+        UDP port on which the drone's events are heard, on the address of this host that faces it.
     tilt : float
         Of 100 per cent roll or pitch [rad]; the drone takes 5 to 25 degrees.
     climb : float
         Of 100 per cent climb [m/s]; the drone takes 0.5 to 2.
+    land_after : float
+        Time without its caller after which the drone is told to land, from when it hovers [s].
 
     """
 
@@ -91,12 +100,14 @@ class MamboLink:
         port: int = 43210,
         tilt: float = math.radians(10.0),
         climb: float = 0.5,
+        land_after: float = 3.0,
     ) -> None:
         self.kind = kind
         self.address = address
         self.port = port
         self.tilt = tilt
         self.climb = climb
+        self.land_after = land_after
         #: What is wrong with the link; while it is not connected it goes on trying.
         self.error = ''
         #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...
@@ -119,6 +130,7 @@ class MamboLink:
         self._steering: tuple[int, int, int, int] | None = None
         self._wanted: Literal['', 'take_off', 'land'] = ''
         self._asked_at = -math.inf
+        self._called_at = math.inf
         self._thread: threading.Thread | None = None
 
     # ---- what the caller asks for ------------------------------------------------------------
@@ -149,6 +161,12 @@ class MamboLink:
     def airborne(self) -> bool:
         """Whether the drone says that it is in the air, landing included."""
         return self.flying_state in AIRBORNE
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Datagrams that were not used: reason to number."""
+        receiver = getattr(self._drone, 'drone_connection', None)
+        return Counter(getattr(getattr(receiver, 'udp_receive_sock', None), 'dropped', {}))
 
     @property
     def position(self) -> PositionEvent | None:
@@ -182,6 +200,10 @@ class MamboLink:
         with self._lock:
             self._steering = (roll, pitch, yaw, climb)
         self._wake.set()
+
+    def keep_alive(self) -> None:
+        """Note that the caller still looks after the drone; the first call arms the switch."""
+        self._called_at = time.monotonic()
 
     def hover(self) -> None:
         """Send the piloting command with which the drone keeps its place by itself."""
@@ -231,7 +253,7 @@ class MamboLink:
                 "e0:14:d0:63:3d:d0 (pyparrot's findMinidrone shows it)"
             )
         if self.kind == 'wifi':
-            _check_port(self.port)
+            _check_port(self.port, self.address)
         return minidrone
 
     # ---- the thread --------------------------------------------------------------------------
@@ -255,6 +277,7 @@ class MamboLink:
             connection.drone_type = 'Minidrone'
             connection.ip_address = self.address
             connection.udp_receive_port = self.port
+            guard(connection, self.address, self.port)
         return drone
 
     def _work(self, drone: Any) -> None:
@@ -272,6 +295,7 @@ class MamboLink:
             drone.ask_for_state_update()
             self._connected.set()
             while not self._closing.is_set():
+                self._watch_caller()
                 self._do_wanted()
                 self._send_steering()
                 if self.kind == 'ble':
@@ -284,6 +308,17 @@ class MamboLink:
         finally:
             self._connected.clear()
             self._leave(drone)
+
+    def _watch_caller(self) -> None:
+        """Have the drone hover, and then land, where the caller hangs."""
+        late = time.monotonic() - self._called_at - CALLER_TIMEOUT
+        if late <= 0.0 or not self.airborne:
+            return
+        if late > self.land_after:
+            self.land()
+        else:
+            with self._lock:
+                self._steering = (0, 0, 0, 0)
 
     def _try_to_connect(self, drone: Any) -> str:
         """Return why there is no connection, or nothing."""
@@ -328,10 +363,7 @@ class MamboLink:
             return
         connection = drone.drone_connection
         connection.is_listening = False
-        # Its listener waits up to five seconds for a packet: an empty one ends that, and then it
-        # closes the sockets itself.
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as knock:
-            knock.sendto(b'', ('127.0.0.1', self.port))
+        # Its listener closes the sockets itself.
         connection.listener_thread.join(2.0)
 
     # ---- what comes in -----------------------------------------------------------------------
@@ -362,13 +394,15 @@ class MamboLink:
             self._position = PositionEvent(position, -math.radians(psi), time.monotonic())
 
 
-def _check_port(port: int) -> None:
-    """Raise where somebody has the port: pyparrot would take it over, and steal the packets."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as test:
-        try:
-            test.bind(('0.0.0.0', port))
-        except OSError as error:
-            raise MamboLinkError(
-                f'UDP port {port}: {error.strerror}; allowed is one that is free: pyparrot hears '
-                'its drone there on all interfaces, so one Mambo per process and host'
-            ) from error
+def _check_port(port: int, drone: str) -> None:
+    """Raise where somebody has the port."""
+    try:
+        DroneSocket(drone, port).close()
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            # No way to the drone yet: its network may come.
+            return
+        raise MamboLinkError(
+            f'UDP port {port}: {error.strerror}; allowed is one that is free: one Mambo per '
+            'process and host'
+        ) from error

@@ -348,6 +348,7 @@ class MamboPilot:
 
     def goal_cancelled(self, now: float) -> None:
         """Note that its goal was cancelled: it hovers, and lands if no other follows."""
+        self._resting |= self.phase in (Phase.CONNECTING, Phase.GROUND)
         self.hover()
         self._cancelled_at = now
 

@@ -27,7 +27,8 @@ class MamboSettings(Settings):
         default=43210,
         ge=1024,
         le=65535,
-        description='UDP port on which the drone is heard, on all interfaces of this host',
+        description='UDP port on which the drone is heard, on the address of this host that '
+        'faces it',
     )
     ground: Finite = Field(
         default=0.0, description='Height of the floor below its start in the map [m]'

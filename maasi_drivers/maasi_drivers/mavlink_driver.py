@@ -39,17 +39,21 @@ class MavlinkRobot(AgentDriver[DataT]):
     """
     A vehicle with an autopilot.
 
-    With `link: mavlink` it is reached by MAVLink; `odom`, `battery` and `cmd_vel` are not used
-    then. With `link: topics` it is a robot like any other.
+    With `link: mavlink` it is reached by MAVLink; `odom`, `battery_state` and `cmd_vel` are
+    not used then. With `link: topics` it is a robot like any other.
     """
 
     links = ('topics', 'mavlink')
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        self._vehicle_link: VehicleLink | None = None
+
+    def prepare(self) -> None:
+        """Make controller, sensor and geofence."""
+        super().prepare()
         settings = self.settings
         self._mavlink = settings.mavlink or MavlinkSettings()
-        self._vehicle_link: VehicleLink | None = None
         self._arrivals = ArrivalClock()
         self._map_from_local = Pose.from_yaw(
             [*settings.start[:2], self._mavlink.ground], -self._mavlink.map_yaw
@@ -83,7 +87,7 @@ class MavlinkRobot(AgentDriver[DataT]):
         link = VehicleLink(self._mavlink, self.settings.start[2] - self._mavlink.ground)
         self._vehicle_link = link
         self._taken, self._heading, self._ending = -1, None, False
-        self._entities.append(self.create_wall_timer(_POLL_PERIOD, self._poll))
+        self.create_wall_timer(_POLL_PERIOD, self._poll)
 
         def flying() -> bool:
             with link.vehicle() as vehicle:

@@ -209,7 +209,7 @@ class FeedReceiver:
 
     """
 
-    def __init__(self, port: int, address: str = '0.0.0.0') -> None:
+    def __init__(self, port: int, address: str = '127.0.0.1') -> None:
         self.counts: Counter[str] = Counter()
         self.problem = ''
         self._last: int | None = None

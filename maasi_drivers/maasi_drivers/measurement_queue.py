@@ -65,6 +65,7 @@ class MeasurementQueue(Generic[DataT]):
         self._frames: deque[Frame[DataT]] = deque(maxlen=frames)
         self._requests: deque[MeasurementRequest] = deque()
         self._capacity = requests
+        self._next: MeasurementRequest | None = None
         #: Stamp of the last image [ns].
         self.latest: int | None = None
 
@@ -102,7 +103,8 @@ class MeasurementQueue(Generic[DataT]):
         latest = self.history.latest
         if not self._requests or latest is None:
             return None
-        request = self._requests[0]
+        # The earliest one, so that a request for a time to come holds up no other.
+        request = self._next = min(self._requests, key=lambda item: item.stamp)
         while self._frames:
             frame = self._frames[0]
             if frame.stamp >= request.stamp:
@@ -118,5 +120,6 @@ class MeasurementQueue(Generic[DataT]):
         return None
 
     def answered(self) -> None:
-        """Take the first request off."""
-        self._requests.popleft()
+        """Take off the request that `next` returned."""
+        if self._next is not None and self._next in self._requests:
+            self._requests.remove(self._next)

@@ -8,6 +8,7 @@ import numpy as np
 
 from maasi_drivers.agent_driver import AgentDriver, FloatArray, Sighting
 from maasi_drivers.odometry import StampedPose
+from maasi_drivers.ranging_mount import RangingMount
 from maasi_filter.conversions import stamp_from_ros
 from maasi_filter.qos import sensor_reader
 from maasi_filter.search_node import run
@@ -20,19 +21,23 @@ class RangingDriver(AgentDriver[FloatArray]):
 
     Subscribes
     ----------
-    `ranges` (maasi_msgs/RangeArray)
+    `ranges` (maasi_msgs/RangeArray); what its angles are relative to: `ranging.frame`
     """
 
     def set_up_sensor(self) -> None:
         """Connect."""
+        ranging = self.settings.ranging
+        self._mount = RangingMount(ranging, self.sensor) if ranging.frame == 'body' else None
         quality = sensor_reader(self.settings.lockstep)
         self.create_subscription(RangeArray, 'ranges', self._on_ranges, quality)
 
     def _on_ranges(self, message: RangeArray) -> None:
         values = np.array(
             [(item.range, item.bearing, item.elevation) for item in message.ranges], dtype=float
-        ).reshape(-1, 3)[:, : self.dimension]
-        limits = np.array([math.inf, math.pi, 0.5 * math.pi][: self.dimension]) + 1e-6
+        ).reshape(-1, 3)
+        if self._mount is None:
+            values = values[:, : self.dimension]
+        limits = np.array([math.inf, math.pi, 0.5 * math.pi][: values.shape[1]]) + 1e-6
         good = np.isfinite(values).all(axis=1) & (values[:, 0] >= 0.0)
         good &= (np.abs(values) <= limits).all(axis=1)
         if not good.all():
@@ -46,7 +51,10 @@ class RangingDriver(AgentDriver[FloatArray]):
         self.take_frame('ranges', stamp_from_ros(message.header.stamp), values[good])
 
     def look(self, data: FloatArray, pose: StampedPose) -> Sighting:
-        """Return the measurements of one sweep, as they came."""
+        """Return the measurements of one sweep: as they came, or from the mounted sensor."""
+        if self._mount is not None:
+            values, covariances, positions = self._mount.measurements(data, pose)
+            return Sighting(values, covariances, positions, {})
         positions = self.sensor.measurement.inverse(data, pose.pose)
         return Sighting(data, None, positions, {})
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +20,7 @@ from maasi_drivers.waypoint_follower import Goal, GoalStatus
 from maasi_filter.conversions import point_to_ros, stamp_from_ros
 from maasi_filter.qos import sensor_reader
 from maasi_filter.search_node import SettingsError, run
+from maasi_filter.silence import Silence
 from maasi_msgs.action import GoToWaypoint
 from maasi_planner.motion import MotionModel, RobotState
 from maasi_planner.obstacles import Obstacles
@@ -43,7 +43,7 @@ class Nav2Navigation:
     frame : str
         Of the waypoints: Nav2's global frame.
     timeout : float
-        Longest silence while Nav2 has a goal [s of wall time]: its feedback comes many times a
+        Longest silence while Nav2 has a goal [s]: its feedback comes many times a
         second, whatever the robot does.
     on_end : callable
         Told when Nav2 ended a goal by itself: goal, whether it was reached, and why if not.
@@ -72,7 +72,7 @@ class Nav2Navigation:
         self._frame = frame
         self._timeout = timeout
         self._on_end = on_end
-        self._heard = 0.0
+        self._silence = Silence(node)
         self._client = ActionClient(node, NavigateToPose, 'navigate_to_pose')
         self._goal: Goal | None = None
         self._handle: Any = None
@@ -93,7 +93,7 @@ class Nav2Navigation:
             return None
         if not self.there:
             return 'Nav2 is gone'
-        silence = time.monotonic() - self._heard
+        silence = self._silence.length
         if silence > self._timeout:
             return f'Nav2 has said nothing for {silence:.1f} s'
         return None
@@ -101,7 +101,7 @@ class Nav2Navigation:
     def go(self, goal: Goal, heading: float) -> None:
         """Send the robot to a waypoint, to face `heading` there [rad]; the goal before is over."""
         self._goal, self._handle = goal, None
-        self._heard = time.monotonic()
+        self._silence.end()
         pose = PoseStamped()
         pose.header.frame_id = self._frame
         pose.pose.position = point_to_ros([goal.waypoint[0], goal.waypoint[1], 0.0])
@@ -111,10 +111,10 @@ class Nav2Navigation:
         future.add_done_callback(lambda answer: self._answered(goal, answer.result()))
 
     def _on_feedback(self, _: Any) -> None:
-        self._heard = time.monotonic()
+        self._silence.end()
 
     def _answered(self, goal: Goal, handle: Any) -> None:
-        self._heard = time.monotonic()
+        self._silence.end()
         if handle is None or not handle.accepted:
             self._ended(goal, False, 'Nav2 refuses the waypoint')
             return
@@ -152,10 +152,6 @@ class Nav2Navigation:
         if handle is not None:
             handle.cancel_goal_async()
 
-    def destroy(self) -> None:
-        """Leave the graph."""
-        self._client.destroy()
-
 
 class TurtlebotDriver(CameraDriver):
     """
@@ -176,9 +172,13 @@ class TurtlebotDriver(CameraDriver):
     """
 
     def __init__(self, **options: Any) -> None:
-        self._seen: ScanUnicycle | None = None
-        self._nav2: Nav2Navigation | None = None
         super().__init__(**options)
+        self._nav2: Nav2Navigation | None = None
+
+    def prepare(self) -> None:
+        """Make controller, detector, and the client of Nav2."""
+        self._seen: ScanUnicycle | None = None
+        super().prepare()
         self._scan: LaserScan | None = None
         self._scanned_at: int | None = None
         # The goal on the way, the least distance that was left to it, and when that was.
@@ -215,12 +215,10 @@ class TurtlebotDriver(CameraDriver):
         super()._begin_anew()
         self._scan = self._scanned_at = self._nearest = None
 
-    def destroy_node(self) -> None:
+    def tear_down(self) -> None:
         """Let go of Nav2 as well."""
-        super().destroy_node()
-        if self._nav2 is not None:
-            self._nav2.destroy()
-            self._nav2 = None
+        super().tear_down()
+        self._nav2 = None
 
     # ---- the laser scan ----------------------------------------------------------------------
 

@@ -40,11 +40,13 @@ class Play:
         kind = 'submarine' if firmware == 'ardusub' else 'copter'
         settings = {'vehicle': kind, 'arm': True} | changes
         self.to_driver, self.to_autopilot = Wire(), Wire()
+        link = MavlinkSettings.model_validate(settings)
         self.vehicle = Vehicle(
-            MavlinkSettings.model_validate(settings),
-            HEIGHTS[firmware],
-            mavlink.MAVLink(self.to_autopilot, 255, 190),
+            link, HEIGHTS[firmware], mavlink.MAVLink(self.to_autopilot, link.own_system, 190)
         )
+        # A ground station on the same network, which the autopilot passes on; None: there is none.
+        self.station = None
+        self._beat_at = 0.0
         self.vehicle.wanted = True
         self.autopilot = FakeAutopilot(
             AutopilotSettings.model_validate({'firmware': firmware} | (autopilot or {})),
@@ -61,6 +63,14 @@ class Play:
 
     def turn(self):
         self.now += PERIOD
+        if self.station is not None and self.now - self._beat_at >= 1.0:
+            self._beat_at = self.now
+            wire = Wire()
+            sender = mavlink.MAVLink(wire, self.station, 190)
+            sender.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4)
+            self.to_driver.write(bytes(wire.data))
+            for message in wire.take():
+                self.autopilot.handle(message)
         self.autopilot.advance(PERIOD)
         heard = self.to_driver.take()
         if self.driver_lives:

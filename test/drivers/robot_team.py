@@ -4,6 +4,7 @@ import math
 import time
 
 import numpy as np
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
@@ -116,12 +117,13 @@ class Team(Node):
         self.create_subscription(DetectionArray, 'detections', self.detections.append, RELIABLE)
         self.create_subscription(LockstepDone, '/lockstep/ready', self.ready.append, LATCHED_ALL)
         self.odometry = self.create_publisher(Odometry, 'odom', RELIABLE)
-        self.battery = self.create_publisher(BatteryState, 'battery', RELIABLE)
+        self.battery = self.create_publisher(BatteryState, 'battery_state', RELIABLE)
         self.batches = self.create_publisher(MeasurementBatch, '/measurement_batch', RELIABLE)
         self.images = self.create_publisher(Image, 'camera/image_raw', RELIABLE)
         self.calibrations = self.create_publisher(CameraInfo, 'camera/camera_info', RELIABLE)
         self.ranges = self.create_publisher(RangeArray, 'ranges', RELIABLE)
-        self.used = [self.odometry, self.battery, self.batches]
+        self.used = [self.battery, self.batches]
+        self.used += [self.odometry] if self.settings.pose_source == 'odometry' else []
         self.used += [self.images] if self.settings.camera else [self.ranges]
         if lockstep:
             self.steps = self.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)
@@ -218,6 +220,23 @@ class Team(Node):
         handle = self.send(*arguments, **options)
         assert handle.accepted
         return handle, handle.get_result_async()
+
+    def refused(self, *arguments, **options):
+        """Send a goal that is aborted at once; return the reason that its client reads."""
+        _, result = self.send_accepted(*arguments, **options)
+        self.until(result.done, 'the goal is not refused')
+        assert result.result().status == GoalStatus.STATUS_ABORTED
+        assert result.result().result.reason
+        return result.result().result.reason
+
+    def takes(self, *arguments, live=lambda: None):
+        """Return whether the robot sets out for a goal."""
+        _, result = self.send_accepted(*arguments)
+        self.until(
+            lambda: live() or result.done() or self.state.goal_status == AgentState.MOVING,
+            'the goal is not answered',
+        )
+        return not result.done() or result.result().status != GoalStatus.STATUS_ABORTED
 
     def ask(self, stamp, robots=('rover',), step=0):
         self.batch += 1

@@ -130,13 +130,13 @@ def test_a_cancelled_goal_stops_the_robot(play, kind):
 def test_a_goal_that_makes_no_sense_is_refused(play, capfd, changes, field):
     driver, team = play()
     team.move()
-    assert not team.send(**({'position': [0.5, 0.5, 0.0]} | changes)).accepted
+    assert field in team.refused(**({'position': [0.5, 0.5, 0.0]} | changes))
     assert driver.dropped['goal'] == 1
     assert field in capfd.readouterr().err
     team.move()
     assert team.state.goal_status == AgentState.IDLE
     # On the border, within the robot's radius, is allowed.
-    assert team.send([2.5, 0.5, 0.0]).accepted
+    assert team.takes([2.5, 0.5, 0.0], live=team.move)
 
 
 # ---- odometry that is missing or bad ---------------------------------------------------------
@@ -313,6 +313,21 @@ def test_ranges_pass_through_as_they_come(play):
     assert answer.dropped == 1 and driver.dropped['range'] == 1
 
 
+def test_ranges_of_a_mounted_sensor_are_turned_by_the_pose(play):
+    _, team = play('ranging', ranging={'frame': 'body', 'rpy': [0.0, 0.0, 0.5]})
+    team.move()
+    sweep = RangeArray(ranges=[RangeMeasurement(range=2.0, bearing=-0.2, elevation=0.0)])
+    team.ranges.publish(sweep)
+    team.ask(0)
+    answer = team.answer()
+    (item,) = answer.detections
+    turn = answer.pose.pose.orientation
+    yaw = 2.0 * math.atan2(turn.z, turn.w)
+    assert (item.range, item.elevation) == pytest.approx((2.0, 0.0))
+    assert item.bearing == pytest.approx(yaw + 0.3)
+    assert len(item.covariance) == 9
+
+
 # ---- lockstep --------------------------------------------------------------------------------
 
 
@@ -372,7 +387,7 @@ def test_in_lockstep_a_robot_that_is_left_out_gives_its_goal_up(play):
     lockstep_step(team, 2, robots=['other'])
     team.until(result.done)
     assert result.result().result.reason == 'left'
-    assert not team.send([1.0, 1.0, 0.0]).accepted
+    assert 'the robot has left' in team.refused([1.0, 1.0, 0.0])
     lockstep_step(team, 3)
     team.until_done(3)
     assert [item.step for item in team.done] == [0, 1, 3]

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
 import cv2
@@ -29,7 +30,6 @@ from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.conversions import pose_to_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.parameters import flatten
 from maasi_filter.pose import Pose
-from maasi_filter.search_node import SettingsError
 from maasi_msgs.msg import AgentState
 from maasi_sim.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.mambo_firmware import FirmwareSettings, FlyingState
@@ -104,7 +104,7 @@ def hears_why(flight, result, reason):
     flight.until(lambda: flight.status == AgentState.UNAVAILABLE and reason in flight.reason)
     flight.until(result.done)
     assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert not flight.team.send(GOAL).accepted
+    assert flight.team.refused(GOAL)
 
 
 # ---- a flight --------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ def test_nothing_takes_off_without_arm(fly):
     flight = fly(mambo={'arm': False})
     flight.until(lambda: 'mambo.arm' in flight.reason)
     assert flight.status == AgentState.UNAVAILABLE
-    assert not flight.team.send(GOAL).accepted
+    assert flight.team.refused(GOAL)
     known = len(flight.team.states)
     flight.until(lambda: len(flight.team.states) > known + 20)
     assert flight.fake.firmware.take_offs == 0
@@ -286,6 +286,31 @@ def test_what_is_lost_has_it_hover_then_land(fly, fault, reason):
     assert flight.fake.firmware.take_offs == 1
 
 
+def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
+    flight = fly(mambo={'land_after': 1.0})
+    firmware = flight.fake.firmware
+    # Not by its own watchdog: the last command would be flown for ever.
+    firmware.settings = firmware.settings.model_copy(update={'command_timeout': math.inf})
+    flight.on_its_way()
+
+    def await_without_the_executor(condition):
+        deadline = time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < deadline, flight.fake.snapshot()
+            time.sleep(0.02)
+
+    def speed():
+        return np.linalg.norm(flight.fake.snapshot()[0].velocity[:2])
+
+    assert speed() > 0.1
+    await_without_the_executor(lambda: speed() < 0.05)
+    # It was told so before it lands.
+    assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
+    await_without_the_executor(lambda: flight.flying_state == FlyingState.LANDED)
+    # Once it is looked after again, it is said why it does not go on.
+    flight.until(lambda: flight.status == AgentState.UNAVAILABLE and 'Mambo is' in flight.reason)
+
+
 def test_a_low_battery_lands_it(fly):
     flight = fly()
     _, result = flight.on_its_way()
@@ -315,7 +340,7 @@ def test_a_goal_outside_the_geofence_is_refused_and_leaves_it_where_it_is(fly):
     flight.up()
     points = [[1.7, 0.8, 1.6], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5]]
     for number, point in enumerate(points, start=1):
-        assert not flight.team.send(point).accepted
+        assert flight.team.refused(point)
         assert flight.driver.dropped['goal'] == number
     flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
     assert flight.status in (AgentState.IDLE, AgentState.ABORTED)
@@ -345,7 +370,7 @@ def test_a_camera_that_hangs_has_it_hover(fly, fault):
     flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
     hangs = False
     flight.up()
-    assert flight.team.send(GOAL).accepted
+    assert flight.team.takes(GOAL)
 
 
 def test_when_its_driver_is_killed_the_firmware_has_it_hover_then_land(process):
@@ -374,9 +399,11 @@ def test_a_driver_that_is_told_to_end_lands_it(process):
 
 
 def refused(context, made, settings):
-    with pytest.raises(SettingsError) as caught:
-        made(context=context, namespace='/rover', parameter_overrides=parameters_of(settings))
-    return str(caught.value)
+    node = made(context=context, namespace='/rover', parameter_overrides=parameters_of(settings))
+    assert node.trigger_configure().name == 'FAILURE'
+    problem = node.problem
+    node.destroy_node()
+    return problem
 
 
 def test_a_link_that_cannot_be_is_said(context, monkeypatch):

@@ -24,7 +24,6 @@ from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.parameters import flatten
 from maasi_filter.pose import Pose
-from maasi_filter.search_node import SettingsError
 from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
 from maasi_sim.autopilot_settings import AutopilotSettings
 from maasi_sim.fake_mavlink_vehicle import FakeVehicle
@@ -118,7 +117,7 @@ class Flight:
         assert reason in result.result().result.reason
         self.until(lambda: self.speed < STOPPED)
         assert np.linalg.norm((self.position - before)[:2]) < LONGEST_WAY
-        assert not self.team.send([1.0, 1.0, 0.8]).accepted
+        assert self.team.refused([1.0, 1.0, 0.8])
 
 
 @pytest.fixture
@@ -232,7 +231,7 @@ def test_without_arm_nothing_is_armed_and_goals_are_refused(fly, capfd):
     flight = fly(link={'arm': False})
     flight.until(lambda: flight.team.states and 'arm is false' in flight.state.reason)
     assert flight.state.goal_status == AgentState.UNAVAILABLE
-    assert not flight.team.send(START).accepted
+    assert flight.team.refused(START)
     assert 'the robot cannot go on: vehicle: not armed: arm is false' in capfd.readouterr().err
     assert not flight.vehicle.autopilot.armed
     assert flight.mode == 'STABILIZE'
@@ -263,12 +262,12 @@ def test_what_the_autopilot_does_by_itself_is_shown(fly, capfd):
 def test_goals_that_are_not_finite_or_outside_the_geofence_are_refused(fly, capfd):
     flight = fly(link={'geofence': [[-3.0, 3.0], [-3.0, 3.0], [0.5, 3.0]]}).fly()
     for goal in ([math.nan, 0.0, 0.8], [0.0, 0.0, math.inf], [0.0, 3.5, 0.8], [0.0, 0.0, 4.0]):
-        assert not flight.team.send(goal).accepted
+        assert flight.team.refused(goal)
     flight.until(lambda: flight.driver.dropped['goal'] == 4)
     assert 'allowed are finite numbers' in capfd.readouterr().err
     assert 'the geofence' in flight.driver._problem(flight.team.goal([0.0, 3.5, 0.8]))
     assert flight.vehicle.running
-    assert flight.team.send([0.0, 2.5, 0.8]).accepted
+    assert flight.team.takes([0.0, 2.5, 0.8])
 
 
 def test_blown_out_of_the_geofence_it_comes_back(fly):
@@ -371,10 +370,12 @@ def test_a_port_that_is_taken_is_tried_again(context, fly):
 
 
 def test_other_drivers_do_not_have_this_link(context):
-    with pytest.raises(SettingsError, match=r"link: read 'mavlink', allowed .* topics"):
-        TurtlebotDriver(
-            context=context, parameter_overrides=parameters_of(TURTLEBOT | {'link': 'mavlink'})
-        )
+    driver = TurtlebotDriver(
+        context=context, parameter_overrides=parameters_of(TURTLEBOT | {'link': 'mavlink'})
+    )
+    assert driver.trigger_configure().name == 'FAILURE'
+    assert "link: read 'mavlink', allowed with this driver is topics" in driver.problem
+    driver.destroy_node()
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])

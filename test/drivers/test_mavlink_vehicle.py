@@ -1,6 +1,7 @@
 """What the driver says to an autopilot, against a fake one, in simulated time."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,7 +54,7 @@ def test_a_heartbeat_tells_the_firmware():
     'changes, word',
     [
         ({'geofence': [[0, 1], [1, 0], [0, 1]]}, 'geofence'),
-        ({'system': 255}, 'own_system'),
+        ({'system': 240}, 'own_system'),
         ({'lead': math.nan}, 'lead'),
         ({'url': ''}, 'url'),
     ],
@@ -136,10 +137,120 @@ def test_failsafes_are_read_and_shown(firmware):
         assert 'FS_EKF_ACTION is 0, which is off' in play.said
 
 
-def test_another_ground_station_is_warned_of():
-    play = Play(own_system=250)
-    play.run(6.0)
-    assert 'SYSID_MYGCS or MAV_GCS_SYSID is 255, own_system is 250' in play.said
+@pytest.mark.parametrize(
+    ('parameters', 'text'),
+    [
+        ({'SYSID_MYGCS': 255}, 'SYSID_MYGCS is 255, mavlink.own_system is 240'),
+        ({'MAV_GCS_SYSID_HI': 255}, 'MAV_GCS_SYSID_HI is 255: any ground station with an id from'),
+    ],
+)
+def test_nothing_is_armed_where_another_ground_station_would_do_for_the_driver(parameters, text):
+    play = Play(autopilot={'parameters': parameters})
+    play.run(10.0)
+    assert text in play.said
+    assert text in play.vehicle.trouble
+    assert not play.commands(ARM)
+
+
+def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver():
+    play = Play()
+    play.station = play.vehicle.settings.own_system
+    play.run(10.0)
+    assert not play.commands(ARM)
+    assert 'another program sends heartbeats with system id 240' in play.vehicle.trouble
+    play.station = None
+    play.fly()
+    # In the air it is reported: the failsafe would not act now.
+    play.reports.clear()
+    play.station = play.vehicle.settings.own_system
+    play.run(2.0)
+    assert 'another program sends heartbeats with system id 240' in play.said
+
+
+def test_a_ground_station_of_its_own_id_does_not_keep_the_failsafe_from_acting():
+    play = Play().fly()
+    play.station = 255
+    play.go(SPEED)
+    play.driver_lives = False
+    play.run(AT_MOST + 8.0)
+    assert play.autopilot.mode == play.autopilot.firmware.land
+
+
+@pytest.mark.parametrize('drift', [-0.05, 0.05])
+def test_a_barometer_that_drifts_before_arming_does_not_keep_it_at_its_take_off(drift):
+    play = Play(autopilot={'barometer_drift': drift, 'estimator_time': 12.0})
+    play.fly()
+    assert abs(play.autopilot._height_error) > 0.55
+    play.run(4.0)
+    # Above the ground, whatever the barometer says.
+    assert play.autopilot.body.position[2] == pytest.approx(HEIGHTS['arducopter'], abs=0.1)
+    assert play.vehicle.origin[2] == pytest.approx(play.autopilot._height_error, abs=0.05)
+    assert len(play.commands(mavlink.MAV_CMD_NAV_TAKEOFF)) == 1
+
+
+def test_what_a_take_off_leaves_over_is_flown_by_set_point():
+    play = Play()
+    play.until(lambda: play.vehicle.phase is Phase.ARMING)
+    # Home is set by somebody else, half a metre lower than where it stands.
+    play.until(lambda: play.autopilot.armed)
+    play.autopilot._home = -0.5
+    play.fly()
+    play.run(4.0)
+    assert play.autopilot.body.position[2] == pytest.approx(HEIGHTS['arducopter'], abs=0.1)
+
+
+def test_a_vehicle_that_does_not_rise_lands_and_says_why():
+    play = Play(rise_timeout=6.0)
+    play.autopilot.body.limits = replace(play.autopilot.body.limits, climb=0.0)
+    play.run(20.0)
+    assert 'it came no nearer to its height in 6 s: at ' in play.vehicle.trouble
+    assert 'm of 2.0 m' in play.vehicle.trouble
+    assert not play.autopilot.armed
+
+
+def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on():
+    play = Play(autopilot={'charge': 0.01})
+    play.until(lambda: play.vehicle.phase is Phase.ARMING)
+    play.autopilot.take_mode('LOITER')
+    play.run(3.0)
+    assert play.vehicle.phase is Phase.RELEASED
+    play.autopilot.charge = 1.0
+    play.autopilot.take_mode('GUIDED')
+    play.fly()
+    assert 'GUIDED is back' in play.said
+
+
+def test_the_loss_of_gnss_is_seen_in_flight():
+    play = Play().fly().go(SPEED)
+    play.autopilot.lose_gnss()
+    play.run(1.5)
+    assert play.vehicle.trouble == 'vehicle: GNSS is lost (GPS_RAW_INT.fix_type 1)'
+    play.run(9.0)
+    assert play.vehicle.trouble == 'vehicle: the autopilot has lost its position estimate'
+
+
+def test_an_autopilot_that_restarts_is_left_alone():
+    play = Play().fly().go(SPEED)
+    play.autopilot.restart()
+    play.run(5.0)
+    assert 'vehicle: is disarmed' in play.vehicle.trouble
+    assert 'the autopilot has restarted' in play.said
+    armed = len(play.commands(ARM))
+    play.run(10.0)
+    assert len(play.commands(ARM)) == armed
+
+
+def test_two_batteries_are_two():
+    play = Play(autopilot={'charge': 0.8, 'more_batteries': [0.05]})
+    seen = set()
+    for _ in range(500):
+        play.turn()
+        seen.add(round(play.vehicle.charge, 2))
+    assert seen - {-1.0} <= {0.05, 0.8}
+    assert play.vehicle.charge == pytest.approx(0.05)
+    first = Play(autopilot={'charge': 0.8, 'more_batteries': [0.05]}, battery=0)
+    first.run(5.0)
+    assert first.vehicle.charge == pytest.approx(0.8)
 
 
 def test_reasons_against_arming_are_shown():

@@ -102,3 +102,12 @@ def test_only_so_many_images_and_requests_are_kept():
     ]
     assert dropped == [1]
     assert answers(queue) == [(2, 20, 20), (3, 30, 30)]
+
+
+def test_a_request_for_a_time_to_come_holds_up_no_other():
+    queue = queue_of(0, 100)
+    queue.add_request(MeasurementRequest(1, 90, 0))
+    queue.add_request(MeasurementRequest(2, 10, 1))
+    queue.add_frame(Frame(20, None))
+    queue.add_frame(Frame(95, None))
+    assert answers(queue) == [(2, 20, 20), (1, 95, 95)]

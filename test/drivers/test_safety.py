@@ -18,10 +18,11 @@ from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, image_message, number
 from sensor_msgs.msg import BatteryState
 
 from maasi_drivers.agent_driver import _WATCH_PERIOD
-from maasi_drivers.driver_settings import LIVELINESS_LEASE, DriverSettings
+from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.guard_node import _STOP_PERIOD
 from maasi_filter.conversions import stamp_to_ros
-from maasi_msgs.msg import AgentState
+from maasi_filter.node_settings import LIVELINESS_LEASE
+from maasi_msgs.msg import AgentState, BatchMember, MeasurementBatch
 
 # After a fault the robot has been stopped by then [s].
 LATEST = 1.5
@@ -40,7 +41,7 @@ def gives_up(team, result, reason):
     assert team.state.goal_status == AgentState.UNAVAILABLE
     assert reason in team.state.reason
     assert_array_equal(team.command, np.zeros(4))
-    assert not team.send([1.0, 1.0, 0.0]).accepted
+    assert reason in team.refused([1.0, 1.0, 0.0])
 
 
 def steps_until_stopped(team, move=None):
@@ -82,13 +83,13 @@ def test_without_odometry_the_robot_is_stopped(play, frozen):
     known = len(team.commands), len(team.states)
     team.until(lambda: len(team.commands) >= known[0] + 3 and len(team.states) > known[1])
     assert_array_equal([numbers(item) for item in team.commands[-3:]], np.zeros((3, 4)))
-    assert not team.send([1.0, 1.0, 0.0]).accepted
+    assert team.refused([1.0, 1.0, 0.0])
     team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
     team.step += 1
     team.odometry.publish(team.odometry_message())
     team.until(lambda: team.state.step == team.step)
     assert team.state.goal_status == AgentState.ABORTED
-    assert team.send([1.0, 1.0, 0.0]).accepted
+    assert team.takes([1.0, 1.0, 0.0], live=team.move)
 
 
 def test_a_low_battery_ends_the_way(play):
@@ -153,7 +154,7 @@ def test_a_pose_that_hangs_under_a_command_to_move_stops_the_robot(play, kind):
     team.body.step([0.2, 0.0, 0.0, 0.3], 0.5)
     team.move()
     assert team.state.goal_status == AgentState.ABORTED
-    assert team.send([1.0, 1.0, 1.0 if kind == 'mambo' else 0.0]).accepted
+    assert team.takes([1.0, 1.0, 1.0 if kind == 'mambo' else 0.0], live=team.move)
 
 
 def test_a_robot_that_stands_may_have_the_same_pose_for_long(play):
@@ -187,14 +188,26 @@ def test_a_camera_that_hangs_stops_the_robot(play, fault):
     for _ in range(3):
         move()
     team.until(lambda: move() or team.state.goal_status == AgentState.ABORTED)
-    assert team.send([1.0, 1.0, 0.0]).accepted
+    assert team.takes([1.0, 1.0, 0.0], live=team.move)
 
 
 def test_a_camera_that_was_never_there_is_said(play):
     _, team = play(sensor_timeout=None)
     assert steps_until_stopped(team) <= LATEST
     assert 'no new image' in team.state.reason
-    assert not team.send([1.0, 1.0, 0.0]).accepted
+    assert team.refused([1.0, 1.0, 0.0])
+
+
+def test_a_minimum_without_a_charge_is_warned_of(play, monkeypatch):
+    monkeypatch.setattr('maasi_drivers.agent_driver._BATTERY_PATIENCE', 0.3)
+    driver, team = play(battery_minimum=0.2)
+    team.until(lambda: team.move() or 'battery' in driver._warned)
+    # An unknown charge does not end what a low one began.
+    team.battery.publish(BatteryState(percentage=0.1))
+    team.until(lambda: team.move() or 'battery at 0.10' in team.state.reason)
+    team.battery.publish(BatteryState(percentage=math.nan))
+    team.until(lambda: team.move() or team.state.battery == -1.0)
+    assert 'battery at 0.10' in team.state.reason
 
 
 def test_a_battery_that_speaks_per_cent_is_not_full_at_one_per_cent(play):
@@ -314,3 +327,33 @@ def test_a_driver_that_is_told_to_end_leaves_zeros(process, team, number):
     assert result.result().status == GoalStatus.STATUS_ABORTED
     assert result.result().result.reason == 'the driver stops'
     team.until(lambda: not np.any(team.command))
+
+
+def test_a_battery_once_above_full_is_a_fraction_as_before(play):
+    _, team = play(battery_minimum=0.2)
+    for percentage, charge in ((0.9, 0.9), (1.1, 1.0), (0.8, 0.8)):
+        team.battery.publish(BatteryState(percentage=percentage))
+        expected = pytest.approx(charge)
+        team.until(lambda expected=expected: team.move() or team.state.battery == expected)
+    assert team.state.goal_status == AgentState.IDLE
+
+
+def test_odometry_and_batches_from_another_time_change_nothing(play):
+    driver, team = play(odometry_timeout=0.5)
+    team.move(3)
+    for sec, nanosec, reason in (
+        (-5, 0, 'bad stamp'),
+        (2**31 - 1, 0, 'odometry stamp'),
+        (1, 2**32 - 1, 'bad stamp'),
+    ):
+        message = team.odometry_message()
+        message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
+        before = driver.dropped[reason]
+        team.odometry.publish(message)
+        team.until(lambda reason=reason, before=before: driver.dropped[reason] == before + 1)
+    batch = MeasurementBatch(id=7, members=[BatchMember(robot='rover')])
+    batch.stamp.sec = 10**6
+    team.batches.publish(batch)
+    team.until(lambda: driver.dropped['batch'] == 1)
+    team.move(3)
+    assert driver.dropped['odometry stamp'] == 1

@@ -1,6 +1,7 @@
 """A sensor's noise R from recordings of one target."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -339,3 +340,42 @@ def test_detections_of_a_driver_do_as_well(tmp_path, capsys):
     noise = calibrate(tmp_path, '--target', *map(str, TARGET))
     assert_allclose(noise['deviations'], [0.011, 0.03], rtol=0.15)
     assert 'detections used' in capsys.readouterr().out
+
+
+def cut_copy(folder, copy, share):
+    """Copy a recording, and keep a share of its file."""
+    shutil.copytree(folder, copy)
+    (file,) = (copy / 'bag').glob('*.mcap')
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    return copy
+
+
+def test_of_a_cut_recording_what_is_readable_is_used(recording, tmp_path, capsys):
+    folder = cut_copy(recording[0], tmp_path / 'cut', 0.8)
+    noise = calibrate(folder, '--target', *map(str, TARGET))
+    whole = calibrate(recording[0], '--target', *map(str, TARGET))
+    assert 0.4 * whole['used'] < noise['used'] < whole['used']
+    assert_allclose(noise['deviations'], whole['deviations'], rtol=0.5)
+    assert 'is missing; what is before it is read' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('share', [0.0, 0.00002, 0.02])
+def test_of_a_cut_recording_with_too_little_one_error_is_said(recording, tmp_path, capsys, share):
+    folder = cut_copy(recording[0], tmp_path / 'cut', share)
+    assert main([str(folder), '--parameters', str(folder / 'driver.yaml')]) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert [line.partition(':')[0] for line in errors][-1:] == ['error']
+    assert len(errors) <= 2
+
+
+def test_of_a_recording_damaged_inside_what_is_before_is_used(recording, tmp_path, capsys):
+    folder = cut_copy(recording[0], tmp_path / 'cut', 1.0)
+    (file,) = (folder / 'bag').glob('*.mcap')
+    data = bytearray(file.read_bytes())
+    # The start of a compressed chunk.
+    middle = data.index(b'\x28\xb5\x2f\xfd', len(data) // 2)
+    data[middle : middle + 4] = bytes(4)
+    file.write_bytes(data)
+    main([str(folder), '--parameters', str(folder / 'driver.yaml'), '--target', *map(str, TARGET)])
+    assert 'is damaged' in capsys.readouterr().err

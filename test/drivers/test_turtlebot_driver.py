@@ -15,13 +15,13 @@ import pytest
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_allclose, assert_array_equal
 from rclpy.executors import SingleThreadedExecutor
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers, start_guard
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers, parameters_of, start_guard
 from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.qos import RELIABLE
-from maasi_filter.search_node import SettingsError
 from maasi_msgs.msg import AgentState
 from maasi_sim.laser_scan import LaserScanner, LaserSettings
 
@@ -99,7 +99,7 @@ def test_without_a_scan_the_robot_is_stopped(play):
     assert 'no scan for' in result.result().result.reason
     assert 'no scan for' in team.state.reason
     team.until(lambda: robot.move() or team.state.goal_status == AgentState.ABORTED)
-    assert team.send([1.4, 1.5, 0.0]).accepted
+    assert team.takes([1.4, 1.5, 0.0], live=robot.move)
 
 
 def test_a_waypoint_that_cannot_be_reached_is_given_up(play):
@@ -238,11 +238,18 @@ def send(team, position):
 
 
 def send_first(team, position):
-    """Send a goal until it is taken: the driver may find Nav2 later than the team the driver."""
+    """Send a goal until Nav2 is there: the driver may find it later than the team the driver."""
     for _ in range(1000):
         handle = send(team, position)
-        if handle.accepted:
-            return handle
+        result = handle.get_result_async()
+        team.until(
+            lambda result=result: (
+                stand(team) or result.done() or team.state.goal_status == AgentState.MOVING
+            )
+        )
+        if not result.done():
+            return result
+        assert 'Nav2 is not there' in result.result().result.reason
     raise AssertionError(f'no goal is taken: {team.states[-1:]}')
 
 
@@ -255,7 +262,7 @@ def reason_of_abort(team, result):
 def test_nav2_drives_to_the_waypoints(driven):
     team, said, nav2, _ = driven
     # Reached.
-    result = send_first(team, [0.3, 0.8, 0.0]).get_result_async()
+    result = send_first(team, [0.3, 0.8, 0.0])
     line = heard(team, said, 'goal')
     assert line['frame'] == 'map'
     assert_allclose(line['position'], [0.3, 0.8, 0.0])
@@ -306,8 +313,8 @@ def test_nav2_drives_to_the_waypoints(driven):
     while 'Nav2' not in reason:
         assert 'no odometry for' in reason
         handle = send(team, [0.7, 0.8, 0.0])
-        reason = reason_of_abort(team, handle.get_result_async()) if handle.accepted else 'no Nav2'
-    assert 'Nav2 has said nothing for' in reason or reason in ('Nav2 is gone', 'no Nav2')
+        reason = reason_of_abort(team, handle.get_result_async())
+    assert 'Nav2 has said nothing for' in reason or 'Nav2 is' in reason
 
 
 def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, context):
@@ -333,8 +340,11 @@ def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, contex
     guard.destroy_node()
 
 
-def test_nav2_that_is_not_installed_is_said(play, monkeypatch):
+def test_nav2_that_is_not_installed_is_said(context, monkeypatch):
     # None stands for a module that cannot be imported, also where Nav2 is installed.
     monkeypatch.setitem(sys.modules, 'nav2_msgs', None)
-    with pytest.raises(SettingsError, match='the package nav2_msgs is not installed'):
-        play(navigation='nav2')
+    settings = TURTLEBOT | {'navigation': 'nav2'}
+    driver = TurtlebotDriver(context=context, parameter_overrides=parameters_of(settings))
+    assert driver.trigger_configure().name == 'FAILURE'
+    assert 'the package nav2_msgs is not installed' in driver.problem
+    driver.destroy_node()

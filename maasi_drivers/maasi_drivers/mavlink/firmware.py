@@ -62,6 +62,8 @@ class Firmware:
         By the name of the parameter.
     ground_station : tuple of str
         Parameters, one of which holds the system id of the ground station it listens to.
+    ground_station_high : str
+        Parameter with the highest of these ids, where newer versions have a range.
 
     """
 
@@ -77,6 +79,7 @@ class Firmware:
     returns: bool
     failsafes: Mapping[str, Failsafe]
     ground_station: tuple[str, ...] = ()
+    ground_station_high: str = ''
 
     def mode_name(self, mode: int) -> str:
         """Return a mode's name."""
@@ -124,6 +127,7 @@ ARDUCOPTER = Firmware(
         'FENCE_ENABLE': Failsafe('it leaves the fence of the autopilot'),
     },
     ground_station=('SYSID_MYGCS', 'MAV_GCS_SYSID'),
+    ground_station_high='MAV_GCS_SYSID_HI',
 )
 
 ARDUSUB = Firmware(
@@ -157,6 +161,7 @@ ARDUSUB = Firmware(
         'BATT_FS_LOW_ACT': Failsafe('the battery is low'),
     },
     ground_station=('SYSID_MYGCS', 'MAV_GCS_SYSID'),
+    ground_station_high='MAV_GCS_SYSID_HI',
 )
 
 PX4_COPTER = Firmware(

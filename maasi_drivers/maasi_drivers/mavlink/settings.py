@@ -16,18 +16,19 @@ class MavlinkSettings(Settings):
     """How the driver reaches an autopilot, and what it may have it do."""
 
     url: str = Field(
-        default='udpin:0.0.0.0:14550',
+        default='udpin:127.0.0.1:14550',
         min_length=1,
         description='As pymavlink has it: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or the '
-        'name of a serial device',
+        'name of a serial device; udpin:0.0.0.0:PORT is heard from the whole network',
     )
     baud: int = Field(default=57600, ge=1200, description='Of a serial device [1/s]')
     system: int = Field(default=1, ge=1, le=255, description='System id of the vehicle')
     own_system: int = Field(
-        default=255,
+        default=240,
         ge=1,
         le=255,
-        description='System id of the driver; the autopilot must know it as its ground station',
+        description='System id of the driver, of nobody else (ground stations have 255); the '
+        'autopilot must have it as its ground station (SYSID_MYGCS, MAV_GCS_SYSID)',
     )
     vehicle: Literal['copter', 'submarine'] = Field(
         default='copter', description='What it is; another one is left alone'
@@ -73,6 +74,18 @@ class MavlinkSettings(Settings):
     )
     latency: float = Field(
         default=0.0, ge=0.0, le=1.0, description='Age of a position when it arrives [s]'
+    )
+    rise_timeout: float = Field(
+        default=15.0,
+        gt=0.0,
+        description='Time without coming nearer to its height at the start after which it lands '
+        '[s]',
+    )
+    battery: int = Field(
+        default=-1,
+        ge=-1,
+        le=255,
+        description='Id of the battery that counts (BATTERY_STATUS.id); -1: the emptiest of all',
     )
     at_end: Ending = Field(
         default='land',

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maasi_drivers.mavlink.failsafes import FailsafeCheck
 from maasi_drivers.mavlink.firmware import Firmware, identify
 from maasi_drivers.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation, swap_yaw
 from maasi_drivers.mavlink.protocol import mavlink
@@ -29,15 +30,17 @@ _ENDING_PERIOD = 0.3
 _ARMING_PERIOD = 2.0
 # How long setpoints go ahead of the mode where they must [s].
 _STREAM_AHEAD = 1.2
-# Height is reached within this [m].
-_RISEN = 0.2
+# Height is reached within this; a shorter way is no progress [m].
+_RISEN, _PROGRESS = 0.2, 0.1
+# Of GPS_RAW_INT: the least fix with a height.
+_FIX_3D = 3
 # Texts of the autopilot that are younger explain a refusal [s].
 _TEXT_AGE = 6.0
 # Position only, and yaw: no velocity, acceleration, yaw rate.
 _SETPOINT_MASK = 0x9F8
 # Of EKF_STATUS_REPORT: a level or absolute position, and none that is only assumed.
 _EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
-_ERROR, _WARNING = 3, 4
+_ERROR, _WARNING, _INFO = 3, 4, 6
 
 _MESSAGES = {
     'LOCAL_POSITION_NED': None,
@@ -46,6 +49,7 @@ _MESSAGES = {
     'SYS_STATUS': 1.0,
     'EXTENDED_SYS_STATE': 2.0,
     'EKF_STATUS_REPORT': 2.0,
+    'GPS_RAW_INT': 2.0,
 }
 
 
@@ -111,7 +115,7 @@ class Vehicle:
     settings : MavlinkSettings
         Of the link.
     height : float
-        To which it rises, over its origin [m].
+        To which it rises, over its origin; a copter's origin is on the ground [m].
     sender : MAVLink
         Packs messages and writes them to the wire.
 
@@ -124,11 +128,8 @@ class Vehicle:
     telemetry : Telemetry or None
         Newest.
     origin : ndarray, shape (3,)
-        Of the settings, in the local frame of the autopilot, ENU [m].
-    charge : float
-        Of the battery, 0 to 1; -1 where it is not known.
-    parameters : dict
-        Of the failsafes, as read; None where the autopilot does not have it.
+        Of the settings, in the local frame of the autopilot, ENU [m]. Its height is that of the
+        ground when a copter is armed: the estimate drifts until then.
     wanted : bool
         Whether it may be armed now; set while the driver is active.
 
@@ -141,8 +142,6 @@ class Vehicle:
         self.firmware: Firmware | None = None
         self.telemetry: Telemetry | None = None
         self.origin = np.zeros(3)
-        self.charge = -1.0
-        self.parameters: dict[str, float | None] = {}
         self.wanted = False
         self.armed = False
         self.mode = -1
@@ -153,18 +152,24 @@ class Vehicle:
         self._commands: deque[_Command] = deque()
         self._detail = ''
         self._beat_at = self._phase_at = self._sent_at = -math.inf
-        self._asked_at = self._tried_at = -math.inf
-        self._heard_at = -math.inf
+        self._tried_at = self._heard_at = -math.inf
         self._lost = False
-        self._asked: Counter[str] = Counter()
-        self._checked = False
+        self._failsafes: FailsafeCheck | None = None
         self._estimates: bool | None = None
+        self._fix: int | None = None
+        self._fix_needed = False
+        self._landed = mavlink.MAV_LANDED_STATE_UNDEFINED
+        self._charges: dict[int, float] = {}
+        # Least way left to its height so far, and when [m, s].
+        self._nearest, self._nearer_at = math.inf, -math.inf
         self._local: tuple[Any, ...] | None = None
         self._attitude = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
         self._setpoint: FloatArray | None = None
         self._yaw: float | None = None
         self._ending: Ending | None = None
         self._ending_taken = False
+        # Why it lands by itself.
+        self._reason = ''
 
     # ---- what the driver wants ---------------------------------------------------------------
 
@@ -172,6 +177,27 @@ class Vehicle:
     def flying(self) -> bool:
         """Whether it follows setpoints, with a link that works."""
         return self.phase is Phase.FLYING and not self._lost
+
+    @property
+    def _blind(self) -> str:
+        """Why its position is not to be trusted in flight; empty where it is."""
+        if self._estimates is False:
+            return 'the autopilot has lost its position estimate'
+        if self._fix_needed and self._fix is not None and self._fix < _FIX_3D:
+            return f'GNSS is lost (GPS_RAW_INT.fix_type {self._fix})'
+        return ''
+
+    @property
+    def charge(self) -> float:
+        """Of the battery that counts, 0 to 1; -1 where it is not known."""
+        if self.settings.battery >= 0:
+            return self._charges.get(self.settings.battery, -1.0)
+        return min((value for value in self._charges.values() if value >= 0.0), default=-1.0)
+
+    @property
+    def parameters(self) -> Mapping[str, float | None]:
+        """Of the failsafes, as read; None where the autopilot does not have it."""
+        return {} if self._failsafes is None else self._failsafes.values
 
     @property
     def at_rest(self) -> bool:
@@ -185,6 +211,8 @@ class Vehicle:
         """Why it cannot go anywhere; empty where it can."""
         if self._lost:
             return f'link: nothing heard from system {self.settings.system}'
+        if self.phase is Phase.FLYING and self._blind:
+            return f'vehicle: {self._blind}'
         what = ': '.join(part for part in (self.phase.value, self._detail) if part)
         return f'vehicle: {what}' if what else ''
 
@@ -219,23 +247,37 @@ class Vehicle:
         if self.phase is Phase.FLYING:
             self._setpoint, self._yaw = target, float(yaw)
 
-    def finish(self, ending: Ending) -> None:
+    def finish(self, ending: Ending, reason: str = '') -> None:
         """Have it hold its position or land, and send it nowhere any more.
 
         With a pilot's mode nothing is said, and on the ground it just is not armed any more.
+
+        Parameters
+        ----------
+        ending : {'hold', 'land'}
+            What it is to do.
+        reason : str
+            For the planner.
         """
         self.wanted = False
         if self.phase is Phase.ENDING and self._ending == ending:
             return
         if self.armed and self.phase not in (Phase.RELEASED, Phase.STOPPED, Phase.REFUSED):
             self._ending, self._ending_taken = ending, False
+            self._reason = f', {reason}' if reason else ''
             self._commands.clear()
-            self._enter(Phase.ENDING, 'it lands' if ending == 'land' else 'it holds its position')
+            what = 'it lands' if ending == 'land' else 'it holds its position'
+            self._enter(Phase.ENDING, what + self._reason)
 
     # ---- what comes in -----------------------------------------------------------------------
 
     def handle(self, message: Any, now: float) -> None:
-        """Take a message; those of others are not looked at."""
+        """Take a message; of others only heartbeats with the driver's own id matter."""
+        if message.get_srcSystem() == self.settings.own_system:
+            # What the driver sends does not come back.
+            if message.get_type() == 'HEARTBEAT' and self._failsafes is not None:
+                self._failsafes.hear_own_id(now)
+            return
         if (
             message.get_srcSystem() != self.settings.system
             or message.get_srcComponent() != mavlink.MAV_COMP_ID_AUTOPILOT1
@@ -266,6 +308,9 @@ class Vehicle:
             if mode == self.firmware.external and armed and self.firmware.returns:
                 self._report(_WARNING, f'the pilot gives {self.firmware.mode_name(mode)} back')
                 self._begin_flying()
+            elif mode == self.firmware.external and not armed:
+                self._report(_INFO, f'{self.firmware.mode_name(mode)} is back: it may be armed')
+                self._enter(Phase.PREPARING)
             elif mode != before:
                 self._detail = f'mode {self.firmware.mode_name(mode)}'
 
@@ -293,18 +338,18 @@ class Vehicle:
             self._enter(Phase.REFUSED, str(error))
             return False
         self.firmware = firmware
-        self.parameters = {}
+        self._failsafes = FailsafeCheck(firmware, self.settings, self._sender, self._report)
         for name, rate in _MESSAGES.items():
             number = getattr(mavlink, f'MAVLINK_MSG_ID_{name}')
             interval = 1e6 / (rate or self.settings.position_rate)
             self._ask(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (number, interval))
-        self._report(6, f'{firmware.name} is there as system {self.settings.system}')
+        self._report(_INFO, f'{firmware.name} is there as system {self.settings.system}')
         return True
 
     def _on_disarmed(self) -> None:
         self._commands.clear()
         if self.phase is Phase.ENDING:
-            self._enter(Phase.STOPPED, 'it has landed')
+            self._enter(Phase.STOPPED, f'it has landed{self._reason}')
         elif self.phase not in (Phase.PREPARING, Phase.WAITING):
             self._report(_WARNING, 'the autopilot or the pilot has disarmed it')
             self._enter(Phase.STOPPED, 'by the autopilot or the pilot')
@@ -330,7 +375,7 @@ class Vehicle:
             # Heard again, or an autopilot that was started again: then the frame is another.
             if before[0] - message.time_boot_ms < 1000:
                 return
-            self._report(_WARNING, 'the clock of the autopilot jumped back')
+            self._on_restart()
         self._local = (message.time_boot_ms, values)
         if before is not None and before[1] == values and self.armed:
             # An estimate that moves at all never says the same twice: it is frozen.
@@ -338,7 +383,6 @@ class Vehicle:
             return
         if self.telemetry is None and self.settings.origin == 'here':
             self.origin = swap_enu_ned(values[:3])
-            self.height += float(self.origin[2])
         self.telemetry = Telemetry(
             0 if self.telemetry is None else self.telemetry.number + 1,
             now,
@@ -346,6 +390,15 @@ class Vehicle:
             swap_enu_ned(values[3:]),
             *self._attitude,
         )
+
+    def _on_restart(self) -> None:
+        """Leave an autopilot alone that was restarted: its local frame is another one."""
+        text = 'the autopilot has restarted'
+        self._report(_WARNING, text)
+        if self.phase not in (Phase.CONNECTING, Phase.PREPARING, Phase.WAITING):
+            self._commands.clear()
+            self._enter(Phase.STOPPED, text)
+            self.wanted = False
 
     def _on_attitude(self, message: Any, now: float) -> None:
         quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
@@ -357,7 +410,20 @@ class Vehicle:
         self._attitude = (swap_orientation(quaternion / norm), swap_flu_frd(rates))
 
     def _on_battery(self, message: Any, now: float) -> None:
-        self.charge = message.battery_remaining / 100.0 if message.battery_remaining >= 0 else -1.0
+        left = message.battery_remaining
+        self._charges[int(message.id)] = left / 100.0 if 0 <= left <= 100 else -1.0
+
+    def _on_status(self, message: Any, now: float) -> None:
+        """Take the first battery's charge, where BATTERY_STATUS does not come."""
+        left = message.battery_remaining
+        if 0 not in self._charges and 0 <= left <= 100:
+            self._charges[0] = left / 100.0
+
+    def _on_landed(self, message: Any, now: float) -> None:
+        self._landed = int(message.landed_state)
+
+    def _on_gnss(self, message: Any, now: float) -> None:
+        self._fix = int(message.fix_type)
 
     def _on_estimator(self, message: Any, now: float) -> None:
         self._estimates = bool(message.flags & _EKF_POSITION) and not message.flags & _EKF_ASSUMED
@@ -368,15 +434,13 @@ class Vehicle:
         self._report(int(message.severity), f'autopilot: {text}')
 
     def _on_parameter(self, message: Any, now: float) -> None:
-        assert self.firmware is not None or self.phase is Phase.CONNECTING
-        name = message.param_id.rstrip('\0')
-        if self.firmware is None or name not in self._names():
+        if self.firmware is None or self._failsafes is None:
             return
         value = float(message.param_value)
         if self.firmware.name == 'PX4' and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:
             # PX4 sends the bytes of an integer in the place of a float.
             value = float(struct.unpack('<i', struct.pack('<f', value))[0])
-        self.parameters[name] = value
+        self._failsafes.take(message.param_id.rstrip('\0'), value)
 
     def _on_answer(self, message: Any, now: float) -> None:
         if not self._commands or self._commands[0].number != message.command:
@@ -395,10 +459,10 @@ class Vehicle:
             self._sender.heartbeat_send(
                 mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE
             )
-        if self.firmware is None:
+        if self.firmware is None or self._failsafes is None:
             return
         self._judge_link(now)
-        self._read_parameters(now)
+        self._failsafes.read(now)
         self._go_on(now)
         self._say_command(now)
         self._say_setpoint(now)
@@ -412,68 +476,6 @@ class Vehicle:
             if self.phase is Phase.FLYING:
                 self._begin_flying()
         self._lost = lost
-
-    def _names(self) -> list[str]:
-        assert self.firmware is not None
-        return [*self.firmware.failsafes, *self.firmware.ground_station]
-
-    def _read_parameters(self, now: float) -> None:
-        if self._checked or now - self._asked_at < _ANSWER_PATIENCE:
-            return
-        self._asked_at = now
-        assert self.firmware is not None
-        stations = self.firmware.ground_station
-        if any(self.parameters.get(name) is not None for name in stations):
-            # Names of the same in older and newer versions.
-            for name in stations:
-                self.parameters.setdefault(name, None)
-        for name in self._names():
-            if name not in self.parameters:
-                if self._asked[name] == _TRIES:
-                    self.parameters[name] = None
-                    continue
-                self._asked[name] += 1
-                self._sender.param_request_read_send(
-                    self.settings.system,
-                    mavlink.MAV_COMP_ID_AUTOPILOT1,
-                    name.encode(),
-                    -1,
-                )
-        if len(self.parameters) == len(self._names()):
-            self._checked = True
-            self._report_failsafes()
-
-    def _report_failsafes(self) -> None:
-        assert self.firmware is not None
-        for name, failsafe in self.firmware.failsafes.items():
-            value = self.parameters[name]
-            if value is None:
-                state = 'is not known'
-            else:
-                state = f'is {value:g}' + (', which is off' if value in failsafe.off else '')
-            off = value is None or value in failsafe.off
-            self._report(
-                _WARNING if off else 6, f'failsafe for when {failsafe.meaning}: {name} {state}'
-            )
-        stations = [self.parameters[name] for name in self.firmware.ground_station]
-        heard = [value for value in stations if value is not None]
-        if heard and self.settings.own_system not in heard:
-            self._report(
-                _WARNING,
-                f'{" or ".join(self.firmware.ground_station)} is {heard[0]:g}, own_system is '
-                f'{self.settings.own_system}: the autopilot does not miss the driver',
-            )
-
-    def _unguarded(self) -> str:
-        """Return what is wrong with the failsafe of the link, or ''."""
-        assert self.firmware is not None
-        for name, failsafe in self.firmware.failsafes.items():
-            if failsafe.guards_link and self.settings.require_failsafe:
-                value = self.parameters.get(name)
-                if value is None or value in failsafe.off:
-                    text = 'is not known' if value is None else f'is {value:g}'
-                    return f'failsafe {name} {text}, and require_failsafe is true'
-        return ''
 
     def _go_on(self, now: float) -> None:
         if self._phase_at == -math.inf:
@@ -494,14 +496,16 @@ class Vehicle:
 
     def _prepare(self, now: float) -> None:
         self._detail = self._recent_text(now)
-        if self._checked and self.telemetry is not None and self._estimates is not False:
+        assert self._failsafes is not None
+        if self._failsafes.complete and self.telemetry is not None and self._estimates is not False:
             self._enter(Phase.WAITING)
 
     def _wait(self, now: float) -> None:
         assert self.firmware is not None
         if self.armed:
             if self.mode == self.firmware.external:
-                self._report(6, f'it is armed, in {self.firmware.mode_name(self.mode)}: taken over')
+                name = self.firmware.mode_name(self.mode)
+                self._report(_INFO, f'it is armed, in {name}: taken over')
                 self._begin_flying()
             else:
                 self._detail = f'it is flown in {self.firmware.mode_name(self.mode)}'
@@ -511,7 +515,8 @@ class Vehicle:
         elif not self.wanted:
             self._detail = 'the driver is not active'
         else:
-            self._detail = self._unguarded()
+            assert self._failsafes is not None
+            self._detail = self._failsafes.problem(now)
             if not self._detail:
                 self._setpoint, self._yaw = self._here(), None
                 self._enter(Phase.STARTING)
@@ -528,32 +533,63 @@ class Vehicle:
 
     def _arm(self, now: float) -> None:
         if self.armed:
-            self._setpoint = self._here()
-            self._tried_at = -math.inf
-            self._enter(Phase.RISING)
+            self._begin_rising(now)
         elif now - self._tried_at >= _ARMING_PERIOD and not self._commands:
             self._tried_at = now
             self._detail = self._recent_text(now)
             self._ask(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 
+    def _begin_rising(self, now: float) -> None:
+        assert self.firmware is not None
+        self._setpoint = self._here()
+        if self.firmware.kind == 'copter':
+            # It stands on the ground; the barometer may have drifted since the estimator started.
+            self.origin[2] = self._setpoint[2]
+        self._nearest, self._nearer_at = math.inf, now
+        self._enter(Phase.RISING)
+
+    @property
+    def _top(self) -> float:
+        """Height to which it rises, in its local frame [m]."""
+        return float(self.origin[2]) + self.height
+
     def _rise(self, now: float) -> None:
         assert self.firmware is not None and self.telemetry is not None
         assert self._setpoint is not None
         height = float(self.telemetry.position[2])
-        if abs(height - self.height) <= _RISEN:
+        left = abs(height - self._top)
+        if left < self._nearest - _PROGRESS:
+            self._nearest, self._nearer_at = left, now
+        # Home may be elsewhere: what the take-off leaves over is flown by set-point.
+        taken_off = (
+            self.firmware.rise == 'command' and self._landed == mavlink.MAV_LANDED_STATE_IN_AIR
+        )
+        if left <= _RISEN or taken_off:
             self._begin_flying()
+        elif now - self._nearer_at > self.settings.rise_timeout:
+            reason = (
+                f'it came no nearer to its height in {self.settings.rise_timeout:g} s: at '
+                f'{height:.1f} m of {self._top:.1f} m'
+            )
+            self._report(_ERROR, f'{reason}: it lands')
+            self.finish('land', reason)
         elif self.firmware.rise == 'setpoint':
-            self._setpoint[2] = self.height
-        elif now - self._tried_at >= _ARMING_PERIOD and not self._commands:
-            # Taken while it rises, it says the same again.
+            self._setpoint[2] = self._top
+        elif (
+            now - self._tried_at >= _ARMING_PERIOD
+            and not self._commands
+            and abs(height - float(self.origin[2])) < _RISEN
+        ):
+            # ArduCopter refuses it once it is in the air.
             self._tried_at = now
-            if self._tried_at - self._phase_at < 2.0 * _ARMING_PERIOD or height < _RISEN:
-                self._ask(mavlink.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.height))
+            self._ask(mavlink.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.height))
 
     def _begin_flying(self) -> None:
         self._setpoint, self._yaw = self._here(), None
         if self.phase is Phase.RISING:
-            self._setpoint[2] = self.height
+            self._setpoint[2] = self._top
+        if self.phase is not Phase.FLYING:
+            self._fix_needed = self._fix is not None and self._fix >= _FIX_3D
         self._commands.clear()
         self._enter(Phase.FLYING)
 
@@ -678,7 +714,9 @@ _HANDLERS: dict[str, Callable[[Vehicle, Any, float], None]] = {
     'LOCAL_POSITION_NED': Vehicle._on_position,
     'ATTITUDE_QUATERNION': Vehicle._on_attitude,
     'BATTERY_STATUS': Vehicle._on_battery,
-    'SYS_STATUS': Vehicle._on_battery,
+    'SYS_STATUS': Vehicle._on_status,
+    'EXTENDED_SYS_STATE': Vehicle._on_landed,
+    'GPS_RAW_INT': Vehicle._on_gnss,
     'EKF_STATUS_REPORT': Vehicle._on_estimator,
     'STATUSTEXT': Vehicle._on_text,
     'PARAM_VALUE': Vehicle._on_parameter,

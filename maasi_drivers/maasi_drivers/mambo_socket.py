@@ -1,0 +1,127 @@
+"""The UDP socket on which pyparrot hears a Mambo, guarded against what others send. Without ROS.
+
+pyparrot 1.5.20 (`pyparrot/networking/wifiConnection.py`) binds it to all interfaces, takes every
+datagram for one of the drone's, hands the last one out again after a timeout, and its listener
+dies of a frame that is cut short, or loops for ever over one whose size is zero.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections import Counter
+from typing import Any
+
+# Type, buffer, sequence, total size.
+_HEADER = struct.Struct('<BBBI')
+_TYPES = range(1, 5)
+# Longest wait for a datagram: then the listener looks whether it is to end [s].
+_TIMEOUT = 0.3
+
+
+def address_towards(host: str) -> str:
+    """Return the address of this host from which it reaches another one.
+
+    Raises
+    ------
+    OSError
+        If there is no way to it.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect((host, 9))
+        return str(probe.getsockname()[0])
+
+
+def frame_problem(data: bytes) -> str:
+    """Return what is wrong with the frames of a datagram; empty where nothing is."""
+    while data:
+        if len(data) < _HEADER.size:
+            return f'frame: read {len(data)} bytes, allowed are at least {_HEADER.size}'
+        kind, _, _, size = _HEADER.unpack_from(data)
+        if kind not in _TYPES:
+            return f'frame type: read {kind}, allowed are 1 to 4'
+        if not _HEADER.size <= size <= len(data):
+            return f'frame size: read {size}, allowed are {_HEADER.size} to {len(data)}'
+        data = data[size:]
+    return ''
+
+
+class DroneSocket:
+    """
+    Receives datagrams of one drone alone.
+
+    Parameters
+    ----------
+    drone : str
+        Its IP address.
+    port : int
+        UDP port of this host.
+
+    Attributes
+    ----------
+    dropped : Counter
+        Datagrams that were not used: reason to number.
+    problem : str
+        Text of the last one.
+
+    Raises
+    ------
+    OSError
+        If the drone cannot be reached, or the port is taken.
+    """
+
+    def __init__(self, drone: str, port: int) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.problem = ''
+        self._drone = drone
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((address_towards(drone), port))
+        except OSError:
+            self._socket.close()
+            raise
+        self._socket.settimeout(_TIMEOUT)
+
+    def recvfrom(self, size: int) -> tuple[bytes, Any]:
+        """Return the next datagram; no bytes where none came, or one that must not be used."""
+        try:
+            data, sender = self._socket.recvfrom(size)
+        except TimeoutError:
+            return b'', None
+        if sender[0] != self._drone:
+            return self._drop('foreign sender', f'sender: read {sender[0]}, allowed is the drone')
+        problem = frame_problem(data)
+        return self._drop('bad frame', problem) if problem else (data, sender)
+
+    def close(self) -> None:
+        """Close it."""
+        self._socket.close()
+
+    def _drop(self, reason: str, text: str) -> tuple[bytes, Any]:
+        self.dropped[reason] += 1
+        self.problem = text
+        return b'', None
+
+
+def guard(connection: Any, drone: str, port: int) -> None:
+    """Have a connection of pyparrot listen by a `DroneSocket`.
+
+    What the drone's frames hold may still be too short for pyparrot's parser: such a frame is
+    dropped instead of ending the listener.
+    """
+    handle = connection.handle_data
+
+    def open_sockets() -> None:
+        connection.udp_send_sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        connection.udp_receive_sock = DroneSocket(drone, port)
+
+    def handle_data(data: bytes) -> None:
+        try:
+            handle(data)
+        except (struct.error, KeyError, IndexError, TypeError, ValueError) as error:
+            receiver = connection.udp_receive_sock
+            receiver.dropped['bad content'] += 1
+            receiver.problem = f'content of a frame: {error}'
+
+    connection._create_udp_connection = open_sockets
+    connection.handle_data = handle_data

@@ -1,0 +1,18 @@
+"""A driver whose executor thread loops for ever on SIGUSR1; its middleware goes on."""
+
+import signal
+import sys
+
+from maasi_drivers import mambo_driver, turtlebot_driver
+
+
+def hang(number, frame):
+    # Python runs this in the main thread, which is the one that spins.
+    while True:
+        pass
+
+
+if __name__ == '__main__':
+    signal.signal(signal.SIGUSR1, hang)
+    main = {'mambo': mambo_driver.main, 'turtlebot': turtlebot_driver.main}[sys.argv.pop(1)]
+    raise SystemExit(main())

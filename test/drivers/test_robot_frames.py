@@ -1,0 +1,302 @@
+"""Frames on /tf and /tf_static, the description, poses from tf, and goals in other frames."""
+
+import math
+import sys
+import time
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import TransformStamped
+from numpy.testing import assert_allclose, assert_array_equal
+from rclpy.executors import SingleThreadedExecutor
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, lockstep_step, parameters_of
+from rosbags.typesys import Stores, get_typestore
+from std_msgs.msg import String
+from tf2_msgs.msg import TFMessage
+
+from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.pose_speed import PoseSpeed
+from maasi_drivers.projection import Camera
+from maasi_drivers.transform_buffer import TransformBuffer
+from maasi_drivers.turtlebot_driver import TurtlebotDriver
+from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.pose import Pose, compose, inverse
+from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE
+from maasi_msgs.msg import AgentState
+
+BASE = 'rover/base_link'
+DOCK = Pose.from_yaw([1.0, 1.2, 0.0], 2.0)
+
+
+def transform(parent, child, pose, stamp=0):
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = parent
+    message.header.stamp = stamp_to_ros(stamp)
+    place, turn = message.transform.translation, message.transform.rotation
+    place.x, place.y, place.z = pose.position.tolist()
+    turn.w, turn.x, turn.y, turn.z = pose.orientation.tolist()
+    return message
+
+
+def pose_of(item):
+    place, turn = item.transform.translation, item.transform.rotation
+    return Pose(np.array([place.x, place.y, place.z]), np.array([turn.w, turn.x, turn.y, turn.z]))
+
+
+class Listener:
+    """What any node hears on /tf and /tf_static."""
+
+    def __init__(self, team):
+        self.moving, self.static = [], []
+        team.create_subscription(TFMessage, '/tf', self.moving.append, RELIABLE)
+        team.create_subscription(TFMessage, '/tf_static', self.static.append, LATCHED_ALL)
+
+    def buffer(self):
+        made = TransformBuffer(10**12)
+        for messages, static in ((self.static, True), (self.moving, False)):
+            for item in (item for message in messages for item in message.transforms):
+                stamp = stamp_from_ros(item.header.stamp)
+                made.add(
+                    item.header.frame_id, item.child_frame_id, pose_of(item), stamp, static=static
+                )
+        return made
+
+
+# ---- what is published -----------------------------------------------------------------------
+
+
+def test_frames_agree_with_the_state(play):
+    driver, team = play(tf_rate=10.0)
+    heard = Listener(team)
+    team.until(lambda: driver.count_subscribers('/tf') == 2)
+    team.send_accepted([1.0, 1.0, 0.0])
+    team.move(20)
+    team.until(lambda: len(heard.moving) == 10)
+    team.until(lambda: any(len(message.transforms) == 3 for message in heard.static))
+    buffer = heard.buffer()
+    states = {stamp_from_ros(state.header.stamp): state for state in team.states}
+    for message in heard.moving:
+        (item,) = message.transforms
+        stamp = stamp_from_ros(item.header.stamp)
+        # Ten times a second, of twenty states.
+        assert stamp % (2 * NANOSECONDS) == 0
+        found, expected = buffer.pose('map', BASE, stamp), pose_from_ros(states[stamp].pose.pose)
+        assert_allclose(found.position, expected.position, atol=1e-9)
+        assert_allclose(found.rotation(), expected.rotation(), atol=1e-9)
+    assert_allclose(buffer.pose('map', 'rover/odom').position, team.start.position)
+    camera = Camera.from_settings(team.settings.camera)
+    optical = buffer.pose(BASE, 'rover/camera_optical')
+    assert_allclose(optical.position, team.settings.camera.mount.position, atol=1e-12)
+    assert_allclose(optical.rotation(), camera.rotation, atol=1e-12)
+    # The type is that of a real tf2_msgs.
+    expected = get_typestore(Stores.ROS2_JAZZY).hash_rihs01('tf2_msgs/msg/TFMessage')
+    (info,) = [
+        info for info in team.get_publishers_info_by_topic('/tf') if info.node_name == 'driver'
+    ]
+    assert expected == f'RIHS01_{bytes(info.topic_type_hash.value).hex()}'
+
+
+def test_who_comes_late_hears_static_frames_and_description(play):
+    _, team = play()
+    team.move(3)
+    heard, texts = Listener(team), []
+    team.create_subscription(String, 'robot_description', texts.append, LATCHED)
+    team.until(lambda: heard.static and texts)
+    (message,) = heard.static
+    names = {(item.header.frame_id, item.child_frame_id) for item in message.transforms}
+    assert names == {
+        ('map', 'rover/odom'),
+        (BASE, 'rover/camera'),
+        ('rover/camera', 'rover/camera_optical'),
+    }
+    root = ElementTree.fromstring(texts[0].data)
+    assert root.tag == 'robot' and root.get('name') == 'rover'
+    links = [link.get('name') for link in root.iter('link')]
+    assert links == [BASE, 'rover/camera', 'rover/camera_optical']
+    assert root.find('link/visual/geometry/cylinder').get('radius') == '0.11'
+    buffer = heard.buffer()
+    for joint in root.iter('joint'):
+        parent, child = joint.find('parent').get('link'), joint.find('child').get('link')
+        origin = [float(number) for number in joint.find('origin').get('xyz').split()]
+        assert_allclose(buffer.pose(parent, child).position, origin, atol=1e-12)
+
+
+def test_in_lockstep_each_step_has_its_transform(play):
+    _, team = play(lockstep=True)
+    heard = Listener(team)
+    team.until(lambda: team.count_subscribers('/tf') == 1 and team.count_publishers('/tf') == 1)
+    for k in range(5):
+        lockstep_step(team, k)
+        team.until_done(k + 1)
+    team.until(lambda: len(heard.moving) == 5)
+    stamps = [stamp_from_ros(message.transforms[0].header.stamp) for message in heard.moving]
+    assert stamps == [k * NANOSECONDS for k in range(5)]
+
+
+def test_with_rate_0_others_publish_the_frames(play):
+    _, team = play(tf_rate=0.0)
+    team.move(2)
+    assert not team.count_publishers('/tf') and not team.count_publishers('/tf_static')
+    assert not team.count_publishers('robot_description')
+
+
+# ---- poses from tf ---------------------------------------------------------------------------
+
+
+class Localised:
+    """A robot whose pose a localiser and its own odometry publish on /tf, in real time."""
+
+    def __init__(self, team):
+        self.team = team
+        self.map_from_odom = Pose.from_yaw([0.5, -0.2, 0.0], 0.4)
+        self.publisher = team.create_publisher(TFMessage, '/tf', RELIABLE)
+        team.until(self.publisher.get_subscription_count)
+        self.stamp = time.time_ns()
+
+    def publish(self):
+        pose = compose(inverse(self.map_from_odom), self.team.body.robot_state().pose)
+        # As localisers do, ahead of the odometry.
+        correction = transform('map', 'odom', self.map_from_odom, self.stamp + NANOSECONDS // 2)
+        moved = transform('odom', 'chassis', pose, self.stamp)
+        self.publisher.publish(TFMessage(transforms=[correction, moved]))
+
+    def move(self):
+        team, known = self.team, len(self.team.commands)
+        self.stamp = max(self.stamp + NANOSECONDS, time.time_ns() - 500_000_000)
+        self.publish()
+        end = time.monotonic() + 0.5
+        team.until(lambda: len(team.commands) > known or time.monotonic() > end)
+        if len(team.commands) > known:
+            team.body.step(team.command, STEP)
+
+    def send(self, position):
+        """Send a goal while poses go on; return the future of its result."""
+        sent = self.team.go_to.send_goal_async(self.team.goal(position))
+        self.team.until(lambda: self.move() or sent.done())
+        return sent.result().get_result_async()
+
+
+def test_a_driver_follows_poses_on_tf_and_stops_when_they_go_stale(play):
+    driver, team = play(pose_source='tf', base_frame='chassis', odometry_timeout=3.0)
+    assert not team.count_subscribers('odom')
+    robot = Localised(team)
+    # One correction without odometry is no pose.
+    robot.publisher.publish(
+        TFMessage(transforms=[transform('map', 'odom', robot.map_from_odom, robot.stamp)])
+    )
+    team.until(lambda: robot.move() or team.states)
+    goal = team.start.position + np.array([0.15, 0.1, 0.0])
+    result = robot.send(goal)
+    team.until(lambda: robot.move() or result.done())
+    assert result.result().status == GoalStatus.STATUS_SUCCEEDED
+    assert np.linalg.norm(team.body.robot_state().pose.position - goal) <= 0.1
+    pose = team.body.robot_state().pose
+    result = robot.send([1.8, 1.8, 0.0])
+    team.until(lambda: robot.move() or np.any(team.command != 0.0))
+    # Silence.
+    team.until(result.done)
+    assert 'no pose on tf for' in result.result().result.reason
+    team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
+    assert_array_equal(team.command, np.zeros(4))
+    assert np.linalg.norm(team.body.robot_state().pose.position - pose.position) < 0.5
+    # Transforms that come late are no pose.
+    robot.stamp += NANOSECONDS
+    team.until(lambda: time.time_ns() - robot.stamp > 3_100_000_000)
+    known = driver.dropped['stale transform']
+    robot.publish()
+    team.until(lambda: driver.dropped['stale transform'] > known)
+    assert team.state.goal_status == AgentState.UNAVAILABLE
+    assert 'no pose on tf' in team.refused([1.8, 1.8, 0.0])
+    # They are back.
+    team.until(lambda: robot.move() or team.state.goal_status != AgentState.UNAVAILABLE)
+    robot.send([1.8, 1.8, 0.0])
+    team.until(lambda: robot.move() or team.state.goal_status == AgentState.MOVING)
+
+
+def test_velocities_come_from_differences():
+    speed = PoseSpeed()
+    assert not speed.place(0, Pose.from_yaw([0.0, 0.0, 1.0], 3.1)).velocity.any()
+    placed = speed.place(10**8, Pose.from_yaw([0.02, -0.04, 1.0], -3.1))
+    assert_allclose(placed.velocity, [0.2, -0.4, 0.0], atol=1e-9)
+    assert_allclose(placed.angular_velocity, [0.0, 0.0, 10 * (2 * math.pi - 6.2)], atol=1e-9)
+    # A jump is no velocity, and neither is a difference over a gap.
+    assert not speed.place(2 * 10**8, Pose([9.0, 0.0, 1.0])).velocity.any()
+    assert not speed.place(5 * 10**9, Pose([9.5, 0.0, 1.0])).velocity.any()
+
+
+@pytest.mark.parametrize('changes', [{'lockstep': True}, {'link': 'mambo_wifi'}])
+def test_what_poses_from_tf_do_not_go_with_is_wrong_input(changes):
+    with pytest.raises(ValueError, match='pose_source'):
+        DriverSettings.model_validate(TURTLEBOT | {'pose_source': 'tf'} | changes)
+
+
+# ---- goals in other frames -------------------------------------------------------------------
+
+
+def test_a_goal_in_another_frame_is_reached_where_that_is(play):
+    driver, team = play()
+    static = team.create_publisher(TFMessage, '/tf_static', LATCHED)
+    moving = team.create_publisher(TFMessage, '/tf', RELIABLE)
+    team.until(lambda: static.get_subscription_count() and moving.get_subscription_count())
+    bad = transform('map', 'nothing', DOCK)
+    bad.transform.translation.x = math.nan
+    static.publish(TFMessage(transforms=[transform('map', 'dock', DOCK), bad]))
+    team.until(lambda: driver.dropped['transform'] == 1)
+    team.move()
+    offset = np.array([0.7, 0.4, 0.0])
+    expected = DOCK.position + DOCK.rotation() @ offset
+    _, result = team.send_accepted(offset, frame='dock')
+    team.until(lambda: team.move() or result.done())
+    assert result.result().status == GoalStatus.STATUS_SUCCEEDED
+    place = team.body.robot_state().pose.position
+    assert np.linalg.norm(place - expected) <= team.settings.motion.tolerance + 0.01
+    # Relative to the robot itself, as it stands.
+    heading = team.body.robot_state().pose.rotation()
+    _, result = team.send_accepted([-0.1, 0.0, 0.0], frame=BASE, number=2)
+    team.until(lambda: team.move() or result.done())
+    ended = team.body.robot_state().pose.position
+    away = np.linalg.norm(ended - (place + heading @ [-0.1, 0.0, 0.0]))
+    assert away <= team.settings.motion.tolerance + 0.01
+    # What tf does not know, knows outside the bounds, or knows no more, is refused.
+    assert "'kitchen' is not known" in team.refused([0.0, 0.0, 0.0], frame='kitchen')
+    assert 'position.' in team.refused([9.0, 0.0, 0.0], frame='dock')
+    odd = transform('map', 'odd', DOCK)
+    odd.transform.rotation.w = odd.transform.rotation.z = 0.0
+    cart = transform('map', 'cart', DOCK, team.step * NANOSECONDS)
+    moving.publish(TFMessage(transforms=[cart, odd]))
+    team.until(lambda: driver.dropped['transform'] == 2)
+    assert team.takes([0.0, 0.0, 0.0], live=team.move)
+    # Beyond `odometry_timeout`, short of a jump of time.
+    team.step += round(35.0 / STEP)
+    team.move()
+    assert 'too old' in team.refused([0.0, 0.0, 0.0], frame='cart')
+
+
+# ---- without tf2_msgs ------------------------------------------------------------------------
+
+
+def test_without_tf2_msgs_there_is_no_tf_and_all_else_works(play, monkeypatch, capfd):
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+    _, team = play()
+    team.move(3)
+    assert not team.count_publishers('/tf') and team.count_publishers('robot_description') == 1
+    assert capfd.readouterr().err.count('tf2_msgs is not installed') == 1
+    assert 'allowed is' in team.refused([0.0, 0.0, 0.0], frame='dock')
+    assert team.takes([1.0, 1.0, 0.0], live=team.move)
+
+
+def test_poses_from_tf_need_tf2_msgs(context, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+    executor = SingleThreadedExecutor(context=context)
+    driver = TurtlebotDriver(
+        context=context,
+        namespace='/rover',
+        parameter_overrides=parameters_of(TURTLEBOT | {'pose_source': 'tf'}),
+    )
+    executor.add_node(driver)
+    assert driver.trigger_configure().name == 'FAILURE'
+    assert 'tf2_msgs is not installed' in driver.problem
+    driver.destroy_node()
+    executor.shutdown()
