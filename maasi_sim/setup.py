@@ -20,11 +20,11 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'cuboid_sim_node = maasi_sim.cuboid_sim_node:main',
-            'sim_node = maasi_sim.sim_node:main',
-            'fake_mambo = maasi_sim.fake_mambo:main',
-            'fake_mavlink_vehicle = maasi_sim.fake_mavlink_vehicle:main',
-            'run_scenario = maasi_sim.run_scenario:main',
+            'cuboid_sim_node = maasi_entry:maasi_sim.cuboid_sim_node',
+            'sim_node = maasi_entry:maasi_sim.sim_node',
+            'fake_mambo = maasi_entry:maasi_sim.fake_mambo',
+            'fake_mavlink_vehicle = maasi_entry:maasi_sim.fake_mavlink_vehicle',
+            'run_scenario = maasi_entry:maasi_sim.run_scenario',
         ],
     },
 )

@@ -1,89 +1,69 @@
-"""Launch the nodes of a scenario: ros2 launch maasi_sim scenario.launch.py scenario:=FILE."""
+"""Launch a run of a scenario: ros2 launch maasi_sim scenario.launch.py scenario:=FILE.
 
-import tempfile
-from pathlib import Path
+It starts `run_scenario`, which starts the nodes, records and writes the report. The launch ends
+with it. Exit status: 0 if `run_scenario` exited with 0, else 1, after an error with its exit code.
+"""
 
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction
 from launch.events import Shutdown
+from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.substitutions import ExecutableInPackage
 
-ARGUMENTS = {
-    'scenario': ('mambo_turtlebot', 'scenario file, or name of one in maasi_config'),
-    'seed': ('', "of all random numbers; empty: the scenario's"),
-    'lockstep': ('false', 'step by step, as fast as it goes; true or false'),
-    'rate': ('', 'simulated over wall time; empty: 1, in lockstep as fast as it goes'),
-    'rviz': ('false', 'whether RViz shows the search; true or false'),
-}
+from maasi_sim.launch_arguments import ARGUMENTS, ending, is_true, scenario_options
+
+# Wall time for stopping the robots and writing the results before it is terminated or killed [s].
+PATIENCE = '60'
 
 
-def start_nodes(context: LaunchContext) -> list:
-    """Return the actions that start the scenario's nodes."""
-    from maasi_sim.cuboid_scenario import CuboidScenario, load_any_scenario
-    from maasi_sim.linked_robots import with_addresses
-    from maasi_sim.node_plan import plan_nodes
-    from maasi_sim.scenario import config_folder
+def end_launch(event: ProcessExited, context: LaunchContext) -> EmitEvent:
+    """End the launch; an exception makes its exit status 1."""
+    if event.returncode:
+        raise RuntimeError(ending(event.returncode))
+    return EmitEvent(event=Shutdown(reason='the run has ended'))
 
-    given = {name: LaunchConfiguration(name).perform(context).strip() for name in ARGUMENTS}
-    overrides = {}
-    if given['seed']:
-        overrides['seed:='] = (('seed',), int(given['seed']))
-    scenario = load_any_scenario(given['scenario'], overrides)
-    if not isinstance(scenario, CuboidScenario):
-        scenario = with_addresses(scenario)
-    folder = Path(tempfile.mkdtemp(prefix='maasi_'))
-    file = folder / 'scenario.yaml'
-    file.write_text(scenario.text(), encoding='utf-8')
-    plans = plan_nodes(
-        scenario,
-        seed=scenario.seed,
-        lockstep=given['lockstep'].lower() == 'true',
-        rate=float(given['rate']) if given['rate'] else None,
-        recorder=False,
-        file=file,
+
+def show(scenario: str) -> Node:
+    """Return RViz with the view of a scenario."""
+    from maasi_sim.cuboid_scenario import load_any_scenario
+    from maasi_sim.scenario import config_folder, find_scenario
+
+    three = load_any_scenario(find_scenario(scenario), {}).dimension == 3
+    view = config_folder() / 'rviz' / ('search_3d.rviz' if three else 'search.rviz')
+    return Node(
+        package='rviz2',
+        executable='rviz2',
+        arguments=['-d', str(view)],
+        parameters=[{'use_sim_time': True}],
+        output='log',
     )
-    actions = []
-    for plan in plans:
-        parameters = folder / f'{plan.file_name}.yaml'
-        parameters.write_text(plan.parameter_text(), encoding='utf-8')
-        actions.append(
-            Node(
-                package=plan.package,
-                executable=plan.executable,
-                name=plan.name,
-                namespace=plan.namespace,
-                parameters=[str(parameters)],
-                output='screen',
-                emulate_tty=True,
-                on_exit=[EmitEvent(event=Shutdown(reason=f'{plan.full_name} ended'))]
-                if scenario.on_exit == 'end'
-                else None,
-                respawn=scenario.on_exit == 'respawn',
-                respawn_delay=1.0,
-            )
-        )
-    if given['rviz'].lower() == 'true':
-        view = 'search_3d.rviz' if scenario.dimension == 3 else 'search.rviz'
-        actions.append(
-            Node(
-                package='rviz2',
-                executable='rviz2',
-                arguments=['-d', str(config_folder() / 'rviz' / view)],
-                output='log',
-            )
-        )
-    return actions
+
+
+def start_run(context: LaunchContext) -> list:
+    """Return the actions that start the run, and RViz if asked for."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    # First, so that nothing starts where it is not installed.
+    actions = [show(given['scenario'].strip())] if is_true(given, 'rviz') else []
+    run = ExecuteProcess(
+        cmd=[ExecutableInPackage('run_scenario', 'maasi_sim'), *scenario_options(given)],
+        output='screen',
+        sigterm_timeout=PATIENCE,
+        sigkill_timeout=PATIENCE,
+        on_exit=end_launch,
+    )
+    return [*actions, run]
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the arguments and what starts the nodes."""
+    """Return the arguments and what starts the run."""
     return LaunchDescription(
         [
             *(
                 DeclareLaunchArgument(name, default_value=default, description=description)
                 for name, (default, description) in ARGUMENTS.items()
             ),
-            OpaqueFunction(function=start_nodes),
+            OpaqueFunction(function=start_run),
         ]
     )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from maasi_filter.settings import Settings
+from maasi_filter.settings import Finite, Settings
 
 FirmwareName = Literal['arducopter', 'ardusub', 'px4']
 
@@ -24,6 +24,13 @@ class AutopilotSettings(Settings):
     )
     noise: float = Field(
         default=0.005, ge=0.0, description='Deviation of the position that it says [m]'
+    )
+    barometer_drift: Finite = Field(
+        default=0.0, description='Of the height that it believes until it is armed [m/s]'
+    )
+    more_batteries: list[Annotated[float, Field(ge=0.0, le=1.0)]] = Field(
+        default_factory=list,
+        description='Charges of batteries beside the first, which do not change',
     )
     endurance: float = Field(
         default=1200.0, gt=0.0, description='Time for which a full battery lasts in the air [s]'

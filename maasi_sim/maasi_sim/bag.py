@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import queue
-import tempfile
 import threading
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -13,7 +12,6 @@ from typing import Any, Literal
 
 import numpy as np
 import yaml
-from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import (
     Connection,
     Qos,
@@ -23,9 +21,22 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
+
+from maasi_drivers.bag_reader import BagError, BagMessage, BagReader
+from maasi_sim.mcap_writer import FLUSH_PERIOD, BagFile
+
+__all__ = [
+    'Bag',
+    'BagError',
+    'BagMessage',
+    'BagWriteError',
+    'BagWriter',
+    'TopicQos',
+    'interface_folder',
+    'load_types',
+]
 
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
@@ -35,12 +46,15 @@ ImageFormat = Literal['jpeg', 'png', 'raw']
 
 # Encodings that are compressed, with their number of channels.
 _CHANNELS = {'bgr8': 3, 'rgb8': 3, 'mono8': 1, '8UC1': 1, '8UC3': 3}
-_MAGIC = b'\x89MCAP0\r\n'
+# Shortest wait for a message, so that a chunk that is due does not spin [s].
+_LEAST_WAIT = 0.01
+# Time of what is no message, but a topic that was announced.
+_ANNOUNCED = -(2**63)
 _FOREVER = QosTime(9223372036, 854775807)
 
 
-class BagError(RuntimeError):
-    """A recording cannot be written or read."""
+class BagWriteError(BagError):
+    """A recording cannot be written: the disk is full, or fails."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +78,6 @@ class TopicQos:
             _FOREVER,
             False,
         )
-
-
-@dataclass(frozen=True)
-class BagMessage:
-    """A message of a recording: topic, time [ns, of the run's clock], type and content."""
-
-    topic: str
-    time: int
-    type: str
-    message: Any
 
 
 def interface_folder(package: str) -> Path:
@@ -113,6 +117,8 @@ def load_types(packages: Collection[str] = ('maasi_msgs',)) -> Typestore:
 class BagWriter:
     """Write a recording in a thread of its own; always closable, and readable once closed.
 
+    What was handed in is in the file after `FLUSH_PERIOD`: a killed process loses no more.
+
     Images are stored as `sensor_msgs/msg/CompressedImage` on `<topic>/compressed`, in the encoding
     that image_transport would use. Messages keep the order in which they were handed in: times
     that do not rise are moved up by a nanosecond.
@@ -132,8 +138,9 @@ class BagWriter:
     Raises
     ------
     BagError
-        If the folder exists or cannot be made. `write`, `wait` and `close` raise it when the
-        thread could not write (disk full).
+        If the folder exists. `write`, `wait` and `close` raise it when the thread failed.
+    BagWriteError
+        If the folder cannot be made, or the thread could not write (disk full).
     """
 
     def __init__(
@@ -149,12 +156,11 @@ class BagWriter:
         self._limit = backlog
         if self.path.exists():
             raise BagError(f'{path}: exists already')
-        self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
-        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer = BagFile(self.path)
         try:
             self._writer.open()
         except OSError as error:
-            raise BagError(f'{path}: cannot be written: {error.strerror}') from error
+            raise BagWriteError(f'{path}: cannot be written: {error.strerror}') from error
         self._topics: dict[str, tuple[str, TopicQos]] = {}
         self._connections: dict[str, Connection] = {}
         self._time = -1
@@ -178,6 +184,10 @@ class BagWriter:
         if type_name not in self._types.fielddefs:
             raise BagError(f'topic {topic}: unknown message type {type_name}')
         self._topics[topic] = (type_name, qos or TopicQos())
+        # To describe a topic takes a while: not when its first messages wait. Of images it is not
+        # known yet how they are stored.
+        if type_name != IMAGE_TYPE:
+            self._queue.put((topic, _ANNOUNCED, b''))
 
     def write(self, topic: str, time: int, data: bytes) -> None:
         """Take a serialised message (CDR) received at `time` [ns]."""
@@ -203,6 +213,11 @@ class BagWriter:
             self._writer.set_custom_data(key, value)
         self.write_message(SCENARIO_TOPIC, 0, string(data=text))
 
+    @property
+    def failed(self) -> bool:
+        """Whether something could not be written: nothing more is."""
+        return self._error is not None
+
     def wait(self, backlog: int = 0) -> None:
         """Wait until at most `backlog` bytes are still to be written."""
         with self._changed:
@@ -216,12 +231,15 @@ class BagWriter:
         self._closed = True
         self._queue.put(None)
         self._thread.join()
-        try:
-            for topic in self._topics:
-                self._connect(topic, self._topics[topic][0] == IMAGE_TYPE)
-            self._writer.close()
-        except Exception as error:
-            self._error = self._error or error
+        if self._error is None:
+            try:
+                for topic in self._topics:
+                    self._connect(topic, self._topics[topic][0] == IMAGE_TYPE)
+                self._writer.close()
+            except Exception as error:
+                self._error = error
+        if self._error is not None:
+            self._writer.give_up()
         self._check()
 
     def __enter__(self) -> BagWriter:
@@ -239,19 +257,30 @@ class BagWriter:
 
     def _check(self) -> None:
         if self._error is not None:
-            raise BagError(f'{self.path}: writing failed: {self._error}') from self._error
+            text = getattr(self._error, 'strerror', None) or self._error
+            kind = BagWriteError if isinstance(self._error, OSError) else BagError
+            raise kind(f'{self.path}: writing failed: {text}') from self._error
 
     def _work(self) -> None:
+        due = FLUSH_PERIOD
         while True:
-            item = self._queue.get()
+            try:
+                item = self._queue.get(timeout=due)
+            except queue.Empty:
+                item = '', 0, b''
             if item is None:
                 return
             topic, time, data = item
             if self._error is None:
                 try:
-                    self._store(topic, time, data)
+                    if topic and time == _ANNOUNCED:
+                        self._connect(topic, False)
+                    elif topic:
+                        self._store(topic, time, data)
+                    due = max(self._writer.flush(), _LEAST_WAIT)
                 except Exception as error:
                     self._error = error
+                    due = FLUSH_PERIOD
             with self._changed:
                 self._pending -= len(data)
                 self._changed.notify_all()
@@ -313,99 +342,8 @@ class BagWriter:
         return bytes(self._types.serialize_cdr(message, COMPRESSED_TYPE))
 
 
-def _seal(path: Path, folder: Path) -> Path:
-    """Copy what is whole of an MCAP file that was never closed, and end it as the format asks."""
-    data = path.read_bytes()
-    if not data.startswith(_MAGIC):
-        raise BagError('it is not an MCAP file')
-    end = len(_MAGIC)
-    while end + 9 <= len(data):
-        after = end + 9 + int.from_bytes(data[end + 1 : end + 9], 'little')
-        if after > len(data):
-            break
-        end = after
-    copy = folder / path.name
-    with copy.open('wb') as file:
-        file.write(data[:end])
-        # An empty data end and footer: opcode, length, content.
-        file.write(b'\x0f' + (4).to_bytes(8, 'little') + bytes(4))
-        file.write(b'\x02' + (20).to_bytes(8, 'little') + bytes(20))
-        file.write(_MAGIC)
-    return copy
-
-
-class Bag:
-    """Read a recording, also one that was never closed (a process was killed while writing it).
-
-    Parameters
-    ----------
-    path : Path
-        Its folder, the folder of the run that holds it as `bag`, or its `.mcap` file.
-
-    Raises
-    ------
-    BagError
-        If there is none or it is damaged.
-    """
-
-    def __init__(self, path: Path) -> None:
-        path = Path(path)
-        if not path.exists():
-            raise BagError(f'{path}: there is no such recording')
-        if (path / 'bag').is_dir():
-            path = path / 'bag'
-        if path.is_dir() and not (path / 'metadata.yaml').exists():
-            files = sorted(path.glob('*.mcap'))
-            if len(files) != 1:
-                raise BagError(f'{path}: is not a recording: it has no metadata.yaml')
-            path = files[0]
-        self.path = path
-        self._sealed: tempfile.TemporaryDirectory[str] | None = None
-        try:
-            if path.is_file() and not path.read_bytes().endswith(_MAGIC):
-                self._sealed = tempfile.TemporaryDirectory()
-                path = _seal(path, Path(self._sealed.name))
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
-            self._reader.open()
-        except Exception as error:
-            raise BagError(f'{self.path}: cannot be read: {error}') from error
-
-    @property
-    def store(self) -> Typestore:
-        """Message types as they were when the recording was made."""
-        return self._reader.typestore
-
-    @property
-    def types(self) -> dict[str, str]:
-        """Type name by topic."""
-        return {item.topic: item.msgtype for item in self._reader.connections}
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Number of messages by topic."""
-        return {item.topic: item.msgcount for item in self._reader.connections}
-
-    def raw(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Yield topic, type, time [ns] and serialised message, in order of time."""
-        chosen = [
-            item for item in self._reader.connections if topics is None or item.topic in topics
-        ]
-        if not chosen:
-            return
-        try:
-            for connection, time, data in self._reader.messages(chosen):
-                yield connection.topic, connection.msgtype, time, data
-        except AnyReaderError as error:
-            raise BagError(f'{self.path}: cannot be read: {error}') from error
-
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
-        """Yield the messages of `topics` (all if None), in order of time."""
-        for topic, type_name, time, data in self.raw(topics):
-            yield BagMessage(topic, time, type_name, self.decode(data, type_name))
-
-    def decode(self, data: bytes, type_name: str) -> Any:
-        """Return the message of serialised bytes."""
-        return self._reader.deserialize(data, type_name)
+class Bag(BagReader):
+    """Read the recording of a run; also one whose end is missing."""
 
     def scenario(self) -> dict[str, Any]:
         """Return what was run: scenario, seed and the parameters of each node.
@@ -421,22 +359,6 @@ class Bag:
                 return content
         raise BagError(f'{self.path}: holds no scenario: run_scenario did not record it')
 
-    def close(self) -> None:
-        """Close the files."""
-        if self._sealed is not None:
-            self._sealed.cleanup()
-        if self._reader.stack is not None:
-            self._reader.close()
-
     def __enter__(self) -> Bag:
         """Return itself."""
         return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the files."""
-        self.close()

@@ -79,11 +79,6 @@ class CuboidSimNode(SimNode):
         self._link_timer.cancel()
         return entities
 
-    def tear_down(self) -> None:
-        """See `SimNode.tear_down`."""
-        self.destroy_timer(self._link_timer)
-        super().tear_down()
-
     def on_new_step(self) -> None:
         """See `SimNode.on_new_step`."""
         self._sent.clear()

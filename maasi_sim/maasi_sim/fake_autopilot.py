@@ -1,4 +1,12 @@
-"""An autopilot that is none: it answers MAVLink 2 as ArduCopter, ArduSub or PX4 do."""
+"""A fake autopilot: it answers MAVLink 2 as ArduCopter, ArduSub or PX4 do.
+
+ArduCopter's manners are those of its source: the height of NAV_TAKEOFF is above home
+(`ModeGuided::do_user_takeoff_start_m`), home is set at arming (`AP_Arming_Copter::arm`), a take-off
+is refused in the air (`Mode::do_user_takeoff_U_m`) and ends within a tenth of its height
+(`_AutoTakeoff::run`), EXTENDED_SYS_STATE tells take-off from flight
+(`GCS_MAVLINK_Copter::landed_state`), and the ground station failsafe looks at the system id of
+heartbeats alone (`GCS::sysid_is_gcs`). Heights that it reports are above the EKF's origin.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +33,8 @@ FIRMWARES: dict[str, Firmware] = {
     'ardusub': ARDUSUB,
     'px4': PX4_COPTER,
 }
-# As they come; but with a failsafe for the link, which a copter does not have.
+# As they come, but set up as docs/robots_mavlink.md asks: a failsafe for the link, and the system
+# id of the driver as that of the ground station.
 PARAMETERS: dict[str, dict[str, float]] = {
     'arducopter': {
         'FS_GCS_ENABLE': 5,
@@ -34,7 +43,7 @@ PARAMETERS: dict[str, dict[str, float]] = {
         'FS_EKF_ACTION': 1,
         'BATT_FS_LOW_ACT': 1,
         'FENCE_ENABLE': 0,
-        'SYSID_MYGCS': 255,
+        'SYSID_MYGCS': 240,
     },
     'ardusub': {
         'FS_GCS_ENABLE': 4,
@@ -42,7 +51,7 @@ PARAMETERS: dict[str, dict[str, float]] = {
         'FS_EKF_ACTION': 0,
         'FS_LEAK_ENABLE': 1,
         'BATT_FS_LOW_ACT': 0,
-        'SYSID_MYGCS': 255,
+        'SYSID_MYGCS': 240,
     },
     'px4': {
         'COM_OBL_RC_ACT': 4,
@@ -60,6 +69,8 @@ _DISARM_DELAY = 10.0
 _OFFBOARD_STREAM, _OFFBOARD_AGE = 1.0, 0.5
 _HEARTBEAT_PERIOD, _STATUS_PERIOD = 1.0, 1.0
 _LANDING, _SURFACING = 0.5, 0.3
+# From the loss of GNSS to that of the position estimate [s].
+_DEAD_RECKONING = 8.0
 _EKF_GOOD = 1 | 2 | 4 | 8 | 16 | 32
 _EKF_START = 1 | 128
 _POSITION_IGNORED, _VELOCITY_IGNORED, _YAW_IGNORED = 0b111, 0b111 << 3, 1 << 10
@@ -148,6 +159,10 @@ class FakeAutopilot:
         # Since when setpoints come without a pause, and the last of them.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
         self._rising_to: float | None = None
+        # True height at arming, and how far off the height is that it believes [m].
+        self._home, self._height_error = 0.0, 0.0
+        # Time at which GNSS was lost; its position estimate goes a while later.
+        self._gnss_lost_at = math.inf
         self._armed_at = -math.inf
         self._station_at = math.inf
         self._failed: set[str] = set()
@@ -158,6 +173,7 @@ class FakeAutopilot:
                 'HEARTBEAT': _HEARTBEAT_PERIOD,
                 'BATTERY_STATUS': _STATUS_PERIOD,
                 'EXTENDED_SYS_STATE': _STATUS_PERIOD,
+                'GPS_RAW_INT': _STATUS_PERIOD,
                 **{name: 1.0 / rate for name, rate in _COMMON_RATES.items()},
             }
         )
@@ -189,6 +205,17 @@ class FakeAutopilot:
         """Say the same position from now on, with new stamps."""
         self._frozen = self._position_message()
 
+    def lose_gnss(self) -> None:
+        """Lose GNSS: the fix at once, the position estimate when dead reckoning ends."""
+        self._gnss_lost_at = self._now
+
+    def restart(self) -> None:
+        """Start again, as after a brown-out: disarmed, with a clock from zero."""
+        self.armed = False
+        self._now = 0.0
+        self._hold()
+        self._streams.last.clear()
+
     # ---- the clock ---------------------------------------------------------------------------
 
     def advance(self, dt: float) -> None:
@@ -207,6 +234,7 @@ class FakeAutopilot:
     def _move(self, dt: float) -> None:
         body = self.body
         if not self.armed:
+            self._height_error += self.settings.barometer_drift * dt
             if not body.grounded:
                 body.drift(dt)
             return
@@ -220,9 +248,9 @@ class FakeAutopilot:
         elif self._rising_to is not None:
             target = np.array([*body.position[:2], self._rising_to])
             body.fly_to(target, None, dt)
-            if abs(body.position[2] - self._rising_to) < 0.1:
+            if abs(body.position[2] - self._rising_to) < 0.1 * (self._rising_to - self._home):
+                self._setpoint = _Setpoint(target)
                 self._rising_to = None
-                self._hold()
         elif setpoint is not None and setpoint.velocity is not None:
             body.fly(setpoint.velocity, dt)
         elif setpoint is not None:
@@ -321,8 +349,9 @@ class FakeAutopilot:
 
     def _position_message(self) -> tuple[float, ...]:
         noise = self._generator.normal(0.0, self.settings.noise or 1e-9, 6)
+        believed = self.body.position + np.array([0.0, 0.0, self._height_error])
         return (
-            *(swap_enu_ned(self.body.position) + noise[:3]).tolist(),
+            *(swap_enu_ned(believed) + noise[:3]).tolist(),
             *(swap_enu_ned(self.body.velocity) + noise[3:]).tolist(),
         )
 
@@ -341,22 +370,38 @@ class FakeAutopilot:
 
     def _say_battery(self) -> None:
         unknown = [0xFFFF] * 9
-        voltage = round(12_000 + 4_800 * self.charge)
-        self._sender.battery_status_send(
-            0, 0, 0, 0x7FFF, [voltage, *unknown], -1, -1, -1, round(100.0 * self.charge)
-        )
+        for number, charge in enumerate([self.charge, *self.settings.more_batteries]):
+            voltage = round(12_000 + 4_800 * charge)
+            self._sender.battery_status_send(
+                number, 0, 0, 0x7FFF, [voltage, *unknown], -1, -1, -1, round(100.0 * charge)
+            )
 
     def _say_landed(self) -> None:
-        state = (
-            mavlink.MAV_LANDED_STATE_ON_GROUND
-            if self.body.grounded
-            else mavlink.MAV_LANDED_STATE_IN_AIR
-        )
+        if self.body.grounded:
+            state = mavlink.MAV_LANDED_STATE_ON_GROUND
+        elif self.mode == self.firmware.land:
+            state = mavlink.MAV_LANDED_STATE_LANDING
+        elif self._rising_to is not None:
+            state = mavlink.MAV_LANDED_STATE_TAKEOFF
+        else:
+            state = mavlink.MAV_LANDED_STATE_IN_AIR
         self._sender.extended_sys_state_send(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
 
     def _say_estimator(self) -> None:
-        flags = _EKF_GOOD if self.ready else _EKF_START
-        self._sender.ekf_status_report_send(flags, 0.1, 0.1, 0.1, 0.1, 0.0)
+        good = self.ready and self._now - self._gnss_lost_at < _DEAD_RECKONING
+        self._sender.ekf_status_report_send(
+            _EKF_GOOD if good else _EKF_START, 0.1, 0.1, 0.1, 0.1, 0.0
+        )
+
+    def _say_gnss(self) -> None:
+        fix = (
+            mavlink.GPS_FIX_TYPE_NO_FIX
+            if self._now >= self._gnss_lost_at
+            else mavlink.GPS_FIX_TYPE_3D_FIX
+        )
+        self._sender.gps_raw_int_send(
+            self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12
+        )
 
     # ---- what it hears -----------------------------------------------------------------------
 
@@ -370,7 +415,7 @@ class FakeAutopilot:
             handler(self, message)
 
     def _on_heartbeat(self, message: Any) -> None:
-        if message.get_srcSystem() == self.parameters.get('SYSID_MYGCS', 255):
+        if message.get_srcSystem() == self.parameters.get('SYSID_MYGCS'):
             self._station_at = self._now
 
     def _on_read(self, message: Any) -> None:
@@ -439,6 +484,7 @@ class FakeAutopilot:
             return int(mavlink.MAV_RESULT_FAILED)
         if not self.armed:
             self.armed, self._armed_at = True, self._now
+            self._home = float(self.body.position[2])
             self._station_at = min(self._station_at, self._now)
             self._say(6, 'Arming motors')
         return int(mavlink.MAV_RESULT_ACCEPTED)
@@ -449,9 +495,10 @@ class FakeAutopilot:
             or self.firmware is not ARDUCOPTER
             or self.mode != self.firmware.external
             or not message.param7 > 0.0
+            or not self.body.grounded
         ):
             return int(mavlink.MAV_RESULT_FAILED)
-        self._setpoint, self._rising_to = None, float(message.param7)
+        self._setpoint, self._rising_to = None, self._home + float(message.param7)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _on_setpoint(self, message: Any) -> None:
@@ -478,7 +525,7 @@ class FakeAutopilot:
         if not (wants_position or wants_velocity):
             return
         self._setpoint = _Setpoint(
-            swap_enu_ned(position),
+            swap_enu_ned(position) - np.array([0.0, 0.0, self._height_error]),
             None if wants_position else swap_enu_ned(velocity),
             None if mask & _YAW_IGNORED else swap_yaw(message.yaw),
         )
@@ -491,6 +538,7 @@ _MESSAGES: dict[str, Callable[[FakeAutopilot], None]] = {
     'BATTERY_STATUS': FakeAutopilot._say_battery,
     'EXTENDED_SYS_STATE': FakeAutopilot._say_landed,
     'EKF_STATUS_REPORT': FakeAutopilot._say_estimator,
+    'GPS_RAW_INT': FakeAutopilot._say_gnss,
 }
 _HANDLERS: dict[str, Callable[[FakeAutopilot, Any], None]] = {
     'HEARTBEAT': FakeAutopilot._on_heartbeat,

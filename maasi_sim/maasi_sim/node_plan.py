@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ class NodePlan:
         Whether the time is its.
     remaps : dict
         Names of topics that are called otherwise.
+    given : dict
+        Parameters that are not in its file: what must not be taken over with it to real robots.
     """
 
     package: str
@@ -51,6 +54,7 @@ class NodePlan:
     says_done: bool = True
     is_clock: bool = False
     remaps: Mapping[str, str] = field(default_factory=dict)
+    given: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def full_name(self) -> str:
@@ -67,7 +71,9 @@ class NodePlan:
         content = {'/**': {'ros__parameters': dict(self.parameters)}}
         return to_yaml(content)
 
-    def command(self, executable: Path, parameter_file: Path) -> list[str]:
+    def command(
+        self, executable: Path, parameter_file: Path, log_level: str | None = None
+    ) -> list[str]:
         """Return the command line of its process; what it says goes to its standard output."""
         return [
             str(executable),
@@ -84,6 +90,12 @@ class NodePlan:
             ),
             '--params-file',
             str(parameter_file),
+            *(
+                word
+                for name, value in self.given.items()
+                for word in ('--param', f'{name}:={json.dumps(value)}')
+            ),
+            *(('--log-level', log_level) if log_level else ()),
         ]
 
 
@@ -98,7 +110,7 @@ def plan_nodes(
 ) -> list[NodePlan]:
     """Return the nodes that a scenario needs: sim, drivers and guards, filter, planner.
 
-    In a search of buildings: sim, and a planner for each robot.
+    In a search of buildings: sim, and for each robot a planner and a guard.
 
     Parameters
     ----------
@@ -143,12 +155,25 @@ def plan_nodes(
         )
     ]
     if isinstance(scenario, CuboidScenario):
-        return plans + [_cuboid_plan(name, scenario, common) for name in scenario.names()]
+        for name in scenario.names():
+            plans.append(_cuboid_plan(name, scenario, common))
+            # It decides once a step, and its commands are for one step.
+            plans.append(_guard_plan(name, common, scenario.step))
+        return plans
     for name in scenario.names():
         plans += _robot_plans(name, scenario.robots[name], scenario, common)
     for namespace, names in scenario.namespaces().items():
         plans += _team_plans(namespace, names, scenario, common)
     return plans
+
+
+def with_saved_state(plan: NodePlan, folder: Path) -> NodePlan:
+    """Return the plan of a node that goes on where it was when it is started again."""
+    if plan.executable != 'filter_node':
+        return plan
+    file = str(folder / f'{plan.file_name}.maasi')
+    parameters = {**plan.parameters, 'save_file': file, 'save_batches': True}
+    return replace(plan, parameters=parameters)
 
 
 def _cuboid_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -> NodePlan:
@@ -183,6 +208,7 @@ def _cuboid_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) ->
         name,
         {**flatten(settings), **_SIMULATED},
         topics=tuple(f'/{name}/{topic}' for topic in ('state', 'decision', 'cmd_vel', 'link/tx')),
+        given={'search_on_start': True},
     )
 
 
@@ -209,7 +235,7 @@ def _team_plans(
             'filter_node',
             'filter_node',
             namespace,
-            {**flatten(filter_settings), **_SIMULATED},
+            {**flatten(filter_settings.resolved()), **_SIMULATED},
             topics=(within(namespace, UPDATE), within(namespace, FOUND)),
         ),
         NodePlan(
@@ -219,6 +245,7 @@ def _team_plans(
             namespace,
             {**flatten(planner_settings(scenario, names, common)), **_SIMULATED},
             topics=(within(namespace, DECISIONS), within(namespace, BATCH)),
+            given={'search_on_start': True},
         ),
     ]
 
@@ -227,7 +254,7 @@ def _robot_plans(
     name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
 ) -> list[NodePlan]:
     """Return a robot's driver, and its guard if it has one."""
-    from maasi_drivers.driver_settings import DriverSettings, GuardSettings
+    from maasi_drivers.driver_settings import DriverSettings
     from maasi_filter.parameters import flatten
 
     settings = DriverSettings.model_validate(
@@ -245,7 +272,7 @@ def _robot_plans(
             'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
         }
     )
-    topics = ['state', 'detections']
+    topics = ['state', 'detections', 'robot_description']
     if robot.link == 'topics':
         topics.append('cmd_vel')
     own = name in scenario.namespaces()
@@ -261,16 +288,25 @@ def _robot_plans(
             topics=tuple(f'/{name}/{topic}' for topic in topics),
         )
     ]
-    if robot.guard:
-        plans.append(
-            NodePlan(
-                'maasi_drivers',
-                'guard_node',
-                'guard',
-                name,
-                {**flatten(GuardSettings.model_validate(common)), **_SIMULATED},
-                says_ready=False,
-                says_done=False,
-            )
-        )
+    guarded = robot.link == 'topics' if robot.guard is None else robot.guard
+    if guarded:
+        plans.append(_guard_plan(name, common, 0.0))
     return plans
+
+
+def _guard_plan(name: str, common: dict[str, Any], period: float) -> NodePlan:
+    """Return the guard of a robot whose executor may be busy for `period` seconds."""
+    from maasi_drivers.driver_settings import GuardSettings
+    from maasi_filter.node_settings import LIVELINESS_LEASE
+    from maasi_filter.parameters import flatten
+
+    lease = max(LIVELINESS_LEASE, period)
+    return NodePlan(
+        'maasi_drivers',
+        'guard_node',
+        'guard',
+        name,
+        {**flatten(GuardSettings.model_validate({**common, 'lease': lease})), **_SIMULATED},
+        says_ready=False,
+        says_done=False,
+    )

@@ -149,6 +149,7 @@ class _Tally:
         self._found: dict[str, dict[int, Found]] = {name: {} for name in scenario.namespaces()}
         self._expected: dict[str, float] = {}
         self._last_scores: Scores | None = None
+        self._counted: set[tuple[str, str, int]] = set()
 
     @property
     def found(self) -> list[Found]:
@@ -173,7 +174,11 @@ class _Tally:
                 changed = True
         self._found[update.namespace] = before
         for member in message.members:
-            self.measurements[member.robot] = self.measurements.get(member.robot, 0) + 1
+            # A restarted filter publishes its last update again.
+            key = (update.namespace, member.robot, int(member.measurement))
+            if key not in self._counted:
+                self._counted.add(key)
+                self.measurements[member.robot] = self.measurements.get(member.robot, 0) + 1
         # All filters believe in the same targets.
         self._expected[update.namespace] = float(message.expected_number)
         self.expected_number = max(self._expected.values())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import fcntl
 import os
@@ -14,9 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 from setproctitle import setproctitle
+
+from maasi_sim.shared_memory import LONGEST_CREATION, remove_dead_ports
 
 # Domains whose ports lie below those that Linux gives to others (from 32768).
 DOMAINS = range(0, 102)
@@ -49,6 +52,8 @@ class Domain:
     """
 
     def __init__(self, number: int | None = None, folder: Path | None = None) -> None:
+        # A run that was killed a moment ago, at its start, leaves some that are young.
+        remove_dead_ports(patience=LONGEST_CREATION + 1.0)
         self._folder = folder or Path('/tmp/maasi_domains')
         self._folder.mkdir(mode=0o777, parents=True, exist_ok=True)
         if self._folder.stat().st_uid == os.getuid():
@@ -234,12 +239,16 @@ def _run_and_exit(
     except SystemExit as leaving:
         code = leaving.code
         if isinstance(code, str):
-            print(code, file=sys.stderr)
+            with contextlib.suppress(OSError):
+                print(code, file=sys.stderr)
     except BaseException:
-        traceback.print_exc()
+        with contextlib.suppress(OSError):
+            traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        # Where the disk is full, the copy must not go on as if it were the run.
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
         os._exit(code if isinstance(code, int) else 0 if code is None else 1)
 
 
@@ -286,7 +295,7 @@ class NodeProcess:
             If it cannot be.
         """
         parent = os.getpid()
-        with self.log.open('ab') as output:
+        with self._output() as output:
             try:
                 if self.main is not None and _single_threaded():
                     self._process = ForkedProcess(
@@ -306,10 +315,18 @@ class NodeProcess:
             except OSError as error:
                 raise ProcessError(f'{self.name}: cannot be started: {error}') from error
 
+    def _output(self) -> BinaryIO:
+        """Open the log; where it cannot be (disk full), the node runs without one."""
+        try:
+            return self.log.open('ab')
+        except OSError:
+            return open(os.devnull, 'ab')
+
     def restart(self) -> None:
         """Start it again after it died."""
         self.restarts += 1
-        with self.log.open('ab') as output:
+        remove_dead_ports()
+        with contextlib.suppress(OSError), self.log.open('ab') as output:
             output.write(f'--- start number {self.restarts + 1} ---\n'.encode())
         self.start()
 

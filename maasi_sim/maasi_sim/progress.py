@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from dataclasses import dataclass
@@ -60,11 +61,12 @@ class ProgressDisplay:
         return time.monotonic() - self._last >= self._period
 
     def say(self, text: str) -> None:
-        """Write a line that stays."""
-        if self._live is not None:
-            self._live.console.print(text, markup=False, highlight=False)
-        else:
-            print(text, file=self._stream, flush=True)
+        """Write a line that stays; a terminal that is gone or a full disk does not end the run."""
+        with contextlib.suppress(OSError):
+            if self._live is not None:
+                self._live.console.print(text, markup=False, highlight=False)
+            else:
+                print(text, file=self._stream, flush=True)
 
     def show(self, status: Status) -> None:
         """Show a status, if it is time or it has a new target."""

@@ -10,8 +10,10 @@ from collections.abc import Collection
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -38,8 +40,11 @@ from maasi_sim.observer import STEP, RunObserver
 
 NAME = '/recorder'
 CLOCK, READY, DONE = '/clock', '/lockstep/ready', '/lockstep/done'
+DIAGNOSTICS = '/diagnostics'
 # What is left out: of no use to who reads the recording.
 _SKIPPED = ('/parameter_events', READY)
+# A copy of the found targets for a restarted filter.
+_KEPT = '/found_targets/kept'
 # What is recorded while the nodes are ended.
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
 _WITH_STEP = (
@@ -54,6 +59,12 @@ _WITH_STEP = (
     SearchLink,
     SearchLinkArray,
 )
+# A message may arrive before the time that it is stamped with: it is recorded when that time has
+# come, so that no stamp is ahead of its log time. Longest wait [s of wall time], and the lead above
+# which a stamp is taken for one of another clock [ns].
+_LONGEST_HOLD, _LARGEST_LEAD = 1.0, 60 * 10**9
+# Longest wait for robots to hear that they are to stop [s].
+_STOP_PATIENCE = 1.0
 _READY_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -76,7 +87,7 @@ class Recorder:
     Publishes
     ---------
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone);
-    `<robot>/cmd_vel` (geometry_msgs/TwistStamped): zeros, when `stop_robot` is called
+    `<robot>/cmd_vel` (geometry_msgs/TwistStamped or Twist): zeros, when `stop_robots` is called
 
     Parameters
     ----------
@@ -109,12 +120,16 @@ class Recorder:
         self.time = 0
         self.step: int | None = None
         self.last_seen: dict[str, float] = {}
+        #: When each node was last heard of in the diagnostics [s of wall time].
+        self.heartbeats: dict[str, float] = {}
+        self._held: list[tuple[str, bytes]] = []
+        self._hold_began = 0.0
         self._last_done: deque[bytes] = deque(maxlen=100)
         self.ready: set[str] = set()
         self._finished = False
         self._last_step = -1
         self.complaints: list[str] = []
-        self._wanted = {*observer.topics, CLOCK, DONE}
+        self._wanted = {*observer.topics, CLOCK, DONE, DIAGNOSTICS}
         self._subscriptions: dict[str, Subscription] = {}
         self._refused: set[str] = set()
         self._ready_subscription = self._subscribe(
@@ -182,7 +197,7 @@ class Recorder:
 
     def _wants(self, topic: str) -> bool:
         # A name with an underscore in front is hidden: the inner topics of actions.
-        if topic in _SKIPPED or '/_' in topic:
+        if topic in _SKIPPED or '/_' in topic or topic.endswith(_KEPT):
             return False
         return self.bag is not None or topic in self._wanted
 
@@ -252,15 +267,50 @@ class Recorder:
             self.last_seen[topic] = now
             if topic == DONE:
                 self._last_done.append(data)
+            elif topic == DIAGNOSTICS:
+                for status in deserialize_message(data, DiagnosticArray).status:
+                    self.heartbeats[status.name] = now
             if not self._finished or topic in self.observer.result_topics:
                 self.observer.add(topic, data)
         self.observer.settle()
         if self.observer.end_step is not None and not self._finished:
             self._last_step = self.observer.end_step
             taken = self._until(taken, self._last_step)
-        if self.bag is not None:
-            for topic, data in taken:
+        self._record(taken)
+
+    def _record(self, taken: list[tuple[str, bytes]]) -> None:
+        # One that has failed ends the run: `bag.failed`.
+        if self.bag is None or self.bag.failed:
+            return
+        try:
+            for topic, data in self._due(taken):
                 self.bag.write(topic, self.time, data)
+        except BagError:
+            if not self.bag.failed:
+                raise
+
+    def _due(self, taken: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+        """Return what to record now; hold what is stamped with a time that has not come yet."""
+        now = time.monotonic()
+        items = self._held + taken
+        if not self._held:
+            self._hold_began = now
+        if self._last_step >= 0:
+            items = self._until(items, self._last_step)
+        self._held = []
+        if self._finished or now - self._hold_began > _LONGEST_HOLD:
+            return items
+        due = []
+        early: set[str] = set()
+        for topic, data in items:
+            lead = _stamp(topic, self._subscriptions[topic].msg_type, data) - self.time
+            # A topic keeps its order.
+            if topic in early or 0 < lead <= _LARGEST_LEAD:
+                early.add(topic)
+                self._held.append((topic, data))
+            else:
+                due.append((topic, data))
+        return due
 
     def finish(self) -> None:
         """Keep from now on only what belongs to the steps so far, and how all is stopped."""
@@ -277,10 +327,8 @@ class Recorder:
             if self._finished and topic.rpartition('/')[2] in _AT_THE_END:
                 kept.append((topic, data))
                 continue
-            if _has_stamp_first(kind):
-                seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
-                if seconds * 10**9 + nanoseconds > end:
-                    continue
+            if _stamp(topic, kind, data) > end:
+                continue
             if kind in _WITH_STEP and deserialize_message(data, kind).step > step:
                 continue
             kept.append((topic, data))
@@ -302,16 +350,32 @@ class Recorder:
             steps[message.node] = max(message.step, steps.get(message.node, 0))
         return steps
 
-    def stop_robot(self, name: str) -> None:
-        """Publish zeros on a robot's `cmd_vel`."""
-        topic = f'/{name}/cmd_vel'
-        types = dict(self.node.get_topic_names_and_types()).get(topic, [])
-        kind = Twist if types == ['geometry_msgs/msg/Twist'] else TwistStamped
-        publisher = self.node.create_publisher(kind, topic, _RELIABLE)
-        message: Any = kind()
-        if isinstance(message, TwistStamped):
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.time, 10**9)
-        publisher.publish(message)
+    def stop_robots(self, names: Collection[str]) -> None:
+        """Publish zeros on `cmd_vel` of robots that listen to it, and wait until they arrive."""
+        types = dict(self.node.get_topic_names_and_types())
+        publishers = []
+        for name in names:
+            topic = f'/{name}/cmd_vel'
+            if self.node.count_subscribers(topic):
+                plain = types[topic] == ['geometry_msgs/msg/Twist']
+                chosen = Twist if plain else TwistStamped
+                publishers.append(self.node.create_publisher(chosen, topic, _RELIABLE))
+        deadline = time.monotonic() + _STOP_PATIENCE
+        while time.monotonic() < deadline and any(
+            publisher.get_subscription_count() < self.node.count_subscribers(publisher.topic)
+            for publisher in publishers
+        ):
+            time.sleep(0.005)
+        for publisher in publishers:
+            kind: Any = publisher.msg_type
+            message = kind()
+            if isinstance(message, TwistStamped):
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.time, 10**9)
+            publisher.publish(message)
+        for publisher in publishers:
+            left = max(deadline - time.monotonic(), 0.0)
+            publisher.wait_for_all_acked(Duration(nanoseconds=round(left * 1e9)))
+            self.node.destroy_publisher(publisher)
 
     def close(self) -> None:
         """Leave the graph."""
@@ -331,9 +395,24 @@ def _take(subscription: Subscription) -> list[bytes]:
         taken.append(item[0])
 
 
-def _has_stamp_first(kind: Any) -> bool:
-    """Return whether messages of a type begin with a stamp: with a header, or as the clock."""
-    return next(iter(kind.get_fields_and_field_types())) in ('header', 'clock')
+def _stamp_offset(topic: str, kind: Any, data: bytes) -> int | None:
+    """Return where the first stamp of a serialised message is; None where it has none."""
+    first = next(iter(kind.get_fields_and_field_types()))
+    if first in ('header', 'clock'):
+        return 4
+    # Transforms are a sequence: its length comes first.
+    if topic.rpartition('/')[2] == 'tf' and first == 'transforms' and len(data) >= 16:
+        return 8
+    return None
+
+
+def _stamp(topic: str, kind: Any, data: bytes) -> int:
+    """Return the first stamp of a serialised message, 0 if it has none [ns]."""
+    offset = _stamp_offset(topic, kind, data)
+    if offset is None:
+        return 0
+    seconds, nanoseconds = struct.unpack_from('<iI', data, offset)
+    return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def _message_class(name: str) -> type:

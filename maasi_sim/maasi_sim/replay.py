@@ -14,6 +14,7 @@ from maasi_sim.bag import Bag, BagError
 from maasi_sim.node_plan import NodePlan
 from maasi_sim.observer import FOUND, UPDATE, within
 from maasi_sim.processes import Domain, NodeProcess, find_executable, stop
+from maasi_sim.results import make_folder, write_text
 
 FILTER = 'filter_node'
 EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
@@ -26,6 +27,7 @@ REPLAYED = {
     'lockstep': False,
     'batch_timeout': 1e6,
     'save_file': '',
+    'save_batches': False,
     'particles_rate': 0.0,
     'markers_rate': 0.0,
 }
@@ -203,8 +205,6 @@ def replay(
     BagError
         If the recording cannot be replayed.
     """
-    from maasi_sim.run_scenario import make_folder
-
     recording = read_recording(path)
     folder = make_folder(out, '_replay')
     with Domain(domain_id) as domain:
@@ -237,7 +237,7 @@ def _process(facts: dict[str, Any], namespace: str, folder: Path) -> NodeProcess
         {**recorded['parameters'], **REPLAYED},
     )
     parameters = folder / f'{plan.file_name}.yaml'
-    parameters.write_text(plan.parameter_text(), encoding='utf-8')
+    write_text(parameters, plan.parameter_text())
     executable = find_executable(plan.package, plan.executable)
     log = folder / f'{plan.file_name}.log'
     return NodeProcess(plan.full_name, plan.command(executable, parameters), log)

@@ -86,9 +86,12 @@ def build_report(record: RunRecord) -> dict[str, Any]:
 def write_report(record: RunRecord, folder: Path) -> dict[str, Any]:
     """Write `report.json` and `report.png` into a folder and return the report."""
     report = build_report(record)
+    from maasi_sim.results import write_text, write_whole
+
     text = json.dumps(report, indent=2, allow_nan=False)
-    (folder / 'report.json').write_text(text + '\n', encoding='utf-8')
-    plot_report(record).savefig(folder / 'report.png', dpi=110)
+    write_text(folder / 'report.json', text + '\n')
+    figure = plot_report(record)
+    write_whole(folder / 'report.png', lambda path: figure.savefig(path, dpi=110))
     return report
 
 

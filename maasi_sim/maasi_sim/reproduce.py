@@ -38,6 +38,12 @@ def build_parser() -> argparse.ArgumentParser:
         '--runs', type=_count, metavar='N', help="maps of each (default: the paper's number)"
     )
     parser.add_argument(
+        '--case',
+        action='append',
+        metavar='NAME',
+        help='only this case of each experiment; may be given several times',
+    )
+    parser.add_argument(
         '--workers', type=_count, metavar='N', help='processes (default: one for each core)'
     )
     parser.add_argument('--cluster', metavar='ADDRESS', help='scheduler of a Dask cluster')
@@ -101,6 +107,9 @@ def main(arguments: list[str] | None = None) -> int:
         )
     except UnknownExperiment as error:
         return _refuse(str(error), WRONG_INPUT)
+    unknown = _unknown_case(wanted, options)
+    if unknown:
+        return _refuse(unknown, WRONG_INPUT)
     try:
         code = run_all(wanted, options) if wanted else DONE
         if options.document is not None:
@@ -113,6 +122,15 @@ def main(arguments: list[str] | None = None) -> int:
         return _refuse(f'{error}; the runs until now are kept', STOPPED)
     except KeyboardInterrupt:
         return _refuse('interrupted; the same command goes on from here', INTERRUPTED)
+
+
+def _unknown_case(wanted: list[Experiment], options: argparse.Namespace) -> str:
+    """Return what is wrong with the names of cases, '' if nothing is."""
+    known = {case.name for item in wanted for case in item.cases(options.small)}
+    for name in options.case or []:
+        if name not in known:
+            return f"unknown case '{name}'; allowed are {', '.join(sorted(known))}"
+    return ''
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -145,6 +163,8 @@ def run_all(wanted: list[Experiment], options: argparse.Namespace) -> int:
     for experiment in wanted:
         runs = options.runs or experiment.runs
         work = plan(experiment, options.out, runs, options.seed, options.small)
+        if options.case:
+            work.tasks = [task for task in work.tasks if task.case in options.case]
         for complaint in work.complaints:
             print(f'warning: {complaint}', file=sys.stderr)
         plans.append(work)

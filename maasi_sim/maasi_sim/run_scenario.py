@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -20,14 +19,16 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
     from maasi_sim.bag import BagWriter
-    from maasi_sim.cuboid_observer import CuboidObserver, CuboidRecord
+    from maasi_sim.cuboid_observer import CuboidObserver
     from maasi_sim.cuboid_scenario import AnyScenario
     from maasi_sim.node_plan import NodePlan
-    from maasi_sim.observer import RunObserver, RunRecord
+    from maasi_sim.observer import RunObserver
     from maasi_sim.processes import Domain, NodeProcess
     from maasi_sim.recorder_node import Recorder
 
-DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, NOT_WRITTEN, INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 
 # Bytes that may wait for the disk when the recorder says that it is done with a step.
 _BACKLOG = 8 * 2**20
@@ -96,6 +97,7 @@ class Options:
     planner: str | None = None
     time_limit: float | None = None
     domain_id: int | None = None
+    log_level: str | None = None
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -104,7 +106,8 @@ def build_parser() -> argparse.ArgumentParser:
         prog='run_scenario',
         description='Run a scenario as separate ROS 2 processes, or replay a recording of one.',
         epilog='Exit codes: 0 all targets found (or, with stop: planner_done, ended as meant), '
-        '1 not all found, 2 wrong input, 3 a node died or hung, 130 interrupted.',
+        '1 not all found, 2 wrong input, 3 a node died or hung, 4 bag or report could not be '
+        'written (disk full), 130 interrupted.',
     )
     parser.add_argument(
         'scenario', nargs='?', metavar='FILE', help='scenario file, or name of one in config'
@@ -129,6 +132,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--domain-id', type=_whole, metavar='N', help='ROS domain (default: one of its own)'
     )
+    parser.add_argument('--log-level', choices=LOG_LEVELS, help='of the nodes (default: info)')
     parser.add_argument(
         '--replay',
         type=Path,
@@ -139,16 +143,19 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _whole(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f'read {text}, allowed are whole numbers from 0')
-    return value
+    # No sign, underscore or digits of another alphabet.
+    if not (text.isascii() and text.isdecimal()):
+        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are whole numbers from 0")
+    return int(text)
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = float('nan')
     if not 0.0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f'read {text}, allowed are finite numbers above 0')
+        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are finite numbers above 0")
     return value
 
 
@@ -162,8 +169,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if (options.replay is None) == (options.scenario is None):
         parser.error('give either a scenario or --replay BAG')
-    from maasi_sim.bag import BagError
+    from maasi_sim.bag import BagError, BagWriteError
     from maasi_sim.processes import ProcessError
+    from maasi_sim.results import ResultsError
     from maasi_sim.yaml_files import ScenarioError
 
     try:
@@ -182,41 +190,14 @@ def main(arguments: list[str] | None = None) -> int:
             planner=options.planner,
             time_limit=options.time_limit,
             domain_id=options.domain_id,
+            log_level=options.log_level,
         )
         return ScenarioRun(chosen, interruption).execute()
-    except (ScenarioError, ProcessError, BagError) as error:
-        for line in str(error).splitlines():
-            print(f'error: {line}', file=sys.stderr)
-        return WRONG_INPUT
-
-
-def make_folder(out: Path | None, suffix: str = '') -> Path:
-    """Return a new folder of a run: `out`, or one named by the time in `runs`.
-
-    Raises
-    ------
-    ScenarioError
-        If it cannot be made, or holds a run already.
-    """
-    from maasi_sim.yaml_files import ScenarioError
-
-    try:
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            if (out / 'bag').exists() or (out / 'report.json').exists():
-                raise ScenarioError(f'--out: {out} holds a run already, allowed is another folder')
-            return out.resolve()
-        stamp = datetime.now().strftime('%Y%m%d_%H%M%S') + suffix
-        for number in range(1, 1000):
-            folder = Path('runs') / (stamp if number == 1 else f'{stamp}_{number}')
-            try:
-                folder.mkdir(parents=True)
-            except FileExistsError:
-                continue
-            return folder.resolve()
-    except OSError as error:
-        raise ScenarioError(f'--out: {error.filename}: {error.strerror}') from None
-    raise ScenarioError(f'--out: runs/{stamp} exists a thousand times')
+    except (ScenarioError, ProcessError, BagError, ResultsError) as error:
+        with contextlib.suppress(OSError):
+            for line in str(error).splitlines():
+                print(f'error: {line}', file=sys.stderr)
+        return NOT_WRITTEN if isinstance(error, (ResultsError, BagWriteError)) else WRONG_INPUT
 
 
 class ScenarioRun:
@@ -237,6 +218,7 @@ class ScenarioRun:
 
     def __init__(self, options: Options, interruption: Interruption) -> None:
         from maasi_sim.cuboid_scenario import load_any_scenario
+        from maasi_sim.node_watch import NodeWatch
         from maasi_sim.progress import ProgressDisplay
         from maasi_sim.scenario import find_scenario
 
@@ -261,11 +243,16 @@ class ScenarioRun:
         self._ended: float | None = None
         self._failed: set[str] = set()
         self._looked = 0.0
+        limits = self.scenario.limits
+        self.watch = NodeWatch(limits.heartbeat, limits.start)
         self._clocks: set[str] = set()
+        # What could not be written, and why.
+        self._unwritten: list[str] = []
 
     def execute(self) -> int:
         """Run it and return the exit code."""
         from maasi_sim.processes import Domain
+        from maasi_sim.results import make_folder
 
         with Domain(self.options.domain_id) as domain:
             self.folder = make_folder(self.options.out)
@@ -283,14 +270,17 @@ class ScenarioRun:
     def _prepare(self) -> None:
         """Write down what is run, and find the nodes' executables."""
         from maasi_sim.linked_robots import with_addresses
-        from maasi_sim.node_plan import plan_nodes
+        from maasi_sim.node_plan import plan_nodes, with_saved_state
         from maasi_sim.processes import NodeProcess, find_executable
+        from maasi_sim.results import ResultsError, write_text
+        from maasi_sim.rviz_view import view_text
         from maasi_sim.scenario import Scenario
 
         if isinstance(self.scenario, Scenario):
             self.scenario = with_addresses(self.scenario)
         file = self.folder / 'scenario.yaml'
-        file.write_text(self.scenario.text(), encoding='utf-8')
+        write_text(file, self.scenario.text())
+        write_text(self.folder / 'view.rviz', view_text(self.scenario))
         self.plans = plan_nodes(
             self.scenario,
             seed=self.seed,
@@ -299,15 +289,25 @@ class ScenarioRun:
             recorder=True,
             file=file,
         )
+        if self.scenario.on_exit == 'respawn':
+            self.plans = [with_saved_state(plan, self.folder / 'state') for plan in self.plans]
+        self._beside = {
+            plan.full_name for plan in self.plans if not plan.says_done and not plan.is_clock
+        }
         self._clocks = {plan.full_name for plan in self.plans if plan.is_clock}
         parameters = self.folder / 'parameters'
-        parameters.mkdir(exist_ok=True)
+        try:
+            parameters.mkdir(exist_ok=True)
+        except OSError as error:
+            raise ResultsError(f'{parameters}: {error.strerror}') from error
         for plan in self.plans:
             path = parameters / f'{plan.file_name}.yaml'
-            path.write_text(plan.parameter_text(), encoding='utf-8')
+            write_text(path, plan.parameter_text())
             self.processes[plan.full_name] = NodeProcess(
                 plan.full_name,
-                plan.command(find_executable(plan.package, plan.executable), path),
+                plan.command(
+                    find_executable(plan.package, plan.executable), path, self.options.log_level
+                ),
                 self.folder / f'{plan.file_name}.log',
             )
 
@@ -330,6 +330,7 @@ class ScenarioRun:
             if not self.interruption:
                 for process in self.processes.values():
                     process.start()
+                    self.watch.begin(process.name, process.pid, time.monotonic())
             from maasi_sim.bag import BagWriter, load_types
             from maasi_sim.recorder_node import Recorder
 
@@ -349,9 +350,17 @@ class ScenarioRun:
             if recorder is not None:
                 recorder.close()
             if bag is not None:
-                bag.close()
+                self._close(bag)
             self.display.close()
         return self._report(ending, recorder, observer)
+
+    def _close(self, bag: BagWriter) -> None:
+        from maasi_sim.bag import BagError
+
+        try:
+            bag.close()
+        except BagError as error:
+            self._unwritten.append(str(error))
 
     def _warn(self) -> None:
         from maasi_sim.scenario import Scenario, never_seen
@@ -392,6 +401,8 @@ class ScenarioRun:
             if ending is not None:
                 return ending
             recorder.discover()
+            # What they say while they start is recorded as it comes.
+            recorder.drain()
             ready = recorder.take_ready()
             late = [name for name in expected if name not in ready]
             missing = recorder.missing(needed)
@@ -412,11 +423,16 @@ class ScenarioRun:
             recorder.wait(_POLL)
         for complaint in recorder.complaints:
             self.display.say(f'warning: {complaint}')
+        # Their executors run, also where no heartbeat has been heard so far.
+        for name in expected:
+            self.watch.beat(name, time.monotonic())
         recorder.publish_ready()
         return None
 
     def _follow(self, recorder: Recorder, observer: RunObserver | CuboidObserver) -> Ending:
         """Follow the run until it ends, and return how."""
+        from maasi_sim.bag import BagError
+
         lockstep = self.options.lockstep
         limit = round(self.scenario.limits.time * 1e9)
         moved = time.monotonic()
@@ -432,9 +448,13 @@ class ScenarioRun:
                 last, moved = now, time.monotonic()
                 self._begun = self._begun or moved
                 if recorder.bag is not None:
-                    recorder.bag.wait(_BACKLOG)
+                    with contextlib.suppress(BagError):
+                        recorder.bag.wait(_BACKLOG)
                 if lockstep and recorder.step is not None:
                     recorder.publish_done(recorder.step)
+            elif any(self.processes[name].restarts for name in self.watch.starting()):
+                # A restarted node may have to compile: `limits.start` counts.
+                moved = time.monotonic()
             elif time.monotonic() - moved > self.scenario.limits.silence:
                 return self._hung(recorder)
             if self.display.due or observer.news:
@@ -444,6 +464,8 @@ class ScenarioRun:
         """Return the ending that the scenario asks for, if it has come."""
         if observer.completed is not None:
             return Ending('all_found', DONE)
+        if recorder.bag is not None and recorder.bag.failed:
+            return Ending('not_recorded', NOT_WRITTEN)
         if observer.settled is not None:
             if self.scenario.stop == 'planner_done':
                 return Ending('planner_done', DONE, observer.settled)
@@ -460,6 +482,12 @@ class ScenarioRun:
         if time.monotonic() - self._looked < _LOOK_PERIOD:
             return None
         self._looked = time.monotonic()
+        for name, beat in recorder.heartbeats.items():
+            self.watch.beat(name, beat)
+        recorder.heartbeats.clear()
+        ending = self._look_for_hung(recorder)
+        if ending is not None:
+            return ending
         for name, process in self.processes.items():
             if process.running:
                 continue
@@ -467,7 +495,7 @@ class ScenarioRun:
             event = {'time': recorder.time / 1e9, 'node': name, 'event': 'died'}
             robot = self._robot_of(name)
             if robot is not None and name.endswith(('/driver', '/cuboid_planner')):
-                recorder.stop_robot(robot)
+                recorder.stop_robots([robot])
             tries = self.scenario.limits.restarts
             # Another sim would begin with another time.
             if name in self._clocks:
@@ -475,6 +503,7 @@ class ScenarioRun:
             if self.scenario.on_exit == 'respawn' and process.restarts < tries:
                 self.events.append({**event, 'event': 'restarted'})
                 process.restart()
+                self.watch.begin(name, process.pid, self._looked)
                 self.display.say(f'{text}; it is started again')
                 continue
             self.events.append(event)
@@ -482,6 +511,34 @@ class ScenarioRun:
             if process.restarts:
                 text += f', after {process.restarts} restarts'
             return Ending('node_died', NODE_FAILED, text)
+        return None
+
+    def _look_for_hung(self, recorder: Recorder) -> Ending | None:
+        """End the run, or kill and restart, where a node hangs or does not get ready."""
+        now = self._looked
+        # Before the first step `_wait_until_ready` looks after those that start.
+        late = [] if self._begun is None else self.watch.late(now)
+        if late:
+            self._failed.update(late)
+            text = f'{", ".join(late)} not ready {self.scenario.limits.start:g} s after the start'
+            return Ending('not_ready', NODE_FAILED, text)
+        hung = self.watch.hung(now)
+        for name, silent in hung.items():
+            # In lockstep a step may take long: `limits.silence` counts for those that it awaits.
+            awaited = self.options.lockstep and name not in self._beside
+            if self._begun is None or awaited or not self.processes[name].running:
+                continue
+            text = f'{name} hangs: no heartbeat for {silent:.1f} s'
+            self.events.append({'time': recorder.time / 1e9, 'node': name, 'event': 'hung'})
+            robot = self._robot_of(name)
+            if robot is not None:
+                recorder.stop_robots([robot])
+            if self.scenario.on_exit == 'respawn' and name not in self._clocks:
+                self.display.say(f'{text}; it is killed')
+                self.processes[name].signal(signal.SIGKILL)
+                continue
+            self._failed.add(name)
+            return Ending('node_hung', NODE_FAILED, text)
         return None
 
     def _hung(self, recorder: Recorder) -> Ending:
@@ -534,11 +591,11 @@ class ScenarioRun:
             if plan.package == 'maasi_drivers' or plan.executable == 'cuboid_planner_node'
         ]
         others = [name for name in self.processes if name not in drivers]
-        if ending.reason == 'node_hung':
-            for name in self.scenario.names():
-                recorder.stop_robot(name)
-        # Drivers stop their robots: the sim, or the robot, must still be there to hear it.
+        # Drivers stop their robots: the sim, or the robot, must still be there to hear it. One that
+        # hangs does not, and may have a command on its way when it is killed: before and after.
+        recorder.stop_robots(self.scenario.names())
         stubborn = stop([self.processes[name] for name in drivers])
+        recorder.stop_robots(self.scenario.names())
         recorder.wait(_POLL)
         recorder.drain()
         stubborn += stop([self.processes[name] for name in others])
@@ -550,20 +607,29 @@ class ScenarioRun:
         self, ending: Ending, recorder: Recorder, observer: RunObserver | CuboidObserver
     ) -> int:
         """Write the report, say how it went, and return the exit code."""
+        from maasi_sim.results import store_report
+
         wall = 0.0
         if self._begun is not None and self._ended is not None:
             wall = self._ended - self._begun
         record = observer.record(ending.reason, recorder.time / 1e9, wall, self.events)
-        report, words = report_on(record, self.folder)
-        self.display.say(words)
+        stored = store_report(record, self.folder)
+        self.display.say(stored.words)
         if ending.text:
             self.display.say(f'ended: {ending.text}')
         if ending.code == NODE_FAILED:
             self._show_logs()
-        self.display.say(f'report: {_short(self.folder / "report.json")}')
-        if ending.reason == 'planner_done' and ending.code == NOT_ALL_FOUND:
-            return DONE if report['missed'] == 0 else NOT_ALL_FOUND
-        return ending.code
+        unwritten = self._unwritten + ([stored.problem] if stored.problem else [])
+        for problem in unwritten:
+            self.display.say(f'error: {problem}')
+        place = 'nowhere'
+        if stored.folder is not None:
+            place = _short(stored.folder / 'report.json')
+        self.display.say(f'report: {place}')
+        code = ending.code
+        if ending.reason == 'planner_done' and stored.report['missed'] == 0:
+            code = DONE
+        return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
     def _show_logs(self) -> None:
         for process in self.processes.values():
@@ -582,19 +648,6 @@ def make_observer(
     if isinstance(scenario, CuboidScenario):
         return CuboidObserver(name, scenario, seed, types)
     return RunObserver(name, scenario, seed, types)
-
-
-def report_on(record: RunRecord | CuboidRecord, folder: Path) -> tuple[dict[str, Any], str]:
-    """Write a report into a folder; return it, and what to say of it."""
-    from maasi_sim.cuboid_observer import CuboidRecord
-    from maasi_sim.cuboid_report import cuboid_summary, write_cuboid_report
-    from maasi_sim.report import summary, write_report
-
-    if isinstance(record, CuboidRecord):
-        report = write_cuboid_report(record, folder)
-        return report, cuboid_summary(report)
-    report = write_report(record, folder)
-    return report, summary(report)
 
 
 def _short(path: Path) -> str:

@@ -73,8 +73,10 @@ class RobotSettings(Settings):
         'mavlink_driver',
         'mavlink_camera_driver',
     ] = Field(description='Executable of maasi_drivers that drives it')
-    guard: bool = Field(
-        default=False, description='Whether a guard stops it when its driver is gone'
+    guard: bool | None = Field(
+        default=None,
+        description='Whether a guard stops it when its driver dies or hangs; none: where it is '
+        'reached by topics, as another link has a time limit of its own',
     )
     link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
         default='topics', description='How its driver reaches it; the sim plays the other end'
@@ -131,6 +133,12 @@ class LimitSettings(Settings):
         default=30.0,
         gt=0.0,
         description='Wall time without a step until a node counts as hung [s]',
+    )
+    heartbeat: float = Field(
+        default=4.5,
+        ge=2.0,
+        description='Wall time without a sign of life of a node, while it does not wait for a '
+        'processor, until it counts as hung; free running [s]',
     )
     restarts: int = Field(
         default=3, ge=0, description='Restarts of one node with on_exit: respawn [1]'

@@ -33,6 +33,7 @@ from maasi_filter.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
+from maasi_filter.marker_board import MarkerBoard
 from maasi_filter.pose import Pose
 from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_writer
 from maasi_filter.search_node import SearchNode, SettingsError, run
@@ -99,7 +100,7 @@ class RobotTopics:
         linear = max(equipment.odometry.velocity_noise**2, _LEAST_VARIANCE)
         angular = max(equipment.odometry.heading_noise**2, _LEAST_VARIANCE)
         self._odometry.twist.covariance[::7] = [linear] * 3 + [angular] * 3
-        self._battery_publisher = None if self.linked else publisher(BatteryState, 'battery')
+        self._battery_publisher = None if self.linked else publisher(BatteryState, 'battery_state')
         self._battery = BatteryState(
             **dict.fromkeys(('voltage', 'temperature', 'current', 'charge', 'capacity'), math.nan),
             design_capacity=math.nan,
@@ -112,7 +113,7 @@ class RobotTopics:
         if equipment.camera is not None:
             self._image_publisher = publisher(Image, 'camera/image_raw')
             self._info_publisher = publisher(CameraInfo, 'camera/camera_info')
-            self._image, self._info = camera_messages(equipment.camera, f'{name}/camera')
+            self._image, self._info = camera_messages(equipment.camera, f'{name}/camera_optical')
             self.sensor_topic = self._image_publisher.topic_name
         elif equipment.sensor is not None:
             self._ranges_publisher = publisher(RangeArray, 'ranges')
@@ -225,8 +226,8 @@ class SimNode(SearchNode[SimNodeSettings]):
 
     Publishes
     ---------
-    `<robot>/odom` (nav_msgs/Odometry), `<robot>/battery` (sensor_msgs/BatteryState), unless its
-    link is another one than topics;
+    `<robot>/odom` (nav_msgs/Odometry), `<robot>/battery_state` (sensor_msgs/BatteryState), unless
+    its link is another one than topics;
     `<robot>/camera/image_raw` (sensor_msgs/Image), `<robot>/camera/camera_info`
     (sensor_msgs/CameraInfo), `<robot>/scan` (sensor_msgs/LaserScan), `<robot>/ranges`
     (maasi_msgs/RangeArray): those that the robot has;
@@ -245,6 +246,11 @@ class SimNode(SearchNode[SimNodeSettings]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('sim_node', SimNodeSettings, lockstep_member=False, **options)
+        self._stamp = 0
+        self._linked: dict[str, LinkedRobot] = {}
+
+    def prepare(self) -> None:
+        """Load the scenario."""
         settings = self.settings
         if not settings.lockstep and settings.rate == 0.0:
             raise SettingsError('parameter rate: read 0, allowed is above 0 unless in lockstep')
@@ -259,7 +265,6 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._length = self.scenario.step
         self._period = self._length / settings.rate if settings.rate > 0.0 else 0.0
         self._entities: list[Any] = []
-        self._linked: dict[str, LinkedRobot] = {}
         self._stamp = 0
         # Of the last step that was published anew.
         self._repeated = -1
@@ -271,6 +276,7 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._ready_since: float | None = None
         # In lockstep: nodes that are not done, and topics of commands that have not come.
         self._waiting: set[str] = set()
+        self._taking = False
         self._last_command: dict[str, int] = {}
         self._due = 0.0
         self._said, self._said_at = '', 0.0
@@ -356,7 +362,7 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._look_timer.cancel()
         self._step_timer = self.create_wall_timer(self._period or 1.0, self._on_step_timer)
         self._step_timer.cancel()
-        self._watch_timer = self.create_wall_timer(1.0, self._watch)
+        self.create_wall_timer(1.0, self._watch)
 
     def start(self) -> None:
         """Wait for the nodes, or go on where it was stopped."""
@@ -370,29 +376,12 @@ class SimNode(SearchNode[SimNodeSettings]):
 
     def halt(self) -> None:
         """Stop the time."""
-        if self._entities:
-            self._step_timer.cancel()
-            self._look_timer.cancel()
+        self._step_timer.cancel()
+        self._look_timer.cancel()
 
     def tear_down(self) -> None:
-        """Disconnect; the simulation begins anew with the next *configure*."""
-        for timer in (self._look_timer, self._step_timer, self._watch_timer):
-            self.destroy_timer(timer)
-        for entity in self._entities:
-            if isinstance(entity, Publisher):
-                self.destroy_publisher(entity)
-            else:
-                self.destroy_subscription(entity)
-        self._entities.clear()
-        self._ready.clear()
-        self._endpoints.clear()
-        self._returned.clear()
-        self._waiting.clear()
-        self._last_command.clear()
+        """Disconnect; the next *configure* begins a new simulation."""
         self._close_links()
-        self._ready_since = None
-        self.step = -1
-        self.simulation = self.simulate()
 
     def destroy_node(self) -> None:
         """Leave, once robots with a link of their own have been told to stop."""
@@ -406,6 +395,10 @@ class SimNode(SearchNode[SimNodeSettings]):
         for robot in self._linked.values():
             robot.close()
         self._linked.clear()
+
+    def stamp_of_diagnostics(self) -> Time:
+        """Return the time that it publishes: its own clock is that of the wall."""
+        return stamp_to_ros(self._stamp)
 
     def status(self) -> dict[str, Any]:
         """Return where the simulation stands."""
@@ -573,8 +566,15 @@ class SimNode(SearchNode[SimNodeSettings]):
         than a step does.
         """
         handle(message)
-        if not self.settings.lockstep:
+        if not self.settings.lockstep or self._taking:
             return
+        self._taking = True
+        try:
+            self._take_waiting()
+        finally:
+            self._taking = False
+
+    def _take_waiting(self) -> None:
         until = time.monotonic() + _HURRY
         while self.active and self._waiting and time.monotonic() < until:
             self._wait_set.clear_entities()
@@ -588,7 +588,11 @@ class SimNode(SearchNode[SimNodeSettings]):
                 if subscription.handle.pointer in ready:
                     item = subscription.handle.take_message(subscription.msg_type, False)
                     if item is not None:
-                        subscription.callback.args[0](item[0])
+                        subscription.callback(item[0])
+
+    def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
+        """Pass everything on: commands are compared with the step, and zeros always stop."""
+        callback(message)
 
     def _on_done(self, message: LockstepDone) -> None:
         if message.step == self.step and message.node in self._waiting:
@@ -704,7 +708,7 @@ class SimNode(SearchNode[SimNodeSettings]):
                 shape.pose.position = point_to_ros([*centre[:2], 0.5 * (low + high)])
                 shape.scale.z = float(high - low)
             shapes.append(shape)
-        markers.publish(MarkerArray(markers=shapes))
+        markers.publish(MarkerBoard().replace(MarkerArray(markers=shapes)))
 
 
 def main(arguments: list[str] | None = None) -> int:

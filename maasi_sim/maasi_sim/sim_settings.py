@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field
 
 from maasi_filter.node_settings import NodeSettings
@@ -9,6 +11,8 @@ from maasi_filter.node_settings import NodeSettings
 
 class SimNodeSettings(NodeSettings):
     """Settings of the simulation node; all else is in the scenario file."""
+
+    live: ClassVar[frozenset[str]] = frozenset({'command_age'})
 
     step: float = Field(
         default=0.0, ge=0.0, le=10.0, description="Duration of a step; 0: the scenario's [s]"

@@ -35,6 +35,11 @@ def to_yaml(content: Any) -> str:
     return text
 
 
+# Far more than any scenario has.
+_MOST_ENTRIES = 100_000
+_STRANGE = yaml.reader.Reader.NON_PRINTABLE
+
+
 class _Loader(yaml.SafeLoader):
     """A safe loader that also takes `1e-3` for a number, as YAML 1.2 and ROS do."""
 
@@ -94,19 +99,29 @@ def read_layer(path: Path) -> Layer:
         raise ScenarioError(f'{path}: is not text in UTF-8') from None
     except OSError as error:
         raise ScenarioError(f'{path}: cannot be read: {error.strerror}') from None
+    strange = _STRANGE.search(text)
+    if strange:
+        number = text.count('\n', 0, strange.start()) + 1
+        raise ScenarioError(
+            f'{path}:{number}: is not YAML: read character {ord(strange.group()):#x}, allowed is '
+            'text without control characters'
+        )
     loader = _Loader(text)
     try:
         node = loader.get_single_node()
         if node is None:
             raise ScenarioError(f'{path}: is empty, a mapping of keys is needed')
+        _check_size(node, path)
         layer = Layer(None)
         layer.data = _build(loader, node, (), layer.origins, path)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        line = f':{mark.line + 1}' if mark else ''
-        raise ScenarioError(f'{path}{line}: is not YAML: {error.problem}') from None
+        place = f'{path}:{mark.line + 1}' if mark else path
+        raise ScenarioError(f'{place}: is not YAML: {error.problem}') from None
     except yaml.YAMLError as error:
-        raise ScenarioError(f'{path}: is not YAML: {error}') from None
+        raise ScenarioError(f'{path}: is not YAML: {_one_line(error)}') from None
+    except RecursionError:
+        raise ScenarioError(f'{path}: is nested too deeply') from None
     finally:
         loader.dispose()
     if not isinstance(layer.data, dict):
@@ -114,6 +129,38 @@ def read_layer(path: Path) -> Layer:
             f'{path}: read {_show(layer.data)}, a mapping of keys is needed at the top'
         )
     return layer
+
+
+def _check_size(top: yaml.Node, path: Path) -> None:
+    """Refuse aliases that hold themselves, or that stand for more than anyone would write."""
+    entries = 0
+    above: set[int] = set()
+    waiting: list[tuple[yaml.Node, bool]] = [(top, False)]
+    while waiting:
+        node, leaving = waiting.pop()
+        if leaving:
+            above.discard(id(node))
+            continue
+        entries += 1
+        line = node.start_mark.line + 1
+        if id(node) in above:
+            raise ScenarioError(f'{path}:{line}: an alias stands inside its own anchor')
+        if entries > _MOST_ENTRIES:
+            raise ScenarioError(
+                f'{path}:{line}: read more than {_MOST_ENTRIES} entries, aliases counted as often '
+                'as they stand there'
+            )
+        if isinstance(node, yaml.CollectionNode):
+            above.add(id(node))
+            waiting.append((node, True))
+            for item in node.value:
+                parts = item if isinstance(item, tuple) else (item,)
+                waiting += [(part, False) for part in parts]
+
+
+def _one_line(error: Exception) -> str:
+    text = ' '.join(str(error).split())
+    return text if len(text) <= 200 else f'{text[:197]}...'
 
 
 def _build(loader: _Loader, node: yaml.Node, key: Key, origins: dict[Key, str], path: Path) -> Any:
@@ -334,7 +381,7 @@ def _inside(annotation: Any, step: str | int) -> list[Any]:
 
 def _show(value: Any) -> str:
     if isinstance(value, str):
-        return f"'{value}'"
+        return f"'{value}'" if len(value) <= 60 else f"'{value[:57]}...'"
     if isinstance(value, float) and not math.isfinite(value):
         return {math.inf: '.inf', -math.inf: '-.inf'}.get(value, '.nan')
     if value is None:

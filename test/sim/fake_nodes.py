@@ -1,7 +1,8 @@
 """Nodes that play a run by a script: what they find, when they die. Started as processes by tests.
 
 Usage: fake_nodes.py ROLE --ros-args ... with parameters `robots`, `lockstep`, `step`, `trouble`
-(none, die, hang, raise, deaf, silent), `trouble_step`, `targets` (flat), `finished_step`, `marker`.
+(none, die, hang, loop, raise, deaf, silent), `trouble_step`, `targets` (flat), `finished_step`,
+`marker`.
 """
 
 import os
@@ -10,6 +11,7 @@ import sys
 import threading
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException
@@ -50,6 +52,8 @@ class Fake(Node):
         self.trouble = self.value('trouble', 'none')
         self.trouble_step = self.value('trouble_step', 0)
         self.full_name = self.get_fully_qualified_name()
+        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.create_timer(1.0, self.beat)
         self.ready = self.create_publisher(LockstepDone, '/lockstep/ready', LATCHED)
         self.done = self.create_publisher(LockstepDone, '/lockstep/done', ALL)
         if role != 'sim_node':
@@ -57,6 +61,10 @@ class Fake(Node):
 
     def value(self, name, default):
         return self.declare_parameter(name, default).value
+
+    def beat(self):
+        """Publish a sign of life, as all nodes do."""
+        self.diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(name=self.full_name)]))
 
     def say_ready(self, *peers):
         """Say so once each publisher has as many subscriptions as named, the recorder's apart."""
@@ -96,6 +104,9 @@ class Fake(Node):
             os.kill(os.getpid(), signal.SIGKILL)
         if self.trouble == 'raise':
             raise RuntimeError('a scripted trouble')
+        while self.trouble == 'loop':
+            # The executor's thread is busy for ever; the process lives.
+            pass
         return self.trouble == 'hang'
 
     def stamp(self, message, step):

@@ -12,7 +12,7 @@ FAKES = Path(__file__).with_name('fake_nodes.py')
 class FakePlan(node_plan.NodePlan):
     """Starts a fake in place of the executable."""
 
-    def command(self, executable, parameter_file):
+    def command(self, executable, parameter_file, log_level=None):
         rest = super().command(executable, parameter_file)[1:]
         return [sys.executable, str(FAKES), self.executable, *rest]
 

@@ -1,14 +1,21 @@
 """Recordings: what is written can be read, whatever happened to the writer."""
 
+import json
 import multiprocessing
 import os
+import resource
+import shutil
+import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import yaml
+from ament_index_python.packages import get_package_share_directory
+from rosbags.rosbag2.storage_mcap import McapReader
 
-from maasi_sim.bag import Bag, BagError, BagWriter, TopicQos, load_types
+from maasi_sim.bag import Bag, BagError, BagWriteError, BagWriter, TopicQos, load_types
 
 
 @pytest.fixture(scope='module')
@@ -187,3 +194,165 @@ def test_what_a_killed_writer_left_can_be_read(tmp_path):
         steps = [int(item.message.data.split()[0]) for item in bag.messages()]
     assert steps == list(range(len(steps)))
     assert len(steps) > 15
+
+
+LIMIT = 60.0
+
+
+def _write_a_little_and_wait_for_the_end(path):
+    """Hand in less than a chunk, and never close."""
+    types = load_types()
+    writer = BagWriter(Path(path), types)
+    writer.add_topic('/done', 'maasi_msgs/msg/LockstepDone')
+    for step in range(10):
+        writer.write_message('/done', step, done(types, step))
+    time.sleep(LIMIT)
+
+
+def test_a_little_is_in_the_file_soon(tmp_path):
+    process = multiprocessing.get_context('fork').Process(
+        target=_write_a_little_and_wait_for_the_end, args=(str(tmp_path / 'bag'),)
+    )
+    process.start()
+    deadline = time.monotonic() + LIMIT
+    steps = []
+    while steps != list(range(10)):
+        assert time.monotonic() < deadline, steps
+        try:
+            with Bag(tmp_path) as bag:
+                steps = [item.message.step for item in bag.messages()]
+                assert 'the end of bag.mcap is missing' in bag.recovered
+        except BagError:
+            steps = []
+    process.kill()
+    process.join(LIMIT)
+
+
+@pytest.fixture(scope='module')
+def whole(types, tmp_path_factory):
+    """Return a recording of several chunks."""
+    folder = tmp_path_factory.mktemp('whole') / 'bag'
+    noise = np.random.default_rng(0).bytes(30000).hex()
+    with BagWriter(folder, types) as writer:
+        writer.add_topic('/text', 'std_msgs/msg/String')
+        string = types.types['std_msgs/msg/String']
+        for step in range(60):
+            writer.write_message('/text', step, string(data=f'{step} {noise}'))
+    return folder
+
+
+@pytest.mark.parametrize('metadata', [True, False])
+def test_a_recording_cut_anywhere_gives_what_is_before_the_cut(whole, tmp_path, metadata):
+    data = (whole / 'bag.mcap').read_bytes()
+    folder = tmp_path / 'bag'
+    shutil.copytree(whole, folder)
+    if not metadata:
+        (folder / 'metadata.yaml').unlink()
+    lengths = [*range(0, 60, 7), *np.linspace(60, len(data) - 1, 25).astype(int)]
+    counts = []
+    for length in lengths:
+        (folder / 'bag.mcap').write_bytes(data[:length])
+        try:
+            with Bag(folder) as bag:
+                steps = [int(item.message.data.split()[0]) for item in bag.messages()]
+                assert bag.recovered
+        except BagError as error:
+            assert length < 60 and 'no whole record' in str(error)
+            steps = []
+        assert steps == list(range(len(steps)))
+        counts.append(len(steps))
+    assert counts == sorted(counts)
+    # The last cuts are within the index.
+    assert counts[0] == 0 and counts[-1] == 60 and len(set(counts)) >= 3
+
+
+def test_zeros_after_a_cut_are_no_records(whole, tmp_path):
+    data = (whole / 'bag.mcap').read_bytes()
+    file = tmp_path / 'bag.mcap'
+    file.write_bytes(data[:1000000] + bytes(100000))
+    with Bag(file) as bag:
+        assert len(list(bag.messages())) > 15
+
+
+def test_what_is_damaged_inside_is_said(whole, tmp_path):
+    shutil.copytree(whole, tmp_path / 'bag')
+    file = tmp_path / 'bag' / 'bag.mcap'
+    data = bytearray(file.read_bytes())
+    data[50000:51000] = bytes(1000)
+    file.write_bytes(data)
+    with Bag(tmp_path) as bag, pytest.raises(BagError, match='is damaged'):
+        list(bag.messages())
+
+
+def test_only_metadata_is_missing(whole, tmp_path):
+    shutil.copytree(whole, tmp_path / 'bag')
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    with Bag(tmp_path) as bag:
+        assert bag.counts == {'/text': 60}
+        assert bag.recovered.endswith('has no metadata.yaml')
+
+
+def _write_until_full(path, queue):
+    # More than this, and a write fails as on a full disk.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+    types = load_types()
+    writer = BagWriter(Path(path), types, backlog=50_000)
+    writer.add_topic('/text', 'std_msgs/msg/String')
+    text = np.random.default_rng(0).bytes(4000).hex()
+    try:
+        for step in range(10**6):
+            string = types.types['std_msgs/msg/String'](data=f'{step} {text}')
+            writer.write_message('/text', step, string)
+    except BagWriteError as error:
+        queue.put(str(error))
+    try:
+        writer.close()
+    except BagWriteError as error:
+        queue.put(str(error))
+
+
+def test_a_full_disk_is_said_and_what_is_whole_can_be_read(tmp_path):
+    context = multiprocessing.get_context('fork')
+    queue = context.Queue()
+    process = context.Process(target=_write_until_full, args=(str(tmp_path / 'bag'), queue))
+    process.start()
+    for _ in range(2):
+        assert 'writing failed: File too large' in queue.get(timeout=LIMIT)
+    process.join(LIMIT)
+    with Bag(tmp_path) as bag:
+        steps = [int(item.message.data.split()[0]) for item in bag.messages()]
+    assert steps == list(range(len(steps))) and steps
+
+
+def _installed_hash(type_name):
+    package, _, kind = type_name.split('/')
+    file = Path(get_package_share_directory(package)) / 'msg' / f'{kind}.json'
+    hashes = json.loads(file.read_text())['type_hashes']
+    return next(item['hash_string'] for item in hashes if item['type_name'] == type_name)
+
+
+def test_a_recording_names_distribution_and_type_hashes_as_ros_does(types, tmp_path):
+    kinds = [f'maasi_msgs/msg/{name}' for name in ('FilterUpdate', 'AgentState', 'PlanDecision')]
+    kinds += ['nav_msgs/msg/Odometry', 'sensor_msgs/msg/BatteryState', 'rosgraph_msgs/msg/Clock']
+    with BagWriter(tmp_path / 'bag', types) as writer:
+        for kind in kinds:
+            writer.add_topic(f'/{kind.rpartition("/")[2]}', kind)
+        writer.add_topic('/image', 'sensor_msgs/msg/Image')
+    content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    content = content['rosbag2_bagfile_information']
+    assert (content['version'], content['ros_distro']) == (9, 'jazzy')
+    stored = {
+        item['topic_metadata']['type']: item['topic_metadata']['type_description_hash']
+        for item in content['topics_with_message_count']
+    }
+    assert stored == {
+        kind: _installed_hash(kind) for kind in [*kinds, 'sensor_msgs/msg/CompressedImage']
+    }
+    reader = McapReader(tmp_path / 'bag' / 'bag.mcap')
+    reader.open()
+    for channel in reader.channels.values():
+        assert b'topic_type_hash' in channel.metadata
+        assert stored[channel.schema].encode() in channel.metadata
+    reader.close()
+    # The reader of rosbag2 takes the distribution from the copy inside the file.
+    assert b'ros_distro: jazzy' in (tmp_path / 'bag' / 'bag.mcap').read_bytes()

@@ -54,9 +54,11 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     )
     assert [plan.full_name for plan in plans] == [
         '/sim_node',
-        *(f'/{robot}/cuboid_planner' for robot in scenario.names()),
+        *(f'/{robot}/{node}' for robot in scenario.names() for node in ('cuboid_planner', 'guard')),
     ]
-    for plan in plans[1:]:
+    # A guard must not take a decision of a step's length for a fault.
+    assert all(plan.parameters['lease'] >= scenario.step for plan in plans[2::2])
+    for plan in plans[1::2]:
         flat = yaml.safe_load(plan.parameter_text())['/**']['ros__parameters']
         assert flat.pop('use_sim_time')
         read = CuboidPlannerSettings.model_validate(unflatten(CuboidPlannerSettings, flat))

@@ -368,8 +368,59 @@ def test_page_says_what_was_run_and_what_was_not(toy, tmp_path, capsys):
     assert reproduce.main(['000-toy', '--out', str(out), '--workers', '1']) == 0
     assert reproduce.main(['--document', str(file), '--out', str(out)]) == 0
     assert 'not in full' not in file.read_text()
-    assert reproduce.main(['--document', str(file), '--out', str(tmp_path / 'nothing')]) == 0
-    assert '**not run**' in file.read_text()
+    new = tmp_path / 'docs' / 'new.md'
+    assert reproduce.main(['--document', str(new), '--out', str(tmp_path / 'nothing')]) == 0
+    assert '**not run**' in new.read_text()
+
+
+def test_page_keeps_the_tables_of_what_was_not_run_again(toy, tmp_path, capsys):
+    """Tables and picture stay, marked as earlier ones; text is that of the present code."""
+    file = tmp_path / 'docs' / 'page.md'
+    arguments = ['000-toy', '--out', str(tmp_path / 'out'), '--workers', '1']
+    assert reproduce.main([*arguments, '--document', str(file)]) == 0
+    first = file.read_text()
+    tables = [line for line in first.splitlines() if line.startswith('| first')]
+    assert len(tables) >= 2
+    picture = (file.parent / 'reproduction' / '000-toy.png').read_bytes()
+    for _ in range(2):
+        text = file.read_text().replace('first minus second', 'FIRST minus second')
+        file.write_text(text.replace('# The papers', '# Old words'))
+        assert reproduce.main(['--document', str(file), '--out', str(tmp_path / 'nothing')]) == 0
+        text = file.read_text()
+        # A row that is not in the results, so that it can only be from the page.
+        assert 'FIRST minus second' in text
+        assert 'Old words' not in text
+        assert [line for line in text.splitlines() if line.startswith('| first')] == [
+            line for line in tables if 'minus' not in line
+        ]
+        assert 'each case, from an earlier campaign.' in text
+        assert 'campaign, from an earlier' not in text
+    assert (file.parent / 'reproduction' / '000-toy.png').read_bytes() == picture
+    # What is run again replaces it.
+    assert reproduce.main([*arguments, '--document', str(file)]) == 0
+    assert file.read_text() == first
+
+
+def test_only_some_cases_run_again_leave_the_rows_of_the_others(toy, tmp_path, capsys):
+    file = tmp_path / 'docs' / 'page.md'
+    arguments = ['000-toy', '--workers', '1', '--document', str(file)]
+    assert reproduce.main([*arguments, '--out', str(tmp_path / 'old')]) == 0
+    before = file.read_text()
+    name = toy.cases(False)[0].name
+    options = ['--case', name, '--runs', '2', '--out', str(tmp_path / 'new')]
+    assert reproduce.main([*arguments, *options]) == 0
+    after = file.read_text()
+    for row in (line for line in before.splitlines() if line.startswith('| ')):
+        cells = [cell.strip() for cell in row.strip('|').split('|')]
+        if cells[0] in ('case', 'paired on the same maps', 'experiment') or len(cells) < 4:
+            continue
+        marked = '| ' + ' | '.join([*cells[:2], f'{cells[2]} (earlier)', *cells[3:]]) + ' |'
+        # Of the case that was run again there is the new row only.
+        assert (marked in after) == (cells[0] != name), row
+        assert row not in after or cells[0] == name
+    assert f'| {name} | steps | 1 of 2 |' in after or f'| {name} | steps | 2 of 2 |' in after
+    assert reproduce.main([*arguments, '--case', 'none such']) == 2
+    assert name in capsys.readouterr().err
 
 
 # Command line

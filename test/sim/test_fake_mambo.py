@@ -232,26 +232,66 @@ def test_pyparrot_flies_it(pair):
     assert not fake._unacked
 
 
-def test_pyparrot_that_repeats_its_last_packet_is_not_believed(pair):
+def test_a_packet_that_is_repeated_is_not_believed(pair):
     fake, link = pair()
     until(lambda: link.position is not None)
+    handle = link._drone.drone_connection.handle_data
+    packets = []
+
+    def keep(data):
+        if data:
+            packets.append(data)
+        handle(data)
+
+    link._drone.drone_connection.handle_data = keep
+    until(lambda: len(packets) > 20)
     fake.cut_down = True
-    time.sleep(0.2)
+    # Those on their way have come when nothing is heard for a while.
+    until(lambda: time.monotonic() - link.heard_at > 1.0)
     heard, received = link.heard_at, link.position.received
-    repeated = link._drone.drone_connection.handle_data
-    count = 0
-
-    def counting(data):
-        nonlocal count
-        count += 1
-        repeated(data)
-
-    link._drone.drone_connection.handle_data = counting
-    # It waits five seconds for a packet, then hands out the last one again.
-    until(lambda: count >= 1)
+    handle(packets[-1])
+    for packet in packets[-3:]:
+        handle(packet)
     assert link.heard_at == heard and link.position.received == received
     fake.cut_down = False
     until(lambda: link.position.received > received)
+
+
+BAD_FRAMES = [
+    b'\x01',
+    b'\x02\x7f\x00',
+    struct.pack('<BBBI', 2, 127, 0, 0),
+    struct.pack('<BBBI', 2, 127, 0, 3),
+    struct.pack('<BBBI', 2, 127, 0, 4000),
+    struct.pack('<BBBI', 9, 127, 0, 7),
+    struct.pack('<BBBI', 1, 139, 0, 7),
+    struct.pack('<BBBI', 2, 127, 0, 9) + b'\x02\x12',
+]
+
+
+def test_datagrams_that_are_not_the_drones_or_are_cut_short_do_not_end_the_link(pair):
+    fake, link = pair()
+    until(lambda: link.position is not None)
+    receiver = link._drone.drone_connection.udp_receive_sock
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.bind((own_address(), 0))
+        for data in BAD_FRAMES:
+            stranger.sendto(data, ('127.0.0.1', link.port))
+        until(lambda: receiver.dropped['foreign sender'] == len(BAD_FRAMES))
+        # The same from the drone's own address.
+        for data in BAD_FRAMES:
+            fake._air.sendto(data, ('127.0.0.1', link.port))
+    until(lambda: receiver.dropped['bad frame'] + receiver.dropped['bad content'] >= 7)
+    received = link.position.received
+    until(lambda: link.position.received > received)
+    assert link.connected and not link.error
+    assert link.dropped == receiver.dropped
+
+
+def test_the_drone_is_heard_on_the_address_that_faces_it_alone(pair):
+    _, link = pair()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('127.0.0.9', link.port))
 
 
 def test_a_landing_is_asked_for_again_when_commands_are_lost(pair):

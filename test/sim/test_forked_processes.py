@@ -69,6 +69,30 @@ def test_it_ends_with_what_its_function_says(tmp_path, body, code, words):
     assert words in (tmp_path / 'log').read_text()
 
 
+@pytest.mark.parametrize(
+    ('body', 'code'),
+    [
+        ('print("text without an end", end=""); return 4', '4'),
+        ('sys.exit("no such thing")', '1'),
+        ('raise ValueError("of the node")', '1'),
+    ],
+)
+def test_it_ends_where_its_log_cannot_be_written(tmp_path, body, code):
+    (tmp_path / 'log').symlink_to('/dev/full')
+    out = play(
+        tmp_path,
+        f"""
+        def main():
+            {body}
+        try:
+            print(end(node(main)).code)
+        finally:
+            print('the run goes on')
+        """,
+    )
+    assert out.splitlines() == [code, 'the run goes on']
+
+
 def test_output_arguments_and_environment_are_its_own(tmp_path):
     out = play(
         tmp_path,

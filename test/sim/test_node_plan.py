@@ -32,12 +32,13 @@ def read_back(plan, model):
     return model.model_validate(unflatten(model, flat)), simulated
 
 
-def test_the_demo_has_a_sim_two_drivers_a_guard_a_filter_and_a_planner():
+def test_the_demo_has_a_sim_two_guarded_drivers_a_filter_and_a_planner():
     plans = plans_of(load_scenario('mambo_turtlebot'))
     assert {name: (plan.package, plan.executable) for name, plan in plans.items()} == {
         '/sim_node': ('maasi_sim', 'sim_node'),
         '/mambo/driver': ('maasi_drivers', 'mambo_driver'),
         '/turtlebot/driver': ('maasi_drivers', 'turtlebot_driver'),
+        '/mambo/guard': ('maasi_drivers', 'guard_node'),
         '/turtlebot/guard': ('maasi_drivers', 'guard_node'),
         '/filter_node': ('maasi_filter', 'filter_node'),
         '/planner_node': ('maasi_planner', 'planner_node'),
@@ -62,7 +63,8 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     assert simulated
     assert (search.step, search.seed, search.lockstep) == (scenario.step, 4, lockstep)
     assert search.environment == scenario.environment
-    assert search.filter == scenario.filter
+    # With what the preset stands for.
+    assert search.filter == scenario.filter.resolved()
     planner, simulated = read_back(plans['/planner_node'], PlannerNodeSettings)
     assert simulated
     assert planner.environment == scenario.environment
@@ -143,7 +145,11 @@ def test_a_linked_robot_has_its_link_and_no_commands_by_topic():
     driver, _ = read_back(plans['/drone/driver'], DriverSettings)
     assert driver.link == 'mavlink'
     assert driver.mavlink == scenario.robots['drone'].mavlink
-    assert plans['/drone/driver'].topics == ('/drone/state', '/drone/detections')
+    expected = ('/drone/state', '/drone/detections', '/drone/robot_description')
+    assert plans['/drone/driver'].topics == expected
+    # Its autopilot stops it.
+    assert '/drone/guard' not in plans
+    assert '/rov/guard' in plans
     driver, _ = read_back(plans['/rov/driver'], DriverSettings)
     assert (driver.link, driver.mavlink) == ('topics', None)
     assert '/rov/cmd_vel' in plans['/rov/driver'].topics

@@ -164,7 +164,9 @@ class Run:
             header=self.header(time),
             batch_id=self.batch,
             step=round(time / self.scenario.step),
-            members=[self.make(member, robot=name, decision=0, measurement=0) for name in robots],
+            members=[
+                self.make(member, robot=name, decision=0, measurement=self.batch) for name in robots
+            ],
             missing=[],
             expected_number=1.5,
             found=len(self.found),

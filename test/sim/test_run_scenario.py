@@ -12,7 +12,8 @@ import pytest
 import yaml
 
 from maasi_sim.bag import Bag
-from maasi_sim.run_scenario import Options, ScenarioRun, build_parser, make_folder
+from maasi_sim.results import make_folder
+from maasi_sim.run_scenario import Options, ScenarioRun, build_parser
 from maasi_sim.yaml_files import ScenarioError
 
 WITH_FAKES = Path(__file__).with_name('run_with_fakes.py')
@@ -262,14 +263,19 @@ def test_a_node_that_never_gets_ready_is_named(tmp_path, scenario):
     assert run.report['end_reason'] == 'not_ready'
 
 
-def test_a_deaf_node_is_killed(tmp_path, scenario):
-    run = Run(
-        tmp_path / 'run', scenario(), '--lockstep', script={'filter_node': {'trouble': 'deaf'}}
-    )
+def test_deaf_nodes_are_killed_and_no_robot_goes_on(tmp_path, scenario):
+    script = {name: {'trouble': 'deaf'} for name in ('filter_node', 'mambo/driver')}
+    run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
     code, output = run.wait()
     assert code == 0, output
-    assert 'had to be killed: /filter_node' in output
+    killed = next(line for line in output.splitlines() if 'had to be killed' in line)
+    assert '/filter_node' in killed and '/mambo/driver' in killed
     assert run.nodes() == []
+    with Bag(run.folder / 'bag') as bag:
+        topics = ['/mambo/cmd_vel', '/second/cmd_vel']
+        last = {item.topic: item.message for item in bag.messages(topics)}
+    # The deaf driver has not said so itself.
+    assert [last[topic].twist.linear.x for topic in topics] == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(

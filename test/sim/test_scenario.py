@@ -220,7 +220,7 @@ WRONG_LINKS = [
     ('drone', {'start': [1.0, 1.0, -1.0]}, 'drone.start', 'above mavlink.ground'),
     ('rov', {'start': [1.0, 1.0, 1.0]}, 'rov.start', 'below mavlink.ground'),
     ('drone', {'guard': True}, 'drone.guard', 'its autopilot stops it'),
-    ('rov', {'mavlink': {'arm': True, 'url': 'udpin:0.0.0.0:14550'}}, 'rov.mavlink.url', 'drone'),
+    ('rov', {'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}, 'rov.mavlink.url', 'drone'),
     ('drone', {'driver': 'ranging_driver'}, 'drone.link', 'does not have it'),
 ]
 

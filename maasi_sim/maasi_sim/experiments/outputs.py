@@ -52,17 +52,19 @@ def picture(results: Results, dpi: int = 110) -> bytes:
 def table_markdown(results: Results) -> str:
     """Return the tables with what a reader must know of them."""
     experiment = results.experiment
-    parts = [f'# {experiment.name}: {experiment.title}\n', described(experiment, results)]
+    parts = [f'# {experiment.name}: {experiment.title}\n', described(experiment, markdown(results))]
     return '\n'.join(parts)
 
 
-def described(experiment: Experiment, results: Results) -> str:
+def described(experiment: Experiment, tables: str) -> str:
     """Return tables, note, causes and choices in Markdown."""
-    parts = [markdown(results)]
+    parts = [tables]
     if experiment.note:
         parts.append(f'{experiment.note}\n')
     if experiment.causes:
-        parts.append(f'Likely causes of differences: {experiment.causes}\n')
+        parts.append(f'Likely causes of differences, not tested: {experiment.causes}\n')
+    if experiment.tested:
+        parts.append(f'Causes of differences, tested: {experiment.tested}\n')
     if experiment.choices:
         parts.append(
             '\n'.join(

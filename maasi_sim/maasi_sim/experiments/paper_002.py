@@ -31,6 +31,7 @@ _PAPER_FILTER = {'preset': 'paper_002', 'particles': 10000}
 _RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 10000}
 _GRID = {'grid': [5, 5], 'spacing': 72.5, 'corner': [-10.0, -10.0]}
 _CENTRALIZED, _INDEPENDENT = 'centralized', 'independent'
+_SHARED = 'centralized, one exploration'
 _STYLES = {
     'lawnmower': 'lawnmower',
     _INDEPENDENT: 'as',
@@ -45,11 +46,17 @@ CHOICES = (
         'Not given; those of 000 in two dimensions.',
     ),
     Choice('weight alpha of exploration', '5', 'Not given; that of 001.'),
+    Choice(
+        'explorations',
+        'one for each agent, of its own measurements, (12) and (16)',
+        'As printed. "One exploration" is lowered by the measurements of both agents.',
+    ),
     Choice('motion', 'straight, one move in a step', 'The planner only sees positions.'),
     Choice(
         'filter',
         'preset paper_002',
-        'Births where measurements point, T_m = 0.5 and a jitter: as printed nothing is found; '
+        'Births where measurements point, T_m = 0.5, a jitter, and the running corrector of 000: '
+        'as printed nothing is found, or a target several times; '
         'docs/filter_presets.md has each with its reason.',
     ),
     Choice(
@@ -162,6 +169,13 @@ def _homogeneous(small: bool) -> list[Case]:
         case(_INDEPENDENT, square(pair(ring, together, 0.1), _planner('independent'))),
         case(_CENTRALIZED, square(pair(ring, together, 0.1), _planner('centralized'))),
         case(
+            _SHARED,
+            square(
+                pair(ring, together, 0.1),
+                {**_planner('centralized'), 'agent_exploration': 'shared'},
+            ),
+        ),
+        case(
             'MAASI, recommended',
             square(pair(_GRID, together, 1.0), _RECOMMENDED, _RECOMMENDED_FILTER),
             'recommended',
@@ -194,6 +208,7 @@ def _fig5() -> Experiment:
             Comparison(_CENTRALIZED, 'lawnmower', FOUND.name),
             Comparison(_CENTRALIZED, _INDEPENDENT, FOUND.name),
             Comparison(_CENTRALIZED, _INDEPENDENT, MEASUREMENTS.name),
+            Comparison(_CENTRALIZED, _SHARED, MEASUREMENTS.name),
             Comparison('MAASI, recommended', _CENTRALIZED, MEASUREMENTS.name),
         ),
         choices=(*CHOICES, _LANES_CHOICE),

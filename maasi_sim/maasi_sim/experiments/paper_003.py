@@ -36,6 +36,7 @@ _PAPER_FILTER = {
     'expected_targets': 18.0,
 }
 _RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 10000, 'expected_targets': 18.0}
+_TRUE_NUMBER = 18
 _RING = {'ring': 8, 'distance': 9.0}
 _OURS = 'MI with exploration'
 _PRINTED = 'MI with exploration, births as printed'
@@ -86,6 +87,11 @@ CHOICES = (
         'lanes of the lawnmower',
         '43 m apart',
         'Not given; the widest that cover the area within the 240 steps of figure 4.',
+    ),
+    Choice(
+        'expected targets N0 of births and of the recommended planner',
+        '18, the true number of 003-fig4',
+        'Not given; a number that a search does not know. N0 = 1 and 100 are run beside it.',
     ),
     Choice(
         'a found target counts',
@@ -157,10 +163,18 @@ def _methods(
         *cases,
         case(_OURS, area(high, _EXPLORER)),
         case(_PRINTED, area(high, _EXPLORER, search_filter=_PRINTED_FILTER)),
-        case(
-            'ASI, recommended',
-            area(high, _RECOMMENDED, _grid(high), _RECOMMENDED_FILTER),
-            'recommended',
+        *(
+            case(
+                'ASI, recommended' + (f', N0 = {number}' if number != _TRUE_NUMBER else ''),
+                area(
+                    high,
+                    {**_RECOMMENDED, 'expected_targets': float(number)},
+                    _grid(high),
+                    {**_RECOMMENDED_FILTER, 'expected_targets': float(number)},
+                ),
+                'recommended',
+            )
+            for number in (_TRUE_NUMBER, 1, 100)
         ),
     ]
 
@@ -186,6 +200,11 @@ def _fig4() -> Experiment:
             Comparison(_OURS, 'lawnmower', FOUND.name),
             Comparison(_PRINTED, _OURS, FOUND.name),
             Comparison('ASI, recommended', _OURS, MEASUREMENTS.name),
+            *(
+                Comparison(f'ASI, recommended, N0 = {number}', 'ASI, recommended', quantity.name)
+                for number in (1, 100)
+                for quantity in (FOUND, MEASUREMENTS)
+            ),
         ),
         choices=(
             *CHOICES,

@@ -179,7 +179,9 @@ class Experiment:
     choices : sequence of Choice
         What the paper leaves open.
     causes : str
-        Why we differ from the paper, as far as we know; empty where we do not.
+        Why we may differ from the paper; not tested.
+    tested : str
+        Why we differ from the paper, tested by runs; says which, and what stays unknown.
     runs : int
         Number of maps in the paper.
     seconds : float
@@ -200,6 +202,7 @@ class Experiment:
     comparisons: Sequence[Comparison] = ()
     choices: Sequence[Choice] = ()
     causes: str = ''
+    tested: str = ''
     runs: int = 10
     seconds: float = 2.0
     maps: str | None = None

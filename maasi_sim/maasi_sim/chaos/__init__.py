@@ -1,0 +1,1 @@
+"""Fault campaign: whole runs in which nodes are killed or hang, judged by what they leave."""

@@ -1,0 +1,165 @@
+"""The cases of the fault campaign, and what is promised for each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Fault = Literal['kill', 'pause', 'hang']
+When = Literal['start', 'middle']
+
+SEARCH_NODES = (
+    '/sim_node',
+    '/mambo/driver',
+    '/mambo/guard',
+    '/turtlebot/driver',
+    '/turtlebot/guard',
+    '/filter_node',
+    '/planner_node',
+)
+BUILDING_NODES = ('/sim_node', '/red/cuboid_planner')
+_PAIRS = (
+    ('/filter_node', '/planner_node'),
+    ('/filter_node', '/mambo/driver'),
+    ('/mambo/driver', '/mambo/guard'),
+    ('/mambo/driver', '/turtlebot/driver'),
+)
+SIM = '/sim_node'
+# Length of a pause [s].
+PAUSE = 3.0
+
+_GRID = {'grid': [6, 6], 'spacing': 0.45, 'corner': [-0.1, -0.1]}
+# One target is seen from the start, so that there is something to lose; the last one is far.
+_SEARCH: dict[str, Any] = {
+    'version': 1,
+    'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
+    'step': 0.05,
+    'targets': {'positions': [[1.8, 1.8], [0.3, 0.3], [1.2, 2.2], [2.2, 0.2]]},
+    'robots': {
+        'mambo': {'type': 'mambo', 'start': [1.9, 1.9, 1.0], 'candidates': _GRID},
+        'turtlebot': {'type': 'turtlebot3_burger', 'start': [0, 0, 0], 'candidates': _GRID},
+    },
+    'filter': {'preset': 'recommended', 'particles': 2000},
+    'planner': {'name': 'maasi', 'measurement': 'periodic'},
+}
+_BUILDINGS: dict[str, Any] = {
+    'version': 1,
+    'environment': {'bounds': [[0.0, 300.0], [0.0, 300.0], [0.0, 80.0]]},
+    'step': 1.0,
+    'robots': {
+        'red': {
+            'type': 'search_drone',
+            'start': [160.0, 175.0, 5.0],
+            'hazard': {'failures': False},
+        }
+    },
+    'planner': {
+        'name': 'cuboid_mpc',
+        'detection_probability': 1.0,
+        'objects': [{'centre': [175.0, 130.0], 'size': [60.0, 60.0, 60.0]}],
+    },
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A run, and the fault in it.
+
+    Attributes
+    ----------
+    fault : {'kill', 'pause', 'hang'}
+        SIGKILL; SIGSTOP and SIGCONT after three seconds; SIGSTOP.
+    nodes : tuple of str
+        Whom it strikes, all at the same time.
+    when : {'start', 'middle'}
+        As soon as their processes are there; once a target is found (a cell is visited).
+    lockstep, respawn : bool
+        How the scenario runs.
+    buildings : bool
+        Whether it is the search of buildings.
+    """
+
+    fault: Fault
+    nodes: tuple[str, ...]
+    when: When
+    lockstep: bool
+    respawn: bool
+    buildings: bool = False
+
+    @property
+    def name(self) -> str:
+        """Unique name, for the command line."""
+        return '-'.join(
+            (
+                'buildings' if self.buildings else 'search',
+                'lockstep' if self.lockstep else 'free',
+                'respawn' if self.respawn else 'end',
+                self.fault,
+                self.when,
+                '+'.join(node.strip('/').replace('/', '_') for node in self.nodes),
+            )
+        )
+
+    @property
+    def ends_the_run(self) -> bool:
+        """Whether exit code 3 is promised; otherwise the run goes on to its end, 0 or 1."""
+        if self.fault == 'pause':
+            return False
+        # Another sim would begin with another time; a start that hangs is not repeated.
+        if not self.respawn or SIM in self.nodes:
+            return True
+        return self.fault == 'hang' and (self.lockstep or self.when == 'start')
+
+    def scenario(self) -> dict[str, Any]:
+        """Return the content of its scenario file."""
+        limits: dict[str, Any] = {'silence': 8.0, 'start': 120.0, 'time': 12.0}
+        if self.fault == 'hang' and self.when == 'start':
+            limits['start'] = 30.0
+        if not self.ends_the_run and not self.lockstep:
+            # Long enough for a node to start again on a busy machine.
+            limits['time'] = 16.0 if self.fault == 'pause' else 20.0
+        if self.buildings:
+            limits['time'] *= 3.0
+        return {
+            **(_BUILDINGS if self.buildings else _SEARCH),
+            'stop': 'all_found',
+            'on_exit': 'respawn' if self.respawn else 'end',
+            'limits': limits,
+        }
+
+    def options(self) -> list[str]:
+        """Return how its run is started."""
+        if self.lockstep:
+            return ['--lockstep']
+        return ['--rate', '3'] if self.buildings else []
+
+
+def all_cases() -> list[Case]:
+    """Return the whole campaign; the cases of which most is at stake come first."""
+    cases: list[Case] = []
+    modes = [(lockstep, respawn) for lockstep in (False, True) for respawn in (True, False)]
+    striking: tuple[Fault, ...] = ('kill', 'hang')
+    for fault in striking:
+        for lockstep, respawn in modes:
+            cases += [Case(fault, (node,), 'middle', lockstep, respawn) for node in SEARCH_NODES]
+    for lockstep in (False, True):
+        cases += [Case('pause', (node,), 'middle', lockstep, False) for node in SEARCH_NODES]
+    for lockstep, respawn in modes:
+        cases += [Case('kill', pair, 'middle', lockstep, respawn) for pair in _PAIRS]
+    for lockstep, respawn in modes:
+        cases += [Case('kill', (node,), 'start', lockstep, respawn) for node in SEARCH_NODES]
+    every: tuple[Fault, ...] = ('kill', 'hang', 'pause')
+    for fault in every:
+        for lockstep, respawn in modes:
+            if fault == 'pause' and respawn:
+                continue
+            cases += [
+                Case(fault, (node,), 'middle', lockstep, respawn, buildings=True)
+                for node in BUILDING_NODES
+            ]
+    for lockstep in (False, True):
+        cases += [Case('hang', pair, 'middle', lockstep, False) for pair in _PAIRS]
+        cases += [Case('pause', pair, 'middle', lockstep, False) for pair in _PAIRS]
+        cases += [Case('hang', (node,), 'start', lockstep, False) for node in SEARCH_NODES]
+        cases += [Case('pause', (node,), 'start', lockstep, False) for node in SEARCH_NODES]
+    return cases

@@ -1,0 +1,71 @@
+"""The arguments of `scenario.launch.py`, as options of `run_scenario`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+# Name, default and description; empty: as run_scenario has it.
+ARGUMENTS = {
+    'scenario': ('mambo_turtlebot', 'scenario file, or name of one in maasi_config'),
+    'out': ('', 'folder of the results; empty: runs/<time> below the working directory'),
+    'seed': ('', "of all random numbers; empty: the scenario's"),
+    'lockstep': ('false', 'step by step, as fast as it goes; true or false'),
+    'rate': ('', 'simulated over wall time; empty: 1, in lockstep as fast as possible'),
+    'record': ('true', 'whether a bag is recorded; true or false'),
+    'planner': ('', "name of the planner; empty: the scenario's"),
+    'time_limit': ('', "simulated time [s]; empty: the scenario's"),
+    'log_level': ('', 'of the nodes: debug, info, warn, error or fatal; empty: info'),
+    'rviz': ('false', 'whether RViz shows the search; true or false'),
+}
+_OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'log_level')
+_ENDINGS = {
+    1: 'not all targets were found',
+    2: 'wrong input',
+    3: 'a node died or hung',
+    4: 'the results could not be written',
+    130: 'interrupted',
+}
+
+
+def is_true(given: Mapping[str, str], name: str) -> bool:
+    """Return an argument that is true or false.
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+    """
+    text = given[name].strip().lower()
+    if text not in ('true', 'false'):
+        raise ValueError(f"{name}: read '{given[name]}', allowed are true and false")
+    return text == 'true'
+
+
+def scenario_options(given: Mapping[str, str]) -> list[str]:
+    """Return the command line of `run_scenario` for the arguments of a launch.
+
+    The nodes are in the ROS domain of the launch, so that other tools see them.
+
+    Raises
+    ------
+    ValueError
+        If an argument is neither true nor false. All others are checked by `run_scenario`.
+    """
+    options = [given['scenario'].strip()]
+    # Joined by '=': a value that begins with '-' stays a value.
+    for name in _OPTIONS:
+        if given[name].strip():
+            options.append(f'--{name.replace("_", "-")}={given[name].strip()}')
+    if is_true(given, 'lockstep'):
+        options.append('--lockstep')
+    if not is_true(given, 'record'):
+        options.append('--no-record')
+    is_true(given, 'rviz')
+    options.append(f'--domain-id={os.environ.get("ROS_DOMAIN_ID") or 0}')
+    return options
+
+
+def ending(code: int) -> str:
+    """Return in words how `run_scenario` ended."""
+    return f'run_scenario exited with {code}: {_ENDINGS.get(code, "unknown")}'

@@ -1,0 +1,132 @@
+"""Every type of node, with settings that it starts with, in the namespace of its robot."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+from rclpy.parameter import Parameter
+
+from maasi_drivers.driver_settings import DriverSettings, GuardSettings
+from maasi_drivers.guard_node import GuardNode
+from maasi_drivers.mambo_driver import MamboDriver
+from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
+from maasi_drivers.mavlink_driver import MavlinkDriver
+from maasi_drivers.ranging_driver import RangingDriver
+from maasi_drivers.turtlebot_driver import TurtlebotDriver
+from maasi_filter.filter_node import FilterNode
+from maasi_filter.node_settings import FilterNodeSettings
+from maasi_filter.parameters import flatten
+from maasi_planner.cuboid_planner_node import CuboidPlannerNode
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.planner_node import PlannerNode
+from maasi_planner.planners.cuboid.node_settings import CuboidPlannerSettings
+from maasi_sim.cuboid_sim_node import CuboidSimNode
+from maasi_sim.sim_node import SimNode
+from maasi_sim.sim_settings import SimNodeSettings
+
+BOUNDS = [[-0.3, 2.4], [-0.3, 2.4]]
+SPACE = [[0.0, 30.0], [0.0, 30.0], [0.0, 30.0]]
+BOX = {'kind': 'box', 'lower': [-0.2, -0.2], 'upper': [0.2, 0.2]}
+DRIVER = {
+    'environment': {'bounds': BOUNDS},
+    'start': [0.4, 0.3, 0.0],
+    'odometry_timeout': 30.0,
+    'sensor_timeout': 0.0,
+    'motion': {'model': 'unicycle', 'speed': 0.2},
+    'sensor': {'detection': BOX},
+    'camera': {'focal_length': [120.0, 120.0]},
+}
+RANGING = {
+    'environment': {'bounds': SPACE},
+    'start': [5.0, 5.0, 5.0],
+    'odometry_timeout': 30.0,
+    'sensor_timeout': 0.0,
+    'motion': {'model': 'constant_speed', 'speed': 2.0},
+    'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
+}
+FLYING = DRIVER | {'start': [1.0, 1.0, 1.0], 'motion': {'model': 'mambo', 'tilt': 0.1}}
+ROBOT = {
+    'candidates': {'grid': [3, 3], 'spacing': 0.5, 'corner': [0.5, 0.5]},
+    'motion': {'model': 'unicycle', 'speed': 0.2},
+    'sensor': {'detection': BOX, 'period': 0.5},
+    'start': [0.4, 0.3, 0.0],
+}
+BUILDING = {
+    'environment': {'bounds': [[0.0, 140.0], [0.0, 140.0], [0.0, 60.0]]},
+    'start': [5.0, 5.0, 5.0],
+    'objects': [[70.0, 70.0, 10.0, 20.0, 20.0, 20.0]],
+}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A type of node: class, module to start it by, settings, namespace."""
+
+    made: Any
+    settings: Any
+    namespace: str = ''
+
+    @property
+    def module(self):
+        return self.made.__module__
+
+    @property
+    def name(self):
+        """Of the node."""
+        module = self.module.rpartition('.')[2]
+        known = {'guard_node': 'guard', 'cuboid_planner_node': 'cuboid_planner'}
+        if module.endswith('_driver'):
+            return 'driver'
+        return known.get(module, module.removeprefix('cuboid_'))
+
+    def parameters(self, **changes):
+        model = type(self.settings)
+        content = self.settings.model_dump(by_alias=True, exclude_unset=True)
+        return flatten(model.model_validate(content | changes))
+
+    def make(self, context, **changes):
+        flat = self.parameters(**changes)
+        return self.made(
+            context=context,
+            namespace=self.namespace,
+            parameter_overrides=[Parameter(name, value=value) for name, value in flat.items()],
+        )
+
+    def write(self, file, **changes):
+        content = {'/**': {'ros__parameters': self.parameters(**changes)}}
+        file.write_text(yaml.safe_dump(content))
+
+
+def driver(settings):
+    return DriverSettings.model_validate(settings)
+
+
+KINDS = {
+    'filter': Kind(
+        FilterNode,
+        FilterNodeSettings.model_validate(
+            {
+                'environment': {'bounds': BOUNDS},
+                'filter': {'particles': 2000},
+                'robots': {'rover': {'sensor': {'detection': BOX}}},
+            }
+        ),
+    ),
+    'planner': Kind(
+        PlannerNode,
+        PlannerNodeSettings.model_validate(
+            {'environment': {'bounds': BOUNDS}, 'robots': {'rover': ROBOT}}
+        ),
+    ),
+    'cuboid_planner': Kind(
+        CuboidPlannerNode, CuboidPlannerSettings.model_validate(BUILDING), '/rover'
+    ),
+    'turtlebot': Kind(TurtlebotDriver, driver(DRIVER), '/rover'),
+    'mambo': Kind(MamboDriver, driver(FLYING), '/rover'),
+    'ranging': Kind(RangingDriver, driver(RANGING), '/rover'),
+    'mavlink': Kind(MavlinkDriver, driver(RANGING), '/rover'),
+    'mavlink_camera': Kind(MavlinkCameraDriver, driver(FLYING), '/rover'),
+    'guard': Kind(GuardNode, GuardSettings(), '/rover'),
+    'sim': Kind(SimNode, SimNodeSettings(scenario='mambo_turtlebot')),
+    'cuboid_sim': Kind(CuboidSimNode, SimNodeSettings(scenario='buildings_one')),
+}

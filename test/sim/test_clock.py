@@ -1,0 +1,260 @@
+"""A real `/clock` that goes back: every node lives on, and a robot without a pose stands."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from lifecycle_msgs.srv import GetState
+from nav_msgs.msg import Odometry
+from node_kinds import KINDS
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+
+from maasi_filter.conversions import stamp_to_ros
+from maasi_filter.qos import RELIABLE
+from maasi_msgs.action import GoToWaypoint
+from maasi_msgs.msg import AgentState
+from maasi_sim.processes import Domain
+
+PATIENCE = 120.0
+SECOND = 1_000_000_000
+JUMPS = tuple(item * SECOND for item in (60, 5, 61, 0, 2))
+
+
+class World(Node):
+    """Publishes `/clock`, and odometry of a rover; hears what nodes say."""
+
+    def __init__(self, context):
+        super().__init__('world', context=context)
+        self.executor_used = SingleThreadedExecutor(context=context)
+        self.executor_used.add_node(self)
+        self.clock = self.create_publisher(Clock, '/clock', RELIABLE)
+        self.stamps = {}
+        self.statuses, self.commands, self.states = [], [], []
+        self.create_subscription(DiagnosticArray, '/diagnostics', self.take, 10)
+        self.create_subscription(TwistStamped, '/rover/cmd_vel', self.commands.append, RELIABLE)
+        self.create_subscription(AgentState, '/rover/state', self.states.append, RELIABLE)
+        self.odometry = self.create_publisher(Odometry, '/rover/odom', RELIABLE)
+        self.position = 0.0
+
+    def take(self, message):
+        for status in message.status:
+            self.statuses.append(status)
+            self.stamps[status.name] = message.header.stamp
+
+    def until(self, condition, what=''):
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end, what
+            self.executor_used.spin_once(timeout_sec=0.02)
+
+    def tell(self, nanoseconds):
+        self.clock.publish(Clock(clock=stamp_to_ros(nanoseconds)))
+
+    def seen_at(self, nanoseconds, nodes):
+        """Publish a time until all nodes, name to process, have diagnostics of that time.
+
+        A sim stamps its diagnostics with the time that it publishes itself.
+        """
+        stamp = stamp_to_ros(nanoseconds)
+
+        def stamped():
+            # Best effort: one message may be lost.
+            self.tell(nanoseconds)
+            for name, process in nodes.items():
+                assert process.poll() is None, f'{name} ended with {process.returncode}'
+            return all(self.stamps.get(name) == stamp for name in nodes if 'sim' not in name)
+
+        self.until(stamped, f'diagnostics at {nanoseconds}')
+
+    def move(self, nanoseconds, step=0.0):
+        message = Odometry()
+        message.header.stamp = stamp_to_ros(nanoseconds)
+        message.header.frame_id = 'odom'
+        message.pose.pose.orientation.w = 1.0
+        self.position += step
+        message.pose.pose.position.x = self.position
+        self.odometry.publish(message)
+
+
+@pytest.fixture
+def world(monkeypatch):
+    with Domain() as domain:
+        for name, value in domain.environment().items():
+            monkeypatch.setenv(name, value)
+        context = Context()
+        rclpy.init(
+            context=context,
+            domain_id=domain.number,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        made = World(context)
+        yield made
+        made.executor_used.shutdown()
+        made.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def start(tmp_path):
+    running = []
+
+    def make(kind, namespace='', **changes):
+        made, file = KINDS[kind], tmp_path / f'{kind}.yaml'
+        made.write(file, **changes)
+        namespace = namespace or made.namespace or '/'
+        command = [sys.executable, '-m', made.module, '--ros-args', '--params-file', str(file)]
+        command += ['-p', 'use_sim_time:=true', '-r', f'__ns:={namespace}']
+        running.append(subprocess.Popen(command, env=os.environ, stderr=subprocess.PIPE, text=True))
+        return running[-1]
+
+    yield make
+    for process in running:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def is_active(world, name):
+    client = world.create_client(GetState, f'{name}/get_state')
+    world.until(client.service_is_ready, f'{name} has no services')
+    future = client.call_async(GetState.Request())
+    world.until(future.done, f'{name} does not answer')
+    world.destroy_client(client)
+    return future.result().current_state.label == 'active'
+
+
+def test_every_type_of_node_lives_through_a_clock_that_goes_back(world, start):
+    nodes = {f'/{kind}/{made.name}': start(kind, f'/{kind}') for kind, made in KINDS.items()}
+    for name in nodes:
+        world.until(lambda name=name: name in {item.name for item in world.statuses}, name)
+    for time_ in JUMPS:
+        world.seen_at(time_, nodes)
+    assert all(is_active(world, name) for name in nodes)
+    for name, process in nodes.items():
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0, (name, said)
+        assert 'Traceback' not in said, (name, said)
+        assert 'clock jumped back by' in said, (name, said)
+
+
+class Rover:
+    """Plays the robot of a driver that has been started."""
+
+    def __init__(self, world):
+        self.world = world
+        self.now = 100 * SECOND
+        world.until(world.odometry.get_subscription_count)
+        world.until(lambda: world.count_publishers('/rover/cmd_vel'))
+        self.client = ActionClient(world, GoToWaypoint, '/rover/go_to')
+        world.until(self.client.server_is_ready)
+        world.until(self.move)
+
+    def move(self, step=0.0):
+        """Go on in time and place; return whether the driver has answered."""
+        self.now += SECOND // 20
+        self.world.tell(self.now)
+        self.world.move(self.now, step)
+        return self.world.commands and self.world.states
+
+    def go_to(self, x, y):
+        goal = GoToWaypoint.Goal(goal_id=1)
+        goal.waypoint.header.frame_id = 'map'
+        goal.waypoint.pose.position.x, goal.waypoint.pose.position.y = x, y
+        handle = self.client.send_goal_async(goal)
+        self.world.until(handle.done)
+        assert handle.result().accepted
+        return handle.result().get_result_async()
+
+    def close(self):
+        self.client.destroy()
+
+
+def test_a_robot_stands_when_the_time_jumps_back_and_goes_on_with_a_new_pose(world, start):
+    process = start('turtlebot')
+    rover = Rover(world)
+    result = rover.go_to(2.0, 1.0)
+    world.until(lambda: rover.move(0.005) and np.any(moving(world.commands[-1:])))
+    # Nothing of the robot comes any more: only the clock, from the start.
+    world.commands.clear()
+    world.tell(0)
+    world.until(lambda: len(world.commands) >= 5 and not np.any(moving(world.commands[-5:])))
+    world.until(result.done)
+    assert result.result().result.reason == 'the time jumped back'
+    world.until(lambda: world.states[-1].goal_status == AgentState.UNAVAILABLE)
+    assert 'odometry' in world.states[-1].reason
+    rover.now = SECOND
+    world.until(lambda: rover.move() and world.states[-1].goal_status != AgentState.UNAVAILABLE)
+    assert process.poll() is None
+    rover.close()
+
+
+def moving(commands):
+    """Return the velocities of commands."""
+    twists = [item.twist for item in commands]
+    return [(item.linear.x, item.linear.y, item.linear.z, item.angular.z) for item in twists]
+
+
+def test_a_slow_simulated_clock_ends_no_goal_and_leaves_no_robot_moving(world, start):
+    start('turtlebot', odometry_timeout=0.5)
+    rover = Rover(world)
+    result = rover.go_to(2.0, 1.0)
+    world.until(lambda: rover.move(0.005) and np.any(moving(world.commands[-1:])))
+    # Time and odometry stand still, as on a busy machine; or it is a real robot without odometry.
+    world.commands.clear()
+    world.until(lambda: len(world.commands) >= 5 and not np.any(moving(world.commands[-5:])))
+    assert world.states[-1].goal_status == AgentState.MOVING
+    assert not result.done()
+    world.until(lambda: rover.move(0.005) and np.any(moving(world.commands[-1:])))
+    assert world.states[-1].goal_status == AgentState.MOVING
+    # Now the odometry is silent in simulated time.
+
+    def silent():
+        world.tell(rover.now + SECOND)
+        return world.states[-1].goal_status == AgentState.UNAVAILABLE
+
+    world.until(silent)
+    assert 'no odometry for' in world.states[-1].reason
+    world.until(result.done)
+    rover.close()
+
+
+@pytest.mark.parametrize('clock', [True, False])
+def test_only_a_missing_clock_is_warned_of(world, start, clock):
+    if not clock:
+        world.destroy_publisher(world.clock)
+    process = start('guard')
+    # Nothing is published on /clock yet, as before the start of a run.
+    world.until(lambda: [item.name for item in world.statuses].count('/rover/guard') >= 6)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=PATIENCE)
+    assert ('no publisher of /clock' in said) != clock, said
+
+
+def test_a_second_clock_that_says_zero_does_not_start_the_search_again(world, start):
+    process = start('planner')
+    nodes = {'/planner_node': process}
+    other = world.create_publisher(Clock, '/clock', RELIABLE)
+    # A time that nobody hears is never repeated.
+    world.until(lambda: other.get_subscription_count() and world.clock.get_subscription_count())
+    for number in range(1, 4):
+        world.seen_at(number * SECOND, nodes)
+        other.publish(Clock())
+    world.seen_at(5 * SECOND, nodes)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, said
+    assert 'it has 2 publishers (world), allowed is one' in said
+    assert 'the search starts again' not in said

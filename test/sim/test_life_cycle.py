@@ -1,0 +1,122 @@
+"""The life cycle of every type of node: cleanup undoes configure, which reads parameters again."""
+
+import time
+from collections import Counter
+
+import pytest
+import rclpy
+from node_kinds import KINDS
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+
+from maasi_filter.executor import LeanExecutor
+from maasi_sim.processes import Domain
+
+PATIENCE = 60.0
+CYCLES = 20
+
+
+@pytest.fixture
+def context():
+    with Domain() as domain:
+        made = Context()
+        rclpy.init(context=made, domain_id=domain.number)
+        yield made
+        rclpy.shutdown(context=made)
+
+
+def made_by(node):
+    """Return how many entities of each kind a node has, as it counts them itself."""
+    return {
+        kind: len(list(getattr(node, kind)))
+        for kind in ('publishers', 'subscriptions', 'services', 'clients', 'timers', 'waitables')
+    }
+
+
+def in_graph(node):
+    """Return how many endpoints a node has under each topic and service, as others see them."""
+    counts = Counter()
+    name, namespace = node.get_name(), node.get_namespace()
+    for topic, _ in node.get_topic_names_and_types():
+        for kind, infos in (
+            ('publisher', node.get_publishers_info_by_topic(topic)),
+            ('subscription', node.get_subscriptions_info_by_topic(topic)),
+        ):
+            number = sum(
+                (info.node_name, info.node_namespace) == (name, namespace) for info in infos
+            )
+            if number:
+                counts[kind, topic] = number
+    for service, _ in node.get_service_names_and_types_by_node(name, namespace):
+        counts['server', service] = node.count_services(service)
+    for service, _ in node.get_client_names_and_types_by_node(name, namespace):
+        counts['client', service] = node.count_clients(service)
+    return counts
+
+
+def until(executor, condition):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline
+        executor.spin_for(0.01)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
+    node = KINDS[kind].make(context)
+    executor = LeanExecutor(node, node.urgent, context=context)
+    unconfigured = made_by(node), in_graph(node)
+    assert node.trigger_configure().name == 'SUCCESS', node.problem
+    configured = made_by(node), in_graph(node)
+    assert configured[0]['publishers'] > unconfigured[0]['publishers']
+    for _ in range(CYCLES):
+        for step in ('activate', 'deactivate', 'cleanup', 'configure'):
+            assert getattr(node, f'trigger_{step}')().name == 'SUCCESS', (step, node.problem)
+            executor.spin_for(0.0)
+    until(executor, lambda: (made_by(node), in_graph(node)) == configured)
+    assert node.trigger_cleanup().name == 'SUCCESS'
+    until(executor, lambda: (made_by(node), in_graph(node)) == unconfigured)
+    executor.shutdown()
+    node.destroy_node()
+
+
+def test_a_parameter_that_is_set_after_cleanup_counts_from_the_next_configure(context):
+    node = KINDS['filter'].make(context)
+    assert node.trigger_configure().name == 'SUCCESS'
+    wanted = Parameter('filter.found_radius', value=0.07)
+    refused = node.set_parameters([wanted])[0]
+    assert not refused.successful and 'unconfigured' in refused.reason
+    assert node.trigger_cleanup().name == 'SUCCESS'
+    wrong = node.set_parameters([Parameter('filter.found_radius', value=-1.0)])[0]
+    assert not wrong.successful and 'filter.found_radius' in wrong.reason
+    assert '-1.0' in wrong.reason
+    assert node.set_parameters([wanted])[0].successful
+    assert node.trigger_configure().name == 'SUCCESS'
+    assert node.settings.filter.found_radius == 0.07
+    assert node.filter.settings.found_radius == 0.07
+    node.destroy_node()
+
+
+def test_robots_can_be_added_between_cleanup_and_configure(context):
+    node = KINDS['filter'].make(context)
+    assert node.trigger_configure().name == 'SUCCESS'
+    assert node.trigger_cleanup().name == 'SUCCESS'
+    assert node.set_parameters([Parameter('robots', value=['rover', 'scout'])])[0].successful
+    name = 'robot.scout.sensor.period'
+    assert node.set_parameters([Parameter(name, value=0.25)])[0].successful
+    assert node.trigger_configure().name == 'SUCCESS', node.problem
+    assert node.settings.robots['scout'].sensor.period == 0.25
+    assert node.count_subscribers('/scout/detections') == 1
+    node.destroy_node()
+
+
+def test_a_configure_that_fails_leaves_nothing_and_can_be_repeated(context):
+    node = KINDS['sim'].make(context, scenario='nowhere.yaml')
+    before = made_by(node)
+    assert node.trigger_configure().name == 'FAILURE'
+    assert 'nowhere.yaml' in node.problem
+    assert made_by(node) == before
+    changed = node.set_parameters([Parameter('scenario', value='mambo_turtlebot')])
+    assert changed[0].successful
+    assert node.trigger_configure().name == 'SUCCESS', node.problem
+    node.destroy_node()

@@ -1,0 +1,145 @@
+"""The recorder: what it writes down, and with which time."""
+
+import time
+
+import pytest
+import rclpy
+import yaml
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+
+from maasi_filter.conversions import stamp_to_ros
+from maasi_sim.bag import Bag, BagWriter, load_types
+from maasi_sim.cuboid_scenario import load_any_scenario
+from maasi_sim.processes import Domain
+from maasi_sim.recorder_node import Recorder
+from maasi_sim.run_scenario import make_observer
+
+PATIENCE = 60.0
+RELIABLE = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
+)
+SCENARIO = {
+    'version': 1,
+    'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
+    'targets': {'positions': [[0.5, 0.5]]},
+    'robots': {
+        'rover': {
+            'type': 'turtlebot3_burger',
+            'start': [0.5, 0.5, 0.0],
+            'candidates': {'grid': [6, 6], 'spacing': 0.34},
+        }
+    },
+}
+
+
+class Session:
+    """A recorder, and a node that publishes the time and odometry."""
+
+    def __init__(self, folder, number, context):
+        file = folder / 'scenario.yaml'
+        file.write_text(yaml.safe_dump(SCENARIO))
+        types = load_types()
+        observer = make_observer('session', load_any_scenario(file, {}), 1, types)
+        self.path = folder / 'bag'
+        self.bag = BagWriter(self.path, types)
+        self.recorder = Recorder(number, observer, self.bag)
+        self.node = rclpy.create_node('robot', context=context)
+        self.clock = self.node.create_publisher(Clock, '/clock', RELIABLE)
+        self.odometry = self.node.create_publisher(Odometry, '/rover/odom', RELIABLE)
+
+    def until(self, condition):
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end
+            self.recorder.discover()
+            self.recorder.wait(0.02)
+            self.recorder.drain()
+
+    def connect(self):
+        self.until(
+            lambda: (
+                not self.recorder.missing(['/clock', '/rover/odom'])
+                and self.clock.get_subscription_count()
+                and self.odometry.get_subscription_count()
+            )
+        )
+
+    def move(self, *times):
+        """Publish odometry with stamps, and wait until it is taken."""
+        before = self.recorder.last_seen.get('/rover/odom')
+        for nanoseconds in times:
+            message = Odometry()
+            message.header.stamp = stamp_to_ros(nanoseconds)
+            self.odometry.publish(message)
+        self.until(lambda: self.recorder.last_seen.get('/rover/odom') != before)
+
+    def tell(self, nanoseconds):
+        self.clock.publish(Clock(clock=stamp_to_ros(nanoseconds)))
+        self.until(lambda: self.recorder.time == nanoseconds)
+
+    def odometry_in_bag(self):
+        """Return stamp and log time of each message [ns], once all is written."""
+        self.recorder.finish()
+        self.recorder.drain()
+        self.bag.close()
+        with Bag(self.path) as bag:
+            read = list(bag.messages(['/rover/odom']))
+        stamps = [item.message.header.stamp for item in read]
+        return [
+            (stamp.sec * 10**9 + stamp.nanosec, item.time)
+            for stamp, item in zip(stamps, read, strict=True)
+        ]
+
+
+@pytest.fixture
+def session(tmp_path, monkeypatch):
+    with Domain() as domain:
+        for name, value in domain.environment().items():
+            monkeypatch.setenv(name, value)
+        context = Context()
+        rclpy.init(
+            context=context,
+            domain_id=domain.number,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        made = Session(tmp_path, domain.number, context)
+        yield made
+        made.bag.close()
+        made.recorder.close()
+        made.node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_no_stamp_is_ahead_of_the_time_of_its_message(session, monkeypatch):
+    # However slow this machine is: the time comes before it would be waited for no longer.
+    monkeypatch.setattr('maasi_sim.recorder_node._LONGEST_HOLD', PATIENCE, raising=False)
+    session.connect()
+    session.tell(10**9)
+    session.move(2 * 10**9)
+    session.tell(2 * 10**9)
+    session.move(2 * 10**9 + 1)
+    session.tell(3 * 10**9)
+    read = session.odometry_in_bag()
+    assert [stamp for stamp, _ in read] == [2 * 10**9, 2 * 10**9 + 1]
+    assert all(stamp <= log_time for stamp, log_time in read), read
+
+
+def test_what_is_stamped_by_another_clock_is_recorded_at_once(session):
+    session.connect()
+    session.tell(10**9)
+    session.move(1_700_000_000 * 10**9)
+    session.tell(2 * 10**9)
+    ((_, log_time),) = session.odometry_in_bag()
+    assert 10**9 <= log_time < 2 * 10**9
+
+
+def test_a_time_that_does_not_come_is_not_waited_for_longer_than_a_moment(session):
+    session.connect()
+    session.tell(10**9)
+    session.move(5 * 10**9)
+    session.until(lambda: session.bag.counts.get('/rover/odom'))
+    assert len(session.odometry_in_bag()) == 1

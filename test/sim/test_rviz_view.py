@@ -1,0 +1,100 @@
+"""RViz's files: each topic is there, and its quality of service fits the publisher's."""
+
+import os
+
+import pytest
+import rclpy
+import yaml
+from node_kinds import KINDS
+from rclpy.context import Context
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from maasi_filter.marker_board import MarkerBoard
+from maasi_sim.cuboid_scenario import load_any_scenario
+from maasi_sim.processes import Domain
+from maasi_sim.rviz_view import view_text
+from maasi_sim.scenario import config_folder, find_scenario
+
+
+def topics_of(text):
+    displays = yaml.safe_load(text)['Visualization Manager']['Displays']
+    return {item['Topic']['Value']: item['Topic'] for item in displays if 'Topic' in item}
+
+
+@pytest.mark.parametrize('name', ['search', 'search_3d'])
+def test_the_files_name_no_robot(name):
+    text = (config_folder() / 'rviz' / f'{name}.rviz').read_text()
+    assert all(topic.count('/') == 1 or 'truth' in topic for topic in topics_of(text))
+
+
+@pytest.mark.parametrize(
+    ('scenario', 'kinds'),
+    [
+        ('mambo_turtlebot', ('filter', 'planner', 'sim')),
+        ('buildings_one', ('cuboid_planner', 'cuboid_sim')),
+    ],
+)
+def test_every_display_fits_its_publisher(monkeypatch, scenario, kinds):
+    displays = topics_of(view_text(load_any_scenario(find_scenario(scenario), {})))
+    with Domain() as domain:
+        for name, value in domain.environment().items():
+            monkeypatch.setenv(name, value)
+        context = Context()
+        rclpy.init(
+            context=context,
+            domain_id=int(os.environ['ROS_DOMAIN_ID']),
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        nodes = [KINDS[kind].make(context) for kind in kinds]
+        try:
+            assert all(node.trigger_configure().name == 'SUCCESS' for node in nodes)
+            shown = 0
+            for topic, wanted in displays.items():
+                for info in [i for node in nodes for i in publishers(node, topic)]:
+                    shown += 1
+                    offered = info.qos_profile
+                    latched = offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
+                    assert latched or wanted['Durability Policy'] == 'Volatile', topic
+                    reliable = offered.reliability == ReliabilityPolicy.RELIABLE
+                    assert reliable or wanted['Reliability Policy'] == 'Best Effort', topic
+            # Of buildings there is neither filter nor exploration.
+            missing = [t for t in displays if not any(publishers(node, t) for node in nodes)]
+            allowed = ['compressed'] if scenario == 'mambo_turtlebot' else ['particles', 'truth']
+            assert all(any(word in topic for word in allowed) for topic in missing), missing
+            assert shown >= 2
+        finally:
+            for node in nodes:
+                node.destroy_node()
+            rclpy.shutdown(context=context)
+
+
+def publishers(node, topic):
+    own = node.get_name()
+    return [item for item in node.get_publishers_info_by_topic(topic) if item.node_name == own]
+
+
+def marker(namespace, number):
+    return Marker(header=Header(frame_id='map'), ns=namespace, id=number, type=Marker.SPHERE)
+
+
+def actions(array):
+    return [(item.action, item.ns, item.id) for item in array.markers]
+
+
+def test_the_first_markers_clear_and_later_ones_replace_those_before():
+    board = MarkerBoard()
+    first = board.replace(MarkerArray(markers=[marker('a', 1), marker('a', 2)]))
+    assert actions(first) == [
+        (Marker.DELETEALL, '', 0),
+        (Marker.ADD, 'a', 1),
+        (Marker.ADD, 'a', 2),
+    ]
+    second = board.replace(MarkerArray(markers=[marker('a', 2), marker('b', 1)]))
+    assert actions(second) == [
+        (Marker.DELETE, 'a', 1),
+        (Marker.ADD, 'a', 2),
+        (Marker.ADD, 'b', 1),
+    ]
