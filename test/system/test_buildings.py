@@ -42,7 +42,9 @@ def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path
     assert (run.folder / 'report.png').stat().st_size > 20_000
     # Nobody but sim and planners takes part.
     logs = sorted(path.stem for path in run.folder.glob('*.log'))
-    assert logs == ['blue_cuboid_planner', 'green_cuboid_planner', 'sim_node']
+    robots = ('blue', 'green')
+    nodes = [f'{robot}_{node}' for robot in robots for node in ('cuboid_planner', 'guard')]
+    assert logs == [*nodes, 'sim_node']
 
     mission = mission_of(load_any_scenario(file, {'seed': (('seed',), 3)}))
     record = mission.run(200)

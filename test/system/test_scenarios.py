@@ -45,6 +45,17 @@ def test_the_same_seed_gives_the_same_run_to_the_bit(repeated):
     assert len(updates) > 50
     assert updates == of_topic(second, '/filter_update')
     assert first.report['found'] == second.report['found']
+    # Of two robots, in the order of arrival.
+    moved = [sorted(map(repr, of_topic(run, '/tf'))) for run in (first, second)]
+    assert len(moved[0]) > 100 and moved[0] == moved[1]
+    for topic in ('/mambo/state', '/turtlebot/state'):
+        charges = [
+            [(item['step'], item['battery']) for item in of_topic(run, topic)]
+            for run in (first, second)
+        ]
+        assert len({charge for _, charge in charges[0]}) > 5
+        length = min(map(len, charges))
+        assert charges[0][:length] == charges[1][:length]
 
 
 def test_the_nodes_decide_as_the_search_in_one_process(repeated):
@@ -68,7 +79,8 @@ def test_the_bag_holds_the_run(repeated):
         facts = bag.scenario()
         topics = {topic for topic, _, _, _ in bag.raw(None)}
     assert facts['seed'] == 3
-    for topic in ('/clock', '/mambo/odom', '/turtlebot/scan', '/particles', '/markers'):
+    frames = ('/tf', '/tf_static', '/mambo/robot_description')
+    for topic in ('/clock', '/mambo/odom', '/turtlebot/scan', '/particles', '/markers', *frames):
         assert topic in topics
     assert any(topic.endswith('image_raw/compressed') for topic in topics)
 

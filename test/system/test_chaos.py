@@ -1,0 +1,190 @@
+"""A short selection of the fault campaign, and that its judgement finds what is wrong."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from maasi_sim.bag import BagWriter, TopicQos, load_types
+from maasi_sim.chaos.campaign import (
+    PASSED,
+    WRONG_INPUT,
+    Result,
+    chosen_cases,
+    main,
+    summary,
+)
+from maasi_sim.chaos.cases import SEARCH_NODES, Case, all_cases
+from maasi_sim.chaos.execution import Outcome
+from maasi_sim.chaos.verdict import judge
+
+pytestmark = pytest.mark.system
+
+SELECTION = [
+    'search-free-respawn-kill-middle-filter_node',
+    'search-free-end-hang-middle-turtlebot_driver',
+    'search-lockstep-respawn-kill-middle-filter_node+planner_node',
+]
+
+
+def test_a_selection_of_the_campaign_passes(tmp_path):
+    file = tmp_path / 'results.json'
+    done = subprocess.run(
+        [
+            *(sys.executable, '-m', 'maasi_sim.chaos.campaign', '--case', *SELECTION),
+            *('--jobs', '3', '--json', str(file), '--out', str(tmp_path / 'runs')),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=500.0,
+        check=False,
+    )
+    assert done.returncode == PASSED, done.stdout
+    results = json.loads(file.read_text())
+    assert results['passed'] == len(SELECTION)
+    assert not results['failed'] and not results['left_out']
+    by_name = {item['name']: item for item in results['cases']}
+    assert set(by_name) == set(SELECTION)
+    respawned = tmp_path / 'runs' / SELECTION[0] / 'run' / 'report.json'
+    events = json.loads(respawned.read_text())['events']
+    assert [item['node'] for item in events if item['event'] == 'restarted'] == ['/filter_node']
+    hung = json.loads((tmp_path / 'runs' / SELECTION[1] / 'run' / 'report.json').read_text())
+    assert hung['end_reason'] == 'node_hung'
+
+
+def test_every_node_is_killed_and_hung_in_every_mode():
+    cases = all_cases()
+    names = [case.name for case in cases]
+    assert len(set(names)) == len(names)
+    for node in SEARCH_NODES:
+        for fault in ('kill', 'hang'):
+            for lockstep in (False, True):
+                for respawn in (False, True):
+                    assert Case(fault, (node,), 'middle', lockstep, respawn) in cases
+        assert Case('pause', (node,), 'start', False, False) in cases
+    assert any(len(case.nodes) == 2 for case in cases)
+    assert any(case.buildings for case in cases)
+
+
+def test_wrong_arguments_are_refused(tmp_path, capsys):
+    assert main(['--case', 'nothing*']) == WRONG_INPUT
+    assert "read 'nothing*'" in capsys.readouterr().err
+    assert main(['--jobs', '0']) == WRONG_INPUT
+    (tmp_path / 'file').touch()
+    assert main(['--out', str(tmp_path)]) == WRONG_INPUT
+    assert main(['--list', '--case', 'buildings-*']) == PASSED
+    assert 'buildings-lockstep-end-kill-middle-sim_node' in capsys.readouterr().out
+    assert len(chosen_cases(['search-free-end-pause-middle-*'])) > 5
+
+
+class Recording:
+    """A run as it is left, with what a test puts into it."""
+
+    def __init__(self, folder):
+        folder.mkdir()
+        self.folder = folder
+        self.types = load_types()
+        self.bag = BagWriter(folder / 'bag', self.types)
+        (folder / 'report.json').write_text(json.dumps({'end_reason': 'time_limit'}))
+
+    def write(self, topic, name, time, **fields):
+        kind = self.types.types[name]
+        self.bag.add_topic(topic, name, TopicQos())
+        self.bag.write(topic, round(1e9 * time), self.types.serialize_cdr(kind(**fields), name))
+
+    def twist(self, speed):
+        vector = self.types.types['geometry_msgs/msg/Vector3']
+        twist = self.types.types['geometry_msgs/msg/Twist']
+        return twist(linear=vector(x=speed, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+
+    def header(self, time):
+        stamp = self.types.types['builtin_interfaces/msg/Time']
+        header = self.types.types['std_msgs/msg/Header']
+        return header(stamp=stamp(sec=int(time), nanosec=round(time % 1.0 * 1e9)), frame_id='map')
+
+    def judge(self, case, code=3, output='/filter_node', left=()):
+        self.bag.close()
+        return judge(case, Outcome(self.folder, code, output, True, 1.0, list(left)))
+
+
+KILLED = Case('kill', ('/filter_node',), 'middle', False, False)
+
+
+@pytest.fixture
+def recording(tmp_path):
+    made = Recording(tmp_path / 'run')
+    time = made.types.types['builtin_interfaces/msg/Time']
+    for second in range(20):
+        made.write('/clock', 'rosgraph_msgs/msg/Clock', second, clock=time(sec=second, nanosec=0))
+    return made
+
+
+def test_a_run_that_keeps_all_promises_passes(recording):
+    assert recording.judge(KILLED) == []
+
+
+def test_a_wrong_ending_is_found(recording):
+    problems = recording.judge(KILLED, code=0, output='', left=['filter_node --ros-args'])
+    assert [item.split(':')[0] for item in problems] == [
+        'exit code',
+        'output',
+        'processes left',
+    ]
+
+
+def test_lost_targets_are_found(recording):
+    targets = []
+    for number in (1, 2):
+        vector = recording.types.types['geometry_msgs/msg/Point']
+        targets.append(
+            recording.types.types['maasi_msgs/msg/FoundTarget'](
+                id=number,
+                position=vector(x=0.0, y=0.0, z=0.0),
+                covariance=np.zeros(9),
+                robot='mambo',
+                measurement=1,
+                batch_id=1,
+                stamp=recording.header(1.0).stamp,
+            )
+        )
+    for second, found in ((1, targets), (2, targets[1:])):
+        recording.write(
+            '/found_targets',
+            'maasi_msgs/msg/FoundTargetArray',
+            second,
+            header=recording.header(second),
+            batch_id=second,
+            targets=found,
+        )
+    assert recording.judge(KILLED) == ['found_targets: without [1] that were found']
+
+
+def test_a_robot_that_is_left_moving_is_found(recording):
+    for second, speed in ((1.0, 0.0), (2.0, 0.2)):
+        recording.write(
+            '/turtlebot/cmd_vel',
+            'geometry_msgs/msg/TwistStamped',
+            second,
+            header=recording.header(second),
+            twist=recording.twist(speed),
+        )
+    (problem,) = recording.judge(KILLED)
+    assert problem.startswith('turtlebot: the last command is (0.2,')
+
+
+def test_a_recording_or_report_that_cannot_be_read_is_found(tmp_path):
+    folder = tmp_path / 'run'
+    folder.mkdir()
+    problems = judge(KILLED, Outcome(folder, 3, '/filter_node', True, 1.0, []))
+    assert [item.split(':')[0] for item in problems] == ['report', 'recording']
+
+
+def test_the_summary_counts_by_kind():
+
+    results = [Result(KILLED, 3, 1.0, 1.0, []), Result(KILLED, 0, 1.0, 1.0, ['exit code'])]
+    content = summary(results, 1, 5)
+    assert content['counts'] == {'search free end kill middle one': {'passed': 1, 'failed': 1}}
+    assert (content['passed'], content['failed'], content['left_out']) == (1, 1, 5)

@@ -1,0 +1,128 @@
+"""The command-line tool beside a run that goes freely."""
+
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import rclpy
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from maasi_filter.qos import sensor_reader
+from maasi_sim.processes import Domain
+
+pytestmark = pytest.mark.system
+PATIENCE = 120.0
+ROBOTS = ('turtlebot', 'mambo')
+# A robot that has not moved further between odometry of this time stands [s, m].
+SPAN, STILL = 1.5, 0.04
+
+
+class Watcher:
+    """Hears where the robots are."""
+
+    def __init__(self, domain):
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = Node('watcher', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.path = {name: [] for name in ROBOTS}
+        for name in ROBOTS:
+            self.node.create_subscription(
+                Odometry,
+                f'{name}/odom',
+                lambda message, name=name: self.hear(name, message),
+                sensor_reader(False),
+            )
+
+    def hear(self, name, message):
+        stamp, point = message.header.stamp, message.pose.pose.position
+        self.path[name].append((stamp.sec + stamp.nanosec * 1e-9, point.x, point.y, point.z))
+
+    def until(self, condition, what):
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end, what
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def moved(self, name, span):
+        """Return how far a robot went in the last `span` seconds; None where not known."""
+        path = np.array(self.path[name])
+        if not len(path) or path[-1, 0] - path[0, 0] < span:
+            return None
+        recent = path[path[:, 0] >= path[-1, 0] - span]
+        return float(np.linalg.norm(np.ptp(recent[:, 1:], axis=0)))
+
+    def all_stand(self):
+        moved = [self.moved(name, SPAN) for name in ROBOTS]
+        return all(way is not None and way < STILL for way in moved)
+
+    def all_moved(self):
+        return all((self.moved(name, SPAN) or 0.0) > 3.0 * STILL for name in ROBOTS)
+
+    def forget(self):
+        for path in self.path.values():
+            path.clear()
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+def test_robots_of_a_free_run_stand_while_paused_and_go_on_when_resumed(tmp_path):
+    with Domain(None) as domain:
+        number, environment = domain.number, {**os.environ, **domain.environment()}
+    # Released: the run locks it itself.
+    words = [
+        'mambo_turtlebot',
+        '--time-limit',
+        '300',
+        '--no-record',
+        '--out',
+        str(tmp_path / 'run'),
+    ]
+    run = subprocess.Popen(
+        [sys.executable, '-m', 'maasi_sim.run_scenario', *words, '--domain-id', str(number)],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.STDOUT,
+    )
+    watcher = Watcher(number)
+
+    def command(word):
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'maasi_planner.search_command', word, '--timeout', '60'],
+            env=environment,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        watcher.until(lambda: process.poll() is not None, f'{word} does not end')
+        assert process.returncode == 0, process.stdout.read()
+        watcher.forget()
+
+    try:
+        watcher.until(watcher.all_moved, 'robots do not move')
+        command('pause')
+        watcher.until(watcher.all_stand, 'robots do not stand')
+        watcher.forget()
+        for _ in range(3):
+            watcher.until(lambda: all(watcher.moved(n, SPAN) is not None for n in ROBOTS), 'silent')
+            assert watcher.all_stand()
+            watcher.forget()
+        command('resume')
+        watcher.until(watcher.all_moved, 'robots do not go on')
+        assert run.poll() is None
+    finally:
+        run.terminate()
+        try:
+            run.wait(60.0)
+        finally:
+            run.kill()
+            watcher.close()
