@@ -32,10 +32,6 @@ class FilterWatch:
         """Note the update of a batch: those before will not come any more."""
         self._open = {number: since for number, since in self._open.items() if number > batch}
 
-    def forget_batches(self) -> None:
-        """Wait for no batch any more."""
-        self._open.clear()
-
     def stalled(self, seconds: float) -> None:
         """Note that the planner itself has stood still: what was sent meanwhile is not read yet."""
         if self._beat is not None:

@@ -340,7 +340,7 @@ def use_planner(world):
     states = world.publisher('/planner/rover/state', AgentState)
     client = ActionClient(world.node, SearchTargets, '/planner/search')
     world.until(client.server_is_ready, 'no search')
-    client.send_goal_async(SearchTargets.Goal())
+    name = world.names['planner']
     before = len(batches)
     step = [10_000]
     clock = [0.0]
@@ -357,7 +357,16 @@ def use_planner(world):
         state.pose.pose.orientation.w = 1.0
         states.publish(state)
 
-    world.until(lambda: tell() or len(batches) > before, 'the planner asks for nothing')
+    def takes_part():
+        return world.status[name][1]['robots'] == 'rover'
+
+    # A search with no robot ends at once.
+    world.until(lambda: tell() or takes_part(), 'the rover does not take part')
+    client.send_goal_async(SearchTargets.Goal())
+    world.until(
+        lambda: tell() or len(batches) > before,
+        lambda: f'the planner asks for nothing: {world.status[name]}\n{world.log("planner")}',
+    )
 
 
 def use_cuboid_planner(world):
