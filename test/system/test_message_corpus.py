@@ -21,6 +21,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'sim'))
 
@@ -371,6 +372,11 @@ def use_planner(world):
 
 def use_cuboid_planner(world):
     decisions = world.heard['/cuboid_planner/rover/decision']
+    start = world.node.create_client(Trigger, '/cuboid_planner/rover/search/start')
+    world.until(start.service_is_ready, 'no start')
+    answer = start.call_async(Trigger.Request())
+    world.until(answer.done, 'no answer to start')
+    assert answer.result().success, answer.result().message
     odometry = world.publisher('/cuboid_planner/rover/odom', Odometry)
     step = [3000]
     clock = [0.0]
