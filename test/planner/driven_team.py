@@ -33,6 +33,10 @@ from maasi_sim.processes import Domain
 
 PATIENCE = 60.0
 STEP = 0.05
+# Wall time of a step of the robots, where odometry is lost at most [s].
+TURN, LONGEST_TURN = 0.01, 1.0
+# Share of its way that a robot goes while something is listened for.
+SLOW = 0.02
 _DRIVER = {
     'step': STEP,
     'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
@@ -69,8 +73,8 @@ class Robot:
         twist = message.twist
         self.command = [twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z]
 
-    def move(self, step):
-        self.body.step(self.command, STEP)
+    def move(self, step, share=1.0):
+        self.body.step(self.command, share * STEP)
         state = self.body.robot_state()
         message = Odometry()
         message.header.frame_id = 'odom'
@@ -169,21 +173,38 @@ class World:
 
     def until(self, condition, what=''):
         """Let the robots move until something is true."""
+        self._repeat(self.turn, condition, what)
+
+    def listen(self, condition, what=''):
+        """Let the robots get hardly any further until something is true."""
+        self._repeat(lambda: self.turn(SLOW), condition, what)
+
+    def _repeat(self, function, condition, what):
         end = time.monotonic() + PATIENCE
         while not condition():
             assert time.monotonic() < end, what or 'nothing came of it'
-            self.turn()
+            function()
 
-    def turn(self):
-        """Do one step of the robots, and what follows from it."""
+    def turn(self, share=1.0):
+        """Do one step of the robots, or a share of one, and what follows from it."""
         self.step += 1
         for robot in self.robots.values():
-            robot.move(self.step)
-        until = time.monotonic() + 0.02
-        while time.monotonic() < until:
-            if self.planner is not None:
-                self.lean.spin_for(0.002)
-            self.executor.spin_once(timeout_sec=0.002)
+            robot.move(self.step, share)
+        now = time.monotonic()
+        while time.monotonic() < now + TURN or (
+            self._is_behind() and time.monotonic() < now + LONGEST_TURN
+        ):
+            self.spin()
+
+    def _is_behind(self):
+        """Tell whether a driver has not answered the present step, on a busy machine."""
+        return any(robot.states and robot.state.step < self.step for robot in self.robots.values())
+
+    def spin(self):
+        """Do what waits to be done."""
+        if self.planner is not None:
+            self.lean.spin_for(0.002)
+        self.executor.spin_once(timeout_sec=0.002)
 
     def pass_steps(self, steps):
         """Let the robots do some steps, each heard by the planner."""

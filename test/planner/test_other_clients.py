@@ -25,15 +25,20 @@ def test_a_goal_of_another_client_is_respected_and_the_robot_is_taken_back_after
 
         _, result = world.send('a', (1.9, 0.1), FOREIGN)
         world.until(lambda: a.state.goal_id == FOREIGN)
-        world.until(lambda: world.logged(f'a follows goal {FOREIGN} of another client'))
-        world.until(lambda: world.status.get('goals of other clients') == f'a (goal {FOREIGN})')
+        seen, decisions = len(a.states), len(world.decisions)
+        world.listen(lambda: world.logged(f'a follows goal {FOREIGN} of another client'))
+        world.listen(lambda: world.status.get('goals of other clients') == f'a (goal {FOREIGN})')
         assert world.status['level'] == DiagnosticStatus.WARN
         assert f'a follows goal {FOREIGN}' in world.status['message']
-        seen, decisions = len(a.states), len(world.decisions)
-        world.until(result.done)
+        world.until(lambda: result.done() and a.state.goal_status != AgentState.MOVING)
         assert result.result().status == GoalStatus.STATUS_SUCCEEDED
         # The planner did not send it anywhere meanwhile, and the other robot went on.
-        assert {state.goal_id for state in a.states[seen:-5]} == {FOREIGN}
+        ended = next(
+            number
+            for number, state in enumerate(a.states)
+            if number >= seen and state.goal_status != AgentState.MOVING
+        )
+        assert {state.goal_id for state in a.states[seen : ended + 1]} == {FOREIGN}
         assert (
             any(
                 item.robot == 'b'
@@ -51,7 +56,7 @@ def test_a_goal_of_another_client_is_respected_and_the_robot_is_taken_back_after
         # Also where the other client has the planner's own number, and cancels its goal.
         same = a.state.goal_id
         handle, result = world.send('a', (0.1, 1.9), same)
-        world.until(lambda: world.status.get('goals of other clients') == f'a (goal {same})')
+        world.listen(lambda: world.status.get('goals of other clients') == f'a (goal {same})')
         handle.cancel_goal_async()
         world.until(result.done)
         assert result.result().status == GoalStatus.STATUS_CANCELED

@@ -12,9 +12,9 @@ from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from scenario_runs import reserved_domain
 
 from maasi_filter.qos import sensor_reader
-from maasi_sim.processes import Domain
 
 pytestmark = pytest.mark.system
 PATIENCE = 120.0
@@ -76,10 +76,14 @@ class Watcher:
         rclpy.shutdown(context=self.context)
 
 
-def test_robots_of_a_free_run_stand_while_paused_and_go_on_when_resumed(tmp_path):
-    with Domain(None) as domain:
-        number, environment = domain.number, {**os.environ, **domain.environment()}
-    # Released: the run locks it itself.
+@pytest.fixture
+def domain():
+    with reserved_domain() as reserved:
+        yield reserved
+
+
+def test_robots_of_a_free_run_stand_while_paused_and_go_on_when_resumed(tmp_path, domain):
+    number, environment = domain.number, {**os.environ, **domain.environment()}
     words = [
         'mambo_turtlebot',
         '--time-limit',
