@@ -1,0 +1,188 @@
+"""Runs whose disk fills in the middle, and a run that is killed: what is left of them.
+
+A write beyond RLIMIT_FSIZE fails (EFBIG, setrlimit(2)), and so does each write to `/dev/full`
+(ENOSPC, full(4)). Neither needs a disk of its own, nor rights.
+"""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import time
+
+import pytest
+import rclpy
+import yaml
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from scenario_runs import PATIENCE, command, processes_with, reserved_domain, wait_for
+
+from maasi_filter.conversions import stamp_from_ros
+from maasi_sim.bag import Bag
+
+pytestmark = pytest.mark.system
+# The run takes more steps than it records before its disk is full.
+SCENARIO = {
+    'version': 1,
+    'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
+    'targets': {'positions': [[0.0, 0.0]]},
+    'robots': {
+        'mambo': {
+            'type': 'mambo',
+            'start': [1.9, 1.9, 1.0],
+            'candidates': {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
+        }
+    },
+    'filter': {'preset': 'recommended', 'particles': 500},
+    'limits': {'time': 300.0},
+}
+# Little enough that the report is larger.
+LITTLE = 16
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    path = tmp_path / 'scenario.yaml'
+    path.write_text(yaml.safe_dump(SCENARIO))
+    return path
+
+
+@pytest.fixture
+def start(scenario, tmp_path):
+    """Start a run in the folder `run`; `elsewhere` is its folder for temporary files."""
+    running = []
+    elsewhere = tmp_path / 'elsewhere'
+    elsewhere.mkdir()
+
+    def make(*options, **variables):
+        process = subprocess.Popen(
+            command(scenario, tmp_path / 'run', *options),
+            env={**os.environ, 'TMPDIR': str(elsewhere), **variables},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        running.append(process)
+        return process
+
+    yield make
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+def fill(process, folder, size=None):
+    """Let no file of a run that records grow further, or beyond a size."""
+    bag = folder / 'bag' / 'bag.mcap'
+    wait_for(lambda: bag.exists() and bag.stat().st_size > 100_000, 'the run records')
+    size = bag.stat().st_size if size is None else size
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, size))
+
+
+def recorded(folder):
+    """Return the times of the clock in a recording without its end [ns]."""
+    with Bag(folder) as bag:
+        assert 'the end of bag.mcap is missing' in bag.recovered or not bag.recovered
+        return [stamp_from_ros(item.message.clock) for item in bag.messages(['/clock'])]
+
+
+def check(process, folder):
+    """Return what a run said whose recording could not be finished."""
+    output, _ = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 4, output
+    assert 'of 1 targets found' in output
+    assert 'bag: writing failed: File too large' in output
+    assert 'Traceback' not in output
+    assert not processes_with(f'{folder}/')
+    times = recorded(folder)
+    assert times == sorted(times) and len(times) > 10
+    return output
+
+
+def test_a_report_is_written_beside_a_recording_that_fills_the_disk(start, tmp_path):
+    folder = tmp_path / 'run'
+    process = start('--lockstep')
+    fill(process, folder)
+    check(process, folder)
+    report = json.loads((folder / 'report.json').read_text())
+    assert report['end_reason'] == 'not_recorded'
+    assert list((tmp_path / 'elsewhere').iterdir()) == []
+
+
+def test_a_report_is_written_elsewhere_where_its_folder_is_full(start, tmp_path):
+    folder = tmp_path / 'run'
+    folder.mkdir()
+    for name in ('part_report.json', 'filter_node.log', 'sim_node.log'):
+        (folder / name).symlink_to('/dev/full')
+    process = start('--lockstep')
+    fill(process, folder)
+    output = check(process, folder)
+    assert 'the report cannot be written: No space left on device' in output
+    (place,) = (tmp_path / 'elsewhere').glob('maasi_report_*')
+    assert f'report: {place}' in output
+    assert json.loads((place / 'report.json').read_text())['end_reason'] == 'not_recorded'
+    assert not (folder / 'report.json').exists()
+
+
+def test_the_summary_is_said_where_nothing_can_be_written_at_all(start, tmp_path):
+    folder = tmp_path / 'run'
+    process = start('--lockstep')
+    fill(process, folder, LITTLE)
+    output = check(process, folder)
+    assert 'the report cannot be written: File too large' in output
+    assert 'report: nowhere' in output
+    assert not (folder / 'report.json').exists()
+    assert list((tmp_path / 'elsewhere').iterdir()) == []
+
+
+class Witness:
+    """Hears the clock of a run."""
+
+    def __init__(self, domain):
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain.number)
+        self.node = Node('witness', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.time = 0
+        self.node.create_subscription(Clock, '/clock', self.hear, 10)
+
+    def hear(self, message):
+        self.time = max(self.time, stamp_from_ros(message.clock))
+
+    def until(self, seconds):
+        deadline = time.monotonic() + PATIENCE
+        while self.time < seconds * 1e9:
+            assert time.monotonic() < deadline
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+def test_a_run_that_is_killed_leaves_all_but_its_last_second(start, tmp_path, monkeypatch):
+    folder = tmp_path / 'run'
+    with reserved_domain() as domain:
+        for name, value in domain.environment().items():
+            monkeypatch.setenv(name, value)
+        # Half as fast as the time of the wall: that is what the promise is about.
+        process = start('--domain-id', domain.number, '--rate', '0.5')
+        witness = Witness(domain)
+        witness.until(3.0)
+        process.send_signal(signal.SIGKILL)
+        process.wait(PATIENCE)
+        wait_for(lambda: not processes_with(f'{folder}/'), 'all nodes end')
+        times = recorded(folder)
+        witness.close()
+    assert times == sorted(times)
+    assert times[-1] >= witness.time - 0.5e9
+    assert not (folder / 'report.json').exists()
+    with Bag(folder) as bag:
+        assert bag.scenario()['scenario']['robots'].keys() == {'mambo'}
+        assert bag.counts['/mambo/state'] > 0
