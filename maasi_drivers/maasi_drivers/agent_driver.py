@@ -69,7 +69,7 @@ _LAST_TASKS = 5
 _LEAST_SPEED, _LEAST_TURN = 0.02, 0.05
 # Kinds of trouble.
 ODOMETRY, _FROZEN_POSE, _SENSOR, BATTERY = 'odometry', 'frozen pose', 'sensor', 'battery'
-_STOP = 'stop'
+STOP = 'stop'
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._answer: DetectionArray | None = None
         self._battery = -1.0
         # Why the robot cannot go on, by kind; empty where it can.
-        self._troubles: dict[str, str] = {_STOP: STOPPED} if self._stop_latch.latched else {}
+        self._troubles: dict[str, str] = {STOP: STOPPED} if self._stop_latch.latched else {}
         self._gauge = BatteryGauge()
         self._charged_at = time.monotonic()
         self._readings = BatteryReadings()
@@ -268,6 +268,10 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
     def hold_robot(self) -> None:
         """Stop the robot now, as its goal was cancelled or its pose is not known."""
         self._publish_command([0.0, 0.0, 0.0, 0.0])
+
+    def awaits_pose(self) -> bool:
+        """Return whether a first pose that does not come is worth a warning."""
+        return True
 
     def watch_robot(self) -> None:
         """Look after the link, ten times a second on wall time."""
@@ -648,13 +652,13 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         """Stop the robot until `release`, whichever client has a goal."""
         if not self.configured:
             return
-        if self.begin_trouble(_STOP, STOPPED):
+        if self.begin_trouble(STOP, STOPPED):
             self.get_logger().warning(STOPPED)
         if self.active and not self.settings.lockstep:
             self.hold_robot()
 
     def _release(self) -> None:
-        if self.configured and self.end_trouble(_STOP):
+        if self.configured and self.end_trouble(STOP):
             self.get_logger().info('released: it takes goals')
 
     @property
@@ -706,7 +710,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         age, timeout = self._silence.length, self.settings.odometry_timeout
         if self._history.latest is None and ODOMETRY not in self._troubles:
             wall = self._silence.wall
-            if wall > _PATIENCE:
+            if wall > _PATIENCE and self.awaits_pose():
                 self.warn_throttled('no odometry', f'no {self._posed} yet, for {wall:.0f} s')
         elif age > timeout or ODOMETRY in self._troubles:
             text = f'no {self._posed} for {age:.1f} s'

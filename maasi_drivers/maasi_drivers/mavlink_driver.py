@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent_driver import BATTERY, ODOMETRY, AgentDriver, DataT, FloatArray
+from maasi_drivers.agent_driver import BATTERY, ODOMETRY, STOP, AgentDriver, DataT, FloatArray
+from maasi_drivers.arm_permission import offer_arm
 from maasi_drivers.arrival_clock import ArrivalClock
 from maasi_drivers.mavlink.link import VehicleLink
 from maasi_drivers.mavlink.settings import MavlinkSettings
@@ -39,6 +40,10 @@ class MavlinkRobot(AgentDriver[DataT]):
     """
     A vehicle with an autopilot.
 
+    Services
+    --------
+    `arm` (std_srvs/Trigger), with `link: mavlink`: it takes off once, or is taken over in the air
+
     With `link: mavlink` it is reached by MAVLink; `odom`, `battery_state` and `cmd_vel` are
     not used then. With `link: topics` it is a robot like any other.
     """
@@ -54,6 +59,8 @@ class MavlinkRobot(AgentDriver[DataT]):
         super().prepare()
         settings = self.settings
         self._mavlink = settings.mavlink or MavlinkSettings()
+        if settings.link == 'mavlink':
+            self._posed = 'LOCAL_POSITION_NED'
         self._arrivals = ArrivalClock()
         self._map_from_local = Pose.from_yaw(
             [*settings.start[:2], self._mavlink.ground], -self._mavlink.map_yaw
@@ -88,12 +95,34 @@ class MavlinkRobot(AgentDriver[DataT]):
         self._vehicle_link = link
         self._taken, self._heading, self._ending = -1, None, False
         self.create_wall_timer(_POLL_PERIOD, self._poll)
+        offer_arm(self, self._arm)
 
         def flying() -> bool:
             with link.vehicle() as vehicle:
                 return vehicle.flying
 
         self.expect(flying)
+
+    def _arm(self) -> str:
+        """Let the vehicle take off; return why not, empty where it may."""
+        link = self._vehicle_link
+        if link is None or not self.active:
+            return 'the driver is not active'
+        for kind in (STOP, BATTERY):
+            if kind in self._troubles:
+                return self._troubles[kind]
+        with link.vehicle() as vehicle:
+            problem = vehicle.permit(time.monotonic())
+        if not problem:
+            self._ending = False
+        return problem
+
+    def stop_by_service(self) -> None:
+        """Have it hold its position; on the ground it is not armed any more."""
+        super().stop_by_service()
+        if self._vehicle_link is not None:
+            with self._vehicle_link.vehicle() as vehicle:
+                vehicle.forbid()
 
     def disconnect_robot(self) -> None:
         """Close the wire."""
@@ -132,6 +161,10 @@ class MavlinkRobot(AgentDriver[DataT]):
         if latest is not None and ODOMETRY not in self._troubles:
             self._send_target(latest.pose.position, latest.pose.yaw)
 
+    def awaits_pose(self) -> bool:
+        """Return whether nothing else says why there is none."""
+        return _VEHICLE not in self._troubles
+
     def watch_robot(self) -> None:
         """Look after the link."""
         super().watch_robot()
@@ -158,7 +191,7 @@ class MavlinkRobot(AgentDriver[DataT]):
         if link is None:
             return
         with link.vehicle() as vehicle:
-            vehicle.wanted = self.active and not self._ending
+            vehicle.active = self.active and not self._ending
             trouble, charge = vehicle.trouble, vehicle.charge
             telemetry, self._local_origin = vehicle.telemetry, vehicle.origin
         if link.failure:
@@ -197,7 +230,9 @@ class MavlinkRobot(AgentDriver[DataT]):
     def _judge(self, trouble: str) -> None:
         """Note whether the vehicle can go on."""
         if trouble:
-            if self.begin_trouble(_VEHICLE, trouble):
+            told = self._troubles.get(_VEHICLE)
+            self.begin_trouble(_VEHICLE, trouble)
+            if trouble != told:
                 self.get_logger().warning(trouble)
             self._heading = None
         elif self.end_trouble(_VEHICLE):

@@ -1,4 +1,4 @@
-"""Start, pause, resume, send home or stop a search, the team's or one robot's."""
+"""Start, pause, resume, send home or stop a search, the team's or one robot's; arm vehicles."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from std_srvs.srv import Trigger
 from maasi_planner.search_modes import COMMANDS
 
 DONE, REFUSED, ABSENT = 0, 1, 2
+# Commands of drivers alone.
+_OF_DRIVERS = ('release', 'arm')
 _TRIGGER = 'std_srvs/srv/Trigger'
 # Services that come up later than this after the last one are not waited for [s].
 _SETTLED = 1.0
@@ -23,12 +25,12 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='search_command',
-        description='Calls the planner; stop and release also reach the drivers themselves, so '
+        description='Calls the planner; stop, release and arm reach the drivers themselves, so '
         'that they work without a planner.',
         epilog='Exit codes: 0 all followed, 1 one refused or did not answer, 2 wrong arguments '
         'or no such service.',
     )
-    parser.add_argument('command', choices=[*COMMANDS, 'release'])
+    parser.add_argument('command', choices=[*COMMANDS, *_OF_DRIVERS])
     parser.add_argument('--robot', metavar='NAME', help='one robot instead of the team')
     parser.add_argument('--namespace', default='', metavar='NS', help='of the team')
     parser.add_argument(
@@ -52,8 +54,9 @@ def wanted(services: dict[str, list[str]], command: str, robot: str, namespace: 
         for name in drivers
         if name.rpartition('/')[0] == top and (not robot or name == f'{top}/{robot}')
     }
-    chosen = {f'{name}/{command}' for name in drivers} if command in ('stop', 'release') else set()
-    if command == 'release':
+    direct = command in ('stop', *_OF_DRIVERS)
+    chosen = {f'{name}/{command}' for name in drivers} & known if direct else set()
+    if command in _OF_DRIVERS:
         return chosen
     team = f'{top}/search/{command}'
     each = {
@@ -111,7 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
         node.destroy_node()
         rclpy.try_shutdown()
     if not answers:
-        print(f'no service for {options.command} within {options.timeout:g} s: is a planner there?')
+        print(f'no service for {options.command} within {options.timeout:g} s: is its node there?')
         return ABSENT
     for name, answer in sorted(answers.items()):
         print(f'{name}: ' + ('no answer' if answer is None else answer.message))

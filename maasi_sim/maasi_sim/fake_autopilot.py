@@ -93,7 +93,7 @@ class _Streams:
 
     def due(self, name: str, now: float) -> bool:
         period = self.periods.get(name, math.inf)
-        if now - self.last.get(name, -math.inf) < period - 1e-6:
+        if math.isinf(period) or now - self.last.get(name, -math.inf) < period - 1e-6:
             return False
         self.last[name] = now
         return True
@@ -137,7 +137,7 @@ class FakeAutopilot:
         self.armed = False
         self.charge = settings.charge
         submarine = self.firmware.kind == 'submarine'
-        self.mode = next(
+        self._first_mode = self.mode = next(
             number
             for number, name in self.firmware.modes.items()
             if name in ('STABILIZE', 'MANUAL')
@@ -168,17 +168,20 @@ class FakeAutopilot:
         self._failed: set[str] = set()
         self._reported_ready = False
         self._frozen: tuple[float, ...] | None = None
-        self._streams = _Streams(
-            {
-                'HEARTBEAT': _HEARTBEAT_PERIOD,
-                'BATTERY_STATUS': _STATUS_PERIOD,
-                'EXTENDED_SYS_STATE': _STATUS_PERIOD,
-                'GPS_RAW_INT': _STATUS_PERIOD,
-                **{name: 1.0 / rate for name, rate in _COMMON_RATES.items()},
-            }
-        )
+        self._streams = self._first_streams()
+
+    def _first_streams(self) -> _Streams:
+        """Return the messages that it sends unasked."""
+        periods = {
+            'HEARTBEAT': _HEARTBEAT_PERIOD,
+            'BATTERY_STATUS': _STATUS_PERIOD,
+            'EXTENDED_SYS_STATE': _STATUS_PERIOD,
+            'GPS_RAW_INT': _STATUS_PERIOD,
+            **{name: 1.0 / rate for name, rate in _COMMON_RATES.items()},
+        }
         if self.firmware is not PX4_COPTER:
-            self._streams.periods['EKF_STATUS_REPORT'] = _STATUS_PERIOD
+            periods['EKF_STATUS_REPORT'] = _STATUS_PERIOD
+        return _Streams(periods)
 
     # ---- for those who play with it ----------------------------------------------------------
 
@@ -210,11 +213,12 @@ class FakeAutopilot:
         self._gnss_lost_at = self._now
 
     def restart(self) -> None:
-        """Start again, as after a brown-out: disarmed, with a clock from zero."""
+        """Start again, as after a brown-out: disarmed, with a clock and message rates anew."""
         self.armed = False
         self._now = 0.0
         self._hold()
-        self._streams.last.clear()
+        self.mode = self._first_mode
+        self._streams = self._first_streams()
 
     # ---- the clock ---------------------------------------------------------------------------
 

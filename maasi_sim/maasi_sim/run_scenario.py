@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
+    from maasi_sim.arming import Arming
     from maasi_sim.bag import BagWriter
     from maasi_sim.cuboid_observer import CuboidObserver
     from maasi_sim.cuboid_scenario import AnyScenario
@@ -331,6 +332,7 @@ class ScenarioRun:
                 for process in self.processes.values():
                     process.start()
                     self.watch.begin(process.name, process.pid, time.monotonic())
+            from maasi_sim.arming import Arming
             from maasi_sim.bag import BagWriter, load_types
             from maasi_sim.recorder_node import Recorder
 
@@ -340,9 +342,11 @@ class ScenarioRun:
                 bag = BagWriter(self.folder / 'bag', types, self.scenario.record.images)
                 bag.write_scenario(self._facts_text(), {'seed': str(self.seed)})
             recorder = Recorder(domain.number, observer, bag)
-            ready = self._wait_until_ready(recorder)
+            arming = Arming(recorder.context, self._taking_off())
+            ready = self._wait_until_ready(recorder, arming)
             threading.Thread(target=self._warn, daemon=True).start()
-            ending = ready or self._follow(recorder, observer)
+            ending = ready or self._follow(recorder, observer, arming)
+            arming.close()
             self._ended = time.monotonic()
             self._end(recorder, ending)
         finally:
@@ -390,7 +394,7 @@ class ScenarioRun:
         }
         return to_yaml(facts)
 
-    def _wait_until_ready(self, recorder: Recorder) -> Ending | None:
+    def _wait_until_ready(self, recorder: Recorder, arming: Arming) -> Ending | None:
         """Wait until every node takes part, the recorder last; return an ending if one does not."""
         begin = time.monotonic()
         patience = _START_PATIENCE
@@ -404,6 +408,7 @@ class ScenarioRun:
             # What they say while they start is recorded as it comes.
             recorder.drain()
             ready = recorder.take_ready()
+            arming.call(ready)
             late = [name for name in expected if name not in ready]
             missing = recorder.missing(needed)
             if not late and not missing:
@@ -429,7 +434,9 @@ class ScenarioRun:
         recorder.publish_ready()
         return None
 
-    def _follow(self, recorder: Recorder, observer: RunObserver | CuboidObserver) -> Ending:
+    def _follow(
+        self, recorder: Recorder, observer: RunObserver | CuboidObserver, arming: Arming
+    ) -> Ending:
         """Follow the run until it ends, and return how."""
         from maasi_sim.bag import BagError
 
@@ -440,6 +447,7 @@ class ScenarioRun:
         while True:
             recorder.wait(_POLL)
             recorder.drain(limit)
+            arming.call(recorder.ready)
             ending = self._look_after(recorder) or self._goal(recorder, observer)
             if ending is not None:
                 return ending
@@ -502,6 +510,7 @@ class ScenarioRun:
                 tries = 0
             if self.scenario.on_exit == 'respawn' and process.restarts < tries:
                 self.events.append({**event, 'event': 'restarted'})
+                recorder.ready.discard(name)
                 process.restart()
                 self.watch.begin(name, process.pid, self._looked)
                 self.display.say(f'{text}; it is started again')
@@ -557,6 +566,11 @@ class ScenarioRun:
         return Ending(
             'node_hung', NODE_FAILED, f'step {recorder.step}: nothing from {who} {silence}'
         )
+
+    def _taking_off(self) -> list[str]:
+        """Return the robots whose drivers take off, all of them simulated."""
+        robots = getattr(self.scenario, 'robots', {})
+        return [name for name, robot in robots.items() if getattr(robot, 'takes_off', False)]
 
     def _robot_of(self, node: str) -> str | None:
         name = node.strip('/').partition('/')[0]

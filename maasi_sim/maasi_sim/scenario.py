@@ -111,6 +111,11 @@ class RobotSettings(Settings):
         default_factory=BatterySettings, description='Its battery, simulated'
     )
 
+    @property
+    def takes_off(self) -> bool:
+        """Whether it is simulated, and takes off when its driver's service `arm` is called."""
+        return self.link != 'topics'
+
 
 class EventSettings(Settings):
     """Something that happens to a robot."""

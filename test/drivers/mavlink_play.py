@@ -36,7 +36,7 @@ class Wire:
 class Play:
     """Both sides, and what went over the wire."""
 
-    def __init__(self, firmware='arducopter', autopilot=None, **changes):
+    def __init__(self, firmware='arducopter', autopilot=None, permitted=True, **changes):
         kind = 'submarine' if firmware == 'ardusub' else 'copter'
         settings = {'vehicle': kind, 'arm': True} | changes
         self.to_driver, self.to_autopilot = Wire(), Wire()
@@ -47,7 +47,7 @@ class Play:
         # A ground station on the same network, which the autopilot passes on; None: there is none.
         self.station = None
         self._beat_at = 0.0
-        self.vehicle.wanted = True
+        self.vehicle.active = True
         self.autopilot = FakeAutopilot(
             AutopilotSettings.model_validate({'firmware': firmware} | (autopilot or {})),
             mavlink.MAVLink(self.to_driver, 1, 1),
@@ -56,6 +56,21 @@ class Play:
         )
         self.now = 100.0
         self.driver_lives = True
+        self.reports = []
+        if permitted:
+            self.permit()
+
+    def permit(self):
+        """Call the service `arm`."""
+        return self.vehicle.permit(self.now)
+
+    def restart_driver(self):
+        """Start another driver in the place of the one before, which was killed."""
+        old = self.vehicle
+        self.vehicle = Vehicle(
+            old.settings, old.height, mavlink.MAVLink(self.to_autopilot, 240, 190)
+        )
+        self.vehicle.active = self.driver_lives = True
         self.reports = []
 
     def cut(self):

@@ -15,11 +15,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
+from std_srvs.srv import Trigger
 
+from maasi_drivers.arm_permission import UNTIL_ARM
 from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
 from maasi_drivers.mavlink_driver import _POLL_PERIOD, MavlinkDriver
+from maasi_drivers.robot_stop import STOPPED as STOPPED_BY_SERVICE
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.parameters import flatten
@@ -95,7 +98,21 @@ class Flight:
     def why(self):
         return f'{self.mode}, {self.team.states[-1:]}'
 
+    def call(self, name):
+        """Call a service of the driver, and return its answer."""
+        client = self.team.create_client(Trigger, f'/rover/{name}')
+        self.until(client.service_is_ready, f'no service {name}')
+        future = client.call_async(Trigger.Request())
+        self.until(future.done, f'no answer of {name}')
+        self.team.destroy_client(client)
+        return future.result()
+
     def fly(self):
+        answer = self.call('arm')
+        assert answer.success, answer.message
+        return self.wait_for_flight()
+
+    def wait_for_flight(self):
         self.until(
             lambda: self.team.states and self.state.goal_status != AgentState.UNAVAILABLE,
             'it does not fly',
@@ -237,6 +254,42 @@ def test_without_arm_nothing_is_armed_and_goals_are_refused(fly, capfd):
     assert flight.mode == 'STABILIZE'
 
 
+def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
+    flight = fly()
+    flight.until(lambda: flight.team.states and UNTIL_ARM in flight.state.reason)
+    assert flight.state.goal_status == AgentState.UNAVAILABLE
+    assert flight.call('stop').success
+    answer = flight.call('arm')
+    assert (answer.success, answer.message) == (False, STOPPED_BY_SERVICE)
+    assert flight.call('release').success
+    flight.fly()
+    answer = flight.call('arm')
+    assert (answer.success, answer.message) == (False, 'it is in the air already')
+    with flight.vehicle._lock:
+        flight.vehicle.autopilot._disarm('Crash: Disarming')
+    reason = 'is disarmed: by the autopilot or the pilot ('
+    flight.until(lambda: reason in flight.state.reason)
+    assert 'Crash: Disarming' in flight.state.reason
+    said = capfd.readouterr().err
+    assert f'arm: refused: {STOPPED_BY_SERVICE}' in said and reason in said
+    # It says by itself why it has no position.
+    assert 'no LOCAL_POSITION_NED yet' not in said
+    with flight.vehicle._lock:
+        flight.vehicle.autopilot.body.position[2] = 0.0
+    flight.fly()
+
+
+def test_an_autopilot_that_restarts_is_said(fly, capfd):
+    flight = fly().fly()
+    result = flight.under_way()
+    with flight.vehicle._lock:
+        flight.vehicle.autopilot.restart()
+    flight.until(lambda: 'the autopilot has restarted' in flight.state.reason)
+    flight.until(result.done)
+    assert 'is disarmed: the autopilot has restarted' in capfd.readouterr().err
+    assert not flight.call('arm').success
+
+
 def test_what_the_autopilot_does_by_itself_is_shown(fly, capfd):
     flight = fly(autopilot={'parameters': {'FS_GCS_ENABLE': 0}})
     shown = []
@@ -308,7 +361,7 @@ def test_a_link_that_comes_back(fly):
     flight.vehicle.cut()
     flight.gives_up(result, 'link: nothing heard from system 1')
     flight.vehicle.cut(False)
-    flight.fly()
+    flight.wait_for_flight()
     _, result = flight.team.send_accepted([1.0, 1.5, 0.8])
     flight.until(result.done)
     assert result.result().result.reached
@@ -319,7 +372,7 @@ def test_a_position_that_hangs(fly):
     result = flight.under_way()
     with flight.vehicle._lock:
         flight.vehicle.autopilot.freeze()
-    flight.gives_up(result, 'no odometry for')
+    flight.gives_up(result, 'no LOCAL_POSITION_NED for')
 
 
 def test_a_sensor_that_falls_silent(fly):
@@ -329,6 +382,7 @@ def test_a_sensor_that_falls_silent(fly):
         if flight.team.states:
             flight.team.ranges.publish(RangeArray(header=flight.state.header))
 
+    assert flight.call('arm').success
     flight.until(
         lambda: (
             sweep() or (flight.team.states and flight.state.goal_status != AgentState.UNAVAILABLE)

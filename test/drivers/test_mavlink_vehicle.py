@@ -9,6 +9,7 @@ from mavlink_play import FIRMWARES, HEIGHTS, Play, mavlink
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
+from maasi_drivers.arm_permission import UNTIL_ARM
 from maasi_drivers.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, identify
 from maasi_drivers.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation, swap_yaw
 from maasi_drivers.mavlink.settings import MavlinkSettings
@@ -106,7 +107,7 @@ def test_nothing_is_armed_without_being_told(firmware):
 
 def test_nothing_is_armed_while_the_driver_is_not_active():
     play = Play()
-    play.vehicle.wanted = False
+    play.vehicle.active = False
     play.run(10.0)
     assert not play.commands(ARM)
     assert 'not active' in play.vehicle.trouble
@@ -159,6 +160,8 @@ def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver():
     assert not play.commands(ARM)
     assert 'another program sends heartbeats with system id 240' in play.vehicle.trouble
     play.station = None
+    play.run(6.0)
+    assert play.permit() == ''
     play.fly()
     # In the air it is reported: the failsafe would not act now.
     play.reports.clear()
@@ -216,8 +219,11 @@ def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on():
     assert play.vehicle.phase is Phase.RELEASED
     play.autopilot.charge = 1.0
     play.autopilot.take_mode('GUIDED')
-    play.fly()
+    play.run(10.0)
     assert 'GUIDED is back' in play.said
+    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert play.permit() == ''
+    play.fly()
 
 
 def test_the_loss_of_gnss_is_seen_in_flight():
@@ -236,8 +242,121 @@ def test_an_autopilot_that_restarts_is_left_alone():
     assert 'vehicle: is disarmed' in play.vehicle.trouble
     assert 'the autopilot has restarted' in play.said
     armed = len(play.commands(ARM))
+    assert play.permit() == 'the autopilot has restarted: start the driver again'
     play.run(10.0)
     assert len(play.commands(ARM)) == armed
+
+
+def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
+    play = Play(permitted=False, origin='here')
+    play.run(10.0)
+    play.autopilot.restart()
+    play.autopilot.body.position[:2] = [3.0, 4.0]
+    play.autopilot.parameters['FS_GCS_ENABLE'] = 0.0
+    play.run(12.0)
+    assert 'the autopilot has restarted' in play.said
+    # Messages, parameters and origin are those of the new start.
+    assert 'FS_GCS_ENABLE is 0' in play.vehicle.trouble
+    assert_allclose(play.vehicle.origin[:2], [3.0, 4.0], atol=0.05)
+    play.autopilot.parameters['FS_GCS_ENABLE'] = 5.0
+    play.autopilot.restart()
+    play.run(12.0)
+    assert play.permit() == ''
+    play.fly()
+
+
+@firmwares
+def test_nothing_takes_off_before_the_service_is_called(firmware):
+    play = Play(firmware, permitted=False)
+    play.run(20.0)
+    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert not play.commands(ARM)
+    assert not play.commands(mavlink.MAV_CMD_DO_SET_MODE)
+    assert play.permit() == ''
+    play.fly()
+    # One call is for one take-off.
+    play.vehicle.finish('land')
+    play.run(20.0)
+    if firmware == 'ardusub':
+        play.autopilot._disarm('Disarming motors')
+        play.run(2.0)
+    assert UNTIL_ARM in play.vehicle.trouble
+    assert not play.autopilot.armed
+    assert play.permit() == ''
+    play.fly()
+
+
+def test_a_driver_restarted_while_its_vehicle_lands_does_not_take_off_again():
+    play = Play().fly()
+    play.driver_lives = False
+    play.run(7.0)
+    assert play.autopilot.mode_name == 'LAND'
+    play.restart_driver()
+    play.run(2.0)
+    assert play.autopilot.armed
+    assert 'it is flown in LAND' in play.permit()
+    play.run(20.0)
+    assert not play.autopilot.armed
+    assert play.autopilot.mode_name == 'LAND'
+    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert not play.commands(ARM)[1:]
+    assert play.permit() == ''
+    play.fly()
+
+
+def test_a_driver_restarted_in_the_air_sends_it_nowhere_before_it_may():
+    play = Play().fly().go(SPEED)
+    play.restart_driver()
+    play.run(6.0)
+    sent = len(play.sent('SET_POSITION_TARGET_LOCAL_NED'))
+    here = play.autopilot.body.position.copy()
+    for _ in range(200):
+        play.lead(SPEED)
+        play.turn()
+    assert len(play.sent('SET_POSITION_TARGET_LOCAL_NED')) == sent
+    assert_allclose(play.autopilot.body.position, here, atol=0.05)
+    assert 'not by this driver' in play.vehicle.trouble
+    # Its end is not the end of what others fly.
+    play.vehicle.finish('land')
+    play.run(2.0)
+    assert play.autopilot.mode_name == 'GUIDED'
+    assert play.permit() == ''
+    play.fly()
+
+
+def test_a_correction_after_a_refusal_does_not_take_it_off():
+    play = Play(autopilot={'parameters': {'FS_GCS_ENABLE': 0}})
+    play.run(10.0)
+    assert 'FS_GCS_ENABLE is 0' in play.vehicle.trouble
+    assert UNTIL_ARM in play.vehicle.trouble
+    assert 'FS_GCS_ENABLE is 0' in play.permit()
+    play.autopilot.parameters['FS_GCS_ENABLE'] = 5.0
+    play.autopilot._sender.param_value_send(b'FS_GCS_ENABLE', 5.0, 9, 1, 0)
+    play.run(20.0)
+    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert not play.commands(ARM)
+    assert play.permit() == ''
+    play.fly()
+
+
+def test_a_permission_that_is_not_used_ends():
+    play = Play(autopilot={'charge': 0.01}, arm_timeout=10.0)
+    play.run(14.0)
+    assert 'not armed within 10 s (PreArm: Battery below minimum arming capacity' in play.said
+    play.autopilot.charge = 1.0
+    armed = len(play.commands(ARM))
+    play.run(20.0)
+    assert len(play.commands(ARM)) == armed
+    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+
+
+def test_a_stop_before_it_is_armed_ends_the_permission():
+    play = Play(autopilot={'charge': 0.01})
+    play.until(lambda: play.vehicle.phase is Phase.ARMING)
+    play.vehicle.forbid()
+    play.autopilot.charge = 1.0
+    play.run(10.0)
+    assert not play.autopilot.armed
 
 
 def test_two_batteries_are_two():
@@ -413,7 +532,7 @@ def test_after_landing_it_is_not_armed_again():
     play.vehicle.finish('land')
     play.run(15.0)
     assert not play.autopilot.armed
-    assert play.vehicle.trouble == 'vehicle: is disarmed: it has landed'
+    assert play.vehicle.trouble == f'vehicle: is disarmed: it has landed, {UNTIL_ARM}'
     armed = len(play.commands(ARM))
     play.run(10.0)
     assert len(play.commands(ARM)) == armed
@@ -424,6 +543,8 @@ def test_a_vehicle_that_is_disarmed_in_the_air_is_left_alone():
     play.autopilot._disarm('Crash: Disarming')
     play.run(AT_MOST)
     assert play.vehicle.phase is Phase.STOPPED
+    assert 'by the autopilot or the pilot (Crash: Disarming)' in play.vehicle.trouble
+    assert 'disarmed by the autopilot or the pilot (Crash: Disarming)' in play.said
     armed = len(play.commands(ARM))
     play.run(10.0)
     assert len(play.commands(ARM)) == armed
@@ -431,12 +552,16 @@ def test_a_vehicle_that_is_disarmed_in_the_air_is_left_alone():
 
 def test_a_copter_that_the_pilot_has_in_the_air_is_taken_over_without_arming():
     play = Play().fly()
-    other = Play(arm=False)
+    other = Play(arm=False, permitted=False)
     other.autopilot.armed = True
     other.autopilot.body.position = play.autopilot.body.position.copy()
     other.autopilot.mode = ARDUCOPTER.external
     other.autopilot._hold()
     other.run(6.0)
+    assert 'it is armed in GUIDED, not by this driver' in other.vehicle.trouble
+    assert not other.sent('SET_POSITION_TARGET_LOCAL_NED')
+    assert other.permit() == ''
+    other.run(0.5)
     assert other.vehicle.flying
     assert not other.commands(ARM)
 

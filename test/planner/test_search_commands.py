@@ -160,6 +160,10 @@ def test_the_command_line_calls_what_was_asked_for():
     assert wanted(services, 'stop', 'b', '/north/') == {'/north/b/search/stop', '/north/b/stop'}
     assert wanted(services, 'stop', '', 'south') == set()
     assert wanted(services, 'pause', '', '') == set()
+    # Of those that fly.
+    services |= {'/a/arm': trigger, '/c/arm': trigger}
+    assert wanted(services, 'arm', '', '') == {'/a/arm'}
+    assert wanted(services, 'arm', 'b', '') == set()
     # A planner for each robot.
     each = {f'/{robot}/search/pause': trigger for robot in ('a', 'b')}
     assert wanted(each, 'pause', '', '') == set(each)

@@ -34,7 +34,15 @@ class MavlinkSettings(Settings):
         default='copter', description='What it is; another one is left alone'
     )
     arm: bool = Field(
-        default=False, description='Whether the driver arms it and takes off; nothing does without'
+        default=False,
+        description='Whether the driver may arm it and take off: each time the service arm is '
+        'called, and never without',
+    )
+    arm_timeout: float = Field(
+        default=60.0,
+        gt=0.0,
+        description='Time after the service arm in which it has to be armed; then it is to be '
+        'called again [s]',
     )
     require_failsafe: bool = Field(
         default=True,

@@ -6,24 +6,26 @@ import math
 import struct
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maasi_drivers.arm_permission import UNTIL_ARM, ArmPermission
+from maasi_drivers.mavlink.commands import CommandQueue, command_name, result_name
+from maasi_drivers.mavlink.estimate import Estimate, Telemetry
 from maasi_drivers.mavlink.failsafes import FailsafeCheck
 from maasi_drivers.mavlink.firmware import Firmware, identify
-from maasi_drivers.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation, swap_yaw
+from maasi_drivers.mavlink.frames import swap_enu_ned, swap_yaw
 from maasi_drivers.mavlink.protocol import mavlink
 from maasi_drivers.mavlink.settings import Ending, MavlinkSettings
 
 FloatArray = NDArray[np.float64]
 
 _HEARTBEAT_PERIOD = 1.0
-# A command that is not answered is said again after so long, so often [s, 1].
-_ANSWER_PATIENCE, _TRIES = 0.5, 5
+# Without attitude and position for so long their messages are asked for again [s].
+_STREAM_PATIENCE = 2.0
 # The mode in which it is to end is asked for until it shows.
 _ENDING_PERIOD = 0.3
 # Between two tries to arm; the autopilot says why not [s].
@@ -32,14 +34,10 @@ _ARMING_PERIOD = 2.0
 _STREAM_AHEAD = 1.2
 # Height is reached within this; a shorter way is no progress [m].
 _RISEN, _PROGRESS = 0.2, 0.1
-# Of GPS_RAW_INT: the least fix with a height.
-_FIX_3D = 3
 # Texts of the autopilot that are younger explain a refusal [s].
 _TEXT_AGE = 6.0
 # Position only, and yaw: no velocity, acceleration, yaw rate.
 _SETPOINT_MASK = 0x9F8
-# Of EKF_STATUS_REPORT: a level or absolute position, and none that is only assumed.
-_EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
 _ERROR, _WARNING, _INFO = 3, 4, 6
 
 _MESSAGES = {
@@ -69,43 +67,6 @@ class Phase(Enum):
     REFUSED = 'is left alone'
 
 
-@dataclass(frozen=True)
-class Telemetry:
-    """
-    Where a vehicle was, in the local frame of its autopilot turned to ENU.
-
-    Attributes
-    ----------
-    number : int
-        Of the message; one that says nothing new does not count.
-    arrival : float
-        On the steady clock [s].
-    position, velocity : ndarray, shape (3,)
-        [m, m/s].
-    orientation : ndarray, shape (4,)
-        Of FLU in ENU, w first.
-    rates : ndarray, shape (3,)
-        Angular velocity in FLU [rad/s].
-
-    """
-
-    number: int
-    arrival: float
-    position: FloatArray
-    velocity: FloatArray
-    orientation: FloatArray
-    rates: FloatArray
-
-
-@dataclass
-class _Command:
-    number: int
-    parameters: tuple[float, ...]
-    answer: Callable[[int | None], None]
-    sent: float = -math.inf
-    tries: int = 0
-
-
 class Vehicle:
     """
     One vehicle, from the first heartbeat to the end.
@@ -125,13 +86,8 @@ class Vehicle:
         How far it is.
     firmware : Firmware or None
         Once it is known.
-    telemetry : Telemetry or None
-        Newest.
-    origin : ndarray, shape (3,)
-        Of the settings, in the local frame of the autopilot, ENU [m]. Its height is that of the
-        ground when a copter is armed: the estimate drifts until then.
-    wanted : bool
-        Whether it may be armed now; set while the driver is active.
+    active : bool
+        Whether the driver is; while it is not, nothing is armed.
 
     """
 
@@ -140,36 +96,32 @@ class Vehicle:
         self.height = height
         self.phase = Phase.CONNECTING
         self.firmware: Firmware | None = None
-        self.telemetry: Telemetry | None = None
-        self.origin = np.zeros(3)
-        self.wanted = False
+        self.active = False
         self.armed = False
         self.mode = -1
-        self.dropped: Counter[str] = Counter()
+        self._permission = ArmPermission(settings.arm_timeout)
+        self._estimate = Estimate(settings, self._on_restart)
         self._sender = sender
         self._reports: deque[tuple[int, str]] = deque(maxlen=200)
         self._texts: deque[tuple[float, str]] = deque(maxlen=8)
-        self._commands: deque[_Command] = deque()
+        self._commands = CommandQueue(settings.system, sender)
         self._detail = ''
         self._beat_at = self._phase_at = self._sent_at = -math.inf
         self._tried_at = self._heard_at = -math.inf
         self._lost = False
         self._failsafes: FailsafeCheck | None = None
-        self._estimates: bool | None = None
-        self._fix: int | None = None
         self._fix_needed = False
-        self._landed = mavlink.MAV_LANDED_STATE_UNDEFINED
-        self._charges: dict[int, float] = {}
+        self._asked_at = -math.inf
         # Least way left to its height so far, and when [m, s].
         self._nearest, self._nearer_at = math.inf, -math.inf
-        self._local: tuple[Any, ...] | None = None
-        self._attitude = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
         self._setpoint: FloatArray | None = None
         self._yaw: float | None = None
         self._ending: Ending | None = None
         self._ending_taken = False
         # Why it lands by itself.
         self._reason = ''
+        # Its local frame is another one since it was restarted after a flight.
+        self._displaced = False
 
     # ---- what the driver wants ---------------------------------------------------------------
 
@@ -179,20 +131,32 @@ class Vehicle:
         return self.phase is Phase.FLYING and not self._lost
 
     @property
+    def telemetry(self) -> Telemetry | None:
+        """Where it is; None before it is known."""
+        return self._estimate.telemetry
+
+    @property
+    def origin(self) -> FloatArray:
+        """Of the settings, in the local frame of the autopilot, ENU, (3,) [m].
+
+        Its height is that of the ground when a copter is armed: the estimate drifts until then.
+        """
+        return self._estimate.origin
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Messages that could not be used: kind to number."""
+        return self._estimate.dropped
+
+    @property
     def _blind(self) -> str:
         """Why its position is not to be trusted in flight; empty where it is."""
-        if self._estimates is False:
-            return 'the autopilot has lost its position estimate'
-        if self._fix_needed and self._fix is not None and self._fix < _FIX_3D:
-            return f'GNSS is lost (GPS_RAW_INT.fix_type {self._fix})'
-        return ''
+        return self._estimate.problem(self._fix_needed)
 
     @property
     def charge(self) -> float:
         """Of the battery that counts, 0 to 1; -1 where it is not known."""
-        if self.settings.battery >= 0:
-            return self._charges.get(self.settings.battery, -1.0)
-        return min((value for value in self._charges.values() if value >= 0.0), default=-1.0)
+        return self._estimate.charge
 
     @property
     def parameters(self) -> Mapping[str, float | None]:
@@ -202,9 +166,19 @@ class Vehicle:
     @property
     def at_rest(self) -> bool:
         """Whether nothing is left to say to it when the driver ends."""
-        if self.phase in (Phase.RELEASED, Phase.STOPPED, Phase.REFUSED) or not self.armed:
+        if not self._is_ours or not self.armed:
             return True
         return self.phase is Phase.ENDING and (self._ending_taken or self.mode == self._ending_mode)
+
+    @property
+    def _is_ours(self) -> bool:
+        return self.phase in (
+            Phase.STARTING,
+            Phase.ARMING,
+            Phase.RISING,
+            Phase.FLYING,
+            Phase.ENDING,
+        )
 
     @property
     def trouble(self) -> str:
@@ -247,10 +221,58 @@ class Vehicle:
         if self.phase is Phase.FLYING:
             self._setpoint, self._yaw = target, float(yaw)
 
+    def permit(self, now: float) -> str:
+        """
+        Let it take off once, or be taken over where it flies; return why not, empty where it may.
+
+        Parameters
+        ----------
+        now : float
+            On the steady clock [s].
+
+        """
+        problem = self._objection(now)
+        if problem:
+            self._permission.end()
+            return problem
+        self._permission.give(now)
+        if self.phase is Phase.STOPPED:
+            self._enter(Phase.PREPARING)
+        return ''
+
+    def forbid(self) -> None:
+        """End the permission; what is being armed is left alone, what flies goes on."""
+        self._permission.end()
+        if self.phase in (Phase.STARTING, Phase.ARMING):
+            self._commands.clear()
+            self._enter(Phase.WAITING)
+
+    def _objection(self, now: float) -> str:
+        """Return why it must not be armed, or taken over."""
+        if self.phase in (Phase.RISING, Phase.FLYING):
+            return 'it is in the air already'
+        if self._displaced:
+            return 'the autopilot has restarted: start the driver again'
+        if self._lost or self.phase in (Phase.RELEASED, Phase.ENDING, Phase.REFUSED):
+            return self.trouble
+        if self.armed and self.firmware is not None and self.mode != self.firmware.external:
+            return f'it is flown in {self.firmware.mode_name(self.mode)}'
+        if not (self.settings.arm or self.armed):
+            return 'mavlink.arm is false'
+        if self.phase is Phase.WAITING and self._failsafes is not None:
+            return self._failsafes.problem(now)
+        return ''
+
+    @property
+    def _is_theirs(self) -> bool:
+        """Whether it is armed in the mode for setpoints, but not by this driver."""
+        waits = self.phase is Phase.WAITING and self.armed
+        return waits and self.firmware is not None and self.mode == self.firmware.external
+
     def finish(self, ending: Ending, reason: str = '') -> None:
         """Have it hold its position or land, and send it nowhere any more.
 
-        With a pilot's mode nothing is said, and on the ground it just is not armed any more.
+        To one that others fly nothing is said, and on the ground it just is not armed any more.
 
         Parameters
         ----------
@@ -259,15 +281,16 @@ class Vehicle:
         reason : str
             For the planner.
         """
-        self.wanted = False
+        self._permission.end()
         if self.phase is Phase.ENDING and self._ending == ending:
             return
-        if self.armed and self.phase not in (Phase.RELEASED, Phase.STOPPED, Phase.REFUSED):
+        if self.armed and self._is_ours:
             self._ending, self._ending_taken = ending, False
             self._reason = f', {reason}' if reason else ''
             self._commands.clear()
             what = 'it lands' if ending == 'land' else 'it holds its position'
             self._enter(Phase.ENDING, what + self._reason)
+        self.forbid()
 
     # ---- what comes in -----------------------------------------------------------------------
 
@@ -287,6 +310,8 @@ class Vehicle:
         handler = _HANDLERS.get(message.get_type())
         if handler is not None:
             handler(self, message, now)
+        elif self.firmware is not None:
+            self._estimate.take(message, now, self.armed)
 
     def _on_heartbeat(self, message: Any, now: float) -> None:
         if self.phase is Phase.REFUSED:
@@ -301,7 +326,7 @@ class Vehicle:
             return
         assert self.firmware is not None
         if was_armed and not armed:
-            self._on_disarmed()
+            self._on_disarmed(now)
         elif mode not in self._own_modes(before):
             self._let_go(mode)
         elif self.phase is Phase.RELEASED:
@@ -309,7 +334,7 @@ class Vehicle:
                 self._report(_WARNING, f'the pilot gives {self.firmware.mode_name(mode)} back')
                 self._begin_flying()
             elif mode == self.firmware.external and not armed:
-                self._report(_INFO, f'{self.firmware.mode_name(mode)} is back: it may be armed')
+                self._report(_INFO, f'{self.firmware.mode_name(mode)} is back: {UNTIL_ARM}')
                 self._enter(Phase.PREPARING)
             elif mode != before:
                 self._detail = f'mode {self.firmware.mode_name(mode)}'
@@ -339,21 +364,31 @@ class Vehicle:
             return False
         self.firmware = firmware
         self._failsafes = FailsafeCheck(firmware, self.settings, self._sender, self._report)
+        self._report(_INFO, f'{firmware.name} is there as system {self.settings.system}')
+        return True
+
+    def _ask_messages(self, now: float) -> None:
+        """Ask for messages, again after a restart: an autopilot forgets their rates."""
+        silence = now - max(self._estimate.heard_at, self._asked_at)
+        known = self._asked_at > -math.inf
+        if self._commands or self._lost or (known and silence < _STREAM_PATIENCE):
+            return
+        self._asked_at = now
         for name, rate in _MESSAGES.items():
             number = getattr(mavlink, f'MAVLINK_MSG_ID_{name}')
             interval = 1e6 / (rate or self.settings.position_rate)
             self._ask(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (number, interval))
-        self._report(_INFO, f'{firmware.name} is there as system {self.settings.system}')
-        return True
 
-    def _on_disarmed(self) -> None:
+    def _on_disarmed(self, now: float) -> None:
         self._commands.clear()
+        self._permission.end()
         if self.phase is Phase.ENDING:
-            self._enter(Phase.STOPPED, f'it has landed{self._reason}')
+            self._enter(Phase.STOPPED, f'it has landed{self._reason}, {UNTIL_ARM}')
         elif self.phase not in (Phase.PREPARING, Phase.WAITING):
-            self._report(_WARNING, 'the autopilot or the pilot has disarmed it')
-            self._enter(Phase.STOPPED, 'by the autopilot or the pilot')
-        self.wanted = False
+            text = self._recent_text(now)
+            why = f'by the autopilot or the pilot{f" ({text})" if text else ""}'
+            self._report(_WARNING, f'it has been disarmed {why}')
+            self._enter(Phase.STOPPED, f'{why}, {UNTIL_ARM}')
 
     def _let_go(self, mode: int) -> None:
         assert self.firmware is not None
@@ -362,71 +397,27 @@ class Vehicle:
             _WARNING, f'the pilot or a failsafe has taken over: mode {name}; the driver lets go'
         )
         self._commands.clear()
+        self._permission.end()
         self._setpoint = None
         self._enter(Phase.RELEASED, f'mode {name}')
 
-    def _on_position(self, message: Any, now: float) -> None:
-        values = (message.x, message.y, message.z, message.vx, message.vy, message.vz)
-        if not all(map(math.isfinite, values)):
-            self.dropped['LOCAL_POSITION_NED that is not finite'] += 1
-            return
-        before = self._local
-        if before is not None and message.time_boot_ms <= before[0]:
-            # Heard again, or an autopilot that was started again: then the frame is another.
-            if before[0] - message.time_boot_ms < 1000:
-                return
-            self._on_restart()
-        self._local = (message.time_boot_ms, values)
-        if before is not None and before[1] == values and self.armed:
-            # An estimate that moves at all never says the same twice: it is frozen.
-            self.dropped['LOCAL_POSITION_NED that is frozen'] += 1
-            return
-        if self.telemetry is None and self.settings.origin == 'here':
-            self.origin = swap_enu_ned(values[:3])
-        self.telemetry = Telemetry(
-            0 if self.telemetry is None else self.telemetry.number + 1,
-            now,
-            swap_enu_ned(values[:3]),
-            swap_enu_ned(values[3:]),
-            *self._attitude,
-        )
-
     def _on_restart(self) -> None:
-        """Leave an autopilot alone that was restarted: its local frame is another one."""
+        """Begin anew with an autopilot that was restarted: its local frame is another one."""
         text = 'the autopilot has restarted'
         self._report(_WARNING, text)
-        if self.phase not in (Phase.CONNECTING, Phase.PREPARING, Phase.WAITING):
-            self._commands.clear()
-            self._enter(Phase.STOPPED, text)
-            self.wanted = False
-
-    def _on_attitude(self, message: Any, now: float) -> None:
-        quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
-        rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
-        norm = float(np.sqrt((quaternion * quaternion).sum()))
-        if not (np.isfinite(rates).all() and math.isfinite(norm) and 0.9 < norm < 1.1):
-            self.dropped['ATTITUDE_QUATERNION that is none'] += 1
-            return
-        self._attitude = (swap_orientation(quaternion / norm), swap_flu_frd(rates))
-
-    def _on_battery(self, message: Any, now: float) -> None:
-        left = message.battery_remaining
-        self._charges[int(message.id)] = left / 100.0 if 0 <= left <= 100 else -1.0
-
-    def _on_status(self, message: Any, now: float) -> None:
-        """Take the first battery's charge, where BATTERY_STATUS does not come."""
-        left = message.battery_remaining
-        if 0 not in self._charges and 0 <= left <= 100:
-            self._charges[0] = left / 100.0
-
-    def _on_landed(self, message: Any, now: float) -> None:
-        self._landed = int(message.landed_state)
-
-    def _on_gnss(self, message: Any, now: float) -> None:
-        self._fix = int(message.fix_type)
-
-    def _on_estimator(self, message: Any, now: float) -> None:
-        self._estimates = bool(message.flags & _EKF_POSITION) and not message.flags & _EKF_ASSUMED
+        self._commands.clear()
+        self._permission.end()
+        self._asked_at = -math.inf
+        if self.phase in (Phase.CONNECTING, Phase.PREPARING, Phase.WAITING):
+            assert self.firmware is not None
+            self._failsafes = FailsafeCheck(
+                self.firmware, self.settings, self._sender, self._report
+            )
+            self._enter(Phase.PREPARING)
+        else:
+            # After a flight it may stand anywhere.
+            self._displaced = True
+            self._enter(Phase.STOPPED, f'{text}: start the driver again')
 
     def _on_text(self, message: Any, now: float) -> None:
         text = message.text.rstrip('\0').strip()
@@ -443,12 +434,7 @@ class Vehicle:
         self._failsafes.take(message.param_id.rstrip('\0'), value)
 
     def _on_answer(self, message: Any, now: float) -> None:
-        if not self._commands or self._commands[0].number != message.command:
-            return
-        if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
-            self._commands[0].sent = now
-            return
-        self._commands.popleft().answer(int(message.result))
+        self._commands.take_answer(message, now)
 
     # ---- what goes out -----------------------------------------------------------------------
 
@@ -463,14 +449,16 @@ class Vehicle:
             return
         self._judge_link(now)
         self._failsafes.read(now)
+        self._ask_messages(now)
         self._go_on(now)
-        self._say_command(now)
+        self._commands.say(now)
         self._say_setpoint(now)
 
     def _judge_link(self, now: float) -> None:
         lost = now - self._heard_at > self.settings.link_timeout
         if lost and not self._lost:
             self._report(_WARNING, f'link: nothing heard for {now - self._heard_at:.1f} s')
+            self.forbid()
         elif self._lost and not lost:
             self._report(_WARNING, 'link: it is back')
             if self.phase is Phase.FLYING:
@@ -480,6 +468,8 @@ class Vehicle:
     def _go_on(self, now: float) -> None:
         if self._phase_at == -math.inf:
             self._phase_at = now
+        if self._permission.expired(now):
+            self._expire(now)
         phase = self.phase
         if phase is Phase.PREPARING:
             self._prepare(now)
@@ -494,32 +484,51 @@ class Vehicle:
         elif phase is Phase.ENDING:
             self._end(now)
 
+    def _expire(self, now: float) -> None:
+        """Give the take-off up: who asked for it may not expect it any more."""
+        text = self._recent_text(now)
+        self._report(
+            _WARNING,
+            f'not armed within {self.settings.arm_timeout:g} s{f" ({text})" if text else ""}, '
+            + UNTIL_ARM,
+        )
+        self.forbid()
+
     def _prepare(self, now: float) -> None:
         self._detail = self._recent_text(now)
         assert self._failsafes is not None
-        if self._failsafes.complete and self.telemetry is not None and self._estimates is not False:
+        if self._failsafes.complete and self._estimate.ready:
             self._enter(Phase.WAITING)
 
     def _wait(self, now: float) -> None:
-        assert self.firmware is not None
-        if self.armed:
-            if self.mode == self.firmware.external:
-                name = self.firmware.mode_name(self.mode)
-                self._report(_INFO, f'it is armed, in {name}: taken over')
-                self._begin_flying()
+        assert self.firmware is not None and self._failsafes is not None
+        name = self.firmware.mode_name(self.mode)
+        permitted = self.active and self._permission.holds(now)
+        if self.armed and not self._is_theirs:
+            self._permission.end()
+            self._detail = f'it is flown in {name}'
+        elif self.armed and permitted:
+            self._report(_INFO, f'it is armed, in {name}: taken over')
+            self._permission.end()
+            if self._estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND:
+                self._begin_rising(now)
             else:
-                self._detail = f'it is flown in {self.firmware.mode_name(self.mode)}'
-            return
-        if not self.settings.arm:
+                self._begin_flying()
+        elif self.armed:
+            self._detail = f'it is armed in {name}, not by this driver, {UNTIL_ARM}'
+        elif not self.settings.arm:
             self._detail = 'arm is false'
-        elif not self.wanted:
+        elif not self.active:
             self._detail = 'the driver is not active'
         else:
-            assert self._failsafes is not None
-            self._detail = self._failsafes.problem(now)
-            if not self._detail:
+            problem = self._failsafes.problem(now)
+            if problem:
+                self._permission.end()
+            elif permitted:
                 self._setpoint, self._yaw = self._here(), None
                 self._enter(Phase.STARTING)
+                return
+            self._detail = f'{problem}, {UNTIL_ARM}' if problem else UNTIL_ARM
 
     def _take_mode(self, now: float) -> None:
         assert self.firmware is not None
@@ -533,6 +542,7 @@ class Vehicle:
 
     def _arm(self, now: float) -> None:
         if self.armed:
+            self._permission.end()
             self._begin_rising(now)
         elif now - self._tried_at >= _ARMING_PERIOD and not self._commands:
             self._tried_at = now
@@ -544,7 +554,7 @@ class Vehicle:
         self._setpoint = self._here()
         if self.firmware.kind == 'copter':
             # It stands on the ground; the barometer may have drifted since the estimator started.
-            self.origin[2] = self._setpoint[2]
+            self._estimate.origin[2] = self._setpoint[2]
         self._nearest, self._nearer_at = math.inf, now
         self._enter(Phase.RISING)
 
@@ -562,7 +572,8 @@ class Vehicle:
             self._nearest, self._nearer_at = left, now
         # Home may be elsewhere: what the take-off leaves over is flown by set-point.
         taken_off = (
-            self.firmware.rise == 'command' and self._landed == mavlink.MAV_LANDED_STATE_IN_AIR
+            self.firmware.rise == 'command'
+            and self._estimate.landed == mavlink.MAV_LANDED_STATE_IN_AIR
         )
         if left <= _RISEN or taken_off:
             self._begin_flying()
@@ -589,7 +600,7 @@ class Vehicle:
         if self.phase is Phase.RISING:
             self._setpoint[2] = self._top
         if self.phase is not Phase.FLYING:
-            self._fix_needed = self._fix is not None and self._fix >= _FIX_3D
+            self._fix_needed = self._estimate.has_fix
         self._commands.clear()
         self._enter(Phase.FLYING)
 
@@ -627,31 +638,11 @@ class Vehicle:
                 return
             if number == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
                 name = mavlink.mavlink_map[int(parameters[0])].msgname
-                self._report(7, f'{name} at another rate: {_result_name(result)}')
+                self._report(7, f'{name} at another rate: {result_name(result)}')
                 return
-            self._report(_WARNING, f'{_command_name(number)}: {_result_name(result)}')
+            self._report(_WARNING, f'{command_name(number)}: {result_name(result)}')
 
-        self._commands.append(_Command(number, parameters, answer))
-
-    def _say_command(self, now: float) -> None:
-        if not self._commands:
-            return
-        command = self._commands[0]
-        if now - command.sent < _ANSWER_PATIENCE:
-            return
-        if command.tries == _TRIES:
-            self._commands.popleft().answer(None)
-            return
-        parameters = [*command.parameters, *[0.0] * (7 - len(command.parameters))]
-        self._sender.command_long_send(
-            self.settings.system,
-            mavlink.MAV_COMP_ID_AUTOPILOT1,
-            command.number,
-            command.tries,
-            *parameters,
-        )
-        command.sent = now
-        command.tries += 1
+        self._commands.ask(number, parameters, answer)
 
     def _say_setpoint(self, now: float) -> None:
         assert self.firmware is not None
@@ -698,26 +689,8 @@ class Vehicle:
         )
 
 
-def _command_name(number: int) -> str:
-    return str(mavlink.enums['MAV_CMD'][number].name)
-
-
-def _result_name(result: int | None) -> str:
-    if result is None:
-        return 'not answered'
-    item = mavlink.enums['MAV_RESULT'].get(result)
-    return f'result {result}' if item is None else str(item.name).removeprefix('MAV_RESULT_')
-
-
 _HANDLERS: dict[str, Callable[[Vehicle, Any, float], None]] = {
     'HEARTBEAT': Vehicle._on_heartbeat,
-    'LOCAL_POSITION_NED': Vehicle._on_position,
-    'ATTITUDE_QUATERNION': Vehicle._on_attitude,
-    'BATTERY_STATUS': Vehicle._on_battery,
-    'SYS_STATUS': Vehicle._on_status,
-    'EXTENDED_SYS_STATE': Vehicle._on_landed,
-    'GPS_RAW_INT': Vehicle._on_gnss,
-    'EKF_STATUS_REPORT': Vehicle._on_estimator,
     'STATUSTEXT': Vehicle._on_text,
     'PARAM_VALUE': Vehicle._on_parameter,
     'COMMAND_ACK': Vehicle._on_answer,

@@ -1,0 +1,71 @@
+"""The permission to take off: asked for by a service, for one take-off, and for a while."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+# What planner and clients read while a vehicle waits for it.
+UNTIL_ARM = 'until the service arm is called'
+
+
+class ArmPermission:
+    """
+    Whether a vehicle may take off: one take-off for each call of the service.
+
+    Parameters
+    ----------
+    timeout : float
+        After which one that was not used ends [s].
+
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
+        self._end = -math.inf
+
+    def give(self, now: float) -> None:
+        """Give it, from `now` on the steady clock [s]."""
+        self._end = now + self.timeout
+
+    def end(self) -> bool:
+        """End it, as after a take-off or a refusal; return whether there was one."""
+        given, self._end = self._end > -math.inf, -math.inf
+        return given
+
+    def holds(self, now: float) -> bool:
+        """Return whether there is one."""
+        return now < self._end
+
+    def expired(self, now: float) -> bool:
+        """Return whether there was one that ran out, and end it then."""
+        return now >= self._end and self.end()
+
+
+def offer_arm(node: Node, arm: Callable[[], str]) -> None:
+    """
+    Create the service `arm` (std_srvs/Trigger) of a node.
+
+    Parameters
+    ----------
+    node : Node
+        Of a robot that takes off.
+    arm : callable
+        Gives the permission, and returns why it does not; empty where it does.
+
+    """
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        problem = arm()
+        response.success = not problem
+        response.message = problem or 'it takes off as soon as it is ready'
+        if problem:
+            node.get_logger().warning(f'arm: refused: {problem}')
+        else:
+            node.get_logger().info('arm: it may take off')
+        return response
+
+    node.create_service(Trigger, 'arm', answer)
