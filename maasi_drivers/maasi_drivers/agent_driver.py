@@ -7,6 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.measurement_queue import Frame, MeasurementQueue, MeasurementRequest
 from maasi_drivers.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.pose_speed import PoseSpeed
+from maasi_drivers.pose_topic import PoseTopic
 from maasi_drivers.robot_frames import RobotFrames
 from maasi_drivers.robot_stop import STOPPED, RobotStop
 from maasi_drivers.waypoint_follower import Goal, GoalStatus, WaypointFollower
@@ -106,7 +108,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
 
     Subscribes
     ----------
-    `odom` (nav_msgs/Odometry), `battery_state` (sensor_msgs/BatteryState);
+    `odom` (nav_msgs/Odometry), or what `PoseTopic` or `RobotFrames` do;
+    `battery_state` (sensor_msgs/BatteryState);
     `measurement_batch` of the team (maasi_msgs/MeasurementBatch)
 
     Publishes
@@ -158,9 +161,9 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         # Robots whose odometry is rare are no exception.
         self._gate = StampGate(max(JUMP, round(2e9 * settings.odometry_timeout)))
         self._odometry: MapOdometry | None = None
-        self._frames = RobotFrames(self, self.robot, self._take_transform)
+        self._frames = RobotFrames(self, self.robot, partial(self._take_placed, 'tf'))
         self._pose_speed = PoseSpeed()
-        self._posed = 'odometry' if settings.pose_source == 'odometry' else 'pose on tf'
+        self._posed = {'odometry': 'odometry', 'tf': 'pose on tf', 'pose': 'pose'}[settings.poses]
         self._follower = WaypointFollower(self._motion)
         self._queue: MeasurementQueue[DataT] = MeasurementQueue(self._history)
         self._unseen: Counter[str] = Counter()
@@ -230,7 +233,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         commands = CommandPublisher(self, 'cmd_vel', settings.command_type, settings.lockstep)
         self._command_publisher = commands
         quality = sensor_reader(settings.lockstep)
-        if settings.pose_source == 'odometry':
+        if settings.poses == 'odometry':
             self.create_subscription(Odometry, 'odom', self._on_odometry, quality)
         self._battery_subscription = self.create_subscription(
             BatteryState, 'battery_state', self._on_battery, quality
@@ -309,6 +312,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         )
         self._stop_latch.offer(self)
         self._frames.set_up()
+        if settings.poses == 'pose':
+            PoseTopic(self, partial(self._take_placed, 'pose'))
         self.set_up_sensor()
         self.create_wall_timer(LIVELINESS_PERIOD, self._state_publisher.assert_liveliness)
         if not settings.lockstep:
@@ -418,8 +423,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self.reset()
         return True
 
-    def _take_transform(self, stamp: int, pose: Pose) -> None:
-        if self.active and self._is_new('tf', stamp):
+    def _take_placed(self, topic: str, stamp: int, pose: Pose) -> None:
+        if self.active and self._is_new(topic, stamp):
             self.take_pose(self._pose_speed.place(stamp, pose))
 
     def take_pose(self, placed: StampedPose) -> None:
@@ -440,7 +445,9 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
             self._answer_step()
 
     def _place(self, stamp: int, message: Odometry) -> StampedPose:
-        frame, wanted = message.header.frame_id.lstrip('/'), self.settings.odometry_frame
+        settings, frame = self.settings, message.header.frame_id.lstrip('/')
+        in_map = settings.odometry_origin == 'map'
+        wanted = settings.odometry_frame or (settings.frame if in_map else '')
         space = frame.rpartition('/')[0]
         if (frame != wanted) if wanted else (space not in ('', self.robot, self._namespace)):
             raise ValueError(
@@ -450,8 +457,8 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         pose = pose_from_ros(message.pose.pose)
         covariance = np.asarray(message.pose.covariance)
         if self._odometry is None:
-            origin = pose if self.settings.odometry_origin == 'first' else None
-            self._odometry = MapOdometry(self._start, origin)
+            origin = pose if settings.odometry_origin == 'first' else None
+            self._odometry = MapOdometry(Pose(np.zeros(3)) if in_map else self._start, origin)
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
         bounded('twist.linear', (linear.x, linear.y, linear.z), FASTEST)
         bounded('twist.angular', (angular.x, angular.y, angular.z), FASTEST)

@@ -146,14 +146,18 @@ class DriverSettings(NodeSettings):
         description='What odom.header.frame_id has to be; none: odom, with this namespace or '
         'without one',
     )
-    odometry_origin: Literal['zero', 'first'] = Field(
+    odometry_origin: Literal['zero', 'first', 'map'] = Field(
         default='zero',
-        description='What the odometry shows at the start: zero, or what its first message says',
+        description='What the odometry shows at the start: zero, or what its first message says; '
+        'map: it is in the map already, and so is its header.frame_id',
     )
-    pose_source: Literal['odometry', 'tf'] = Field(
-        default='odometry',
-        description='Where poses come from: `odom`, or the transform from the frame map to '
-        '`base_frame` on /tf, with link topics and not in lockstep',
+    pose_source: Literal['odometry', 'tf', 'pose'] | None = Field(
+        default=None,
+        description='Where poses come from: `odom` (with link mavlink the autopilot), the '
+        'transform from the frame map to `base_frame` on /tf, or the topic `pose` '
+        '(geometry_msgs/PoseStamped, in the map); none: tf with navigation nav2, so that targets '
+        'are placed where the robot drives, else odometry; the others not in lockstep, and with '
+        'link topics or mavlink',
     )
     base_frame: str = Field(
         default='', description="The robot's own frame on /tf; none: <robot>/base_link"
@@ -197,6 +201,13 @@ class DriverSettings(NodeSettings):
     )
 
     @property
+    def poses(self) -> str:
+        """Where poses come from: odometry, tf or pose."""
+        if self.pose_source is not None:
+            return self.pose_source
+        return 'tf' if self.navigation == 'nav2' else 'odometry'
+
+    @property
     def sensor_patience(self) -> float:
         """Time without a new image or sweep after which the robot is stopped [s]; 0: never."""
         if self.sensor_timeout is not None:
@@ -205,9 +216,10 @@ class DriverSettings(NodeSettings):
 
     @model_validator(mode='after')
     def _consistent(self) -> DriverSettings:
-        if self.pose_source == 'tf' and (self.lockstep or self.link != 'topics'):
+        external = self.pose_source in ('tf', 'pose')
+        if external and (self.lockstep or self.link not in ('topics', 'mavlink')):
             raise ValueError(
-                f"pose_source: got 'tf', allowed with link {self.link!r}"
+                f'pose_source: got {self.pose_source!r}, allowed with link {self.link!r}'
                 f'{" in lockstep" if self.lockstep else ""} is odometry'
             )
         if self.lockstep and self.link != 'topics':

@@ -14,7 +14,7 @@ from maasi_drivers.arrival_clock import ArrivalClock
 from maasi_drivers.mavlink.link import VehicleLink
 from maasi_drivers.mavlink.settings import MavlinkSettings
 from maasi_drivers.mavlink.vehicle import Telemetry
-from maasi_drivers.odometry import StampedPose
+from maasi_drivers.odometry import PoseHistory, StampedPose
 from maasi_drivers.ranging_driver import RangingDriver
 from maasi_filter.conversions import stamp_to_ros
 from maasi_filter.pose import Pose, compose
@@ -30,6 +30,8 @@ _FENCE_MARGIN = 0.5
 _FENCE_HEIGHT = 1.0
 # At the end: how long it waits for the autopilot to say that it holds or lands [s].
 _FAREWELL = 1.0
+# Between a localiser's pose and what the autopilot said, at most [ns].
+_LONGEST_LAG = 300_000_000
 # Closer than this to where it goes, it keeps its heading [m].
 _TURNING = 0.3
 # Of MAVLink's MAV_SEVERITY: up to here errors, warnings, and what is worth a line.
@@ -59,8 +61,11 @@ class MavlinkRobot(AgentDriver[DataT]):
         super().prepare()
         settings = self.settings
         self._mavlink = settings.mavlink or MavlinkSettings()
-        if settings.link == 'mavlink':
+        # Poses of a localiser say where the autopilot's frame is in the map.
+        self._localised = settings.link == 'mavlink' and settings.poses != 'odometry'
+        if settings.link == 'mavlink' and not self._localised:
             self._posed = 'LOCAL_POSITION_NED'
+        self._locals = PoseHistory()
         self._arrivals = ArrivalClock()
         self._map_from_local = Pose.from_yaw(
             [*settings.start[:2], self._mavlink.ground], -self._mavlink.map_yaw
@@ -111,6 +116,8 @@ class MavlinkRobot(AgentDriver[DataT]):
         for kind in (STOP, BATTERY):
             if kind in self._troubles:
                 return self._troubles[kind]
+        if self._localised and (self._history.latest is None or ODOMETRY in self._troubles):
+            return f'no {self._posed}'
         with link.vehicle() as vehicle:
             problem = vehicle.permit(time.monotonic())
         if not problem:
@@ -242,21 +249,38 @@ class MavlinkRobot(AgentDriver[DataT]):
 
     def _take_telemetry(self, telemetry: Telemetry) -> None:
         stamp = self._arrivals.stamp(telemetry.arrival - self._mavlink.latency)
-        latest = self._history.latest
+        latest = (self._locals if self._localised else self._history).latest
         if stamp is None or (latest is not None and stamp <= latest.stamp):
             return
         local = Pose(telemetry.position - self._local_origin, telemetry.orientation)
-        placed = compose(self._map_from_local, local)
-        self._watch_fence(placed.position)
-        self.take_pose(
-            StampedPose(
-                stamp,
-                placed,
-                np.zeros((6, 6)),
-                self._map_from_local.rotation() @ telemetry.velocity,
-                telemetry.rates,
-            )
+        placed = StampedPose(
+            stamp,
+            local if self._localised else compose(self._map_from_local, local),
+            np.zeros((6, 6)),
+            self._map_from_local.rotation() @ telemetry.velocity,
+            telemetry.rates,
         )
+        if self._localised:
+            self._locals.add(placed)
+        else:
+            self.take_pose(placed)
+
+    def take_pose(self, placed: StampedPose) -> None:
+        """Take where it is."""
+        if self._vehicle_link is not None:
+            if self._localised:
+                self._align(placed)
+            self._watch_fence(placed.pose.position)
+        super().take_pose(placed)
+
+    def _align(self, placed: StampedPose) -> None:
+        """Note where the autopilot's frame is, by what it said when a localiser saw it."""
+        local = self._locals.at(placed.stamp) or self._locals.latest
+        if local is None or abs(local.stamp - placed.stamp) > _LONGEST_LAG:
+            return
+        turn = Pose.from_yaw(np.zeros(3), placed.pose.yaw - local.pose.yaw)
+        position = placed.pose.position - turn.rotation() @ local.pose.position
+        self._map_from_local = Pose(position, turn.orientation)
 
     def _watch_fence(self, position: FloatArray) -> None:
         outside = float(np.abs(position - self._inside(position)).max())

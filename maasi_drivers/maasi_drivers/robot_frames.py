@@ -94,7 +94,7 @@ class RobotFrames:
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
-            if self._settings.pose_source == 'tf':
+            if self._settings.poses == 'tf':
                 raise SettingsError(
                     "parameter pose_source: read 'tf', but the package tf2_msgs is not installed "
                     "(sudo apt install ros-$ROS_DISTRO-tf2-msgs); allowed without it is 'odometry'"
@@ -115,7 +115,7 @@ class RobotFrames:
             self._static_publisher = node.create_publisher(
                 kind, node.team_topic('tf_static'), LATCHED
             )
-            if settings.pose_source == 'odometry':
+            if settings.poses != 'tf':
                 self._publisher = node.create_publisher(kind, node.team_topic('tf'), _TF)
         for frame in sensor_frames(self._robot, settings):
             self._add_static(frame.parent, frame.name, frame.pose())
@@ -145,7 +145,7 @@ class RobotFrames:
             Of the odometry's frame in the map.
         """
         settings = self._settings
-        if settings.pose_source == 'tf' or not settings.tf_rate:
+        if settings.poses == 'tf' or not settings.tf_rate:
             return
         # Of the stamp alone, so that runs in lockstep are equal.
         slot = math.floor(placed.stamp * settings.tf_rate * 1e-9 + 1e-6)
@@ -191,7 +191,7 @@ class RobotFrames:
 
     def _on_moving(self, message: Any) -> None:
         self._read('tf', message, static=False)
-        if self._settings.pose_source == 'tf':
+        if self._settings.poses == 'tf':
             self._take_pose()
 
     def _read(self, topic: str, message: Any, *, static: bool) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from maasi_filter.settings import Finite, Settings
 
@@ -12,8 +12,13 @@ FirmwareName = Literal['arducopter', 'ardusub', 'px4']
 
 
 class AutopilotSettings(Settings):
-    """What a fake autopilot is like."""
+    """What a fake autopilot is like, or that there is another one: `external`."""
 
+    external: bool = Field(
+        default=False,
+        description='Whether the sim plays no autopilot: a simulator of ArduPilot or PX4, or a '
+        'real vehicle, is there instead; in a scenario, autopilot: external',
+    )
     firmware: FirmwareName = Field(default='arducopter', description='Whose manners it has')
     system: int = Field(default=1, ge=1, le=255, description='Its system id')
     depth: float = Field(
@@ -41,3 +46,8 @@ class AutopilotSettings(Settings):
     parameters: dict[str, float] = Field(
         default_factory=dict, description='Parameters of the autopilot that differ'
     )
+
+    @model_validator(mode='before')
+    @classmethod
+    def _from_word(cls, value: Any) -> Any:
+        return {'external': True} if value == 'external' else value

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from maasi_filter.pose import Pose
+from maasi_sim.external_robot import ExternalRobot
 from maasi_sim.noise_streams import noise_stream
 from maasi_sim.robots import Leader
 from maasi_sim.scenario import RobotSettings, Scenario
@@ -35,6 +37,8 @@ def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
         If it cannot be opened.
 
     """
+    if robot.external:
+        return ExternalRobot(Pose.from_yaw(robot.start, robot.yaw))
     if robot.link == 'mambo_wifi':
         from maasi_sim.linked_mambo import LinkedMambo
 

@@ -398,6 +398,11 @@ class ScenarioRun:
         """Wait until every node takes part, the recorder last; return an ending if one does not."""
         begin = time.monotonic()
         patience = _START_PATIENCE
+        for name in self._external():
+            self.display.say(
+                f'{name} is external: it takes off when you call its service arm (search_command '
+                f'arm --robot {name}, with ROS_DOMAIN_ID={recorder.context.get_domain_id()})'
+            )
         expected = [plan.full_name for plan in self.plans if plan.says_ready]
         needed = [topic for plan in self.plans for topic in plan.topics]
         while True:
@@ -571,6 +576,11 @@ class ScenarioRun:
         """Return the robots whose drivers take off, all of them simulated."""
         robots = getattr(self.scenario, 'robots', {})
         return [name for name, robot in robots.items() if getattr(robot, 'takes_off', False)]
+
+    def _external(self) -> list[str]:
+        """Return the robots that another program moves."""
+        robots = getattr(self.scenario, 'robots', {})
+        return [name for name, robot in robots.items() if getattr(robot, 'external', False)]
 
     def _robot_of(self, node: str) -> str | None:
         name = node.strip('/').partition('/')[0]

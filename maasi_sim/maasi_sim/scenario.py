@@ -90,7 +90,8 @@ class RobotSettings(Settings):
         default=None, description='With link mavlink: how, and what it may be made to do'
     )
     autopilot: AutopilotSettings = Field(
-        default_factory=AutopilotSettings, description='With link mavlink: its autopilot, simulated'
+        default_factory=AutopilotSettings,
+        description='With link mavlink: its autopilot, simulated; or external: another program',
     )
     start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
         description='Position at the start, x y z [m, map]'
@@ -112,9 +113,14 @@ class RobotSettings(Settings):
     )
 
     @property
+    def external(self) -> bool:
+        """Whether another program than the sim moves it."""
+        return self.link == 'mavlink' and self.autopilot.external
+
+    @property
     def takes_off(self) -> bool:
         """Whether it is simulated, and takes off when its driver's service `arm` is called."""
-        return self.link != 'topics'
+        return self.link != 'topics' and not self.external
 
 
 class EventSettings(Settings):
@@ -433,6 +439,12 @@ def _problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
     yield from _mambo_problems(scenario)
     yield from _mavlink_problems(scenario)
     yield from event_problems(scenario.events, scenario.names(), scenario.limits)
+    for index, event in enumerate(scenario.events):
+        if event.robot in scenario.robots and scenario.robots[event.robot].external:
+            yield (
+                ('events', index, 'robot'),
+                f"read '{event.robot}', which is external; allowed are simulated robots",
+            )
     if scenario.stop == 'all_found' and scenario.targets.count == 0:
         yield ('stop',), "read 'all_found' but there are no targets, allowed is 'planner_done'"
 
@@ -616,10 +628,12 @@ def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
             yield (*key, 'arm'), 'read false, allowed is true: nothing would ever fly'
         match = _MAVLINK_URL.match(link.url)
         if match is None:
-            yield (
-                (*key, 'url'),
-                f"read '{link.url}', allowed is udpin:HOST:PORT, as the sim plays the vehicle",
-            )
+            if not robot.external:
+                yield (
+                    (*key, 'url'),
+                    f"read '{link.url}', allowed is udpin:HOST:PORT, as the sim plays the vehicle, "
+                    'or autopilot: external',
+                )
         elif match[1] in ports:
             yield (
                 (*key, 'url'),
@@ -627,11 +641,11 @@ def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
             )
         else:
             ports[match[1]] = name
-        if link.map_yaw != 0.0:
+        if link.map_yaw != 0.0 and not robot.external:
             yield (*key, 'map_yaw'), f'read {link.map_yaw}, allowed in simulation is 0'
         firmware = robot.autopilot.firmware
-        submarine = firmware == 'ardusub'
-        if submarine != (link.vehicle == 'submarine'):
+        submarine = link.vehicle == 'submarine'
+        if submarine != (firmware == 'ardusub') and not robot.external:
             yield (
                 (*key, 'vehicle'),
                 f"read '{link.vehicle}', but its autopilot.firmware is '{firmware}'",

@@ -37,7 +37,8 @@ from maasi_filter.marker_board import MarkerBoard
 from maasi_filter.pose import Pose
 from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_writer
 from maasi_filter.search_node import SearchNode, SettingsError, run
-from maasi_msgs.msg import LockstepDone, LockstepStep, RangeArray, RangeMeasurement
+from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray, RangeMeasurement
+from maasi_sim.external_robot import ExternalRobot
 from maasi_sim.laser_scan import LaserSettings
 from maasi_sim.linked_robots import LinkedRobot, linked_robot
 from maasi_sim.robots import SimulatedRobot
@@ -237,7 +238,8 @@ class SimNode(SearchNode[SimNodeSettings]):
 
     Subscribes
     ----------
-    `<robot>/cmd_vel` (geometry_msgs/TwistStamped);
+    `<robot>/cmd_vel` (geometry_msgs/TwistStamped); `<robot>/state` (maasi_msgs/AgentState) of
+    robots with `autopilot: external`;
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
     """
 
@@ -335,6 +337,11 @@ class SimNode(SearchNode[SimNodeSettings]):
                 robot = linked_robot(name, self.scenario.robots[name], self.settings.seed)
                 self._linked[name] = robot
                 self.simulation.robots[name].follow(robot)
+                if isinstance(robot, ExternalRobot):
+                    topic = f'{name}/state'
+                    self._entities.append(
+                        self.create_subscription(AgentState, topic, robot.take, 10)
+                    )
                 continue
             self._entities.append(
                 self.create_subscription(

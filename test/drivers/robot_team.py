@@ -123,7 +123,7 @@ class Team(Node):
         self.calibrations = self.create_publisher(CameraInfo, 'camera/camera_info', RELIABLE)
         self.ranges = self.create_publisher(RangeArray, 'ranges', RELIABLE)
         self.used = [self.battery, self.batches]
-        self.used += [self.odometry] if self.settings.pose_source == 'odometry' else []
+        self.used += [self.odometry] if self.settings.poses == 'odometry' else []
         self.used += [self.images] if self.settings.camera else [self.ranges]
         if lockstep:
             self.steps = self.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
@@ -24,9 +25,9 @@ from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
 from maasi_drivers.mavlink_driver import _POLL_PERIOD, MavlinkDriver
 from maasi_drivers.robot_stop import STOPPED as STOPPED_BY_SERVICE
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.parameters import flatten
-from maasi_filter.pose import Pose
+from maasi_filter.pose import Pose, compose
 from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
 from maasi_sim.autopilot_settings import AutopilotSettings
 from maasi_sim.fake_mavlink_vehicle import FakeVehicle
@@ -205,6 +206,35 @@ def test_a_map_that_is_turned_against_north(fly):
     east = [cosine * 1.0 - sine * -1.5, sine * 1.0 + cosine * -1.5]
     assert_allclose(flight.position[:2] - START[:2], east, atol=0.35)
     assert pose_from_ros(flight.state.pose.pose).yaw == pytest.approx(-0.5, abs=0.05)
+
+
+def test_a_localiser_says_where_the_frame_of_the_autopilot_is(fly):
+    flight = fly(pose_source='pose')
+    poses = flight.team.create_publisher(PoseStamped, '/rover/pose', 10)
+    # The autopilot's north is off, and its origin elsewhere.
+    seen_from = Pose.from_yaw([0.7, -0.4, 0.1], 0.4)
+
+    def say():
+        message = PoseStamped(pose=pose_to_ros(compose(seen_from, flight.vehicle.state.pose)))
+        message.header.frame_id = 'map'
+        message.header.stamp = stamp_to_ros(flight.team.get_clock().now().nanoseconds)
+        poses.publish(message)
+
+    def until(condition):
+        flight.until(lambda: say() or condition())
+
+    flight.until(lambda: UNTIL_ARM in flight.driver.trouble)
+    assert flight.call('arm').message == 'no pose'
+    until(lambda: flight.team.states and flight.call('arm').success)
+    until(lambda: flight.state.goal_status != AgentState.UNAVAILABLE)
+    goal = [3.0, -1.0, 1.0]
+    assert flight.team.takes(goal, live=say)
+    until(lambda: flight.state.goal_status == AgentState.REACHED)
+    there = compose(seen_from, flight.vehicle.state.pose).position
+    assert_allclose(there, goal, atol=0.35)
+    # Without it the vehicle stays where it was sent last.
+    flight.until(lambda: 'no pose for' in flight.state.reason)
+    flight.until(lambda: flight.speed < STOPPED)
 
 
 def test_sweeps_answer_batches_with_the_pose_of_their_stamp(fly):

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from numpy.testing import assert_allclose, assert_array_equal
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import NANOSECONDS, STEP, TURTLEBOT, lockstep_step, parameters_of
@@ -21,7 +21,7 @@ from maasi_drivers.pose_speed import PoseSpeed
 from maasi_drivers.projection import Camera
 from maasi_drivers.transform_buffer import TransformBuffer
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.pose import Pose, compose, inverse
 from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE
 from maasi_msgs.msg import AgentState
@@ -226,10 +226,60 @@ def test_velocities_come_from_differences():
     assert not speed.place(5 * 10**9, Pose([9.5, 0.0, 1.0])).velocity.any()
 
 
+@pytest.mark.parametrize('source', ['tf', 'pose'])
 @pytest.mark.parametrize('changes', [{'lockstep': True}, {'link': 'mambo_wifi'}])
-def test_what_poses_from_tf_do_not_go_with_is_wrong_input(changes):
+def test_what_poses_from_tf_do_not_go_with_is_wrong_input(source, changes):
     with pytest.raises(ValueError, match='pose_source'):
-        DriverSettings.model_validate(TURTLEBOT | {'pose_source': 'tf'} | changes)
+        DriverSettings.model_validate(TURTLEBOT | {'pose_source': source} | changes)
+
+
+def test_targets_are_placed_in_the_frame_in_which_nav2_drives():
+    assert DriverSettings.model_validate(TURTLEBOT).poses == 'odometry'
+    assert DriverSettings.model_validate(TURTLEBOT | {'navigation': 'nav2'}).poses == 'tf'
+    chosen = TURTLEBOT | {'navigation': 'nav2', 'pose_source': 'odometry'}
+    assert DriverSettings.model_validate(chosen).poses == 'odometry'
+
+
+def test_a_driver_takes_poses_of_a_localiser_from_a_topic(play):
+    driver, team = play(pose_source='pose', odometry_timeout=1.0)
+    assert not team.count_subscribers('odom')
+    poses = team.create_publisher(PoseStamped, 'pose', RELIABLE)
+    message = PoseStamped()
+    # Not where the robot was put down.
+    place = Pose.from_yaw([0.9, 0.4, 0.0], -1.0)
+    message.pose = pose_to_ros(place)
+
+    def say(frame='map'):
+        message.header.frame_id = frame
+        message.header.stamp = stamp_to_ros(time.time_ns())
+        poses.publish(message)
+
+    team.until(lambda: say() or team.states)
+    found = pose_from_ros(team.state.pose.pose)
+    assert_allclose(found.position, place.position, atol=1e-9)
+    assert found.yaw == pytest.approx(-1.0)
+    team.until(lambda: say('odom') or driver.dropped['pose'] > 3)
+    team.until(lambda: team.state.goal_status == AgentState.UNAVAILABLE)
+    assert 'no pose for' in team.state.reason
+    team.until(lambda: say() or team.state.goal_status != AgentState.UNAVAILABLE)
+
+
+def test_odometry_may_be_in_the_map_already(play):
+    driver, team = play(odometry_origin='map')
+
+    def say():
+        team.step += 1
+        team.odometry.publish(team.odometry_message())
+
+    # The frame is not the map.
+    team.until(lambda: say() or driver.dropped['odometry'] > 3)
+    assert not team.states
+    team.odometry_frame = 'map'
+    team.until(lambda: say() or team.states)
+    # What the odometry says is where it is, wherever it was put down.
+    odometry = pose_from_ros(team.odometry_message().pose.pose)
+    assert_allclose(pose_from_ros(team.state.pose.pose).position, odometry.position, atol=0.02)
+    assert np.linalg.norm(odometry.position - team.start.position) > 0.1
 
 
 # ---- goals in other frames -------------------------------------------------------------------

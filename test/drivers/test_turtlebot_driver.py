@@ -205,7 +205,9 @@ def nav2(context, with_nav2):
 @pytest.fixture
 def driven(nav2, with_nav2, process, context):
     """Start a driver that hands its waypoints to Nav2; return the team, Nav2, and the driver."""
-    driver = process(environment=with_nav2, navigation='nav2', odometry_timeout=0.5)
+    driver = process(
+        environment=with_nav2, navigation='nav2', pose_source='odometry', odometry_timeout=0.5
+    )
     executor = SingleThreadedExecutor(context=context)
     team = Team(context, TURTLEBOT, executor)
     team.connect()
@@ -343,7 +345,7 @@ def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, contex
 def test_nav2_that_is_not_installed_is_said(context, monkeypatch):
     # None stands for a module that cannot be imported, also where Nav2 is installed.
     monkeypatch.setitem(sys.modules, 'nav2_msgs', None)
-    settings = TURTLEBOT | {'navigation': 'nav2'}
+    settings = TURTLEBOT | {'navigation': 'nav2', 'pose_source': 'odometry'}
     driver = TurtlebotDriver(context=context, parameter_overrides=parameters_of(settings))
     assert driver.trigger_configure().name == 'FAILURE'
     assert 'the package nav2_msgs is not installed' in driver.problem

@@ -210,6 +210,7 @@ def test_wrong_files_get_a_message_with_file_line_and_key(load, changes, key, wo
         assert word in message
 
 
+DOCS = Path(__file__).parents[2] / 'docs'
 LINKED = {'link': 'mavlink', 'mavlink': {'arm': True, 'url': 'udpin:127.0.0.1:14550'}}
 WRONG_LINKS = [
     ('drone', {'mavlink': None}, 'drone.mavlink', 'is missing'),
@@ -236,6 +237,20 @@ def test_links_that_cannot_work_are_refused(load, robot, changes, key, words):
     with pytest.raises(ScenarioError, match=words) as caught:
         load(content)
     assert f': robots.{key}: ' in str(caught.value)
+
+
+def test_an_autopilot_may_be_another_program(load):
+    content = yaml.safe_load(find_scenario('drone_rov').read_text())
+    content['robots']['drone'] |= LINKED | {'autopilot': 'external'}
+    content['robots']['drone']['mavlink'] |= {'url': 'tcp:127.0.0.1:5760', 'map_yaw': 0.1}
+    scenario = load(content)
+    drone = scenario.robots['drone']
+    assert drone.external and not drone.takes_off
+    assert load(scenario.content()).robots['drone'].external
+    assert load_scenario(DOCS / 'drone_sitl.yaml').robots['drone'].external
+    content['events'] = [{'at': 5.0, 'robot': 'drone', 'do': 'leave'}]
+    with pytest.raises(ScenarioError, match=r"events\[0\]\.robot: read 'drone', which is external"):
+        load(content)
 
 
 def test_a_drone_with_a_camera_may_be_linked_by_mavlink(load):

@@ -1,5 +1,6 @@
 """The simulation node over real topics, against nodes that play the rest of the team."""
 
+import math
 import socket
 import threading
 import time
@@ -25,8 +26,10 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_drivers.mavlink.link import VehicleLink
 from maasi_drivers.mavlink.settings import MavlinkSettings
+from maasi_filter.conversions import pose_to_ros
+from maasi_filter.pose import Pose
 from maasi_filter.qos import LATCHED, RELIABLE
-from maasi_msgs.msg import LockstepDone, LockstepStep, RangeArray
+from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray
 from maasi_sim.processes import Domain
 from maasi_sim.sim_node import SimNode
 
@@ -556,7 +559,8 @@ def test_a_linked_robot_is_where_its_autopilot_is(make_team, vehicle_link):
     content['robots']['drone']['mavlink']['url'] = vehicle_link.settings.url
     team = make_team(content, robots=('drone',), lockstep=False, rate=1.0)
     with vehicle_link.vehicle() as vehicle:
-        vehicle.wanted = True
+        vehicle.active = True
+        assert vehicle.permit(time.monotonic()) == ''
 
     def flies():
         with vehicle_link.vehicle() as vehicle:
@@ -580,6 +584,33 @@ def test_a_linked_robot_is_where_its_autopilot_is(make_team, vehicle_link):
         assert vehicle.trouble == 'link: nothing heard from system 1'
     team.spin_until(flies)
     assert not drone.of('odom') and not drone.of('battery_state')
+
+
+def test_an_external_robot_is_where_its_driver_says(make_team):
+    content = deepcopy(LINKED)
+    content['robots']['drone'] |= {'autopilot': 'external'}
+    del content['events']
+    team = make_team(content, robots=('drone',), lockstep=False, rate=1.0)
+    # Nobody listens where an autopilot of the sim would be heard.
+    assert not team.sim._linked['drone'].obeys
+    drone = team.drivers['drone']
+    states = drone.create_publisher(AgentState, '/drone/state', 10)
+    team.say_ready()
+    team.spin_until(lambda: drone.of('ranges'))
+    assert drone.of('ranges')[-1].ranges[0].range == pytest.approx(4.0, abs=2.0)
+    state = AgentState(robot='drone')
+    state.pose.pose = pose_to_ros(Pose.from_yaw([14.0, 10.0, 1.0], 0.0))
+    bad = AgentState(robot='drone')
+    bad.pose.pose.position.x = math.nan
+
+    def far():
+        states.publish(state)
+        states.publish(bad)
+        sweep = drone.of('ranges')[-1].ranges
+        return sweep and abs(sweep[0].range - 8.0) < 2.0 and abs(sweep[0].bearing) > 3.0
+
+    team.spin_until(far)
+    assert not drone.of('odom') and drone.command.get_subscription_count() == 0
 
 
 def test_links_run_in_real_time(make_team):
