@@ -340,6 +340,9 @@ class MamboLink:
             if wanted == 'land' and state != 'landed' and self._stale():
                 # What it said last may not be so any more.
                 obeyed = False
+            if wanted == 'take_off' and obeyed:
+                # Once is enough: one that lands by itself stays down.
+                self._wanted = ''
             if not wanted or obeyed or time.monotonic() - self._asked_at < _REPEAT:
                 return
             self._asked_at = time.monotonic()
