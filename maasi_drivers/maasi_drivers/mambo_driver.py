@@ -16,6 +16,7 @@ from maasi_drivers.mambo_link import MamboLink, MamboLinkError
 from maasi_drivers.mambo_pilot import MamboPilot, Phase, tilt_limit
 from maasi_drivers.mambo_settings import MamboSettings
 from maasi_drivers.odometry import StampedPose
+from maasi_drivers.waypoint_follower import Goal
 from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.pose import Pose
 from maasi_filter.qos import sensor_reader
@@ -198,7 +199,7 @@ class MamboDriver(CameraDriver):
         self.arrivals.observe(now, self.get_clock().now().nanoseconds)
         if pilot is None or link is None or not self.active:
             return
-        pilot.update(now, now)
+        pilot.update(now)
         self._judge(pilot)
         if link.battery >= 0.0 and link.battery != self._battery:
             self.take_charge(link.battery)
@@ -277,6 +278,12 @@ class MamboDriver(CameraDriver):
         return StampedPose(stamp, pose, np.diag(variances), velocity, np.zeros(3))
 
     # ---- goals, and what goes out ------------------------------------------------------------
+
+    def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
+        """Return the command for where it will be when that acts, and the goal reached."""
+        pilot = self._pilot
+        flies = pilot is not None and pilot.phase is Phase.FLYING and pilot.has_pose
+        return super().steer(pilot.ahead() if pilot and flies else robot, step)
 
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
         """Return whether pose and images have to change: a command on the ground moves nothing."""

@@ -1,13 +1,8 @@
-"""A Mambo's flight: where it is between its position events, and what it is told. Without ROS.
-
-Position events come twice a second. In between, the motion model flies the commands that were
-sent (dead reckoning), and each event corrects it where it was when the event was made.
-"""
+"""A Mambo's flight: what it is told, from take-off to landing. Without ROS."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from enum import Enum
 from typing import Protocol
 
@@ -15,21 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_drivers.mambo_link import PositionEvent
+from maasi_drivers.mambo_reckoning import DeadReckoning
 from maasi_drivers.mambo_settings import LEAST_TILT, MOST_TILT, MamboSettings
-from maasi_filter.pose import Pose, quaternion_product
+from maasi_drivers.tilt_model import Course, TiltModel
+from maasi_filter.pose import Pose
 from maasi_planner.motion import MotionModel, RobotState
-from maasi_planner.motion.mambo import K_PITCH, K_VX, mambo_parameters
 from maasi_planner.settings import MotionSettings
 
 FloatArray = NDArray[np.float64]
 
-# Share of the difference to an event by which position and velocity are corrected.
-_POSITION_GAIN, _VELOCITY_GAIN = 0.8, 0.25
-# A difference beyond this is no error of dead reckoning: the event is taken as it is [m].
-_JUMP = 0.5
-# Longest time that is reckoned at once [s].
-_LONGEST = 1.0
-_HISTORY = 64
+# Acceleration for each m/s that the speed is wrong [1/s].
+_SPEED_GAIN = 2.5
+# Share of the largest acceleration that stops it before the geofence: the rest is for wind.
+_BRAKE_SHARE = 0.5
+# Most speed for each metre to the geofence, well below what the speed follows by [1/s].
+_NEAR_RATE = 1.0
+# Reckoned with until the speed at the largest tilt is measured; it does not fly by it [m/s].
+_UNKNOWN_SPEED = 1.0
 # How far from its altitude the drone counts as there after take-off [m].
 _ALTITUDE_TOLERANCE = 0.1
 # How far outside the geofence it may drift before it lands [m].
@@ -70,130 +67,6 @@ class Link(Protocol):
 def tilt_limit(motion: MotionSettings) -> float:
     """Return the tilt to set in the drone for a robot's settings [rad]."""
     return min(max(motion.tilt, LEAST_TILT), MOST_TILT)
-
-
-def full_speed(motion: MotionSettings, tilt: float) -> float:
-    """Return the steady speed at a tilt [m/s]: drag holds against it as in the motion model."""
-    if motion.model != 'mambo':
-        return motion.speed
-    parameters = mambo_parameters(motion)
-    return float(tilt * parameters[K_PITCH] / parameters[K_VX])
-
-
-class DeadReckoning:
-    """
-    Where the drone is between its position events.
-
-    Parameters
-    ----------
-    motion : MotionModel
-        That flies the commands.
-    origin : Pose
-        Of the take-off point, in the map: what the events are relative to.
-    settings : MamboSettings
-        Latency and noise.
-
-    """
-
-    def __init__(self, motion: MotionModel, origin: Pose, settings: MamboSettings) -> None:
-        self.motion = motion
-        self.origin = origin
-        self.settings = settings
-        self.state = RobotState.at_rest(origin.position, origin.yaw)
-        #: Time of flight since the last correction [s].
-        self.age = 0.0
-        self._turn = origin.rotation()
-        self._body = motion.body(self.state)
-        self._command = _STILL
-        self._time: float | None = None
-        # Monotonic time, position and heading of late.
-        self._past: deque[tuple[float, FloatArray, float]] = deque(maxlen=_HISTORY)
-
-    def covariance(self) -> FloatArray:
-        """Return that of the pose, (6, 6): x, y, z [m^2], rotations about the map's axes."""
-        settings = self.settings
-        position = settings.position_noise**2 + (settings.position_growth * self.age) ** 2
-        return np.diag([position] * 3 + [settings.attitude_noise**2] * 3)
-
-    def command(self, command: FloatArray) -> None:
-        """Take the velocity command that is flown from now on, (4,)."""
-        self._command = command
-
-    def go_on(self, now: float, time: float, flying: bool) -> None:
-        """
-        Reckon up to a time.
-
-        Parameters
-        ----------
-        now : float
-            Monotonic clock, that of the events [s].
-        time : float
-            Of the flight; a simulated one may pass slower [s].
-        flying : bool
-            Whether it follows commands; if not it is where the last event says.
-
-        """
-        passed = 0.0 if self._time is None else min(max(time - self._time, 0.0), _LONGEST)
-        self._time = time
-        self.age += passed
-        if flying and passed > 0.0:
-            self._body.step(self._command, passed)
-            self.state = self._body.robot_state()
-        self._past.append((now, self.state.pose.position, self.state.pose.yaw))
-
-    def correct(self, event: PositionEvent, flying: bool) -> None:
-        """Take a position event."""
-        measured = self.origin.position + self._turn @ event.position
-        heading = self.origin.yaw + event.yaw
-        self.age = self.settings.latency
-        position, yaw = self._at(event.received - self.settings.latency)
-        error = measured - position
-        if not flying or float(np.abs(error).max()) > _JUMP:
-            self._reset(RobotState.at_rest(measured, heading))
-            return
-        state = self.state
-        turn = _wrapped(heading - yaw)
-        half = 0.5 * turn
-        turned = np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
-        orientation = quaternion_product(turned, state.pose.orientation)
-        self._reset(
-            RobotState(
-                Pose(state.pose.position + _POSITION_GAIN * error, orientation),
-                state.velocity + _VELOCITY_GAIN * error / 0.5,
-                state.angular_velocity,
-            ),
-            _POSITION_GAIN * error,
-            turn,
-        )
-
-    def _reset(self, state: RobotState, move: FloatArray | None = None, turn: float = 0.0) -> None:
-        self.state = state
-        self._body = self.motion.body(state)
-        if move is None:
-            self._past.clear()
-        else:
-            moved = [(at, place + move, yaw + turn) for at, place, yaw in self._past]
-            self._past = deque(moved, maxlen=_HISTORY)
-
-    def _at(self, now: float) -> tuple[FloatArray, float]:
-        """Return position and heading at a time of the monotonic clock."""
-        later: tuple[float, FloatArray, float] | None = None
-        for item in reversed(self._past):
-            if item[0] <= now:
-                if later is None:
-                    ahead = min(now - item[0], _LONGEST)
-                    return item[1] + ahead * self.state.velocity, item[2]
-                share = (now - item[0]) / (later[0] - item[0])
-                turn = share * _wrapped(later[2] - item[2])
-                return item[1] + share * (later[1] - item[1]), item[2] + turn
-            later = item
-        if later is not None:
-            return later[1], later[2]
-        return self.state.pose.position, self.state.pose.yaw
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 class Phase(Enum):
@@ -250,10 +123,10 @@ class MamboPilot:
         self.problem = 'connecting to the Mambo'
         place = home.position.copy()
         place[2] = settings.ground
-        self.reckoning = DeadReckoning(motion, Pose.from_yaw(place, home.yaw), settings)
-        self.full_speed = settings.full_speed or full_speed(motion.settings, link.tilt)
-        # Pose of another system, and when it came.
-        self._other: RobotState | None = None
+        speed = settings.full_speed or _UNKNOWN_SPEED
+        model = TiltModel(link.tilt, speed, link.climb, settings.full_turn)
+        self.reckoning = DeadReckoning(model, Pose.from_yaw(place, home.yaw), settings)
+        # When the pose of another system came.
         self._other_at = -math.inf
         self._event: PositionEvent | None = None
         # Since when the position is what it is; monotonic clock.
@@ -262,6 +135,7 @@ class MamboPilot:
         # Once it was the same in spite of commands, only another one is believed.
         self._stuck = False
         self._command = _STILL
+        self._now = -math.inf
         self._since = -math.inf
         self._lost_since: float | None = None
         self._cancelled_at: float | None = None
@@ -279,9 +153,12 @@ class MamboPilot:
     @property
     def state(self) -> RobotState | None:
         """Where it is; None where that is not known."""
-        if self.settings.pose != 'events':
-            return self._other
-        return None if self._event is None else self.reckoning.state
+        return self.reckoning.state if math.isfinite(self._positioned_at()) else None
+
+    def ahead(self) -> RobotState:
+        """Return where it will be, level, when a command that is sent now acts."""
+        course = self.reckoning.ahead()
+        return RobotState(Pose.from_yaw(course.position, course.yaw), course.velocity)
 
     @property
     def has_pose(self) -> bool:
@@ -291,7 +168,8 @@ class MamboPilot:
     def take_pose(self, now: float, state: RobotState) -> None:
         """Take a pose of another system, at `now` of the monotonic clock [s]."""
         self._note_place(now, state.pose.position)
-        self._other, self._other_at = state, now
+        self._now = self._other_at = now
+        self.reckoning.take(state, now)
 
     def _note_place(self, now: float, place: FloatArray) -> None:
         told_to_move = float(np.abs(self._command[:3]).max()) > _LEAST_SPEED
@@ -328,18 +206,32 @@ class MamboPilot:
     def hover(self) -> None:
         """Stop: the drone keeps its place by its own camera."""
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
-            self._steer(_STILL)
+            self._send(_STILL, _STILL)
 
     def _steer(self, command: FloatArray) -> None:
-        vx, vy, vz, turn = command.tolist()
+        """Tilt it so that its speed comes to that of the command, as far as it can stop."""
+        model, course = self.reckoning.model, self.reckoning.ahead()
+        cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
+        turned = np.array([[cosine, sine], [-sine, cosine]])
+        wish = turned @ self._stoppable(course, turned.T @ command[:2])
+        speed = turned @ course.velocity[:2]
+        tilts = model.shares(model.drag * wish + _SPEED_GAIN * (wish - speed))
+        rest = [command[2] / model.climb, command[3] / model.turn]
+        self._send(command, np.clip([*tilts, *rest], -1.0, 1.0))
+
+    def _stoppable(self, course: Course, wish: FloatArray) -> FloatArray:
+        """Return a velocity in the map (2,) that can be stopped before the geofence."""
+        brake = 2.0 * _BRAKE_SHARE * self.reckoning.model.thrust
+        room = np.abs(self.fence[:2].T - course.position[:2])
+        inside = (course.position[:2] > self.fence[:2, 0], course.position[:2] < self.fence[:2, 1])
+        most = inside * np.minimum(np.sqrt(brake * room), _NEAR_RATE * room)
+        return np.clip(wish, -most[0], most[1])
+
+    def _send(self, command: FloatArray, shares: FloatArray) -> None:
         self._command = command
-        self.reckoning.command(command)
-        self.link.steer(
-            vx / self.full_speed,
-            vy / self.full_speed,
-            vz / self.link.climb,
-            turn / self.settings.full_turn,
-        )
+        self.reckoning.command(self._now, shares)
+        forward, left, up, turn = shares.tolist()
+        self.link.steer(forward, left, up, turn)
 
     def goal_taken(self) -> None:
         """Note that it has somewhere to go: if it rests on the ground it takes off again."""
@@ -361,29 +253,20 @@ class MamboPilot:
     def _land(self) -> None:
         self.phase = Phase.LANDING
         self._command = _STILL
-        self.reckoning.command(_STILL)
+        self.reckoning.command(self._now, _STILL)
         self.link.land()
 
     # ---- the flight --------------------------------------------------------------------------
 
-    def update(self, now: float, time: float) -> None:
-        """
-        Go on: call it at least ten times a second.
-
-        Parameters
-        ----------
-        now : float
-            Monotonic clock [s].
-        time : float
-            Of the flight; a simulated one may pass slower [s].
-
-        """
-        self.reckoning.go_on(now, time, self.flying)
+    def update(self, now: float) -> None:
+        """Go on, at `now` of the monotonic clock [s]: call it at least ten times a second."""
+        self._now = now
+        self.reckoning.go_on(now, self.flying)
         event = self.link.position
         if event is not None and event is not self._event:
             self._event = event
-            self.reckoning.correct(event, self.flying)
             if self.settings.pose == 'events':
+                self.reckoning.correct(event, self.flying)
                 self._note_place(event.received, event.position)
         self.problem = self._go_on(now)
 
@@ -414,6 +297,11 @@ class MamboPilot:
             return self._ended
         if not self.settings.arm:
             return 'on the ground: it may not take off (parameter mambo.arm)'
+        if self.settings.full_speed is None:
+            return (
+                'on the ground: its speed at the largest tilt is not measured (parameter '
+                'mambo.full_speed; measure_mambo says it)'
+            )
         if self._resting:
             # Where its goal was cancelled it waits for another one.
             return ''
@@ -499,9 +387,10 @@ class MamboPilot:
             return self._end_flight(
                 f'it did not come to its altitude in {self.settings.take_off_timeout:g} s'
             )
-        above = state.pose.position.copy()
+        ahead = self.ahead()
+        above = ahead.pose.position.copy()
         above[2] = self.home.position[2]
-        self._steer(self.motion.command(state, above))
+        self._steer(self.motion.command(ahead, above))
         return f'{Phase.CLIMBING.value}, {offset:+.2f} m from its altitude'
 
     # ---- what can be wrong -------------------------------------------------------------------

@@ -56,8 +56,14 @@ class MamboSettings(Settings):
         default=None,
         gt=0.0,
         le=10.0,
-        description='Steady speed at the full tilt of motion.tilt; none: that of the motion model '
-        '[m/s]',
+        description='Steady speed at the largest tilt, motion.tilt, as measure_mambo measures it; '
+        'none: it does not take off [m/s]',
+    )
+    delay: float = Field(
+        default=0.2,
+        ge=0.0,
+        le=1.0,
+        description='From a piloting command to the acceleration that it makes [s]',
     )
     full_turn: float = Field(
         default=2.6, gt=0.0, le=7.0, description='Turn rate at full yaw [rad/s]'

@@ -1,7 +1,6 @@
 """A fake Parrot Mambo: the drone's end of its WiFi protocol, over a firmware that flies a model.
 
-Speaks what pyparrot 1.5.20 speaks: a handshake in JSON over TCP, then frames over UDP:
-`<BBBI` type, buffer, sequence, total size; and in commands and events `<BBH` project, class, id.
+Speaks what pyparrot 1.5.20 speaks: a handshake in JSON over TCP, then frames over UDP.
 """
 
 from __future__ import annotations
@@ -17,12 +16,11 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from maasi_filter.pose import Pose, quaternion_product
 from maasi_sim.mambo_firmware import (
@@ -30,19 +28,20 @@ from maasi_sim.mambo_firmware import (
     TILT_RANGE,
     TURN_RANGE,
     Estimate,
+    FirmwareSettings,
     MamboFirmware,
     Piloting,
 )
+from maasi_sim.mambo_frames import ACK, DATA, DATA_WITH_ACK, Frame, FrameError, frames
+from maasi_sim.tilt_body import TiltBodySettings
 
 #: Where pyparrot looks for the handshake; it cannot be changed there.
 HANDSHAKE_PORT = 44444
 #: Where the drone hears commands, as it says in the handshake.
 COMMAND_PORT = 6000
 
-ACK, DATA, LOW_LATENCY, DATA_WITH_ACK = 1, 2, 3, 4
 PING, PONG, COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 0, 1, 10, 11, 12
 EVENTS, ACKED_EVENTS = 126, 127
-_HEADER = struct.Struct('<BBBI')
 _ID = struct.Struct('<BBH')
 
 _SENSOR_PERIOD, _PING_PERIOD = 0.5, 1.0
@@ -53,47 +52,6 @@ _STEP = 0.02
 # Longest time caught up at once when the host stood still [s].
 _CATCH_UP = 0.5
 _TRIES = 100
-
-
-class FrameError(ValueError):
-    """Bytes that are no frame."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One frame: its type, buffer and sequence number, and what is in it."""
-
-    kind: int
-    buffer: int
-    sequence: int
-    payload: bytes = b''
-
-    def encode(self) -> bytes:
-        """Return its bytes."""
-        size = _HEADER.size + len(self.payload)
-        return _HEADER.pack(self.kind, self.buffer, self.sequence, size) + self.payload
-
-
-def frames(data: bytes) -> Iterator[Frame]:
-    """
-    Yield the frames of a datagram.
-
-    Raises
-    ------
-    FrameError
-        Where the rest is too short for the size that it states.
-
-    """
-    while data:
-        if len(data) < _HEADER.size:
-            raise FrameError(f'frame: got {len(data)} bytes, allowed are at least {_HEADER.size}')
-        kind, buffer, sequence, size = _HEADER.unpack_from(data)
-        if not _HEADER.size <= size <= len(data):
-            raise FrameError(
-                f'frame size: got {size}, allowed is {_HEADER.size} to the {len(data)} bytes there'
-            )
-        yield Frame(kind, buffer, sequence, data[_HEADER.size : size])
-        data = data[size:]
 
 
 def free_address() -> str:
@@ -454,6 +412,23 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--charge', type=float, default=1.0, metavar='X', help='of the battery at the start, 0 to 1'
     )
+    body, firmware = TiltBodySettings(), FirmwareSettings()
+    parser.add_argument(
+        '--drag', type=float, default=body.drag, metavar='D', help='of its body [1/s] (%(default)s)'
+    )
+    parser.add_argument(
+        '--delay',
+        type=float,
+        default=firmware.delay,
+        metavar='S',
+        help='from a command to its tilt set-point [s] (%(default)s)',
+    )
+    parser.add_argument(
+        '--lost-link',
+        choices=('hover', 'land'),
+        default=firmware.lost_link,
+        help='what it does when its controller falls silent (%(default)s)',
+    )
     return parser
 
 
@@ -467,13 +442,23 @@ def main(arguments: list[str] | None = None) -> int:
             raise ScenarioError(f'--charge: read {options.charge}, allowed is 0 to 1')
         robot = robot_type(options.type)
         firmware = MamboFirmware(
-            robot.motion,
             Pose.from_yaw([0.0, 0.0, 0.0], 0.0),
+            FirmwareSettings(
+                delay=options.delay,
+                lost_link=options.lost_link,
+                body=TiltBodySettings(drag=options.drag),
+            ),
             battery=robot.battery.model_copy(update={'charge': options.charge}),
             odometry=robot.odometry,
             seed=options.seed,
         )
         fake = FakeMambo(firmware, options.address, COMMAND_PORT)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        print(
+            f'error: --{wrong["loc"][-1]}: read {wrong["input"]}: {wrong["msg"]}', file=sys.stderr
+        )
+        return 2
     except (ScenarioError, OSError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2

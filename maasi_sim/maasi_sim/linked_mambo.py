@@ -37,7 +37,6 @@ class LinkedMambo:
         settings = robot.mambo or MamboSettings()
         height = robot.start[2] - settings.ground
         firmware = MamboFirmware(
-            robot.motion,
             Pose.from_yaw([*robot.start[:2], settings.ground], robot.yaw),
             FirmwareSettings(take_off_height=_TAKE_OFF_SHARE * height),
             robot.battery,

@@ -1,8 +1,9 @@
 """What a Mambo's own computer does with commands: take-off, flight, landing, and its watchdogs.
 
-Stands in for Parrot's firmware, which is not public. What it does when the controller falls silent
-is read from pyparrot's documentation (without new commands it goes back to hovering) and from the
-drone's manual (it lands when the connection is lost); the times are settings.
+Stands in for Parrot's firmware, which is not public. A piloting command "executes once and goes
+back to hovering without new commands coming in" (pyparrot, `Minidrone.fly_direct`). When the
+connection is lost it hovers on, says pyparrot's author (amymcgovern/pyparrot, issue 165), and
+Parrot's manual that it lands: a setting here, as the times are. The body is that of `tilt_body`.
 
 Frames: the position is relative to the take-off point and heading, x forward, y left, z up.
 """
@@ -10,9 +11,11 @@ Frames: the position is relative to the take-off point and heading, x forward, y
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +24,9 @@ from pydantic import Field
 from maasi_filter.pose import Pose
 from maasi_filter.settings import Settings
 from maasi_planner.motion import RobotState
-from maasi_planner.motion.mambo import K_PITCH, K_VX, MamboBody, mambo_parameters
-from maasi_planner.settings import MotionSettings
 from maasi_sim.odometry_model import OdometryModel, OdometrySettings
 from maasi_sim.robots import Battery, BatterySettings
+from maasi_sim.tilt_body import TiltBody, TiltBodySettings, TiltCommand
 
 FloatArray = NDArray[np.float64]
 
@@ -64,17 +66,22 @@ class FirmwareSettings(Settings):
     command_timeout: float = Field(
         default=0.5, gt=0.0, description='After which the last piloting command is void: hover [s]'
     )
+    delay: float = Field(
+        default=0.1, ge=0.0, le=2.0, description='From a piloting command to its tilt set-point [s]'
+    )
+    lost_link: Literal['hover', 'land'] = Field(
+        default='hover', description='What it does when it hears nothing from its controller'
+    )
     landing_timeout: float = Field(
-        default=3.0, gt=0.0, description='Without anything from the controller until it lands [s]'
+        default=3.0,
+        gt=0.0,
+        description='Without anything from the controller until it lands, with lost_link land [s]',
     )
     critical_charge: float = Field(
         default=0.03, ge=0.0, lt=1.0, description='At which it lands by itself [1]'
     )
-    gain_error: float = Field(
-        default=0.0,
-        gt=-0.9,
-        lt=2.0,
-        description='By how much it flies faster than its model says, as a share [1]',
+    body: TiltBodySettings = Field(
+        default_factory=TiltBodySettings, description='How it answers its set-points'
     )
 
 
@@ -142,12 +149,10 @@ class MamboFirmware:
 
     Parameters
     ----------
-    motion : MotionSettings
-        Of its body.
     start : Pose
         Where it stands on the floor, in the map.
     settings : FirmwareSettings
-        Heights and watchdogs.
+        Body, heights and watchdogs.
     battery : BatterySettings
         Capacity and drain; the motors drain only in flight.
     odometry : OdometrySettings
@@ -161,7 +166,6 @@ class MamboFirmware:
 
     """
 
-    motion: MotionSettings
     start: Pose
     settings: FirmwareSettings = field(default_factory=FirmwareSettings)
     battery: BatterySettings = field(default_factory=BatterySettings)
@@ -177,18 +181,13 @@ class MamboFirmware:
         self.limits = Limits()
         self.charge = Battery(self.battery)
         self.take_offs = 0
-        self._body = self._at_rest(self.start)
+        self._body = TiltBody(self.settings.body, self.start)
         self._odometry = OdometryModel(self.odometry, self.start, self.seed, self.name)
         self._readings = 0
-        self._piloting = Piloting()
-        self._piloted_at = self._heard_at = -math.inf
+        # Piloting commands, and when they begin to act.
+        self._piloted: deque[tuple[float, Piloting]] = deque([(-math.inf, Piloting())])
+        self._heard_at = -math.inf
         self._percent = self.percent
-        parameters = mambo_parameters(self.motion)
-        # The tilt that the velocity loop asks for at a velocity error: its share stands for drag.
-        self._tilt_of_speed = float(parameters[K_VX] / parameters[K_PITCH])
-
-    def _at_rest(self, pose: Pose) -> MamboBody:
-        return MamboBody(self.motion, RobotState.at_rest(pose.position, pose.yaw))
 
     @property
     def percent(self) -> int:
@@ -203,7 +202,7 @@ class MamboFirmware:
     @property
     def height(self) -> float:
         """Above the floor [m]."""
-        return float(self._body.state[2]) - self.floor
+        return float(self._body.position[2]) - self.floor
 
     # ---- what a controller says --------------------------------------------------------------
 
@@ -229,8 +228,7 @@ class MamboFirmware:
 
     def pilot(self, piloting: Piloting) -> None:
         """Take a piloting command, which holds until the next one or its time is up."""
-        self._piloting = piloting
-        self._piloted_at = self.time
+        self._piloted.append((self.time + self.settings.delay, piloting))
 
     def limit_tilt(self, degrees: float) -> None:
         """Set the tilt of 100 per cent [degrees], cut to what is allowed."""
@@ -256,8 +254,8 @@ class MamboFirmware:
         self.time += h
         self._look_after()
         if self.flying_state in AIRBORNE:
-            self._body.step(self._command(), h)
-            self.charge.drain(float(np.linalg.norm(self._body.state[6:9])), h)
+            self._body.step(self._command(), self.limits.tilt, h)
+            self.charge.drain(float(np.linalg.norm(self._body.velocity)), h)
             self._touch()
         if self.percent != self._percent:
             self._percent = self.percent
@@ -272,40 +270,42 @@ class MamboFirmware:
         state = self.flying_state
         if state in (FlyingState.LANDED, FlyingState.LANDING, FlyingState.EMERGENCY):
             return
-        silent = self.time - self._heard_at > self.settings.landing_timeout
-        if silent or self._critical:
+        settings = self.settings
+        silent = self.time - self._heard_at > settings.landing_timeout
+        if (silent and settings.lost_link == 'land') or self._critical:
             self._set(FlyingState.LANDING)
         elif state == FlyingState.TAKING_OFF:
-            if self.height >= self.settings.take_off_height:
+            if self.height >= settings.take_off_height:
                 self._set(FlyingState.HOVERING)
         else:
             moves = self._current().moves
             self._set(FlyingState.FLYING if moves else FlyingState.HOVERING)
 
     def _current(self) -> Piloting:
-        old = self.time - self._piloted_at > self.settings.command_timeout
-        return Piloting() if old else self._piloting
+        piloted = self._piloted
+        while len(piloted) > 1 and piloted[1][0] <= self.time:
+            piloted.popleft()
+        began, piloting = piloted[0]
+        acts = 0.0 <= self.time - began <= self.settings.command_timeout
+        return piloting if acts else Piloting()
 
-    def _command(self) -> FloatArray:
-        """Return the velocity command that the body flies, (4,)."""
+    def _command(self) -> TiltCommand:
+        """Return what the body is told."""
         if self.flying_state == FlyingState.TAKING_OFF:
-            return np.array([0.0, 0.0, _TAKE_OFF_SPEED, 0.0])
+            return TiltCommand(climb=_TAKE_OFF_SPEED)
         if self.flying_state == FlyingState.LANDING:
-            return np.array([0.0, 0.0, -_LANDING_SPEED, 0.0])
-        piloting = self._current()
-        speed = 0.01 * self.limits.tilt / self._tilt_of_speed * (1.0 + self.settings.gain_error)
-        return np.array(
-            [
-                speed * piloting.pitch,
-                -speed * piloting.roll,
-                0.01 * self.limits.climb * piloting.climb,
-                -0.01 * self.limits.turn * piloting.yaw,
-            ]
+            return TiltCommand(climb=-_LANDING_SPEED)
+        piloting, limits = self._current(), self.limits
+        return TiltCommand(
+            pitch=0.01 * limits.tilt * piloting.pitch,
+            roll=0.01 * limits.tilt * piloting.roll,
+            climb=0.01 * limits.climb * piloting.climb,
+            turn=-0.01 * limits.turn * piloting.yaw,
         )
 
     def _touch(self) -> None:
         """Stand on the floor instead of sinking into it."""
-        if self.height > 0.0 or self._body.state[8] > 0.0:
+        if self.height > 0.0 or self._body.velocity[2] > 0.0:
             return
         landing = self.flying_state == FlyingState.LANDING
         self._rest()
@@ -313,9 +313,9 @@ class MamboFirmware:
             self._set(FlyingState.LANDED)
 
     def _rest(self) -> None:
-        position = self._body.state[:3].copy()
+        position = self._body.position.copy()
         position[2] = self.floor
-        self._body = self._at_rest(Pose.from_yaw(position, float(self._body.state[5])))
+        self._body.rest_at(Pose.from_yaw(position, self._body.yaw))
 
     def _set(self, state: FlyingState) -> None:
         if state != self.flying_state:
@@ -329,13 +329,12 @@ class MamboFirmware:
         state = self.state
         self._readings += 1
         reading = self._odometry.step(state, self._readings)
-        roll, pitch, yaw = self._body.state[3:6].tolist()
-        cosine, sine = math.cos(yaw), math.sin(yaw)
+        cosine, sine = math.cos(self._body.yaw), math.sin(self._body.yaw)
         vx, vy, vz = state.velocity.tolist()
         return Estimate(
             position=reading.pose.position,
             yaw=reading.pose.yaw,
             velocity=np.array([cosine * vx + sine * vy, cosine * vy - sine * vx, vz]),
-            roll=roll,
-            pitch=pitch,
+            roll=self._body.roll,
+            pitch=self._body.pitch,
         )

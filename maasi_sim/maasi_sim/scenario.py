@@ -586,11 +586,19 @@ def _mambo_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
             )
         link = robot.mambo
         if link is None:
-            yield (*key, 'mambo'), 'is missing, link mambo_wifi needs it: at least {arm: true}'
+            yield (
+                (*key, 'mambo'),
+                'is missing, link mambo_wifi needs it: at least {arm: true, full_speed: ...}',
+            )
             continue
         key = (*key, 'mambo')
         if not link.arm:
             yield (*key, 'arm'), 'read false, allowed is true: it would never take off'
+        if link.full_speed is None:
+            yield (
+                (*key, 'full_speed'),
+                'is missing: it would never take off; measure_mambo says it, of fake_mambo too',
+            )
         if link.pose != 'events':
             yield (*key, 'pose'), f"read '{link.pose}', allowed in simulation is 'events'"
         if robot.start[2] <= link.ground:

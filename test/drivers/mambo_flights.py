@@ -1,5 +1,6 @@
 """A driver that talks through pyparrot to a fake Mambo, and the team around it."""
 
+import math
 import socket
 
 import numpy as np
@@ -8,7 +9,6 @@ from robot_team import MAMBO, Team, image_message
 from maasi_drivers.measurement_feed import FeedPacket, encode
 from maasi_filter.pose import Pose
 from maasi_msgs.msg import AgentState
-from maasi_planner.settings import MotionSettings
 from maasi_sim.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.mambo_firmware import FirmwareSettings, MamboFirmware
 from maasi_sim.odometry_model import OdometrySettings
@@ -17,6 +17,7 @@ START = [1.0, 1.2, 0.4]
 YAW = 0.6
 GOAL = [1.7, 0.8, 0.5]
 MOTION = MAMBO['motion']
+GRAVITY = 9.81
 
 
 class Flight:
@@ -32,14 +33,15 @@ class Flight:
     def __init__(self, mambo=None, **settings):
         self.address = free_address()
         firmware = MamboFirmware(
-            MotionSettings(**MOTION),
             Pose.from_yaw([*START[:2], 0.0], YAW),
-            FirmwareSettings(take_off_height=0.3),
+            FirmwareSettings(take_off_height=0.3, lost_link='land'),
             odometry=OdometrySettings(position_noise=0.002, heading_noise=0.002),
         )
         self.fake = FakeMambo(firmware, self.address)
         self.fake.run()
-        link = {'arm': True, 'address': self.address, 'port': free_port()} | (mambo or {})
+        full_speed = GRAVITY * math.tan(MOTION['tilt']) / firmware.settings.body.drag
+        link = {'arm': True, 'full_speed': full_speed, 'address': self.address}
+        link |= {'port': free_port()} | (mambo or {})
         # The machine may be busy.
         link.setdefault('link_timeout', 2.0)
         self.settings = MAMBO | {
@@ -63,6 +65,11 @@ class Flight:
     @property
     def flying_state(self):
         return self.fake.snapshot()[1]
+
+    @property
+    def speed(self):
+        """Over the ground [m/s]."""
+        return float(np.linalg.norm(self.fake.snapshot()[0].velocity[:2]))
 
     @property
     def where(self):

@@ -299,11 +299,8 @@ def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
             assert time.monotonic() < deadline, flight.fake.snapshot()
             time.sleep(0.02)
 
-    def speed():
-        return np.linalg.norm(flight.fake.snapshot()[0].velocity[:2])
-
-    assert speed() > 0.1
-    await_without_the_executor(lambda: speed() < 0.05)
+    assert flight.speed > 0.1
+    await_without_the_executor(lambda: flight.speed < 0.05)
     # It was told so before it lands.
     assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
     await_without_the_executor(lambda: flight.flying_state == FlyingState.LANDED)
@@ -321,12 +318,13 @@ def test_a_low_battery_lands_it(fly):
 
 
 def test_a_cancelled_goal_has_it_hover_then_land_and_another_one_takes_it_up(fly):
-    flight = fly(mambo={'cancel_landing': 1.0})
+    flight = fly(mambo={'cancel_landing': 3.0})
     handle, result = flight.on_its_way()
     handle.cancel_goal_async()
     flight.until(result.done)
     assert result.result().status == GoalStatus.STATUS_CANCELED
-    flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
+    flight.until(lambda: flight.speed < 0.05)
+    assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
     flight.until(lambda: flight.flying_state == FlyingState.LANDED)
     flight.until(lambda: flight.status == AgentState.CANCELED)
     _, result = flight.team.send_accepted(GOAL)

@@ -17,19 +17,19 @@ from numpy.testing import assert_allclose
 
 from maasi_drivers.mambo_link import MamboLink, MamboLinkError
 from maasi_filter.pose import Pose
-from maasi_planner.settings import MotionSettings
-from maasi_sim.fake_mambo import FakeMambo, Frame, FrameError, frames
+from maasi_sim.fake_mambo import FakeMambo, main
 from maasi_sim.mambo_firmware import (
     FirmwareSettings,
     FlyingState,
     MamboFirmware,
     Piloting,
 )
+from maasi_sim.mambo_frames import Frame, FrameError, frames
 from maasi_sim.robots import BatterySettings
+from maasi_sim.tilt_body import TiltBody, TiltBodySettings, TiltCommand
 
 # Longest wait for anything; the machine may be busy.
 LIMIT = 30.0
-MOTION = MotionSettings(model='mambo', speed=0.4, tilt=0.1)
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
 # Of this process, so that several can be tested at a time on one host.
 _NUMBERS = itertools.count(os.getpid() % 1000 * 20)
@@ -54,7 +54,7 @@ def until(condition, what='nothing came of it'):
 
 
 def firmware(**changes):
-    return MamboFirmware(MOTION, START, **changes)
+    return MamboFirmware(START, **changes)
 
 
 def hovering(**changes):
@@ -104,7 +104,7 @@ def test_piloting_moves_it_along_its_own_axes():
     move = made.state.pose.position - before
     # It faces the map's y axis.
     assert move[1] > 0.15 and abs(move[0]) < 1e-6
-    fly(made, 2.0)
+    fly(made, 5.0)
     before = made.state.pose.position
     fly(made, 2.0, Piloting(roll=50))
     move = made.state.pose.position - before
@@ -116,33 +116,82 @@ def test_piloting_moves_it_along_its_own_axes():
     assert made.estimate().yaw < -0.2
 
 
-def test_the_speed_of_a_tilt_is_that_of_its_model():
-    made = hovering()
-    made.limit_tilt(math.degrees(0.1))
-    fly(made, 5.0, Piloting(pitch=60))
-    first = made.state.pose.position
-    fly(made, 2.0, Piloting(pitch=60))
-    speed = np.linalg.norm(made.state.pose.position - first) / 2.0
-    assert_allclose(speed, 0.6 * 0.1 / made._tilt_of_speed, rtol=1e-3)
+# ---- body: what a tilt does --------------------------------------------------------------------
 
 
-def test_without_new_commands_it_hovers_and_without_its_controller_it_lands():
+@pytest.mark.parametrize('drag', [0.3, 0.6, 2.6])
+def test_a_tilt_accelerates_it_until_the_drag_holds_against_it(drag):
+    made = hovering(settings=FirmwareSettings(delay=0.0, body=TiltBodySettings(drag=drag)))
+    made.limit_tilt(10.0)
+    acceleration = 9.81 * math.tan(0.6 * math.radians(10.0))
+    fly(made, 0.5, Piloting(pitch=60))
+    # The tilt is there 0.1 s late.
+    early = acceleration / drag * (1.0 - math.exp(-drag * (0.5 - 0.1)))
+    assert_allclose(np.linalg.norm(made.state.velocity), early, rtol=0.1)
+    fly(made, 8.0 / drag, Piloting(pitch=60))
+    assert_allclose(np.linalg.norm(made.state.velocity), acceleration / drag, rtol=0.01)
+    # The nose is down by the tilt.
+    assert made.estimate().pitch == pytest.approx(0.6 * math.radians(10.0), rel=1e-3)
+
+
+def test_a_command_acts_after_the_delay_and_hovering_stops_it():
+    made = hovering(settings=FirmwareSettings(delay=0.3, command_timeout=5.0))
+    made.pilot(Piloting(pitch=100))
+    made.advance(0.28)
+    assert not made.state.velocity[:2].any() and made.flying_state == FlyingState.HOVERING
+    made.advance(0.4)
+    fast = np.linalg.norm(made.state.velocity)
+    assert fast > 0.3
+    made.pilot(Piloting())
+    made.advance(0.28)
+    assert np.linalg.norm(made.state.velocity) > fast
+    made.advance(3.0)
+    assert np.linalg.norm(made.state.velocity) < 0.01
+
+
+def test_in_a_mode_without_stabilisation_it_only_levels_itself():
+    """Parrot's modes medium and difficult: it goes on, and drag alone slows it."""
+    settings = FirmwareSettings(body=TiltBodySettings(drag=0.3, hover_gain=0.0))
+    made = hovering(settings=settings)
+    fly(made, 2.0, Piloting(pitch=50))
+    fast = np.linalg.norm(made.state.velocity)
+    fly(made, 2.0)
+    assert np.linalg.norm(made.state.velocity) > 0.5 * fast
+
+
+def test_vertical_speed_and_rotation_rate_come_with_their_time_constants():
+    settings = TiltBodySettings(climb_time=0.5, turn_time=0.25)
+    body = TiltBody(settings, START)
+    for _ in range(25):
+        body.step(TiltCommand(climb=1.0, turn=2.0), 0.1, 0.02)
+    state = body.robot_state()
+    assert_allclose(state.velocity[2], 1.0 - math.exp(-1.0), rtol=1e-6)
+    assert_allclose(state.angular_velocity[2], 2.0 * (1.0 - math.exp(-2.0)), rtol=1e-6)
+
+
+def test_no_piloting_command_is_flown_for_ever():
     made = hovering()
     fly(made, 2.0, Piloting(pitch=60))
-    assert np.linalg.norm(made.state.velocity) > 0.15
+    assert made.flying_state == FlyingState.FLYING
     silent = made.time
-    states = []
-    while made.flying_state != FlyingState.LANDED:
+    while made.flying_state == FlyingState.FLYING:
         made.advance(0.05)
-        states.append((made.time - silent, made.flying_state))
-        assert made.time - silent < 15.0
-    first = {}
-    for after, state in states:
-        first.setdefault(state, after)
-    settings = made.settings
-    assert_allclose(first[FlyingState.HOVERING], settings.command_timeout, atol=0.11)
-    assert_allclose(first[FlyingState.LANDING], settings.landing_timeout, atol=0.11)
-    assert made.height == 0.0
+        assert made.time - silent <= made.settings.command_timeout + made.settings.delay + 0.06
+
+
+@pytest.mark.parametrize(
+    ('what', 'state'), [('hover', FlyingState.HOVERING), ('land', FlyingState.LANDED)]
+)
+def test_what_it_does_without_its_controller_is_a_setting(what, state):
+    made = hovering(settings=FirmwareSettings(lost_link=what))
+    assert FirmwareSettings().lost_link == 'hover'
+    fly(made, 1.0, Piloting(pitch=30))
+    silent = made.time
+    while made.time - silent < made.settings.landing_timeout - 0.1:
+        made.advance(0.05)
+    assert made.flying_state == FlyingState.HOVERING
+    made.advance(10.0)
+    assert made.flying_state == state
 
 
 def test_an_empty_battery_lands_it_and_keeps_it_on_the_floor():
@@ -155,6 +204,14 @@ def test_an_empty_battery_lands_it_and_keeps_it_on_the_floor():
     made.take_off()
     fly(made, 1.0)
     assert made.flying_state == FlyingState.LANDED
+
+
+@pytest.mark.parametrize(
+    ('option', 'value'), [('--drag', '-1.0'), ('--delay', '-0.1'), ('--charge', '2.0')]
+)
+def test_the_command_says_what_it_does_not_take(capsys, option, value):
+    assert main([option, value]) == 2
+    assert f'error: {option}: read {value}' in capsys.readouterr().err
 
 
 def test_emergency_drops_it():
@@ -190,7 +247,7 @@ def pair():
     started = []
 
     def start(connect=True, settings=None, **changes):
-        made = MamboFirmware(MOTION, START, settings=settings or FirmwareSettings(), **changes)
+        made = MamboFirmware(START, settings=settings or FirmwareSettings(), **changes)
         fake = FakeMambo(made, own_address())
         fake.run()
         link = MamboLink('wifi', fake.address, free_port(), tilt=0.1)
@@ -304,6 +361,16 @@ def test_a_landing_is_asked_for_again_when_commands_are_lost(pair):
     assert fake.firmware.flying_state == FlyingState.HOVERING
     fake.cut_up = False
     until(lambda: fake.firmware.flying_state == FlyingState.LANDED)
+
+
+def test_one_that_lands_by_itself_is_not_told_to_take_off_again(pair):
+    fake, link = pair()
+    link.take_off()
+    until(lambda: link.flying_state == 'hovering')
+    fake.firmware.land()
+    until(lambda: link.flying_state == 'landed')
+    time.sleep(1.5)
+    assert fake.firmware.take_offs == 1 and link.flying_state == 'landed'
 
 
 def test_position_events_that_are_no_numbers_are_left_out(pair):

@@ -20,7 +20,7 @@ SCENARIO = {
         'mambo': {
             'type': 'mambo',
             'link': 'mambo_wifi',
-            'mambo': {'arm': True, 'ground': 0.1},
+            'mambo': {'arm': True, 'full_speed': 1.97, 'ground': 0.1},
             'start': [0.2, 0.6, 0.6],
             'yaw': 0.5,
             'candidates': {'grid': [2, 2], 'spacing': 0.5, 'corner': [0.0, 0.0]},
@@ -59,10 +59,13 @@ def test_it_stands_below_its_start_and_flies_as_its_link_says():
         assert drone.obeys
         assert_allclose(drone.state.pose.position, [0.2, 0.6, 0.5], atol=0.15)
         drone.cut()
-        # Its firmware misses it.
-        until(lambda: not drone.obeys)
+        # Nothing is heard any more; its firmware has it hover.
+        until(lambda: time.monotonic() - link.heard_at > 1.0)
+        assert drone.obeys
         drone.cut(False)
+        link.land()
         until(lambda: link.flying_state == 'landed')
+        assert not drone.obeys
     finally:
         link.close()
         drone.close()
@@ -84,7 +87,8 @@ def test_each_drone_has_an_address_of_this_host():
     ('changes', 'text'),
     [
         ({'mambo': {'arm': False}}, 'mambo.arm: read false, allowed is true'),
-        ({'mambo': None}, r'mambo: is missing, .* at least \{arm: true\}'),
+        ({'mambo': {'arm': True}}, 'mambo.full_speed: is missing'),
+        ({'mambo': None}, r'mambo: is missing, .* at least \{arm: true'),
         ({'mambo': {'arm': True, 'pose': 'pose'}}, "mambo.pose: read 'pose'"),
         ({'start': [0.2, 0.6, 0.0]}, 'start: read height 0.0'),
         ({'guard': True}, 'guard: read true'),

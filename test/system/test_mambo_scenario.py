@@ -16,7 +16,7 @@ def short_search(folder, **link):
     scenario['targets']['count'] = 4
     robots = scenario['robots']
     # The machine may be busy.
-    settings = {'arm': True, 'link_timeout': 3.0, 'land_after': 10.0} | link
+    settings = {'arm': True, 'full_speed': 1.97, 'link_timeout': 3.0, 'land_after': 10.0} | link
     robots['mambo'] |= {'link': 'mambo_wifi', 'mambo': settings}
     robots['mambo']['start'] = [0.9, 0.9, 1.0]
     robots['mambo']['candidates']['grid'] = [4, 4]

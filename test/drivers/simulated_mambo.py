@@ -1,0 +1,226 @@
+"""A Mambo's pilot over the fake's firmware, without a network and in simulated time."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from maasi_drivers.mambo_link import PositionEvent
+from maasi_drivers.mambo_pilot import MamboPilot, Phase
+from maasi_drivers.mambo_settings import MamboSettings
+from maasi_drivers.speed_measurement import MeasuredSpeed, MeasuringFlight, fit_speed
+from maasi_filter.pose import Pose
+from maasi_planner.motion import make_motion
+from maasi_planner.settings import MotionSettings
+from maasi_sim.mambo_firmware import FirmwareSettings, FlyingState, MamboFirmware, Piloting
+from maasi_sim.odometry_model import OdometrySettings
+from maasi_sim.robots import BatterySettings
+from maasi_sim.tilt_body import TiltBodySettings
+
+STEP = 0.05
+TILT = 0.1
+MOTION = MotionSettings(model='mambo', speed=0.4, tilt=TILT)
+HOME = Pose.from_yaw([1.0, 1.2, 1.0], 0.6)
+FENCE = np.array([[-0.4, 2.5], [-0.4, 2.5], [0.0, 2.0]])
+NAMES = {
+    FlyingState.LANDED: 'landed',
+    FlyingState.TAKING_OFF: 'takingoff',
+    FlyingState.HOVERING: 'hovering',
+    FlyingState.FLYING: 'flying',
+    FlyingState.LANDING: 'landing',
+    FlyingState.EMERGENCY: 'emergency',
+}
+
+
+def full_speed(drag):
+    """Return the steady speed of the firmware's body at the largest tilt [m/s]."""
+    return 9.81 * math.tan(TILT) / drag
+
+
+class Flight:
+    """A firmware, a link to it that loses nothing, and time: 20 steps a second."""
+
+    def __init__(
+        self,
+        arm=True,
+        battery=1.0,
+        drag=0.5,
+        firmware_delay=0.1,
+        fence=FENCE,
+        lost_link='land',
+        **settings,
+    ):
+        start = Pose.from_yaw([*HOME.position[:2], 0.0], HOME.yaw)
+        self.firmware = MamboFirmware(
+            start,
+            FirmwareSettings(
+                delay=firmware_delay, lost_link=lost_link, body=TiltBodySettings(drag=drag)
+            ),
+            BatterySettings(charge=battery),
+            OdometrySettings(position_noise=0.002, heading_noise=0.002),
+        )
+        self.firmware.limit_tilt(math.degrees(TILT))
+        self.firmware.limit_climb(0.5)
+        self.connected, self.error = True, ''
+        self.tilt, self.climb = TILT, 0.5
+        self.position = None
+        self.cut_up = self.cut_down = False
+        self.sent = 'true'
+        self.time = self.heard_at = 0.0
+        self._flying_state, self._battery = 'landed', battery
+        self.motion = make_motion(MOTION)
+        settings = {'full_speed': full_speed(drag), 'arm': arm} | settings
+        self.pilot = MamboPilot(self, self.motion, MamboSettings(**settings), HOME, fence)
+        self.goal = None
+        self.problems = []
+
+    # ---- what the pilot sees of a link -------------------------------------------------------
+
+    @property
+    def flying_state(self):
+        if not self.cut_down:
+            self._flying_state = NAMES[self.firmware.flying_state]
+        return self._flying_state
+
+    @property
+    def battery(self):
+        if not self.cut_down:
+            self._battery = self.firmware.charge.charge
+        return self._battery
+
+    def take_off(self):
+        if not self.cut_up:
+            self.firmware.take_off()
+
+    def land(self):
+        if not self.cut_up:
+            self.firmware.land()
+
+    def steer(self, forward, left, up, turn):
+        if not self.cut_up:
+            values = [round(100 * max(-1.0, min(x, 1.0))) for x in (-left, forward, -turn, up)]
+            self.firmware.pilot(Piloting(*values))
+
+    def keep_alive(self):
+        pass
+
+    # ---- time --------------------------------------------------------------------------------
+
+    def step(self, number=1):
+        for _ in range(number):
+            self.time += STEP
+            if not self.cut_up:
+                self.firmware.hear()
+            self.firmware.advance(STEP)
+            if round(self.time / STEP) % 10 == 0 and not self.cut_down:
+                self.heard_at = self.time
+                self._send_position()
+            self.pilot.update(self.time)
+            self.problems.append(self.pilot.problem)
+            if self.goal is not None and self.pilot.phase is Phase.FLYING:
+                self.pilot.fly(self.motion.command(self.pilot.ahead(), self.goal))
+
+    def _send_position(self):
+        if self.sent == 'none':
+            return
+        estimate = self.firmware.estimate()
+        position = estimate.position.copy()
+        position[2] = round(position[2], 2)
+        if self.sent == 'stuck':
+            position = self.position.position
+        yaw = math.radians(round(math.degrees(estimate.yaw)))
+        self.position = PositionEvent(position, yaw, self.time)
+
+    def until(self, condition, limit=30.0):
+        end = self.time + limit
+        while not condition():
+            assert self.time < end, (self.pilot.phase, self.pilot.problem)
+            self.step()
+
+    def flown(self):
+        """Return itself, in the air and on the way."""
+        self.until(lambda: self.pilot.phase is Phase.FLYING)
+        self.goal = HOME.position + np.array([0.9, -0.6, 0.0])
+        self.step(30)
+        return self
+
+    @property
+    def where(self):
+        return self.firmware.state.pose.position
+
+    @property
+    def speed(self):
+        return float(np.linalg.norm(self.firmware.state.velocity))
+
+
+# The field of the scenarios on the floor and what its candidates reach: x and y [m].
+FIELD = np.array([[-0.3, 2.4], [-0.3, 2.4]])
+WAYPOINTS = [[2.2, 2.2], [-0.1, 2.2], [2.2, -0.1], [-0.1, -0.1], [1.05, 1.05], [1.43, 1.05]]
+
+
+@dataclass
+class Flown:
+    """
+    How a flight over the field went.
+
+    Attributes
+    ----------
+    measured : MeasuredSpeed
+        Of the measuring flight before.
+    overshoot : float
+        Farthest beyond a waypoint, in the direction of the leg [m].
+    outside : float
+        Farthest outside the field; negative: inside [m].
+    way, straight : float
+        Flown, and from waypoint to waypoint [m].
+    time : float
+        Until it has stayed at the last one for a second [s].
+    """
+
+    measured: MeasuredSpeed
+    overshoot: float = 0.0
+    outside: float = -math.inf
+    way: float = 0.0
+    straight: float = 0.0
+    time: float = 0.0
+
+
+def measure(drag, delay, way=1.0, legs=6):
+    """Return what a measuring flight says, and how far it went from its place [m]."""
+    flight = Flight(drag=drag, firmware_delay=delay, arm=False)
+    measuring = MeasuringFlight(flight, way, legs, lambda: flight.time)
+    far = 0.0
+    for _ in measuring.steps():
+        flight.step()
+        far = max(far, float(np.hypot(*(flight.where - HOME.position)[:2])))
+    return fit_speed(measuring.legs, TILT), far
+
+
+def measure_and_fly(drag, delay):
+    """Return how a Mambo flies over the field with what its measuring flight says."""
+    flown = Flown(measure(drag, delay)[0])
+    speed, late = flown.measured.full_speed, flown.measured.delay
+    flight = Flight(drag=drag, firmware_delay=delay, full_speed=speed, delay=late)
+    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    began = flight.time
+    for x, y in WAYPOINTS:
+        start, goal = flight.where, np.array([x, y, HOME.position[2]])
+        length = float(np.hypot(*(goal - start)[:2]))
+        flown.straight += length
+        flight.goal, arrived = goal, math.inf
+        while flight.time - arrived < 1.0:
+            before = flight.where
+            flight.step()
+            there = flight.where
+            flown.way += float(np.linalg.norm(there - before))
+            beyond = float((there - start)[:2] @ (goal - start)[:2]) / length - length
+            flown.overshoot = max(flown.overshoot, beyond)
+            sides = [there[:2] - FIELD[:, 1], FIELD[:, 0] - there[:2]]
+            flown.outside = max(flown.outside, float(np.max(sides)))
+            if np.linalg.norm(there - goal) > MOTION.tolerance:
+                arrived = math.inf
+            elif math.isinf(arrived):
+                arrived = flight.time
+            assert flight.time - began < 300.0, 'it does not come to rest'
+    flown.time = flight.time - began
+    return flown

@@ -1,0 +1,133 @@
+"""The flight that measures how fast a Mambo flies at its largest tilt, over the fake's firmware."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from numpy.testing import assert_allclose
+from simulated_mambo import TILT, Flight, full_speed, measure
+
+from maasi_drivers.measure_mambo import main
+from maasi_drivers.speed_measurement import Leg, MeasurementError, MeasuringFlight, fit_speed
+from maasi_filter.pose import Pose
+from maasi_sim.fake_mambo import FakeMambo, free_address, free_port
+from maasi_sim.mambo_firmware import FlyingState, MamboFirmware
+
+WAY = 1.0
+# Longest wait for anything; the machine may be busy.
+LIMIT = 60.0
+
+
+@pytest.mark.parametrize(('drag', 'delay'), [(0.3, 0.0), (0.3, 0.3), (1.0, 0.15), (3.0, 0.3)])
+def test_it_measures_the_speed_and_keeps_within_the_way(drag, delay):
+    measured, far = measure(drag, delay, WAY)
+    assert_allclose(measured.full_speed, full_speed(drag), rtol=0.1)
+    # The time constant of the tilt is a delay, too.
+    assert_allclose(measured.delay, delay + 0.1, atol=0.05)
+    assert measured.doubt < 0.1 and far < WAY
+
+
+def flown(**faults):
+    """Fly half a measurement, then with a fault."""
+    flight = Flight(arm=False)
+    for count, _ in enumerate(MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps()):
+        flight.step()
+        if count == 200:
+            for name, value in faults.items():
+                setattr(flight, name, value)
+    return flight
+
+
+@pytest.mark.parametrize(
+    ('faults', 'text'),
+    [
+        ({'cut_down': True}, 'no position for 1.5 s'),
+        ({'sent': 'none'}, 'no position for 1.5 s'),
+        ({'error': 'the link broke'}, 'the link broke'),
+    ],
+)
+def test_it_does_not_go_on_without_a_link(faults, text):
+    with pytest.raises(MeasurementError, match=text):
+        flown(**faults)
+
+
+def test_it_does_not_go_on_far_from_where_it_took_off():
+    flight = Flight(arm=False)
+    with pytest.raises(MeasurementError, match=r'allowed are 1\.50 m'):
+        for _ in MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps():
+            flight.step()
+            # A draught.
+            flight.firmware._body.position[1] += 0.01
+
+
+def test_it_does_not_take_off_with_a_low_battery():
+    flight = Flight(arm=False, battery=0.15)
+    with pytest.raises(MeasurementError, match=r'battery: read 0\.15'):
+        for _ in MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps():
+            flight.step()
+    assert flight.firmware.take_offs == 0
+
+
+def leg(places):
+    return Leg(0.0, 0.0, [(0.0, 1.0), (1.0, -1.0)], places)
+
+
+def test_what_says_too_little_or_does_not_fit_is_refused():
+    with pytest.raises(MeasurementError, match='fewer than 6'):
+        fit_speed([leg([(0.5, 0.1)])], TILT)
+    with pytest.raises(MeasurementError, match='misfit'):
+        fit_speed([leg([(0.2 * n, 0.3 * math.sin(2.0 * n)) for n in range(10)])], TILT)
+    # It never left the place.
+    with pytest.raises(MeasurementError, match='speed: known to'):
+        fit_speed([leg([(0.1 * n, 0.0) for n in range(10)])], TILT)
+
+
+# ---- the command -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def drone():
+    fake = FakeMambo(MamboFirmware(Pose.from_yaw([0.0, 0.0, 0.0], 0.0)), free_address())
+    fake.run()
+    yield fake
+    fake.close()
+
+
+def command(fake, *options):
+    line = [sys.executable, '-m', 'maasi_drivers.measure_mambo', '--address', fake.address]
+    line += ['--port', str(free_port()), *options]
+    return subprocess.Popen(line, stdout=subprocess.PIPE, text=True, env=os.environ)
+
+
+def test_the_command_measures_through_pyparrot_and_lands(drone):
+    process = command(drone, '--fly', '--legs', '2')
+    output, _ = process.communicate(timeout=LIMIT)
+    assert process.returncode == 0, output
+    lines = dict(line.split(': ') for line in output.splitlines() if line.startswith('mambo.'))
+    drag = drone.firmware.settings.body.drag
+    assert_allclose(float(lines['mambo.full_speed'].split()[0]), full_speed(drag), rtol=0.3)
+    assert drone.snapshot()[1] == FlyingState.LANDED and drone.firmware.take_offs == 1
+
+
+def test_the_command_lands_when_it_is_interrupted(drone):
+    process = command(drone, '--fly')
+    end = time.monotonic() + LIMIT
+    while drone.snapshot()[1] != FlyingState.HOVERING:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=LIMIT)
+    assert process.returncode == 1
+    assert drone.snapshot()[1] == FlyingState.LANDED
+
+
+def test_the_command_says_what_it_would_do_and_what_cannot_be(capsys):
+    assert main([]) == 0
+    assert 'add --fly' in capsys.readouterr().out
+    for option, value in (('--tilt', '0.01'), ('--way', '0.1'), ('--legs', '1'), ('--port', '80')):
+        assert main(['--fly', option, value]) == 2
+        assert f'{option}: read {value}, allowed is' in capsys.readouterr().err
