@@ -1,4 +1,4 @@
-"""Robots that are reached by a link of their own, which the simulation plays in real time."""
+"""Robots that the simulation does not move: it plays their link in real time, or others do."""
 
 from __future__ import annotations
 

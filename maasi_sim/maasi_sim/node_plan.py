@@ -133,6 +133,7 @@ def plan_nodes(
         If a link cannot keep this pace.
     """
     scenario.check_pace(lockstep, rate)
+    external_clock = isinstance(scenario, Scenario) and scenario.external_clock
     common = {'step': scenario.step, 'seed': seed, 'lockstep': lockstep}
     simulation: dict[str, Any] = {
         'scenario': str(file),
@@ -147,7 +148,7 @@ def plan_nodes(
             'maasi_sim',
             'cuboid_sim_node' if alone else 'sim_node',
             'sim_node',
-            parameters=simulation,
+            parameters={**simulation, **(_SIMULATED if external_clock else {})},
             topics=(CLOCK, STEP) if lockstep else (CLOCK,),
             says_ready=False,
             says_done=False,

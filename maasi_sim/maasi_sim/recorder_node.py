@@ -118,6 +118,8 @@ class Recorder:
         self.observer = observer
         self.bag = bag
         self.time = 0
+        # Of the first step [ns].
+        self._begun: int | None = None
         self.step: int | None = None
         self.last_seen: dict[str, float] = {}
         #: When each node was last heard of in the diagnostics [s of wall time].
@@ -235,7 +237,7 @@ class Recorder:
         Parameters
         ----------
         limit : int, optional
-            Simulated time at which the run ends [ns].
+            Simulated time after which the run ends [ns].
         """
         # Left where they are they would end each wait at once.
         self.take_ready()
@@ -249,6 +251,8 @@ class Recorder:
         for data in steps:
             self.step = struct.unpack_from('<Q', data, 4)[0]
             self._set_time(data, 12)
+            if self._begun is None:
+                self._begun = self.time
         taken = [(CLOCK, data) for data in self._take_from(CLOCK)]
         for _, data in taken:
             self._set_time(data, 4)
@@ -259,7 +263,7 @@ class Recorder:
         taken += [(STEP, data) for data in steps]
         if self._finished:
             taken = self._until(taken, self._last_step)
-        elif limit is not None and self.step is not None and self.time >= limit:
+        elif limit is not None and self.step is not None and self._elapsed >= limit:
             self._last_step = self.step - 1
             taken = self._until(taken, self._last_step)
         now = time.monotonic()
@@ -277,6 +281,15 @@ class Recorder:
             self._last_step = self.observer.end_step
             taken = self._until(taken, self._last_step)
         self._record(taken)
+
+    @property
+    def elapsed(self) -> float:
+        """Simulated time since the first step [s]."""
+        return self._elapsed / 1e9
+
+    @property
+    def _elapsed(self) -> int:
+        return self.time - (self._begun or 0)
 
     def _record(self, taken: list[tuple[str, bytes]]) -> None:
         # One that has failed ends the run: `bag.failed`.

@@ -483,7 +483,7 @@ class ScenarioRun:
             if self.scenario.stop == 'planner_done':
                 return Ending('planner_done', DONE, observer.settled)
             return Ending('planner_done', NOT_ALL_FOUND, observer.settled)
-        if recorder.time >= self.scenario.limits.time * 1e9:
+        if recorder.elapsed >= self.scenario.limits.time:
             return Ending('time_limit', NOT_ALL_FOUND)
         return None
 
@@ -505,7 +505,7 @@ class ScenarioRun:
             if process.running:
                 continue
             text = f'{name} {process.how_it_ended()}'
-            event = {'time': recorder.time / 1e9, 'node': name, 'event': 'died'}
+            event = {'time': recorder.elapsed, 'node': name, 'event': 'died'}
             robot = self._robot_of(name)
             if robot is not None and name.endswith(('/driver', '/cuboid_planner')):
                 recorder.stop_robots([robot])
@@ -543,7 +543,7 @@ class ScenarioRun:
             if self._begun is None or awaited or not self.processes[name].running:
                 continue
             text = f'{name} hangs: no heartbeat for {silent:.1f} s'
-            self.events.append({'time': recorder.time / 1e9, 'node': name, 'event': 'hung'})
+            self.events.append({'time': recorder.elapsed, 'node': name, 'event': 'hung'})
             robot = self._robot_of(name)
             if robot is not None:
                 recorder.stop_robots([robot])
@@ -578,9 +578,13 @@ class ScenarioRun:
         return [name for name, robot in robots.items() if getattr(robot, 'takes_off', False)]
 
     def _external(self) -> list[str]:
-        """Return the robots that another program moves."""
+        """Return the robots that another program moves, and that take off."""
         robots = getattr(self.scenario, 'robots', {})
-        return [name for name, robot in robots.items() if getattr(robot, 'external', False)]
+        return [
+            name
+            for name, robot in robots.items()
+            if getattr(robot, 'external', False) and robot.link != 'topics'
+        ]
 
     def _robot_of(self, node: str) -> str | None:
         name = node.strip('/').partition('/')[0]
@@ -590,7 +594,7 @@ class ScenarioRun:
         from maasi_sim.progress import Status
 
         observer.news = False
-        seconds = recorder.time / 1e9
+        seconds = recorder.elapsed
         wall = time.monotonic() - (self._begun or time.monotonic())
         self.display.show(
             Status(
@@ -636,7 +640,7 @@ class ScenarioRun:
         wall = 0.0
         if self._begun is not None and self._ended is not None:
             wall = self._ended - self._begun
-        record = observer.record(ending.reason, recorder.time / 1e9, wall, self.events)
+        record = observer.record(ending.reason, recorder.elapsed, wall, self.events)
         stored = store_report(record, self.folder)
         self.display.say(stored.words)
         if ending.text:

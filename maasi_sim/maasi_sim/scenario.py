@@ -78,6 +78,11 @@ class RobotSettings(Settings):
         description='Whether a guard stops it when its driver dies or hangs; none: where it is '
         'reached by topics, as another link has a time limit of its own',
     )
+    body: Literal['simulated', 'external'] = Field(
+        default='simulated',
+        description='With link topics: whether the sim moves it, or another program, as Gazebo, '
+        'that publishes its odometry and the time (/clock)',
+    )
     link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
         default='topics', description='How its driver reaches it; the sim plays the other end'
     )
@@ -115,7 +120,9 @@ class RobotSettings(Settings):
     @property
     def external(self) -> bool:
         """Whether another program than the sim moves it."""
-        return self.link == 'mavlink' and self.autopilot.external
+        if self.link == 'mavlink':
+            return self.autopilot.external
+        return self.body == 'external'
 
     @property
     def takes_off(self) -> bool:
@@ -239,6 +246,17 @@ class Scenario(Settings):
                     f'robots.{name}.link: read {link!r}, which runs in real time, and {asked}; '
                     'allowed is topics, or rate 1 without lockstep'
                 )
+            if self.robots[name].body == 'external' and (lockstep or rate not in (None, 1.0)):
+                asked = 'lockstep' if lockstep else f'rate {rate:g}'
+                raise ScenarioError(
+                    f"robots.{name}.body: read 'external', and {asked}; allowed is simulated, or "
+                    'neither --lockstep nor --rate: the time is that of /clock'
+                )
+
+    @property
+    def external_clock(self) -> bool:
+        """Whether the time is that of the program that moves a robot."""
+        return any(robot.body == 'external' for robot in self.robots.values())
 
     def removal_distance(self) -> float:
         """Return T_z [m]: the filter's, or four deviations of the coarsest range without."""
@@ -523,6 +541,8 @@ def _robot_problems(
     else:
         if not len(candidates.at(robot.start)):
             yield ('candidates',), 'leave no waypoint inside environment.bounds'
+    if robot.body == 'external' and robot.link != 'topics':
+        yield ('body',), f"read 'external', allowed with link {robot.link} is simulated"
     yield from _sensor_problems(robot, scenario)
 
 

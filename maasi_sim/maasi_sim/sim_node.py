@@ -93,8 +93,9 @@ class RobotTopics:
             return made
 
         equipment = self.robot.equipment
-        # One with a link of its own says by that where it is.
-        self.linked = simulation.scenario.robots[name].link != 'topics'
+        # One that is moved by something else says where it is by itself.
+        robot = simulation.scenario.robots[name]
+        self.linked = robot.link != 'topics' or robot.external
         self._odometry_publisher = None if self.linked else publisher(Odometry, 'odom')
         self._odometry = Odometry(child_frame_id=f'{name}/base_link')
         self._odometry.header.frame_id = f'{name}/odom'
@@ -120,7 +121,9 @@ class RobotTopics:
             self._ranges_publisher = publisher(RangeArray, 'ranges')
             self._ranges = RangeArray(header=Header(frame_id=f'{name}/base_link'))
             self.sensor_topic = self._ranges_publisher.topic_name
-        if equipment.laser is not None:
+        # Who moves a robot on topics has its scan as well.
+        self._scans = equipment.laser is not None and robot.body == 'simulated'
+        if equipment.laser is not None and self._scans:
             self._scan_publisher = publisher(LaserScan, 'scan')
             self._scan = scan_message(equipment.laser, f'{name}/base_scan')
 
@@ -154,7 +157,7 @@ class RobotTopics:
                 for values in robot.ranges(simulation.step).tolist()
             ]
             self._ranges_publisher.publish(self._ranges)
-        if simulation.scan_due(name):
+        if self._scans and simulation.scan_due(name):
             self._scan.header.stamp = stamp
             self._scan.ranges = array.array('f', simulation.scan(name).tobytes())
             self._scan_publisher.publish(self._scan)
@@ -232,14 +235,15 @@ class SimNode(SearchNode[SimNodeSettings]):
     `<robot>/camera/image_raw` (sensor_msgs/Image), `<robot>/camera/camera_info`
     (sensor_msgs/CameraInfo), `<robot>/scan` (sensor_msgs/LaserScan), `<robot>/ranges`
     (maasi_msgs/RangeArray): those that the robot has;
-    `/clock` (rosgraph_msgs/Clock), `lockstep/step` (maasi_msgs/LockstepStep);
+    `/clock` (rosgraph_msgs/Clock), unless a robot is moved by another program, whose time it is
+    then; `lockstep/step` (maasi_msgs/LockstepStep);
     `ground_truth/targets` (geometry_msgs/PoseArray), `ground_truth/markers`
     (visualization_msgs/MarkerArray): latched, only for scoring and for the eye
 
     Subscribes
     ----------
     `<robot>/cmd_vel` (geometry_msgs/TwistStamped); `<robot>/state` (maasi_msgs/AgentState) of
-    robots with `autopilot: external`;
+    robots that another program moves;
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
     """
 
@@ -306,9 +310,12 @@ class SimNode(SearchNode[SimNodeSettings]):
         lockstep = self.settings.lockstep
         self.simulation.warm_up()
         qos = sensor_writer(lockstep)
-        self._clock_publisher = self.create_publisher(Clock, '/clock', qos)
         self._step_publisher = self.create_publisher(LockstepStep, 'lockstep/step', qos)
-        self._entities += [self._clock_publisher, self._step_publisher]
+        self._entities.append(self._step_publisher)
+        self._clock_publisher: Publisher | None = None
+        if not self.scenario.external_clock:
+            self._clock_publisher = self.create_publisher(Clock, '/clock', qos)
+            self._entities.append(self._clock_publisher)
         self._robots = {
             name: RobotTopics(self, self.simulation, name, qos) for name in self.simulation.robots
         }
@@ -367,7 +374,9 @@ class SimNode(SearchNode[SimNodeSettings]):
         )
         self._look_timer = self.create_wall_timer(_LOOK_PERIOD, self._look_for_nodes)
         self._look_timer.cancel()
-        self._step_timer = self.create_wall_timer(self._period or 1.0, self._on_step_timer)
+        # One that follows another clock looks at it more often than it steps.
+        period = self._period if self._clock_publisher is not None else 0.25 * self._period
+        self._step_timer = self.create_wall_timer(period or 1.0, self._on_step_timer)
         self._step_timer.cancel()
         self.create_wall_timer(1.0, self._watch)
 
@@ -463,6 +472,8 @@ class SimNode(SearchNode[SimNodeSettings]):
         )
         self._remember_endpoints()
         self._wall_start = self._due = now
+        if self._clock_publisher is None:
+            self.simulation.begin(self._step_of_clock())
         self._begin_step()
         if not self.settings.lockstep:
             self._step_timer.reset()
@@ -555,7 +566,8 @@ class SimNode(SearchNode[SimNodeSettings]):
         stamp = stamp_to_ros(self._stamp)
         for name in robots:
             self._robots[name].publish(stamp)
-        self._clock_publisher.publish(Clock(clock=stamp))
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(Clock(clock=stamp))
         present = self.simulation.present
         self._step_publisher.publish(
             LockstepStep(
@@ -678,11 +690,15 @@ class SimNode(SearchNode[SimNodeSettings]):
         if self.settings.lockstep:
             self._step_timer.cancel()
             self._go_on_if_complete()
-        else:
+        elif self._clock_publisher is not None or self.simulation.step < self._step_of_clock():
             self.simulation.advance()
             for name, robot in self._linked.items():
                 robot.cut(name in self.simulation.away)
             self._begin_step()
+
+    def _step_of_clock(self) -> int:
+        """Return the step that an external clock has come to."""
+        return math.floor(self.get_clock().now().nanoseconds * 1e-9 / self._length)
 
     # ---- the truth ---------------------------------------------------------------------------
 

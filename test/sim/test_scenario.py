@@ -242,7 +242,8 @@ def test_links_that_cannot_work_are_refused(load, robot, changes, key, words):
 def test_an_autopilot_may_be_another_program(load):
     content = yaml.safe_load(find_scenario('drone_rov').read_text())
     content['robots']['drone'] |= LINKED | {'autopilot': 'external'}
-    content['robots']['drone']['mavlink'] |= {'url': 'tcp:127.0.0.1:5760', 'map_yaw': 0.1}
+    link = {'url': 'tcp:127.0.0.1:5760', 'map_yaw': 0.1}
+    content['robots']['drone']['mavlink'] = LINKED['mavlink'] | link
     scenario = load(content)
     drone = scenario.robots['drone']
     assert drone.external and not drone.takes_off
@@ -251,6 +252,18 @@ def test_an_autopilot_may_be_another_program(load):
     content['events'] = [{'at': 5.0, 'robot': 'drone', 'do': 'leave'}]
     with pytest.raises(ScenarioError, match=r"events\[0\]\.robot: read 'drone', which is external"):
         load(content)
+
+
+def test_a_robot_may_be_moved_by_another_program(load):
+    scenario = load(changed(('robots.turtlebot.body', 'external')))
+    assert scenario.robots['turtlebot'].external and not scenario.robots['turtlebot'].takes_off
+    assert scenario.external_clock
+    with pytest.raises(ScenarioError, match=r'robots\.turtlebot\.body: read .external., and lock'):
+        scenario.check_pace(True, None)
+    scenario.check_pace(False, None)
+    robot = ('robots.mambo', changed()['robots']['mambo'] | LINKED | {'body': 'external'})
+    with pytest.raises(ScenarioError, match=r'robots\.mambo\.body: .* with link mavlink'):
+        load(changed(robot, ('robots.mambo.driver', 'mavlink_camera_driver')))
 
 
 def test_a_drone_with_a_camera_may_be_linked_by_mavlink(load):

@@ -613,6 +613,53 @@ def test_an_external_robot_is_where_its_driver_says(make_team):
     assert not drone.of('odom') and drone.command.get_subscription_count() == 0
 
 
+def test_a_robot_that_another_program_moves_brings_its_own_time(make_team):
+    content = deepcopy(SCENARIO)
+    content['robots'] = {'turtlebot': content['robots']['turtlebot'] | {'body': 'external'}}
+    pace = {'lockstep': False, 'rate': 1.0}
+    team = make_team(content, robots=('turtlebot',), use_sim_time=True, **pace)
+    drone = team.drivers['turtlebot']
+    clock = drone.create_publisher(Clock, '/clock', 10)
+    states = drone.create_publisher(AgentState, '/turtlebot/state', 10)
+    now = 57.0
+
+    def go_on(passed=0.02):
+        nonlocal now
+        now += passed
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(round(now * 1e9), 10**9)
+        clock.publish(message)
+        states.publish(state)
+
+    state = AgentState(robot='turtlebot')
+    state.pose.pose = pose_to_ros(Pose.from_yaw([1.0, 1.2, 0.0], 0.5))
+    for _ in range(10):
+        go_on()
+        team.executor.spin_once(timeout_sec=0.05)
+    team.say_ready()
+    team.spin_until(lambda: go_on() or len(drone.of('camera/image_raw')) >= 3)
+    stamps = [seconds(image.header.stamp) for image in drone.of('camera/image_raw')]
+    assert 57.0 < stamps[0] < stamps[-1] <= now
+    steps = [step.step for step in drone.steps]
+    assert steps == list(range(steps[0], steps[0] + len(steps)))
+    assert steps[0] * STEP == pytest.approx(seconds(drone.steps[0].stamp))
+    robot = team.sim.simulation.robots['turtlebot']
+    assert robot.state.pose.position[:2] == pytest.approx([1.0, 1.2])
+    # It stands still with that clock.
+    for _ in range(3):
+        team.executor.spin_once(timeout_sec=0.1)
+    known = len(drone.steps)
+    time.sleep(0.5)
+    for _ in range(3):
+        team.executor.spin_once(timeout_sec=0.1)
+    assert len(drone.steps) <= known + 1
+    assert len(team.filter.get_publishers_info_by_topic('/clock')) == 1
+    assert not drone.of('odom') and not drone.of('scan')
+    assert drone.command.get_subscription_count() == 0
+    with pytest.raises(AssertionError, match=r'turtlebot\.body: .* and lockstep'):
+        make_team(content, robots=('turtlebot',))
+
+
 def test_links_run_in_real_time(make_team):
     for pace in ({'lockstep': True}, {'lockstep': False, 'rate': 2.0}):
         with pytest.raises(AssertionError, match=r'drone\.link: .* runs in real time'):
