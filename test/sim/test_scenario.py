@@ -255,10 +255,10 @@ def test_an_autopilot_may_be_another_program(load):
 
 
 def test_a_robot_may_be_moved_by_another_program(load):
-    scenario = load(changed(('robots.turtlebot.body', 'external')))
-    assert scenario.robots['turtlebot'].external and not scenario.robots['turtlebot'].takes_off
+    scenario = load(changed(('robots.mambo.body', 'external')))
+    assert scenario.robots['mambo'].external and not scenario.robots['mambo'].takes_off
     assert scenario.external_clock
-    with pytest.raises(ScenarioError, match=r'robots\.turtlebot\.body: read .external., and lock'):
+    with pytest.raises(ScenarioError, match=r'robots\.mambo\.body: read .external., and lock'):
         scenario.check_pace(True, None)
     scenario.check_pace(False, None)
     robot = ('robots.mambo', changed()['robots']['mambo'] | LINKED | {'body': 'external'})
