@@ -295,10 +295,9 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         self._queue.offset = self.offset
         self._state_publisher = self.create_publisher(AgentState, 'state', LIVELY)
         self._detections_publisher = self.create_publisher(DetectionArray, 'detections', RELIABLE)
-        batches = self.create_subscription(
+        self.create_subscription(
             MeasurementBatch, self.team_topic('measurement_batch'), self._on_batch, RELIABLE
         )
-        self.hurry(self.step_subscription, batches)
         self.connect_robot()
         ActionServer(
             self,

@@ -217,15 +217,12 @@ class FilterNode(SearchNode[FilterNodeSettings]):
         )
         self._kept_topic = kept.topic_name
         self.create_subscription(MeasurementBatch, 'measurement_batch', self._on_batch, RELIABLE)
-        self.hurry(self.step_subscription)
         for name in self._sensors:
-            self.hurry(
-                self.create_subscription(
-                    DetectionArray,
-                    self.team_topic(f'{name}/detections'),
-                    partial(self._on_detections, name),
-                    RELIABLE,
-                )
+            self.create_subscription(
+                DetectionArray,
+                self.team_topic(f'{name}/detections'),
+                partial(self._on_detections, name),
+                RELIABLE,
             )
         self._sharing = []
         for name in self._shared:
@@ -236,7 +233,6 @@ class FilterNode(SearchNode[FilterNodeSettings]):
                 )
             )
             self.expect_publisher(topic)
-        self.hurry(*self._sharing)
         # The filters of the others, and the planner that keeps them.
         self.expect_subscribers(self._found_publisher, len(self._shared) + 1 if self._shared else 0)
         if not settings.lockstep:

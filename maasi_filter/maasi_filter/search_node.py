@@ -26,7 +26,7 @@ from rclpy.utilities import get_default_context
 
 from maasi_filter.bad_requests import survive_bad_requests
 from maasi_filter.clock_watch import ClockWatch
-from maasi_filter.executor import LeanExecutor
+from maasi_filter.executor import executor_of
 from maasi_filter.node_entities import NodeEntities
 from maasi_filter.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.qos import LATCHED, RELIABLE
@@ -100,7 +100,6 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
         self._warned: dict[str, float] = {}
         self._peers: list[Callable[[], bool]] = []
         self._peer_timer: Any = None
-        self._urgent_topics: set[str] = set()
         self.step_subscription: Subscription | None = None
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
@@ -244,23 +243,12 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
                 self.get_logger().error(traceback.format_exc())
         self.configured = False
         self._peers.clear()
-        self._urgent_topics.clear()
         self._entities_made.clear()
         self._peer_timer = self._ready_publisher = self._done_publisher = None
         self.step_subscription = None
         self._parameters_read.release()
 
     # ---- readiness and lockstep --------------------------------------------------------------
-
-    def hurry(self, *subscriptions: Subscription | None) -> None:
-        """In lockstep: be woken by these; what comes otherwise is taken along."""
-        if self.settings.lockstep:
-            self._urgent_topics |= {item.topic for item in subscriptions if item is not None}
-
-    @property
-    def urgent(self) -> Collection[str]:
-        """Topics to whose messages the node has to answer at once."""
-        return self._urgent_topics
 
     def expect(self, condition: Callable[[], bool]) -> None:
         """Count as ready only where this holds."""
@@ -482,7 +470,7 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
         signal.signal(signal.SIGTERM, interrupt)
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
-        executor = LeanExecutor(node, node.urgent)
+        executor = executor_of(node)
         if node.get_parameter('autostart').value and not asked:
             if not _configure(node):
                 return 2 if node.problem else 1
@@ -492,7 +480,7 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
         gc.collect()
         gc.freeze()
         while rclpy.ok() and not asked:
-            executor.spin_for(_SIGNAL_PERIOD)
+            executor.spin_once(_SIGNAL_PERIOD)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

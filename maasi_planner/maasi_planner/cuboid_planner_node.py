@@ -147,8 +147,7 @@ class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
         self._odometry: Subscription = self.create_subscription(
             Odometry, 'odom', self._on_odometry, sensor_reader(lockstep)
         )
-        link = self.create_subscription(SearchLinkArray, 'link/rx', self._on_heard, RELIABLE)
-        self.hurry(self.step_subscription, self._odometry, link)
+        self.create_subscription(SearchLinkArray, 'link/rx', self._on_heard, RELIABLE)
         self.expect_publisher(self._odometry.topic_name)
         offer_services(self, [self.name], self.team_topic, self._take_command)
         if not lockstep:

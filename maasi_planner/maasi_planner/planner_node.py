@@ -184,13 +184,11 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
             self._path_publishers[name] = self.create_publisher(
                 Path, self.team_topic(f'{name}/plan'), 10
             )
-            self.hurry(
-                self.create_subscription(
-                    AgentState,
-                    self.team_topic(f'{name}/state'),
-                    partial(self._on_state, name),
-                    RELIABLE,
-                )
+            self.create_subscription(
+                AgentState,
+                self.team_topic(f'{name}/state'),
+                partial(self._on_state, name),
+                RELIABLE,
             )
             self.create_subscription(
                 DetectionArray,
@@ -206,15 +204,11 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
                 self._destination_publishers[name] = publisher
         for name in sorted(self.settings.others):
             topic = self.team_topic(f'{name}/destination')
-            self.hurry(
-                self.create_subscription(
-                    PointStamped, topic, partial(self._on_destination, name), RELIABLE
-                )
+            self.create_subscription(
+                PointStamped, topic, partial(self._on_destination, name), RELIABLE
             )
             self.expect_publisher(topic)
-        self.hurry(
-            self.create_subscription(FilterUpdate, 'filter_update', self._on_update, UPDATES)
-        )
+        self.create_subscription(FilterUpdate, 'filter_update', self._on_update, UPDATES)
         if not self.settings.lockstep and self.settings.filter_timeout:
             self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         self._goals = TeamGoals(

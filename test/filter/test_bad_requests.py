@@ -12,7 +12,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from maasi_filter.executor import LeanExecutor
+from maasi_filter.executor import executor_of
 from maasi_filter.node_settings import NodeSettings
 from maasi_filter.search_node import SearchNode
 from maasi_sim.processes import Domain
@@ -33,14 +33,14 @@ def context():
 def node(context):
     """Return a node whose executor runs in a thread; it keeps what it raised."""
     made = SearchNode('searcher', NodeSettings, context=context)
-    executor = LeanExecutor(made, ())
+    executor = executor_of(made, context)
     ended = threading.Event()
     made.raised = []
 
     def spin():
         while not ended.is_set():
             try:
-                executor.spin_for(0.05)
+                executor.spin_once(0.05)
             except Exception as error:
                 made.raised.append(error)
                 return

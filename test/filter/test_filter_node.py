@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 
 from maasi_filter import FilterSettings, SearchFilter
 from maasi_filter.conversions import MOST_DETECTIONS
-from maasi_filter.executor import LeanExecutor
+from maasi_filter.executor import executor_of
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.node_settings import FilterNodeSettings
 from maasi_filter.parameters import flatten
@@ -101,7 +101,7 @@ def running(**changes):
         assert node.trigger_configure().name == 'SUCCESS', node.problem
         node.trigger_activate()
         team = Team(context)
-        lean = LeanExecutor(node, context=context)
+        own = executor_of(node, context)
         other = SingleThreadedExecutor(context=context)
         other.add_node(team.node)
 
@@ -109,14 +109,14 @@ def running(**changes):
             deadline = time.monotonic() + PATIENCE
             while not condition():
                 assert time.monotonic() < deadline
-                lean.spin_for(0.01)
+                own.spin_once(0.01)
                 other.spin_once(timeout_sec=0.01)
 
         until(lambda: team.batch.get_subscription_count() == 1)
         until(lambda: all(item.get_subscription_count() for item in team.detections.values()))
         until(lambda: team.node.count_publishers('/filter_update') == 1)
         yield node, team, until
-        lean.shutdown()
+        own.shutdown()
         other.shutdown()
         node.destroy_node()
         team.node.destroy_node()

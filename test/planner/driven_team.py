@@ -21,7 +21,7 @@ from test_planner_node import ROBOTS, SETTINGS, START
 from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.conversions import pose_to_ros, stamp_to_ros
-from maasi_filter.executor import LeanExecutor
+from maasi_filter.executor import executor_of
 from maasi_filter.parameters import flatten
 from maasi_filter.pose import Pose, compose, inverse
 from maasi_filter.qos import LATCHED, RELIABLE
@@ -144,7 +144,7 @@ class World:
         )
         assert self.planner.trigger_configure().name == 'SUCCESS'
         assert self.planner.trigger_activate().name == 'SUCCESS'
-        self.lean = LeanExecutor(self.planner, context=self.context)
+        self.own = executor_of(self.planner, self.context)
         goals = self.planner._goals.clients.values()
         self.until(
             lambda: (
@@ -158,8 +158,8 @@ class World:
         )
 
     def end_planner(self):
-        self.lean.shutdown()
         self.planner.destroy_node()
+        self.own.shutdown()
         self.planner = None
 
     def _take_log(self, message):
@@ -203,7 +203,7 @@ class World:
     def spin(self):
         """Do what waits to be done."""
         if self.planner is not None:
-            self.lean.spin_for(0.002)
+            self.own.spin_once(0.002)
         self.executor.spin_once(timeout_sec=0.002)
 
     def pass_steps(self, steps):

@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from maasi_filter.conversions import stamp_to_ros
-from maasi_filter.executor import LeanExecutor
+from maasi_filter.executor import executor_of
 from maasi_filter.parameters import flatten
 from maasi_filter.qos import RELIABLE
 from maasi_msgs.msg import AgentState, SearchLink, SearchLinkArray
@@ -44,7 +44,7 @@ class Flight:
         )
         assert self.planner.trigger_configure().name == 'SUCCESS'
         assert self.planner.trigger_activate().name == 'SUCCESS'
-        self.lean = LeanExecutor(self.planner, context=context)
+        self.own = executor_of(self.planner, context)
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
         self.commands, self.states, self.links = [], [], []
@@ -69,7 +69,7 @@ class Flight:
         end = time.monotonic() + 60.0
         while not condition():
             assert time.monotonic() < end
-            self.lean.spin_for(0.005)
+            self.own.spin_once(0.005)
             self.executor.spin_once(timeout_sec=0.005)
 
     def fly(self, steps):
@@ -139,7 +139,7 @@ def test_a_robot_among_buildings_moves_only_while_it_searches():
             assert flight.fly(2) == [still] * 2
             assert not flight.call('resume').success
         finally:
-            flight.lean.shutdown()
+            flight.own.shutdown()
             flight.executor.shutdown()
             flight.planner.destroy_node()
             flight.node.destroy_node()

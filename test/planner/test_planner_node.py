@@ -15,7 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from maasi_filter.executor import LeanExecutor
+from maasi_filter.executor import executor_of
 from maasi_filter.parameters import flatten
 from maasi_filter.qos import RELIABLE, UPDATES
 from maasi_msgs.action import GoToWaypoint, SearchTargets
@@ -174,7 +174,7 @@ def running(**changes):
         node.trigger_configure()
         node.trigger_activate()
         team = Team(context, len(settings.others))
-        lean = LeanExecutor(node, context=context)
+        own = executor_of(node, context)
         other = SingleThreadedExecutor(context=context)
         other.add_node(team.node)
 
@@ -182,15 +182,15 @@ def running(**changes):
             deadline = time.monotonic() + PATIENCE
             while not condition():
                 assert time.monotonic() < deadline
-                lean.spin_for(0.01)
+                own.spin_once(0.01)
                 other.spin_once(timeout_sec=0.01)
 
         until(lambda: team.connected)
         until(lambda: all(client.server_is_ready() for client in node._goals.clients.values()))
         yield node, team, until
-        lean.shutdown()
-        other.shutdown()
         node.destroy_node()
+        own.shutdown()
+        other.shutdown()
         team.node.destroy_node()
         rclpy.shutdown(context=context)
 

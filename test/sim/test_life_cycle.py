@@ -9,7 +9,7 @@ from node_kinds import KINDS
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
-from maasi_filter.executor import LeanExecutor
+from maasi_filter.executor import executor_of
 from maasi_sim.processes import Domain
 
 PATIENCE = 60.0
@@ -75,10 +75,10 @@ def until(condition, wait=lambda: time.sleep(0.01)):
 @pytest.mark.parametrize('kind', KINDS)
 def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     node = KINDS[kind].make(context)
-    executor = LeanExecutor(node, node.urgent, context=context)
+    executor = executor_of(node, context)
 
     def spin():
-        executor.spin_for(0.01)
+        executor.spin_once(0.01)
 
     until(lambda: is_known(node))
     unconfigured = made_by(node), in_graph(node)
@@ -89,7 +89,7 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     for _ in range(CYCLES):
         for step in ('activate', 'deactivate', 'cleanup', 'configure'):
             assert getattr(node, f'trigger_{step}')().name == 'SUCCESS', (step, node.problem)
-            executor.spin_for(0.0)
+            executor.spin_once(0.0)
     until(lambda: (made_by(node), in_graph(node)) == configured, spin)
     assert node.trigger_cleanup().name == 'SUCCESS'
     until(lambda: (made_by(node), in_graph(node)) == unconfigured, spin)

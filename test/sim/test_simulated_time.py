@@ -12,7 +12,7 @@ from rosgraph_msgs.msg import Clock
 from test_life_cycle import in_graph, made_by
 
 from maasi_filter.conversions import stamp_to_ros
-from maasi_filter.executor import LeanExecutor
+from maasi_filter.executor import executor_of
 from maasi_filter.qos import RELIABLE, UPDATES
 from maasi_msgs.msg import AgentState, BatchMember, FilterUpdate, MeasurementBatch, PlanDecision
 from maasi_sim.processes import Domain
@@ -34,12 +34,12 @@ class World(Node):
         self.create_subscription(FilterUpdate, '/filter_update', self.updates.append, UPDATES)
         self.create_subscription(PlanDecision, '/decisions', self.decisions.append, RELIABLE)
         self.number = 0
-        self.own = LeanExecutor(self, context=context)
+        self.own = executor_of(self, context)
 
     def begin(self, kind, **changes):
         """Start a node; its executor is turned together with that of the world."""
         self.tested = KINDS[kind].make(self.context, **changes)
-        self.other = LeanExecutor(self.tested, context=self.context)
+        self.other = executor_of(self.tested, self.context)
         assert self.tested.trigger_configure().name == 'SUCCESS', self.tested.problem
         assert self.tested.trigger_activate().name == 'SUCCESS'
         return self.tested
@@ -62,8 +62,8 @@ class World(Node):
             self.turn()
 
     def turn(self):
-        self.own.spin_for(0.005)
-        self.other.spin_for(0.005)
+        self.own.spin_once(0.005)
+        self.other.spin_once(0.005)
 
     def wait_in_vain(self):
         """Let much more wall time pass than a timeout."""
