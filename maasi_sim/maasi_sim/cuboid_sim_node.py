@@ -71,7 +71,7 @@ class CuboidSimNode(SimNode):
                 self.create_subscription(
                     SearchLink,
                     f'{name}/link/tx',
-                    partial(self.take, partial(self._on_sent, name)),
+                    partial(self._on_sent, name),
                     RELIABLE,
                 )
             )

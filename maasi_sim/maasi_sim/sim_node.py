@@ -12,11 +12,9 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseArray, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from std_msgs.msg import Header
@@ -58,8 +56,6 @@ _CONNECTION_PATIENCE = 5.0
 # Of simulated time, between two messages on a battery [s].
 _BATTERY_PERIOD = 1.0
 _LEAST_VARIANCE = 1e-12
-# In lockstep: how long messages are taken without the executor, and the longest wait for one [s].
-_HURRY, _HURRY_WAIT = 0.05, 0.01
 # At the end: how long robots with a link of their own are there for drivers that stop them [s].
 _FAREWELL = 1.0
 
@@ -282,7 +278,6 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._ready_since: float | None = None
         # In lockstep: nodes that are not done, and topics of commands that have not come.
         self._waiting: set[str] = set()
-        self._taking = False
         self._last_command: dict[str, int] = {}
         self._due = 0.0
         self._said, self._said_at = '', 0.0
@@ -354,20 +349,14 @@ class SimNode(SearchNode[SimNodeSettings]):
                 self.create_subscription(
                     TwistStamped,
                     f'{name}/cmd_vel',
-                    partial(self.take, partial(self._on_command, name)),
+                    partial(self._on_command, name),
                     RELIABLE if lockstep else 10,
                 )
             )
         self._entities += self.connect()
         if lockstep:
             self._entities.append(
-                self.create_subscription(
-                    LockstepDone, 'lockstep/done', partial(self.take, self._on_done), RELIABLE
-                )
-            )
-            self._urgent = [item for item in self._entities if isinstance(item, Subscription)]
-            self._wait_set = rclpy_implementation.WaitSet(
-                len(self._urgent), 0, 0, 0, 0, 0, self.context.handle
+                self.create_subscription(LockstepDone, 'lockstep/done', self._on_done, RELIABLE)
             )
         self._entities.append(
             self.create_subscription(LockstepDone, 'lockstep/ready', self._on_ready, LATCHED_ALL)
@@ -577,37 +566,6 @@ class SimNode(SearchNode[SimNodeSettings]):
                 imaging=[name for name in robots if self.simulation.images_due(name)],
             )
         )
-
-    def take(self, handle: Callable[[Any], None], message: Any) -> None:
-        """Take a message from the executor, and in lockstep those that follow without it.
-
-        For each message the executor looks at all timers, services and events, which takes longer
-        than a step does.
-        """
-        handle(message)
-        if not self.settings.lockstep or self._taking:
-            return
-        self._taking = True
-        try:
-            self._take_waiting()
-        finally:
-            self._taking = False
-
-    def _take_waiting(self) -> None:
-        until = time.monotonic() + _HURRY
-        while self.active and self._waiting and time.monotonic() < until:
-            self._wait_set.clear_entities()
-            for subscription in self._urgent:
-                self._wait_set.add_subscription(subscription.handle)
-            self._wait_set.wait(round(_HURRY_WAIT * 1e9))
-            ready = self._wait_set.get_ready_entities('subscription')
-            if not ready:
-                return
-            for subscription in self._urgent:
-                if subscription.handle.pointer in ready:
-                    item = subscription.handle.take_message(subscription.msg_type, False)
-                    if item is not None:
-                        subscription.callback(item[0])
 
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
         """Pass everything on: commands are compared with the step, and zeros always stop."""
