@@ -10,9 +10,9 @@ from rclpy.node import Node
 def executor_of(node: Node, context: Context | None = None) -> Executor:
     """Return an executor that runs one node.
 
-    rclpy's events executor, since 7.1.5: the single-threaded one of older versions builds its wait
-    set anew for each callback, and takes two to four times the CPU time per message. In both, a
-    callback that raises ends the spin.
+    It is rclpy's events executor, where this version of rclpy has it: the single-threaded one
+    builds its wait set anew for each callback, which takes two to four times the CPU time. In both,
+    a callback that raises ends the spin. Neither may spin after its `shutdown`.
     """
     try:
         from rclpy.experimental.events_executor import EventsExecutor
