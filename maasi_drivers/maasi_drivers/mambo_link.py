@@ -1,8 +1,11 @@
 """The wire to a Parrot Mambo: pyparrot over WiFi or Bluetooth, behind one thread. Without ROS.
 
-pyparrot keeps handing out its last packet after the link is cut, and the stamp in a position event
-is the time since the one before. So an event counts as new only when one of the acquisition stamps
-that come with it (of speed, altitude or orientation) has changed.
+Over WiFi pyparrot keeps handing out its last packet after the link is cut, and the stamp in a
+position event is the time since the one before. So an event counts as new only when one of the
+acquisition stamps that come with it (of speed, altitude or orientation) has changed. Bluetooth
+delivers few of them, each notification once (pyparrot, docs/minidronecommands.rst: "more
+information via wifi than via BLE"): there each one counts, and so does the acknowledgement of a
+command, which is sent for that purpose when nothing else is heard.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_drivers.mambo_bluetooth import ask_for_answer, mend
 from maasi_drivers.mambo_socket import DroneSocket, guard
 
 FloatArray = NDArray[np.float64]
@@ -35,6 +39,8 @@ CALLER_TIMEOUT = 0.5
 # From one take-off or landing command to the next while the drone does not obey [s].
 _REPEAT = 0.7
 _RETRIES = 3
+# Over Bluetooth: silence after which a command is sent that the drone has to acknowledge [s].
+_PROBE_PERIOD = 0.3
 # From one try to connect to the next [s].
 _RECONNECT = 1.0
 _BLUETOOTH = re.compile(r'([0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}')
@@ -114,7 +120,7 @@ class MamboLink:
         self.flying_state = ''
         #: Charge, 0 to 1; negative: not heard yet.
         self.battery = -1.0
-        #: When something new was last heard from it, monotonic clock [s].
+        #: When something new, or an acknowledgement, was last heard from it, monotonic clock [s].
         self.heard_at = -math.inf
         #: Position events that could not be used.
         self.bad_events = 0
@@ -131,6 +137,7 @@ class MamboLink:
         self._wanted: Literal['', 'take_off', 'land'] = ''
         self._asked_at = -math.inf
         self._called_at = math.inf
+        self._probed_at = -math.inf
         self._thread: threading.Thread | None = None
 
     # ---- what the caller asks for ------------------------------------------------------------
@@ -271,6 +278,14 @@ class MamboLink:
 
         drone = minidrone.Mambo(address=self.address, use_wifi=self.kind == 'wifi')
         drone.sensors = Sensors()
+        received = drone.drone_connection._set_command_received
+
+        def take_answer(channel: str, value: bool, *sequence: int) -> None:
+            received(channel, value, *sequence)
+            if value:
+                link.heard_at = time.monotonic()
+
+        drone.drone_connection._set_command_received = take_answer
         if self.kind == 'wifi':
             connection = drone.drone_connection
             # With its own name for the type it would know no other address than 192.168.99.3.
@@ -278,6 +293,8 @@ class MamboLink:
             connection.ip_address = self.address
             connection.udp_receive_port = self.port
             guard(connection, self.address, self.port)
+        else:
+            mend(drone.drone_connection)
         return drone
 
     def _work(self, drone: Any) -> None:
@@ -299,6 +316,7 @@ class MamboLink:
                 self._do_wanted()
                 self._send_steering()
                 if self.kind == 'ble':
+                    self._probe(drone.drone_connection)
                     drone.smart_sleep(_ROUND)
                 else:
                     self._wake.wait(_ROUND)
@@ -360,6 +378,12 @@ class MamboLink:
         if steering is not None:
             self._drone.fly_direct(*steering)
 
+    def _probe(self, connection: Any) -> None:
+        now = time.monotonic()
+        if now - max(self.heard_at, self._probed_at) >= _PROBE_PERIOD:
+            self._probed_at = now
+            ask_for_answer(connection, self.tilt)
+
     def _leave(self, drone: Any) -> None:
         if self.kind == 'ble':
             drone.disconnect()
@@ -373,6 +397,9 @@ class MamboLink:
 
     def _take(self, name: str, value: Any, sensors: Any) -> None:
         """Take one number of an event; called by pyparrot's thread."""
+        if self.kind == 'ble':
+            self._fresh = True
+            self.heard_at = time.monotonic()
         if name in _STAMPS:
             if self._stamps.get(name) != value:
                 self._stamps[name] = value

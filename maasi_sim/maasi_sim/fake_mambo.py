@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from maasi_filter.pose import Pose, quaternion_product
+from maasi_sim.mambo_commands import ALL_STATES, obey
 from maasi_sim.mambo_firmware import (
     CLIMB_RANGE,
     TILT_RANGE,
@@ -30,7 +31,6 @@ from maasi_sim.mambo_firmware import (
     Estimate,
     FirmwareSettings,
     MamboFirmware,
-    Piloting,
 )
 from maasi_sim.mambo_frames import ACK, DATA, DATA_WITH_ACK, Frame, FrameError, frames
 from maasi_sim.tilt_body import TiltBodySettings
@@ -352,37 +352,13 @@ class FakeMambo:
             return
         number = _ID.unpack_from(frame.payload)
         self.heard[number] = self.heard.get(number, 0) + 1
-        try:
-            self._obey(number, frame.payload[_ID.size :])
-        except struct.error:
-            self.refused += 1
-
-    def _obey(self, number: tuple[int, int, int], content: bytes) -> None:
-        firmware = self.firmware
-        if number == (2, 0, 2):
-            flag, roll, pitch, yaw, climb, _ = struct.unpack('<BbbbbI', content)
-            values = [max(-100, min(value, 100)) for value in (roll, pitch, yaw, climb)]
-            if not flag:
-                # Without the flag the drone keeps itself level.
-                values[:2] = [0, 0]
-            firmware.pilot(Piloting(*values))
-        elif number == (2, 0, 1):
-            firmware.take_off()
-        elif number == (2, 0, 3):
-            firmware.land()
-        elif number == (2, 0, 4):
-            firmware.emergency()
-        elif number == (0, 4, 0):
+        if number == ALL_STATES:
             self._tell_all()
-        elif number in _LIMITS:
-            (value,) = struct.unpack('<f', content)
-            if not math.isfinite(value):
-                self.refused += 1
-                return
-            getattr(firmware, _LIMITS[number])(value)
-
-
-_LIMITS = {(2, 8, 1): 'limit_tilt', (2, 1, 0): 'limit_climb', (2, 1, 1): 'limit_turn'}
+            return
+        try:
+            obey(self.firmware, number, frame.payload[_ID.size :])
+        except ValueError:
+            self.refused += 1
 
 
 def _quaternion(estimate: Estimate) -> list[float]:

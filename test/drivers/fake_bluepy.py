@@ -1,0 +1,175 @@
+"""A stand-in for bluepy, so that pyparrot's own Bluetooth connection reaches a fake Mambo.
+
+What pyparrot uses of `bluepy.btle`: `Peripheral`, `UUID`, `DefaultDelegate`, `BTLEException`
+(pyparrot 1.5.20, `networking/bleConnection.py`; services and characteristics are those that it
+looks for there). Of events the drone sends flying state and battery alone: no speed, altitude,
+orientation or position, which are \"wifi only\" or late (pyparrot, docs/minidronecommands.rst).
+"""
+
+import queue
+import struct
+import sys
+import threading
+import time
+from types import ModuleType
+from typing import ClassVar
+
+from maasi_sim.mambo_commands import ALL_STATES, obey
+
+_SERVICES = {
+    'fa00': ('fa0a', 'fa0b', 'fa0c', 'fa1e'),
+    'fb00': ('fb0e', 'fb0f', 'fb1b', 'fb1c'),
+    'fd21': ('fd22', 'fd23', 'fd24'),
+    'fd51': ('fd52', 'fd53', 'fd54'),
+}
+_STEP = 0.02
+
+
+class BTLEException(Exception):
+    pass
+
+
+class DefaultDelegate:
+    pass
+
+
+class Characteristic:
+    def __init__(self, peripheral, name, handle):
+        self.uuid = f'9a66{name}-0800-9191-11e4-012d1540cb8e'
+        self.name = name
+        self.handle = handle
+        self._peripheral = peripheral
+
+    def getHandle(self):
+        return self.handle
+
+    def write(self, data):
+        self._peripheral.hear(self.name, data)
+
+
+class Service:
+    def __init__(self, name, characteristics):
+        self.uuid = f'9a66{name}-0800-9191-11e4-012d1540cb8e'
+        self._characteristics = characteristics
+
+    def getCharacteristics(self):
+        return self._characteristics
+
+
+class Peripheral:
+    """
+    The radio, and a drone in real time at its other end.
+
+    Attributes
+    ----------
+    firmware : MamboFirmware
+        Of the drone that all find; set by a test.
+    cut : bool
+        Whether nothing gets through; a write without response then still succeeds.
+    heard : list
+        Channel and command of what came through.
+    """
+
+    firmware = None
+    cut = False
+    heard: ClassVar[list] = []
+
+    def __init__(self):
+        self._delegate = None
+        self._waiting = queue.Queue()
+        self._lock = threading.Lock()
+        self._sequence = 0
+        names = [name for group in _SERVICES.values() for name in group]
+        self._characteristics = {
+            name: Characteristic(self, name, 10 + 3 * n) for n, name in enumerate(names)
+        }
+        self._said = None
+        self._ended = threading.Event()
+
+    def connect(self, address, kind):
+        threading.Thread(target=self._live, daemon=True).start()
+
+    def disconnect(self):
+        self._delegate = None
+        self._ended.set()
+
+    def getServices(self):
+        return [
+            Service(name, [self._characteristics[key] for key in keys])
+            for name, keys in _SERVICES.items()
+        ]
+
+    def writeCharacteristic(self, handle, data):
+        pass
+
+    def setDelegate(self, delegate):
+        self._delegate = delegate
+
+    def waitForNotifications(self, timeout):
+        try:
+            name, data = self._waiting.get(timeout=timeout)
+        except queue.Empty:
+            return False
+        self._delegate.handleNotification(self._characteristics[name].handle, data)
+        return True
+
+    # ---- the drone ---------------------------------------------------------------------------
+
+    def _live(self):
+        last = time.monotonic()
+        while not self._ended.wait(_STEP):
+            now = time.monotonic()
+            with self._lock:
+                self.firmware.advance(min(now - last, 0.5))
+                self._tell()
+            last = now
+
+    def _tell(self, again=False):
+        said = (int(self.firmware.flying_state), self.firmware.percent)
+        if said != self._said or again:
+            self._said = said
+            self._notify('fb0e', struct.pack('<BBHI', 2, 3, 1, said[0]))
+            self._notify('fb0e', struct.pack('<BBHB', 0, 5, 1, said[1]))
+
+    def _notify(self, name, content):
+        if not self.cut:
+            self._sequence = (self._sequence + 1) % 256
+            self._waiting.put((name, struct.pack('<BB', 4, self._sequence) + content))
+
+    def hear(self, name, data):
+        if self.cut:
+            return
+        with self._lock:
+            self.firmware.hear()
+            if name not in ('fa0a', 'fa0b', 'fa0c'):
+                return
+            number = struct.unpack_from('<BBH', data, 2)
+            self.heard.append((name, number))
+            if number == ALL_STATES:
+                self._tell(again=True)
+            else:
+                obey(self.firmware, number, data[6:])
+            if name == 'fa0b':
+                self._notify('fb1b', data[1:2])
+
+
+def install(monkeypatch, firmware):
+    """Have pyparrot use it; returns the class of the radio."""
+    # Without it, as it will be for the next test.
+    from pyparrot import Minidrone
+
+    bluepy, btle = ModuleType('bluepy'), ModuleType('bluepy.btle')
+    for item in (Peripheral, DefaultDelegate, BTLEException):
+        setattr(btle, item.__name__, item)
+    btle.UUID = str
+    bluepy.btle = btle
+    monkeypatch.setitem(sys.modules, 'bluepy', bluepy)
+    monkeypatch.setitem(sys.modules, 'bluepy.btle', btle)
+    monkeypatch.setattr(Peripheral, 'firmware', firmware)
+    monkeypatch.setattr(Peripheral, 'cut', False)
+    monkeypatch.setattr(Peripheral, 'heard', [])
+    from pyparrot.networking import bleConnection
+
+    monkeypatch.setattr(Minidrone, 'BLEAvailable', True)
+    monkeypatch.setattr(Minidrone, 'BLEConnection', bleConnection.BLEConnection, raising=False)
+    return Peripheral
