@@ -62,6 +62,11 @@ class SearchRobotSettings(Settings):
         default_factory=BatterySettings, description='Its battery as it is shown, simulated'
     )
 
+    @property
+    def external(self) -> bool:
+        """False: the sim moves it."""
+        return False
+
 
 class CuboidPlanner(CuboidSettings):
     """The planner of each robot, and what is searched."""
@@ -95,6 +100,11 @@ class CuboidScenario(Settings):
     def dimension(self) -> int:
         """3."""
         return self.environment.dimension
+
+    @property
+    def external_clock(self) -> bool:
+        """False: no other program moves these robots."""
+        return False
 
     def names(self) -> list[str]:
         """Return the robots' names in order."""

@@ -133,7 +133,6 @@ def plan_nodes(
         If a link cannot keep this pace.
     """
     scenario.check_pace(lockstep, rate)
-    external_clock = isinstance(scenario, Scenario) and scenario.external_clock
     common = {'step': scenario.step, 'seed': seed, 'lockstep': lockstep}
     simulation: dict[str, Any] = {
         'scenario': str(file),
@@ -148,7 +147,7 @@ def plan_nodes(
             'maasi_sim',
             'cuboid_sim_node' if alone else 'sim_node',
             'sim_node',
-            parameters={**simulation, **(_SIMULATED if external_clock else {})},
+            parameters={**simulation, **(_SIMULATED if scenario.external_clock else {})},
             topics=(CLOCK, STEP) if lockstep else (CLOCK,),
             says_ready=False,
             says_done=False,
