@@ -66,6 +66,7 @@ class MavlinkRobot(AgentDriver[DataT]):
         if settings.link == 'mavlink' and not self._localised:
             self._posed = 'LOCAL_POSITION_NED'
         self._locals = PoseHistory()
+        self._charge_reports = 0
         self._arrivals = ArrivalClock()
         self._map_from_local = Pose.from_yaw(
             [*settings.start[:2], self._mavlink.ground], -self._mavlink.map_yaw
@@ -200,6 +201,7 @@ class MavlinkRobot(AgentDriver[DataT]):
         with link.vehicle() as vehicle:
             vehicle.active = self.active and not self._ending
             trouble, charge = vehicle.trouble, vehicle.charge
+            reports = vehicle.charge_reports
             telemetry, self._local_origin = vehicle.telemetry, vehicle.origin
         if link.failure:
             trouble = f'link: {link.failure}'
@@ -208,7 +210,8 @@ class MavlinkRobot(AgentDriver[DataT]):
         if not self.active:
             return
         self._judge(trouble)
-        if charge != self._battery:
+        if reports != self._charge_reports:
+            self._charge_reports = reports
             self.take_charge(charge)
             if BATTERY in self._troubles and not self._ending:
                 self._ending = True

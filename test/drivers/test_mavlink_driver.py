@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
 from std_srvs.srv import Trigger
 
+from maasi_drivers import agent_driver
 from maasi_drivers.arm_permission import UNTIL_ARM
 from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.mavlink.settings import MavlinkSettings
@@ -436,8 +438,13 @@ def test_the_pilot_takes_over_and_keeps_it(fly, capfd):
     assert flight.mode == 'LOITER'
 
 
-def test_with_a_low_battery_it_lands(fly):
-    flight = fly(battery_minimum=0.2).fly()
+def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
+    monkeypatch.setattr(agent_driver, '_BATTERY_PATIENCE', 2.5)
+    flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
+    # One that stays the same has been heard all the same.
+    begin = time.monotonic()
+    flight.until(lambda: time.monotonic() - begin > 4.0)
+    assert 'battery_minimum cannot act' not in capfd.readouterr().err
     result = flight.under_way()
     with flight.vehicle._lock:
         flight.vehicle.autopilot.charge = 0.15

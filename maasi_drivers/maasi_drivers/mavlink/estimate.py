@@ -74,6 +74,8 @@ class Estimate:
         When position or attitude were heard last, on the steady clock [s].
     landed : int
         MAV_LANDED_STATE.
+    charge_reports : int
+        Messages on batteries so far.
     dropped : Counter
         Messages that could not be used.
 
@@ -84,6 +86,7 @@ class Estimate:
         self._on_restart = on_restart
         self.dropped: Counter[str] = Counter()
         self._number = -1
+        self.charge_reports = 0
         self.forget()
 
     def forget(self) -> None:
@@ -95,6 +98,7 @@ class Estimate:
         self._good: bool | None = None
         self._fix: int | None = None
         self._charges: dict[int, float] = {}
+        self._from_batteries = False
         self._boot_time: int | None = None
         self._position: tuple[int, tuple[float, ...]] | None = None
         self._attitude = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
@@ -132,13 +136,16 @@ class Estimate:
         elif kind == 'ATTITUDE_QUATERNION':
             self._take_attitude(message, now)
         elif kind == 'BATTERY_STATUS':
+            self._from_batteries = True
             left = message.battery_remaining
             self._charges[int(message.id)] = left / 100.0 if 0 <= left <= 100 else -1.0
+            self.charge_reports += 1
         elif kind == 'SYS_STATUS':
             # The first battery's charge, where BATTERY_STATUS does not come.
             left = message.battery_remaining
-            if 0 not in self._charges and 0 <= left <= 100:
+            if 0 <= left <= 100 and not (self._from_batteries and 0 in self._charges):
                 self._charges[0] = left / 100.0
+                self.charge_reports += 1
         elif kind == 'EXTENDED_SYS_STATE':
             self.landed = int(message.landed_state)
         elif kind == 'GPS_RAW_INT':

@@ -159,6 +159,11 @@ class Vehicle:
         return self._estimate.charge
 
     @property
+    def charge_reports(self) -> int:
+        """Messages on batteries so far."""
+        return self._estimate.charge_reports
+
+    @property
     def parameters(self) -> Mapping[str, float | None]:
         """Of the failsafes, as read; None where the autopilot does not have it."""
         return {} if self._failsafes is None else self._failsafes.values
