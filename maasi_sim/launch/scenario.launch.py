@@ -25,9 +25,10 @@ def end_launch(event: ProcessExited, context: LaunchContext) -> EmitEvent:
     return EmitEvent(event=Shutdown(reason='the run has ended'))
 
 
-def show(scenario: str) -> Node:
-    """Return RViz with the view of a scenario."""
+def show(scenario: str, team: str) -> Node:
+    """Return RViz with the view of a scenario, for a team in a namespace."""
     from maasi_sim.cuboid_scenario import load_any_scenario
+    from maasi_sim.rviz_view import shown_topics
     from maasi_sim.scenario import config_folder, find_scenario
 
     three = load_any_scenario(find_scenario(scenario), {}).dimension == 3
@@ -37,6 +38,7 @@ def show(scenario: str) -> Node:
         executable='rviz2',
         arguments=['-d', str(view)],
         parameters=[{'use_sim_time': True}],
+        remappings=[(topic, f'/{team}{topic}') for topic in shown_topics(view)] if team else [],
         output='log',
     )
 
@@ -45,7 +47,11 @@ def start_run(context: LaunchContext) -> list:
     """Return the actions that start the run, and RViz if asked for."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     # First, so that nothing starts where it is not installed.
-    actions = [show(given['scenario'].strip())] if is_true(given, 'rviz') else []
+    actions = (
+        [show(given['scenario'].strip(), given['namespace'].strip(' /'))]
+        if is_true(given, 'rviz')
+        else []
+    )
     run = ExecuteProcess(
         cmd=[ExecutableInPackage('run_scenario', 'maasi_sim'), *scenario_options(given)],
         output='screen',

@@ -25,7 +25,7 @@ class Arming:
     context : Context
         Of rclpy.
     robots : collection of str
-        Simulated robots that take off.
+        Simulated robots that take off, with the namespace of their team.
 
     """
 

@@ -126,6 +126,8 @@ class CuboidObserver:
         self._visited_at: dict[int, Moment] = {}
         self._done: dict[str, int] = {}
         self._team: list[str] | None = None
+        # As in `RunObserver`.
+        self._begin: float | None = None
         self._shots = 0
         self.events: list[dict[str, Any]] = []
         self.news = False
@@ -190,7 +192,7 @@ class CuboidObserver:
 
     def _take(self, name: str, decision: Any) -> None:
         self._decisions[name].append(decision)
-        moment = Moment(seconds(decision.header.stamp), int(decision.step))
+        moment = Moment(self._time(decision.header.stamp), int(decision.step))
         for shot in decision.snapshots:
             self._shots += 1
             known = self._visited_at.get(int(shot.cuboid))
@@ -200,7 +202,12 @@ class CuboidObserver:
         if decision.done:
             self._done.setdefault(name, moment.step)
 
+    def _time(self, stamp: Any) -> float:
+        return seconds(stamp) - (self._begin or 0.0)
+
     def _note_team(self, step: Any) -> None:
+        if self._begin is None:
+            self._begin = seconds(step.stamp)
         team = list(step.robots)
         if self._team is not None:
             for word, names in (
@@ -208,7 +215,8 @@ class CuboidObserver:
                 ('joined', set(team) - set(self._team)),
             ):
                 for name in sorted(names):
-                    self.events.append({'time': seconds(step.stamp), 'agent': name, 'event': word})
+                    time = self._time(step.stamp)
+                    self.events.append({'time': time, 'agent': name, 'event': word})
         self._team = team
 
     def _decode(self, data: bytes, name: str) -> Any:
@@ -241,7 +249,7 @@ class CuboidObserver:
         for name, decisions in self._decisions.items():
             activity = SEARCHING
             for item in decisions:
-                moment = seconds(item.header.stamp)
+                moment = self._time(item.header.stamp)
                 if moment > end_time:
                     continue
                 record.choices[item.how] = record.choices.get(item.how, 0) + 1
@@ -274,8 +282,9 @@ class CuboidObserver:
             for data in states:
                 state = self._decode(data, 'AgentState')
                 place = state.pose.pose.position
-                if seconds(state.header.stamp) <= end_time:
-                    rows.append((seconds(state.header.stamp), place.x, place.y, place.z))
+                moment = self._time(state.header.stamp)
+                if moment <= end_time:
+                    rows.append((moment, place.x, place.y, place.z))
             record.trajectories[name] = np.array(rows, dtype=float).reshape(-1, 4)
         record.events = sorted(
             record.events + self.events + (events or []), key=lambda event: float(event['time'])

@@ -15,10 +15,12 @@ ARGUMENTS = {
     'record': ('true', 'whether a bag is recorded; true or false'),
     'planner': ('', "name of the planner; empty: the scenario's"),
     'time_limit': ('', "simulated time [s]; empty: the scenario's"),
+    'namespace': ('', 'of all nodes and topics of the run; empty: none'),
+    'follow_clock': ('false', 'whether its time is the /clock of another run; true or false'),
     'log_level': ('', 'of the nodes: debug, info, warn, error or fatal; empty: info'),
     'rviz': ('false', 'whether RViz shows the search; true or false'),
 }
-_OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'log_level')
+_OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level')
 _ENDINGS = {
     1: 'not all targets were found',
     2: 'wrong input',
@@ -59,6 +61,8 @@ def scenario_options(given: Mapping[str, str]) -> list[str]:
             options.append(f'--{name.replace("_", "-")}={given[name].strip()}')
     if is_true(given, 'lockstep'):
         options.append('--lockstep')
+    if is_true(given, 'follow_clock'):
+        options.append('--follow-clock')
     if not is_true(given, 'record'):
         options.append('--no-record')
     is_true(given, 'rviz')

@@ -167,6 +167,25 @@ def plan_nodes(
     return plans
 
 
+def in_team(plan: NodePlan, team: str) -> NodePlan:
+    """Return the plan of a node below the namespace of a team; the clock is everybody's."""
+    if not team:
+        return plan
+    return replace(
+        plan,
+        namespace=f'{team}/{plan.namespace}' if plan.namespace else team,
+        topics=tuple(topic if topic == CLOCK else within(team, topic) for topic in plan.topics),
+        remaps={within(team, key): within(team, value) for key, value in plan.remaps.items()},
+    )
+
+
+def with_followed_clock(plan: NodePlan) -> NodePlan:
+    """Return the plan of a node of a run whose clock is another one's."""
+    if not plan.is_clock:
+        return plan
+    return replace(plan, parameters={**plan.parameters, **_SIMULATED, 'follow_clock': True})
+
+
 def with_saved_state(plan: NodePlan, folder: Path) -> NodePlan:
     """Return the plan of a node that goes on where it was when it is started again."""
     if plan.executable != 'filter_node':

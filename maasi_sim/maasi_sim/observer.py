@@ -136,9 +136,10 @@ class _Update:
 class _Tally:
     """Counts what the filters have found, update by update."""
 
-    def __init__(self, scenario: Scenario, truth: FloatArray) -> None:
+    def __init__(self, scenario: Scenario, truth: FloatArray, begin: float) -> None:
         self.scenario = scenario
         self.truth = truth
+        self.begin = begin
         self.radius = scoring_radius(scenario, truth)
         self.measurements = dict.fromkeys(scenario.names(), 0)
         self.progress: list[Progress] = []
@@ -185,7 +186,7 @@ class _Tally:
         if changed or self._last_scores is None:
             self._last_scores = self._scores()
         now = Progress(
-            seconds(message.header.stamp),
+            seconds(message.header.stamp) - self.begin,
             int(message.step),
             int(message.batch_id),
             sum(self.measurements.values()),
@@ -221,15 +222,15 @@ class _Tally:
             np.array(item.covariance, dtype=float).reshape(3, 3)[:size, :size],
             item.robot,
             int(item.measurement),
-            seconds(item.stamp),
+            seconds(item.stamp) - self.begin,
         )
 
 
 class RunObserver:
     """Gather what a report needs from serialised messages, in the order in which they come.
 
-    Only filter updates and found targets are read at once, as the end of a run depends on them;
-    the rest is kept as it is until `record`.
+    Times are those since the first step. Only filter updates and found targets are read at once, as
+    the end of a run depends on them; the rest is kept as it is until `record`.
 
     Parameters
     ----------
@@ -259,7 +260,9 @@ class RunObserver:
             topic: []
             for topic in (*self._decision_topics, *self._state_topics, *self._detection_topics)
         }
-        self._tally = _Tally(scenario, self.truth)
+        # When it began [s]: the time of a clock that it follows has no beginning.
+        self._begin: float | None = None
+        self._tally = _Tally(scenario, self.truth, 0.0)
         self._updates: list[tuple[str, Any]] = []
         self._arrays: dict[str, list[Any]] = {space: [] for space in spaces}
         self._history: list[_Update] = []
@@ -376,7 +379,7 @@ class RunObserver:
         """Return the tally with the updates of several filters in the order of steps and names."""
         if not self._history:
             return self._tally
-        tally = _Tally(self.scenario, self.truth)
+        tally = _Tally(self.scenario, self.truth, self._begin or 0.0)
         for update in sorted(
             self._history,
             key=lambda item: (item.message.step, item.namespace, item.message.batch_id),
@@ -413,10 +416,15 @@ class RunObserver:
         states = self._kept[f'/{name}/state']
         return not states or self._decode(states[-1], 'AgentState').goal_status != UNAVAILABLE
 
+    def _time(self, stamp: Any) -> float:
+        return seconds(stamp) - (self._begin or 0.0)
+
     def _note_team(self, step: Any) -> None:
+        if self._begin is None:
+            self._begin = self._tally.begin = seconds(step.stamp)
         team = list(step.robots)
         if self._team is not None and team != self._team:
-            time = seconds(step.stamp)
+            time = self._time(step.stamp)
             self._note_changes(self.events, time, self._team, team)
         changed = team != self._team
         self._team = team
@@ -476,9 +484,9 @@ class RunObserver:
         lost: list[dict[str, Any]] = []
         for topic, name in self._state_topics.items():
             states = [self._decode(data, 'AgentState') for data in self._kept[topic]]
-            states = [state for state in states if seconds(state.header.stamp) <= end_time]
+            states = [state for state in states if self._time(state.header.stamp) <= end_time]
             record.trajectories[name] = _rows(
-                [(seconds(s.header.stamp), *_point(s.pose.pose.position)) for s in states], 4
+                [(self._time(s.header.stamp), *_point(s.pose.pose.position)) for s in states], 4
             )
             if self._team is None:
                 lost += _absences(name, states)
@@ -488,7 +496,7 @@ class RunObserver:
                 [
                     _point(item.pose.pose.position)
                     for item in arrays
-                    if item.batch_id and seconds(item.header.stamp) <= end_time
+                    if item.batch_id and self._time(item.header.stamp) <= end_time
                 ],
                 3,
             )

@@ -43,7 +43,11 @@ class Domain:
     number : int, optional
         The domain to use; the first free one from 1 if not given (0 is where everybody else is).
     folder : Path, optional
-        Where the lock files are, one for each domain.
+        Where the lock files are: one for each domain, and one for each namespace in it.
+    team : str
+        Namespace of the run.
+    shared : bool
+        Whether other runs, in other namespaces, may be in it already.
 
     Raises
     ------
@@ -51,7 +55,14 @@ class Domain:
         If the one asked for is used by another run, is not from 0 to 101, or none is free.
     """
 
-    def __init__(self, number: int | None = None, folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        number: int | None = None,
+        folder: Path | None = None,
+        *,
+        team: str = '',
+        shared: bool = False,
+    ) -> None:
         # A run that was killed a moment ago, at its start, leaves some that are young.
         remove_dead_ports(patience=LONGEST_CREATION + 1.0)
         self._folder = folder or Path('/tmp/maasi_domains')
@@ -64,17 +75,29 @@ class Domain:
             # One that was asked for may have other nodes in it: that may be why.
             if number is None and _port_used(_FIRST_PORT + _PORTS_PER_DOMAIN * candidate):
                 continue
-            file = self._lock(candidate)
-            if file is not None:
-                self._file: int | None = file
+            problem = self._take(candidate, team, shared)
+            if not problem:
                 self.number = candidate
                 return
-        if number is not None:
-            raise ProcessError(f'domain id: {number} is used by another run')
+            if number is not None:
+                raise ProcessError(f'domain id: {problem} is used by another run')
         raise ProcessError(f'no ROS domain from 1 to {DOMAINS[-1]} is free')
 
-    def _lock(self, number: int) -> int | None:
-        path = self._folder / f'{number}.lock'
+    def _take(self, number: int, team: str, shared: bool) -> str:
+        """Lock a domain and a namespace in it; return what is locked already, empty if nothing."""
+        wanted = {} if shared else {f'{number}': f'{number}'}
+        wanted[f'{number}_{team.replace("/", ".")}'] = f'namespace /{team} in {number}'
+        self._files: list[int] = []
+        for name, words in wanted.items():
+            file = self._lock(name)
+            if file is None:
+                self.release()
+                return words
+            self._files.append(file)
+        return ''
+
+    def _lock(self, name: str) -> int | None:
+        path = self._folder / f'{name}.lock'
         try:
             try:
                 file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -105,9 +128,8 @@ class Domain:
 
     def release(self) -> None:
         """Let others have the domain."""
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
+        while self._files:
+            os.close(self._files.pop())
 
     def __enter__(self) -> Domain:
         """Return itself."""

@@ -12,6 +12,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
+from rcl_interfaces.msg import Log
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -36,11 +37,13 @@ from maasi_msgs.msg import (
 )
 from maasi_sim.bag import BagError, BagWriter, TopicQos
 from maasi_sim.cuboid_observer import CuboidObserver
-from maasi_sim.observer import STEP, RunObserver
+from maasi_sim.observer import STEP, RunObserver, within
 
-NAME = '/recorder'
+NAME = 'recorder'
 CLOCK, READY, DONE = '/clock', '/lockstep/ready', '/lockstep/done'
-DIAGNOSTICS = '/diagnostics'
+DIAGNOSTICS, ROSOUT = '/diagnostics', '/rosout'
+# What all teams of a domain share.
+_SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)
 # What is left out: of no use to who reads the recording.
 _SKIPPED = ('/parameter_events', READY)
 # A copy of the found targets for a restarted filter.
@@ -81,7 +84,9 @@ class Recorder:
 
     Subscribes
     ----------
-    every topic with a publisher, with the quality of service of that publisher;
+    every topic with a publisher, with the quality of service of that publisher; where the team has
+    a namespace, only those below it, `/clock`, and what its nodes say on `/diagnostics` and
+    `/rosout`;
     `lockstep/ready` (maasi_msgs/LockstepDone)
 
     Publishes
@@ -97,10 +102,17 @@ class Recorder:
         Is fed with what the report needs.
     bag : BagWriter, optional
         Recording; None: nothing is recorded, and only what the observer needs is taken.
+    team : str
+        Namespace of the team, without slashes at its ends. The observer is not told of it: its
+        topics are relative to it.
     """
 
     def __init__(
-        self, domain: int, observer: RunObserver | CuboidObserver, bag: BagWriter | None
+        self,
+        domain: int,
+        observer: RunObserver | CuboidObserver,
+        bag: BagWriter | None,
+        team: str = '',
     ) -> None:
         self.context = Context()
         rclpy.init(
@@ -109,7 +121,8 @@ class Recorder:
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self.node = Node(
-            NAME.strip('/'),
+            NAME,
+            namespace=f'/{team}',
             context=self.context,
             start_parameter_services=False,
             enable_rosout=False,
@@ -117,6 +130,8 @@ class Recorder:
         )
         self.observer = observer
         self.bag = bag
+        self._team = team
+        self.name = within(team, f'/{NAME}')
         self.time = 0
         # Of the first step [ns].
         self._begun: int | None = None
@@ -143,19 +158,37 @@ class Recorder:
                 durability=DurabilityPolicy.TRANSIENT_LOCAL,
             ),
         )
-        self._ready_publisher = self.node.create_publisher(LockstepDone, READY, _READY_QOS)
-        self._done_publisher = self.node.create_publisher(LockstepDone, DONE, _RELIABLE)
+        self._ready_publisher = self.node.create_publisher(
+            LockstepDone, within(team, READY), _READY_QOS
+        )
+        self._done_publisher = self.node.create_publisher(
+            LockstepDone, within(team, DONE), _RELIABLE
+        )
         self._wait_set = rclpy_implementation.WaitSet(2, 0, 0, 0, 0, 0, self.context.handle)
 
     def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> Subscription:
-        return self.node.create_subscription(kind, topic, _never, qos, raw=True)
+        return self.node.create_subscription(kind, self._full(topic), _never, qos, raw=True)
+
+    def _full(self, topic: str) -> str:
+        """Return the full name of a topic of the team."""
+        return topic if topic in _SHARED else within(self._team, topic)
+
+    def _relative(self, topic: str) -> str | None:
+        """Return the name of a topic within the team; None for one of somebody else."""
+        if not self._team or topic in _SHARED:
+            return topic
+        inner = topic.removeprefix(f'/{self._team}')
+        return None if inner == topic or inner[0] != '/' or inner in _SHARED else inner
 
     def discover(self) -> None:
         """Subscribe to the topics that have come up since the last time."""
-        for topic, types in self.node.get_topic_names_and_types():
-            if topic in self._subscriptions or topic in self._refused or not self._wants(topic):
+        for full, types in self.node.get_topic_names_and_types():
+            topic = self._relative(full)
+            if topic is None or topic in self._subscriptions or topic in self._refused:
                 continue
-            infos = self.node.get_publishers_info_by_topic(topic)
+            if not self._wants(topic):
+                continue
+            infos = self.node.get_publishers_info_by_topic(full)
             if not infos:
                 continue
             profiles = [info.qos_profile for info in infos]
@@ -168,10 +201,10 @@ class Recorder:
             try:
                 kind = _message_class(types[0])
                 if self.bag is not None:
-                    self.bag.add_topic(topic, types[0], TopicQos(reliable, latched))
+                    self.bag.add_topic(full, types[0], TopicQos(reliable, latched))
             except (ImportError, AttributeError, BagError) as error:
                 self._refused.add(topic)
-                self.complaints.append(f'topic {topic} is not recorded: {error}')
+                self.complaints.append(f'topic {full} is not recorded: {error}')
                 continue
             qos = QoSProfile(
                 history=HistoryPolicy.KEEP_ALL if reliable else HistoryPolicy.KEEP_LAST,
@@ -187,15 +220,13 @@ class Recorder:
 
     def missing(self, topics: Collection[str]) -> list[str]:
         """Return those topics, of use to the recorder, whose publisher is not connected yet."""
-        return [
-            topic
-            for topic in topics
-            if self._wants(topic)
-            and (
-                topic not in self._subscriptions
-                or self._subscriptions[topic].handle.get_publisher_count() == 0
-            )
-        ]
+        return [full for full in topics if self._is_missing(self._relative(full))]
+
+    def _is_missing(self, topic: str | None) -> bool:
+        if topic is None or not self._wants(topic):
+            return False
+        subscription = self._subscriptions.get(topic)
+        return subscription is None or subscription.handle.get_publisher_count() == 0
 
     def _wants(self, topic: str) -> bool:
         # A name with an underscore in front is hidden: the inner topics of actions.
@@ -211,11 +242,11 @@ class Recorder:
 
     def publish_ready(self) -> None:
         """Say that the recorder is ready."""
-        self._ready_publisher.publish(LockstepDone(node=NAME, step=0))
+        self._ready_publisher.publish(LockstepDone(node=self.name, step=0))
 
     def publish_done(self, step: int) -> None:
         """Say that the recorder is done with a step."""
-        self._done_publisher.publish(LockstepDone(node=NAME, step=step))
+        self._done_publisher.publish(LockstepDone(node=self.name, step=step))
 
     def wait(self, timeout: float) -> None:
         """Return when there is a new step (free running: after the time) [s]."""
@@ -237,7 +268,7 @@ class Recorder:
         Parameters
         ----------
         limit : int, optional
-            Simulated time after which the run ends [ns].
+            Simulated time after its start at which the run ends [ns].
         """
         # Left where they are they would end each wait at once.
         self.take_ready()
@@ -252,13 +283,15 @@ class Recorder:
             self.step = struct.unpack_from('<Q', data, 4)[0]
             self._set_time(data, 12)
             if self._begun is None:
-                self._begun = self.time
+                self._begun = _time_at(data, 12)
         taken = [(CLOCK, data) for data in self._take_from(CLOCK)]
         for _, data in taken:
             self._set_time(data, 4)
         for topic, subscription in self._subscriptions.items():
             if topic not in (*self.observer.update_topics, STEP, CLOCK):
-                taken += [(topic, data) for data in _take(subscription)]
+                taken += [
+                    (topic, data) for data in _take(subscription) if self._is_own(topic, data)
+                ]
         taken += updates
         taken += [(STEP, data) for data in steps]
         if self._finished:
@@ -289,7 +322,19 @@ class Recorder:
 
     @property
     def _elapsed(self) -> int:
-        return self.time - (self._begun or 0)
+        return 0 if self._begun is None else self.time - self._begun
+
+    def _is_own(self, topic: str, data: bytes) -> bool:
+        """Return whether a message on a topic that all teams share is the team's own."""
+        if not self._team:
+            return True
+        if topic == DIAGNOSTICS:
+            names = [item.name for item in deserialize_message(data, DiagnosticArray).status]
+            return any(name.startswith(f'/{self._team}/') for name in names)
+        if topic == ROSOUT:
+            logger = f'{self._team.replace("/", ".")}.'
+            return bool(deserialize_message(data, Log).name.startswith(logger))
+        return True
 
     def _record(self, taken: list[tuple[str, bytes]]) -> None:
         # One that has failed ends the run: `bag.failed`.
@@ -297,7 +342,7 @@ class Recorder:
             return
         try:
             for topic, data in self._due(taken):
-                self.bag.write(topic, self.time, data)
+                self.bag.write(self._full(topic), self.time, data)
         except BagError:
             if not self.bag.failed:
                 raise
@@ -352,8 +397,7 @@ class Recorder:
         return [] if subscription is None else _take(subscription)
 
     def _set_time(self, data: bytes, offset: int) -> None:
-        seconds, nanoseconds = struct.unpack_from('<iI', data, offset)
-        self.time = max(self.time, seconds * 10**9 + nanoseconds)
+        self.time = max(self.time, _time_at(data, offset))
 
     def done_steps(self) -> dict[str, int]:
         """Return the last step that each node has said it is done with, of late."""
@@ -368,7 +412,7 @@ class Recorder:
         types = dict(self.node.get_topic_names_and_types())
         publishers = []
         for name in names:
-            topic = f'/{name}/cmd_vel'
+            topic = self._full(f'/{name}/cmd_vel')
             if self.node.count_subscribers(topic):
                 plain = types[topic] == ['geometry_msgs/msg/Twist']
                 chosen = Twist if plain else TwistStamped
@@ -389,6 +433,14 @@ class Recorder:
             left = max(deadline - time.monotonic(), 0.0)
             publisher.wait_for_all_acked(Duration(nanoseconds=round(left * 1e9)))
             self.node.destroy_publisher(publisher)
+
+    def followers(self) -> list[str]:
+        """Return the namespaces of the runs whose time is the clock of this one."""
+        return sorted(
+            info.node_namespace
+            for info in self.node.get_subscriptions_info_by_topic(CLOCK)
+            if info.node_name == 'sim_node' and info.node_namespace.strip('/') != self._team
+        )
 
     def close(self) -> None:
         """Leave the graph."""
@@ -424,6 +476,11 @@ def _stamp(topic: str, kind: Any, data: bytes) -> int:
     offset = _stamp_offset(topic, kind, data)
     if offset is None:
         return 0
+    return _time_at(data, offset)
+
+
+def _time_at(data: bytes, offset: int) -> int:
+    """Return the time at a place of a serialised message [ns]."""
     seconds, nanoseconds = struct.unpack_from('<iI', data, offset)
     return int(seconds) * 10**9 + int(nanoseconds)
 

@@ -102,6 +102,7 @@ def read_recording(path: Path) -> Recording:
     """
     with Bag(path) as bag:
         recording = Recording(bag.scenario())
+        team = recording.facts.get('namespace', '')
         for name in recording.facts.get('nodes', {}):
             namespace, _, node = name.strip('/').rpartition('/')
             if node == FILTER:
@@ -109,7 +110,7 @@ def read_recording(path: Path) -> Recording:
         if not recording.found:
             raise BagError(f'{path}: holds no parameters of {FILTER}')
         robots = recording.facts['scenario']['robots']
-        topics = {f'/{name}/detections': name for name in robots}
+        topics = {within(team, f'/{name}/detections'): name for name in robots}
         detections: dict[tuple[str, int], bytes] = {}
         for topic, kind, _, data in bag.raw(topics):
             message = bag.decode(data, kind)
@@ -117,13 +118,13 @@ def read_recording(path: Path) -> Recording:
             detections.setdefault((topics[topic], int(message.measurement)), data)
         for namespace in recording.namespaces:
             last = 0
-            for item in bag.messages([within(namespace, UPDATE)]):
+            for item in bag.messages([within(team, within(namespace, UPDATE))]):
                 batch = _batch(item.message, detections, path)
                 batch.namespace = namespace
                 batch.late = batch.id <= last
                 last = max(last, batch.id)
                 recording.batches.append(batch)
-            for item in bag.messages([within(namespace, FOUND)]):
+            for item in bag.messages([within(team, within(namespace, FOUND))]):
                 recording.found[namespace] = [plain(target) for target in item.message.targets]
                 recording.found_batch[namespace] = int(item.message.batch_id)
     if len(recording.found) > 1:

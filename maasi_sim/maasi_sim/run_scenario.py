@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import signal
@@ -14,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
+
+from maasi_sim.run_options import Options, parse
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -29,14 +30,14 @@ if TYPE_CHECKING:
 
 DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, NOT_WRITTEN, INTERRUPTED = 0, 1, 2, 3, 4, 130
 
-LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
-
 # Bytes that may wait for the disk when the recorder says that it is done with a step.
 _BACKLOG = 8 * 2**20
 # Longest wall time until the next look at processes and topics [s].
 _POLL = 0.02
 # Wall time between two looks at processes, where steps come in quick succession [s].
 _LOOK_PERIOD = 0.05
+# Between two looks at whether somebody follows the clock [s].
+_FOLLOWERS_PERIOD = 0.5
 # Wall time after which it says whom it waits for, again and again [s].
 _START_PATIENCE = 10.0
 # One thread for each linear algebra: there is a process for each node already.
@@ -85,91 +86,13 @@ class Ending:
     text: str = ''
 
 
-@dataclass(frozen=True)
-class Options:
-    """What the command line says about a run."""
-
-    scenario: str
-    out: Path | None = None
-    seed: int | None = None
-    lockstep: bool = False
-    rate: float | None = None
-    record: bool = True
-    planner: str | None = None
-    time_limit: float | None = None
-    domain_id: int | None = None
-    log_level: str | None = None
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='run_scenario',
-        description='Run a scenario as separate ROS 2 processes, or replay a recording of one.',
-        epilog='Exit codes: 0 all targets found (or, with stop: planner_done, ended as meant), '
-        '1 not all found, 2 wrong input, 3 a node died or hung, 4 bag or report could not be '
-        'written (disk full), 130 interrupted.',
-    )
-    parser.add_argument(
-        'scenario', nargs='?', metavar='FILE', help='scenario file, or name of one in config'
-    )
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR', help='folder of the run (default: runs/<time>)'
-    )
-    parser.add_argument('--seed', type=_whole, metavar='N', help="instead of the scenario's")
-    parser.add_argument(
-        '--lockstep',
-        action='store_true',
-        help='step by step, as fast as it goes: the same seed gives the same run, to the bit',
-    )
-    parser.add_argument(
-        '--rate', type=_positive, metavar='X', help='simulated over wall time (default: 1)'
-    )
-    parser.add_argument('--no-record', action='store_true', help='write no recording')
-    parser.add_argument('--planner', metavar='NAME', help="instead of the scenario's")
-    parser.add_argument(
-        '--time-limit', type=_positive, metavar='S', help='simulated time [s], instead of its own'
-    )
-    parser.add_argument(
-        '--domain-id', type=_whole, metavar='N', help='ROS domain (default: one of its own)'
-    )
-    parser.add_argument('--log-level', choices=LOG_LEVELS, help='of the nodes (default: info)')
-    parser.add_argument(
-        '--replay',
-        type=Path,
-        metavar='BAG',
-        help='feed the filter the recorded measurements, and compare what it finds',
-    )
-    return parser
-
-
-def _whole(text: str) -> int:
-    # No sign, underscore or digits of another alphabet.
-    if not (text.isascii() and text.isdecimal()):
-        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are whole numbers from 0")
-    return int(text)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float('nan')
-    if not 0.0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are finite numbers above 0")
-    return value
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     interruption = Interruption()
     # Before NumPy is loaded; the nodes inherit it.
     for key, value in _NODE_ENVIRONMENT.items():
         os.environ.setdefault(key, value)
-    parser = build_parser()
-    options = parser.parse_args(arguments)
-    if (options.replay is None) == (options.scenario is None):
-        parser.error('give either a scenario or --replay BAG')
+    options = parse(arguments)
     from maasi_sim.bag import BagError, BagWriteError
     from maasi_sim.processes import ProcessError
     from maasi_sim.results import ResultsError
@@ -181,19 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
 
             stop_asked = interruption.__bool__
             return replay(options.replay, options.out, options.domain_id, stop_asked)
-        chosen = Options(
-            scenario=options.scenario,
-            out=options.out,
-            seed=options.seed,
-            lockstep=options.lockstep,
-            rate=options.rate,
-            record=not options.no_record,
-            planner=options.planner,
-            time_limit=options.time_limit,
-            domain_id=options.domain_id,
-            log_level=options.log_level,
-        )
-        return ScenarioRun(chosen, interruption).execute()
+        return ScenarioRun(options, interruption).execute()
     except (ScenarioError, ProcessError, BagError, ResultsError) as error:
         with contextlib.suppress(OSError):
             for line in str(error).splitlines():
@@ -236,6 +147,7 @@ class ScenarioRun:
             overrides['--seed'] = (('seed',), options.seed)
         self.scenario: AnyScenario = load_any_scenario(path, overrides)
         self.seed = self.scenario.seed
+        self._check_namespace()
         self.display = ProgressDisplay()
         self.events: list[dict[str, Any]] = []
         self.processes: dict[str, NodeProcess] = {}
@@ -250,12 +162,26 @@ class ScenarioRun:
         # What could not be written, and why.
         self._unwritten: list[str] = []
 
+    def _check_namespace(self) -> None:
+        from maasi_sim.yaml_files import ScenarioError
+
+        # A node in the namespace of a robot belongs to that robot.
+        last = self.options.namespace.rpartition('/')[2]
+        if last in self.scenario.names():
+            raise ScenarioError(
+                f"--namespace: read '{self.options.namespace}', allowed is a name that is none of "
+                'a robot of the scenario'
+            )
+
     def execute(self) -> int:
         """Run it and return the exit code."""
         from maasi_sim.processes import Domain
         from maasi_sim.results import make_folder
 
-        with Domain(self.options.domain_id) as domain:
+        options = self.options
+        with Domain(
+            options.domain_id, team=options.namespace, shared=options.follow_clock
+        ) as domain:
             self.folder = make_folder(self.options.out)
             os.environ.update(domain.environment())
             self._prepare()
@@ -271,7 +197,12 @@ class ScenarioRun:
     def _prepare(self) -> None:
         """Write down what is run, and find the nodes' executables."""
         from maasi_sim.linked_robots import with_addresses
-        from maasi_sim.node_plan import plan_nodes, with_saved_state
+        from maasi_sim.node_plan import (
+            in_team,
+            plan_nodes,
+            with_followed_clock,
+            with_saved_state,
+        )
         from maasi_sim.processes import NodeProcess, find_executable
         from maasi_sim.results import ResultsError, write_text
         from maasi_sim.rviz_view import view_text
@@ -279,9 +210,10 @@ class ScenarioRun:
 
         if isinstance(self.scenario, Scenario):
             self.scenario = with_addresses(self.scenario)
+        team = self.options.namespace
         file = self.folder / 'scenario.yaml'
         write_text(file, self.scenario.text())
-        write_text(self.folder / 'view.rviz', view_text(self.scenario))
+        write_text(self.folder / 'view.rviz', view_text(self.scenario, team))
         self.plans = plan_nodes(
             self.scenario,
             seed=self.seed,
@@ -290,6 +222,9 @@ class ScenarioRun:
             recorder=True,
             file=file,
         )
+        self.plans = [in_team(plan, team) for plan in self.plans]
+        if self.options.follow_clock:
+            self.plans = [with_followed_clock(plan) for plan in self.plans]
         if self.scenario.on_exit == 'respawn':
             self.plans = [with_saved_state(plan, self.folder / 'state') for plan in self.plans]
         self._beside = {
@@ -341,7 +276,7 @@ class ScenarioRun:
             if self.options.record:
                 bag = BagWriter(self.folder / 'bag', types, self.scenario.record.images)
                 bag.write_scenario(self._facts_text(), {'seed': str(self.seed)})
-            recorder = Recorder(domain.number, observer, bag)
+            recorder = Recorder(domain.number, observer, bag, self.options.namespace)
             arming = Arming(recorder.context, self._taking_off())
             ready = self._wait_until_ready(recorder, arming)
             threading.Thread(target=self._warn, daemon=True).start()
@@ -349,6 +284,12 @@ class ScenarioRun:
             arming.close()
             self._ended = time.monotonic()
             self._end(recorder, ending)
+            if self._is_followed(recorder):
+                if bag is not None:
+                    self._close(bag)
+                code = self._report(ending, recorder, observer)
+                self._keep_clock(recorder)
+                return code
         finally:
             stop(list(self.processes.values()))
             if recorder is not None:
@@ -382,9 +323,11 @@ class ScenarioRun:
             'seed': self.seed,
             'lockstep': self.options.lockstep,
             'rate': self.options.rate,
+            'namespace': self.options.namespace,
+            'follow_clock': self.options.follow_clock,
             'scenario': self.scenario.content(),
             'nodes': {
-                plan.full_name: {
+                self._without_team(plan.full_name): {
                     'package': plan.package,
                     'executable': plan.executable,
                     'parameters': plan.parameters,
@@ -398,10 +341,12 @@ class ScenarioRun:
         """Wait until every node takes part, the recorder last; return an ending if one does not."""
         begin = time.monotonic()
         patience = _START_PATIENCE
+        team = self.options.namespace
+        where = f' --namespace {team}' if team else ''
         for name in self._external():
             self.display.say(
                 f'{name} is external: it takes off when you call its service arm (search_command '
-                f'arm --robot {name}, with ROS_DOMAIN_ID={recorder.context.get_domain_id()})'
+                f'arm --robot {name}{where}, with ROS_DOMAIN_ID={recorder.context.get_domain_id()})'
             )
         expected = [plan.full_name for plan in self.plans if plan.says_ready]
         needed = [topic for plan in self.plans for topic in plan.topics]
@@ -558,6 +503,9 @@ class ScenarioRun:
     def _hung(self, recorder: Recorder) -> Ending:
         """Return the ending of a run in which nothing moves any more."""
         silence = f'for {self.scenario.limits.silence:g} s'
+        if self.options.follow_clock:
+            text = f'/clock, which this run follows, stands still {silence}'
+            return Ending('clock_stopped', NODE_FAILED, text)
         if recorder.step is None:
             return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
         steps = recorder.done_steps()
@@ -573,9 +521,10 @@ class ScenarioRun:
         )
 
     def _taking_off(self) -> list[str]:
-        """Return the robots whose drivers take off, all of them simulated."""
+        """Return the robots, with namespace, whose drivers take off, all of them simulated."""
         robots = getattr(self.scenario, 'robots', {})
-        return [name for name, robot in robots.items() if getattr(robot, 'takes_off', False)]
+        team = f'{self.options.namespace}/'.lstrip('/')
+        return [team + name for name, robot in robots.items() if getattr(robot, 'takes_off', False)]
 
     def _external(self) -> list[str]:
         """Return the robots that another program moves, and that take off."""
@@ -586,8 +535,12 @@ class ScenarioRun:
             if getattr(robot, 'external', False) and robot.link != 'topics'
         ]
 
+    def _without_team(self, name: str) -> str:
+        team = self.options.namespace
+        return name.removeprefix(f'/{team}') if team else name
+
     def _robot_of(self, node: str) -> str | None:
-        name = node.strip('/').partition('/')[0]
+        name = self._without_team(node).strip('/').partition('/')[0]
         return name if name in self.scenario.robots else None
 
     def _show(self, recorder: Recorder, observer: RunObserver | CuboidObserver) -> None:
@@ -618,7 +571,8 @@ class ScenarioRun:
             for plan in self.plans
             if plan.package == 'maasi_drivers' or plan.executable == 'cuboid_planner_node'
         ]
-        others = [name for name in self.processes if name not in drivers]
+        kept = self._clocks if self._is_followed(recorder) else set()
+        others = [name for name in self.processes if name not in kept.union(drivers)]
         # Drivers stop their robots: the sim, or the robot, must still be there to hear it. One that
         # hangs does not, and may have a command on its way when it is killed: before and after.
         recorder.stop_robots(self.scenario.names())
@@ -630,6 +584,21 @@ class ScenarioRun:
         recorder.drain()
         if stubborn:
             self.display.say(f'had to be killed: {", ".join(stubborn)}')
+
+    def _is_followed(self, recorder: Recorder) -> bool:
+        """Return whether another run needs the clock of this one, and may have it."""
+        running = all(self.processes[name].running for name in self._clocks)
+        follows = self.options.follow_clock or self.scenario.external_clock
+        own = running and not (follows or self.options.lockstep)
+        return bool(own and not self.interruption and recorder.followers())
+
+    def _keep_clock(self, recorder: Recorder) -> None:
+        """Let the time go on until nobody follows it any more."""
+        teams = ', '.join(recorder.followers())
+        self.display.say(f'the clock goes on for {teams} (Ctrl-C ends it)')
+        while self._is_followed(recorder):
+            recorder.wait(_FOLLOWERS_PERIOD)
+            recorder.drain()
 
     def _report(
         self, ending: Ending, recorder: Recorder, observer: RunObserver | CuboidObserver

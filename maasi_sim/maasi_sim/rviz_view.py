@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -38,6 +39,14 @@ def view_text(scenario: AnyScenario, namespace: str = '') -> str:
                     _camera(f'Camera of {robot}, bag', f'{topic}/compressed', shown=False)
                 )
     return yaml.safe_dump(content, sort_keys=False)
+
+
+def shown_topics(path: Path) -> list[str]:
+    """Return the topics that a configuration of RViz shows, and those of the frames."""
+    content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    displays = content['Visualization Manager']['Displays']
+    topics = [display['Topic']['Value'] for display in displays if 'Topic' in display]
+    return [*topics, '/tf', '/tf_static']
 
 
 def _camera(name: str, topic: str, *, shown: bool) -> dict[str, Any]:

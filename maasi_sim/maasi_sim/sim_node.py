@@ -33,7 +33,7 @@ from maasi_filter.conversions import (
 )
 from maasi_filter.marker_board import MarkerBoard
 from maasi_filter.pose import Pose
-from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_writer
+from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
 from maasi_filter.search_node import SearchNode, SettingsError, run
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray, RangeMeasurement
 from maasi_sim.external_robot import ExternalRobot
@@ -45,7 +45,7 @@ from maasi_sim.sim_settings import SimNodeSettings
 from maasi_sim.simulation import Simulation
 from maasi_sim.yaml_files import Key
 
-RECORDER = '/recorder'
+RECORDER = 'recorder'
 
 # Between two looks at who is there [s].
 _LOOK_PERIOD = 0.02
@@ -224,6 +224,10 @@ class SimNode(SearchNode[SimNodeSettings]):
     have said that they are done with it and each robot has its command; a node that says again
     that it is ready gets the step anew, so that a step can come twice.
 
+    With `follow_clock`, or where another program moves a robot, the time is that of a `/clock` that
+    somebody else publishes: the robots stand until all are ready, and the first step is that of the
+    time then.
+
     Publishes
     ---------
     `<robot>/odom` (nav_msgs/Odometry), `<robot>/battery_state` (sensor_msgs/BatteryState), unless
@@ -231,15 +235,15 @@ class SimNode(SearchNode[SimNodeSettings]):
     `<robot>/camera/image_raw` (sensor_msgs/Image), `<robot>/camera/camera_info`
     (sensor_msgs/CameraInfo), `<robot>/scan` (sensor_msgs/LaserScan), `<robot>/ranges`
     (maasi_msgs/RangeArray): those that the robot has;
-    `/clock` (rosgraph_msgs/Clock), unless a robot is moved by another program, whose time it is
-    then; `lockstep/step` (maasi_msgs/LockstepStep);
+    `/clock` (rosgraph_msgs/Clock), unless it follows one; `lockstep/step`
+    (maasi_msgs/LockstepStep);
     `ground_truth/targets` (geometry_msgs/PoseArray), `ground_truth/markers`
     (visualization_msgs/MarkerArray): latched, only for scoring and for the eye
 
     Subscribes
     ----------
     `<robot>/cmd_vel` (geometry_msgs/TwistStamped); `<robot>/state` (maasi_msgs/AgentState) of
-    robots that another program moves;
+    robots that another program moves; `/clock`, if it follows one;
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
     """
 
@@ -249,6 +253,7 @@ class SimNode(SearchNode[SimNodeSettings]):
     def __init__(self, **options: Any) -> None:
         super().__init__('sim_node', SimNodeSettings, lockstep_member=False, **options)
         self._stamp = 0
+        self._first = 0
         self._linked: dict[str, LinkedRobot] = {}
 
     def prepare(self) -> None:
@@ -256,6 +261,8 @@ class SimNode(SearchNode[SimNodeSettings]):
         settings = self.settings
         if not settings.lockstep and settings.rate == 0.0:
             raise SettingsError('parameter rate: read 0, allowed is above 0 unless in lockstep')
+        if settings.lockstep and settings.follow_clock:
+            raise SettingsError('parameter follow_clock: read true, allowed is false in lockstep')
         overrides = {'parameter step': (('step',), settings.step)} if settings.step > 0.0 else {}
         try:
             self.scenario = self.load(settings.scenario, overrides)
@@ -264,10 +271,14 @@ class SimNode(SearchNode[SimNodeSettings]):
             self.simulation = self.simulate()
         except (ScenarioError, ValueError) as error:
             raise SettingsError(str(error)) from error
+        self._follows = settings.follow_clock or self.scenario.external_clock
         self._length = self.scenario.step
         self._period = self._length / settings.rate if settings.rate > 0.0 else 0.0
         self._entities: list[Any] = []
         self._stamp = 0
+        # Of the time at which it begins, and the last time of a clock that it follows [ns].
+        self._first = 0
+        self._followed: int | None = None
         # Of the last step that was published anew.
         self._repeated = -1
         # Topics on which each expected node listens.
@@ -305,12 +316,14 @@ class SimNode(SearchNode[SimNodeSettings]):
         lockstep = self.settings.lockstep
         self.simulation.warm_up()
         qos = sensor_writer(lockstep)
-        self._step_publisher = self.create_publisher(LockstepStep, 'lockstep/step', qos)
-        self._entities.append(self._step_publisher)
         self._clock_publisher: Publisher | None = None
-        if not self.scenario.external_clock:
+        if self._follows:
+            self.create_subscription(Clock, '/clock', self._on_clock, sensor_reader(False))
+        else:
             self._clock_publisher = self.create_publisher(Clock, '/clock', qos)
             self._entities.append(self._clock_publisher)
+        self._step_publisher = self.create_publisher(LockstepStep, 'lockstep/step', qos)
+        self._entities.append(self._step_publisher)
         self._robots = {
             name: RobotTopics(self, self.simulation, name, qos) for name in self.simulation.robots
         }
@@ -332,7 +345,7 @@ class SimNode(SearchNode[SimNodeSettings]):
             for node in ('filter_node', 'planner_node'):
                 self._expected[self.team_topic(f'{namespace}/{node}'.strip('/'))] = step_topics
         if self.settings.recorder:
-            self._expected[RECORDER] = step_topics
+            self._expected[self.team_topic(RECORDER)] = step_topics
         self._publish_truth()
         for name, topics in self._robots.items():
             if topics.linked:
@@ -363,9 +376,7 @@ class SimNode(SearchNode[SimNodeSettings]):
         )
         self._look_timer = self.create_wall_timer(_LOOK_PERIOD, self._look_for_nodes)
         self._look_timer.cancel()
-        # One that follows another clock looks at it more often than it steps.
-        period = self._period if self._clock_publisher is not None else 0.25 * self._period
-        self._step_timer = self.create_wall_timer(period or 1.0, self._on_step_timer)
+        self._step_timer = self.create_wall_timer(self._period or 1.0, self._on_step_timer)
         self._step_timer.cancel()
         self.create_wall_timer(1.0, self._watch)
 
@@ -376,7 +387,7 @@ class SimNode(SearchNode[SimNodeSettings]):
             self._look_timer.reset()
         elif self.settings.lockstep:
             self._go_on_if_complete()
-        else:
+        elif not self._follows:
             self._step_timer.reset()
 
     def halt(self) -> None:
@@ -433,7 +444,10 @@ class SimNode(SearchNode[SimNodeSettings]):
         self._ready.add(node)
 
     def _missing(self) -> str:
-        return ', '.join(sorted(set(self._expected) - self._ready))
+        missing = sorted(set(self._expected) - self._ready)
+        if self._follows and self._followed is None:
+            missing.append('/clock')
+        return ', '.join(missing)
 
     def _look_for_nodes(self) -> None:
         if not self.active:
@@ -461,10 +475,10 @@ class SimNode(SearchNode[SimNodeSettings]):
         )
         self._remember_endpoints()
         self._wall_start = self._due = now
-        if self._clock_publisher is None:
-            self.simulation.begin(self._step_of_clock())
+        if self._followed is not None:
+            self._first = self._step_at(self._followed)
         self._begin_step()
-        if not self.settings.lockstep:
+        if not self.settings.lockstep and not self._follows:
             self._step_timer.reset()
 
     def _look_for_returned(self) -> None:
@@ -534,7 +548,7 @@ class SimNode(SearchNode[SimNodeSettings]):
 
     def _begin_step(self) -> None:
         """Publish the step that the simulation has come to."""
-        self.step = self.simulation.step
+        self.step = self._first + self.simulation.step
         self._stamp = stamp_of_step(self.step, self._length)
         self._wall_step = time.monotonic()
         present = self.simulation.present
@@ -648,15 +662,25 @@ class SimNode(SearchNode[SimNodeSettings]):
         if self.settings.lockstep:
             self._step_timer.cancel()
             self._go_on_if_complete()
-        elif self._clock_publisher is not None or self.simulation.step < self._step_of_clock():
-            self.simulation.advance()
-            for name, robot in self._linked.items():
-                robot.cut(name in self.simulation.away)
-            self._begin_step()
+        else:
+            self._advance_freely()
 
-    def _step_of_clock(self) -> int:
-        """Return the step that an external clock has come to."""
-        return math.floor(self.get_clock().now().nanoseconds * 1e-9 / self._length)
+    def _advance_freely(self) -> None:
+        self.simulation.advance()
+        for name, robot in self._linked.items():
+            robot.cut(name in self.simulation.away)
+        self._begin_step()
+
+    def _step_at(self, time_: int) -> int:
+        """Return the last step that has come at a time [ns]."""
+        step = math.floor(time_ * 1e-9 / self._length)
+        return step + 1 if stamp_of_step(step + 1, self._length) <= time_ else step
+
+    def _on_clock(self, message: Clock) -> None:
+        """Follow a clock; time that comes again, as its publisher was started anew, stands."""
+        self._followed = stamp_from_ros(message.clock)
+        while self.active and 0 <= self.step < self._step_at(self._followed):
+            self._advance_freely()
 
     # ---- the truth ---------------------------------------------------------------------------
 

@@ -25,6 +25,11 @@ class SimNodeSettings(NodeSettings):
         ge=0.0,
         description='Simulated over wall time, at most; 0: as fast as possible, in lockstep only',
     )
+    follow_clock: bool = Field(
+        default=False,
+        description='Whether its time is a /clock that somebody else publishes; not in lockstep, '
+        'and `rate` does not count',
+    )
     recorder: bool = Field(default=False, description='Whether it waits for the recorder, too')
     command_age: float = Field(
         default=1.0,

@@ -73,11 +73,6 @@ class Simulation:
         """Robots that take part, in name order."""
         return [name for name in self.robots if name not in self.away]
 
-    def begin(self, step: int) -> None:
-        """Begin at another step than zero, as where the time is not its own."""
-        self._events = {step + key: changes for key, changes in self._events.items()}
-        self.step = step
-
     def warm_up(self) -> None:
         """Compile, or load from the cache, what the robots use; nothing changes."""
         for robot in self.robots.values():

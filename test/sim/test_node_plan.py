@@ -9,7 +9,7 @@ from maasi_drivers.driver_settings import DriverSettings
 from maasi_filter.node_settings import FilterNodeSettings
 from maasi_filter.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_sim.node_plan import NodePlan, plan_nodes
+from maasi_sim.node_plan import NodePlan, in_team, plan_nodes, with_followed_clock
 from maasi_sim.scenario import ScenarioError, config_folder, load_scenario
 from maasi_sim.sim_settings import SimNodeSettings
 
@@ -93,6 +93,31 @@ def test_the_sim_gets_the_file_and_how_fast_it_goes(lockstep, rate, expected):
     assert settings.recorder is False
     # The clock is its own.
     assert not simulated
+
+
+def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there():
+    plans = plans_of(load_scenario('mambo_turtlebot'), lockstep=False)
+    for name, plan in plans.items():
+        moved = in_team(plan, 'north/one')
+        assert moved.full_name == f'/north/one{name}'
+        assert f'__ns:=/{moved.namespace}' in moved.command(Path('/lib/x'), Path('/run/p.yaml'))
+        assert set(moved.topics) == {
+            topic if topic == '/clock' else f'/north/one{topic}' for topic in plan.topics
+        }
+        assert in_team(plan, '') is plan
+
+
+def test_robots_that_plan_for_themselves_get_their_own_batches_in_a_team(tmp_path):
+    plan = NodePlan('p', 'e', 'driver', 'a', remaps={'/measurement_batch': '/a/measurement_batch'})
+    assert in_team(plan, 'team').remaps == {'/team/measurement_batch': '/team/a/measurement_batch'}
+
+
+def test_only_the_sim_is_told_whose_clock_it_is():
+    plans = plans_of(load_scenario('mambo'), lockstep=False)
+    for plan in plans.values():
+        assert (with_followed_clock(plan) == plan) == (not plan.is_clock)
+    settings, simulated = read_back(with_followed_clock(plans['/sim_node']), SimNodeSettings)
+    assert settings.follow_clock and simulated
 
 
 def test_command_lines_name_the_node_and_its_parameters():

@@ -77,6 +77,19 @@ def test_a_domain_that_was_asked_for_is_given_once(tmp_path):
     Domain(57, tmp_path).release()
 
 
+def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_path):
+    with Domain(57, tmp_path, team='team_a'):
+        with Domain(57, tmp_path, team='team/b', shared=True) as second:
+            assert second.number == 57
+            with pytest.raises(ProcessError, match='namespace /team/b in 57 is used by another'):
+                Domain(57, tmp_path, team='team/b', shared=True)
+            with pytest.raises(ProcessError, match='namespace /team_a in 57 is used by another'):
+                Domain(57, tmp_path, team='team_a', shared=True)
+            with pytest.raises(ProcessError, match='domain id: 57 is used by another run'):
+                Domain(57, tmp_path, team='team_c')
+        Domain(57, tmp_path, team='team/b', shared=True).release()
+
+
 @pytest.mark.parametrize('number', [-1, 102])
 def test_domains_that_do_not_exist_are_refused(tmp_path, number):
     with pytest.raises(ProcessError, match='0 to 101'):

@@ -9,11 +9,18 @@ import time
 from pathlib import Path
 
 import pytest
+import rclpy
 import yaml
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from reserved_domain import reserved_domain
+from rosgraph_msgs.msg import Clock
 
 from maasi_sim.bag import Bag
 from maasi_sim.results import make_folder
-from maasi_sim.run_scenario import Options, ScenarioRun, build_parser
+from maasi_sim.run_options import Options, build_parser
+from maasi_sim.run_scenario import ScenarioRun
 from maasi_sim.yaml_files import ScenarioError
 
 WITH_FAKES = Path(__file__).with_name('run_with_fakes.py')
@@ -165,6 +172,47 @@ def test_free_running(tmp_path, scenario):
     assert code == 0, output
     assert run.report['true_found'] == 3
     assert not (run.folder / 'bag').exists()
+
+
+@pytest.fixture
+def follower():
+    """Return a domain, and the simulation of another run in it that follows its clock."""
+    with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        for name, value in domain.environment().items():
+            patch.setenv(name, value)
+        context = Context()
+        rclpy.init(context=context, domain_id=domain.number)
+        node = Node('sim_node', namespace='/other', context=context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        node.times = []
+        node.create_subscription(Clock, '/clock', node.times.append, 10)
+        yield domain.number, node, executor
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(
+    tmp_path, scenario, follower
+):
+    number, node, executor = follower
+    run = Run(tmp_path / 'run', scenario(), '--domain-id', str(number))
+    run.wait_for('report: ')
+    run.wait_for('the clock goes on for /other')
+    assert run.report['end_reason'] == 'all_found'
+    with Bag(run.folder) as bag:
+        assert bag.counts['/mambo/state'] > 0
+    node.times.clear()
+    end = time.monotonic() + LIMIT
+    while len(node.times) < 20 and time.monotonic() < end:
+        executor.spin_once(timeout_sec=0.1)
+    assert len(node.times) >= 20
+    assert len(run.nodes()) == 1
+    node.destroy_node()
+    code, output = run.wait()
+    assert code == 0, output
+    assert run.nodes() == []
 
 
 def test_the_time_limit_ends_a_run_at_the_same_step_each_time(tmp_path, scenario):

@@ -207,7 +207,7 @@ class Team:
         for member in self.members:
             member.say_ready()
 
-    def spin_until(self, condition, limit=10.0):
+    def spin_until(self, condition, limit=120.0):
         end = time.monotonic() + limit
         while not condition():
             assert time.monotonic() < end, self.sim.status()

@@ -4,13 +4,10 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 from maasi_sim.bag import Bag
-from maasi_sim.processes import DOMAINS, Domain, ProcessError
 from maasi_sim.replay import plain
 
 # Far more than any of the runs takes, for a machine that is busy with something else.
@@ -58,24 +55,6 @@ def run_scenario(scenario, folder, *options, environment=None):
         check=False,
     )
     return Run(folder, done.returncode, done.stdout)
-
-
-@contextmanager
-def reserved_domain():
-    """Reserve a domain for a run that is told which to use, and locks it itself.
-
-    It is one of the last, so that no run that takes the first free one gets it.
-    """
-    folder = Path(tempfile.gettempdir()) / 'maasi_reserved_domains'
-    for number in reversed(DOMAINS):
-        try:
-            domain = Domain(number, folder)
-        except ProcessError:
-            continue
-        with domain:
-            yield domain
-        return
-    raise ProcessError('no ROS domain is left to reserve')
 
 
 def wait_for(condition, what):

@@ -17,8 +17,9 @@ import yaml
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
-from scenario_runs import PATIENCE, command, processes_with, reserved_domain, wait_for
+from scenario_runs import PATIENCE, command, processes_with, wait_for
 
 from maasi_filter.conversions import stamp_from_ros
 from maasi_sim.bag import Bag

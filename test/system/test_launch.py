@@ -13,12 +13,13 @@ from pathlib import Path
 
 import pytest
 import yaml
-from scenario_runs import PATIENCE, processes_with, reserved_domain
+from reserved_domain import reserved_domain
+from scenario_runs import PATIENCE, processes_with
 
 from maasi_sim.bag import Bag
 from maasi_sim.launch_arguments import ARGUMENTS, scenario_options
 from maasi_sim.processes import find_executable
-from maasi_sim.run_scenario import build_parser
+from maasi_sim.run_options import build_parser
 
 LAUNCH_FILE = Path(__file__).parents[2] / 'maasi_sim' / 'launch' / 'scenario.launch.py'
 HAS_LAUNCH = bool(importlib.util.find_spec('launch') and importlib.util.find_spec('launch_ros'))
@@ -146,7 +147,7 @@ def test_a_wrong_argument_ends_the_launch_with_one_clear_error(launch, argument,
     assert 'Traceback' not in output
 
 
-@pytest.mark.parametrize('name', ['lockstep', 'record', 'rviz'])
+@pytest.mark.parametrize('name', ['lockstep', 'record', 'rviz', 'follow_clock'])
 def test_what_is_neither_true_nor_false_is_refused(name):
     with pytest.raises(ValueError, match=f"{name}: read 'maybe', allowed are true and false"):
         given = {**DEFAULTS, name: 'maybe'}
@@ -165,9 +166,13 @@ def test_arguments_become_options_that_run_scenario_knows(monkeypatch):
         'planner': 'maasi',
         'time_limit': '9',
         'log_level': 'debug',
+        'namespace': 'team_a',
     }
     options = build_parser().parse_args(scenario_options(given))
     assert (options.scenario, str(options.out), options.seed) == ('mambo_turtlebot', '-folder', 3)
     assert (options.rate, options.planner, options.time_limit) == (2.0, 'maasi', 9.0)
     assert options.lockstep and options.no_record
     assert (options.log_level, options.domain_id) == ('debug', 7)
+    assert (options.namespace, options.follow_clock) == ('team_a', False)
+    options = build_parser().parse_args(scenario_options({**DEFAULTS, 'follow_clock': 'true'}))
+    assert options.follow_clock

@@ -12,7 +12,7 @@ from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from scenario_runs import reserved_domain
+from reserved_domain import reserved_domain
 
 from maasi_filter.qos import sensor_reader
 

@@ -1,0 +1,137 @@
+"""The command line of `run_scenario`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
+_NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line says about a run."""
+
+    scenario: str = ''
+    out: Path | None = None
+    seed: int | None = None
+    lockstep: bool = False
+    rate: float | None = None
+    record: bool = True
+    planner: str | None = None
+    time_limit: float | None = None
+    domain_id: int | None = None
+    log_level: str | None = None
+    namespace: str = ''
+    follow_clock: bool = False
+    replay: Path | None = None
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='run_scenario',
+        description='Run a scenario as separate ROS 2 processes, or replay a recording of one.',
+        epilog='Exit codes: 0 all targets found (or, with stop: planner_done, ended as meant), '
+        '1 not all found, 2 wrong input, 3 a node died or hung, 4 bag or report could not be '
+        'written (disk full), 130 interrupted.',
+    )
+    parser.add_argument(
+        'scenario', nargs='?', metavar='FILE', help='scenario file, or name of one in config'
+    )
+    parser.add_argument(
+        '--out', type=Path, metavar='DIR', help='folder of the run (default: runs/<time>)'
+    )
+    parser.add_argument('--seed', type=_whole, metavar='N', help="instead of the scenario's")
+    parser.add_argument(
+        '--lockstep',
+        action='store_true',
+        help='step by step, as fast as it goes: the same seed gives the same run, to the bit',
+    )
+    parser.add_argument(
+        '--rate', type=_positive, metavar='X', help='simulated over wall time (default: 1)'
+    )
+    parser.add_argument('--no-record', action='store_true', help='write no recording')
+    parser.add_argument('--planner', metavar='NAME', help="instead of the scenario's")
+    parser.add_argument(
+        '--time-limit', type=_positive, metavar='S', help='simulated time [s], instead of its own'
+    )
+    parser.add_argument(
+        '--domain-id', type=_whole, metavar='N', help='ROS domain (default: one of its own)'
+    )
+    parser.add_argument(
+        '--namespace',
+        type=_namespace,
+        metavar='NS',
+        help='of all nodes and topics of the run; /clock and /diagnostics are shared',
+    )
+    parser.add_argument(
+        '--follow-clock',
+        action='store_true',
+        help='its time is the /clock of another run in the domain --domain-id',
+    )
+    parser.add_argument('--log-level', choices=LOG_LEVELS, help='of the nodes (default: info)')
+    parser.add_argument(
+        '--replay',
+        type=Path,
+        metavar='BAG',
+        help='feed the filter the recorded measurements, and compare what it finds',
+    )
+    return parser
+
+
+def _whole(text: str) -> int:
+    # No sign, underscore or digits of another alphabet.
+    if not (text.isascii() and text.isdecimal()):
+        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are whole numbers from 0")
+    return int(text)
+
+
+def _namespace(text: str) -> str:
+    name = text.strip('/')
+    if not _NAMESPACE.fullmatch(name):
+        raise argparse.ArgumentTypeError(
+            f"read '{text[:60]}', allowed are letters, digits and underscores, not a digit first, "
+            'and / between names'
+        )
+    return name
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float('nan')
+    if not 0.0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are finite numbers above 0")
+    return value
+
+
+def parse(arguments: list[str] | None) -> Options:
+    """Return what a command line says; a wrong one ends the process with 2."""
+    parser = build_parser()
+    options = parser.parse_args(arguments)
+    if (options.replay is None) == (options.scenario is None):
+        parser.error('give either a scenario or --replay BAG')
+    if options.follow_clock and options.domain_id is None:
+        parser.error('--follow-clock needs the --domain-id of the run whose clock it is')
+    if options.follow_clock and (options.lockstep or options.rate is not None):
+        parser.error('--follow-clock: allowed without --lockstep and --rate')
+    return Options(
+        scenario=options.scenario or '',
+        out=options.out,
+        seed=options.seed,
+        lockstep=options.lockstep,
+        rate=options.rate,
+        record=not options.no_record,
+        planner=options.planner,
+        time_limit=options.time_limit,
+        domain_id=options.domain_id,
+        log_level=options.log_level,
+        namespace=options.namespace or '',
+        follow_clock=options.follow_clock,
+        replay=options.replay,
+    )

@@ -1,0 +1,25 @@
+"""Domains for runs that are told which to use."""
+
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+
+from maasi_sim.processes import DOMAINS, Domain, ProcessError
+
+
+@contextmanager
+def reserved_domain():
+    """Reserve a domain for a run that is told which to use, and locks it itself.
+
+    It is one of the last, so that no run that takes the first free one gets it.
+    """
+    folder = Path(tempfile.gettempdir()) / 'maasi_reserved_domains'
+    for number in reversed(DOMAINS):
+        try:
+            domain = Domain(number, folder)
+        except ProcessError:
+            continue
+        with domain:
+            yield domain
+        return
+    raise ProcessError('no ROS domain is left to reserve')

@@ -1,0 +1,220 @@
+"""Two teams in one ROS domain, each in its namespace, on one clock."""
+
+import itertools
+import subprocess
+import time
+
+import pytest
+import rclpy
+import yaml
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from reserved_domain import reserved_domain
+from rosgraph_msgs.msg import Clock
+from scenario_runs import PATIENCE, Run, command, replay
+from std_srvs.srv import Trigger
+
+from maasi_filter.conversions import stamp_from_ros, stamp_to_ros
+from maasi_sim.bag import Bag
+
+pytestmark = pytest.mark.system
+STEP = 0.05
+
+
+def scenario(path, start, target, **limits):
+    """Write a scenario with a robot of the same name in each team."""
+    content = {
+        'version': 1,
+        'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
+        'targets': {'positions': [target]},
+        'robots': {
+            'mambo': {
+                'type': 'mambo',
+                'start': [*start, 1.0],
+                'candidates': {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
+            }
+        },
+        'filter': {'preset': 'recommended', 'particles': 2000},
+        'limits': {'time': 120.0, **limits},
+    }
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def launched(*words):
+    return subprocess.Popen(
+        words,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+class Operator:
+    """Calls services of planners."""
+
+    def __init__(self, domain):
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain.number)
+        self.node = rclpy.create_node('operator', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def call(self, service):
+        """Call a service until it does what it is to."""
+        client = self.node.create_client(Trigger, service)
+        while True:
+            self.until(client.service_is_ready, service)
+            answer = client.call_async(Trigger.Request())
+            self.until(answer.done, service)
+            if answer.result().success:
+                return
+
+    def until(self, condition, what):
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end, what
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+def read_until(process, text):
+    for line in process.stdout:
+        if text in line:
+            return
+    raise AssertionError(f'never said {text}')
+
+
+def finished(process, folder):
+    output, _ = process.communicate(timeout=PATIENCE)
+    return Run(folder, process.returncode, output)
+
+
+@pytest.fixture(scope='module')
+def teams(tmp_path_factory):
+    """Return the runs of two teams, by namespace; the first one's clock is that of both.
+
+    The first is paused until the second measures: it would have found all before.
+    """
+    folder = tmp_path_factory.mktemp('teams')
+    first = scenario(folder / 'first.yaml', [1.9, 1.9], [0.3, 0.4])
+    second = scenario(folder / 'second.yaml', [0.3, 0.3], [0.6, 0.6])
+    with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        for name, value in domain.environment().items():
+            patch.setenv(name, value)
+        options = ['--domain-id', domain.number, '--namespace']
+        operator = Operator(domain)
+        leading = launched(*command(first, folder / 'team_a', *options, 'team_a'))
+        operator.call('/team_a/search/pause')
+        following = launched(
+            *command(second, folder / 'team_b', *options, 'team_b', '--follow-clock')
+        )
+        read_until(following, 'measurements')
+        operator.call('/team_a/search/resume')
+        operator.close()
+        return {
+            'team_b': finished(following, folder / 'team_b'),
+            'team_a': finished(leading, folder / 'team_a'),
+        }
+
+
+def test_both_teams_find_their_targets(teams):
+    for run in teams.values():
+        assert run.code == 0, run.output
+        assert run.report['end_reason'] == 'all_found'
+        assert (run.report['true_found'], run.report['false_found']) == (1, 0)
+        assert 0.0 < run.report['time_to_find_all'] < 120.0
+
+
+@pytest.mark.parametrize('team', ['team_a', 'team_b'])
+def test_a_recording_holds_its_own_team_from_its_first_measurement_on(teams, team):
+    with Bag(teams[team].bag) as bag:
+        shared = {'/clock', '/diagnostics', '/rosout', '/scenario'}
+        counts = bag.counts
+        assert {topic for topic in counts if not topic.startswith(f'/{team}/')} == shared
+        names = {
+            status.name for item in bag.messages(['/diagnostics']) for status in item.message.status
+        }
+        loggers = {item.message.name for item in bag.messages(['/rosout'])}
+        batches = [item.message.id for item in bag.messages([f'/{team}/measurement_batch'])]
+        asked = {item.message.batch_id for item in bag.messages([f'/{team}/mambo/detections'])}
+        steps = [item.message for item in bag.messages([f'/{team}/lockstep/step'])]
+        clock = [stamp_from_ros(item.message.clock) for item in bag.messages(['/clock'])]
+    assert names and all(name.startswith(f'/{team}/') for name in names)
+    assert loggers and all(name.startswith(f'{team}.') for name in loggers)
+    assert batches[0] == 1
+    # One that is on its way as the run ends may be missing.
+    assert set(batches[:-1]) <= asked <= set(batches)
+    assert counts[f'/{team}/filter_update'] >= len(batches) - 1
+    numbers = [step.step for step in steps]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert stamp_from_ros(steps[-1].stamp) <= clock[-1]
+
+
+def test_the_second_team_begins_when_it_is_ready_and_its_report_counts_from_there(teams):
+    with Bag(teams['team_b'].bag) as bag:
+        first = next(bag.messages(['/team_b/lockstep/step'])).message
+        facts = bag.scenario()
+    assert facts['namespace'] == 'team_b' and facts['follow_clock'] is True
+    assert '/filter_node' in facts['nodes']
+    assert stamp_from_ros(first.stamp) > 0
+    assert first.step > 0
+
+
+def test_a_run_ends_where_the_clock_that_it_follows_stands_still(tmp_path):
+    path = scenario(tmp_path / 'far.yaml', [1.9, 1.9], [0.0, 0.0], silence=4.0)
+    folder = tmp_path / 'run'
+    with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        for name, value in domain.environment().items():
+            patch.setenv(name, value)
+        operator = Operator(domain)
+        clock = operator.node.create_publisher(Clock, '/clock', 10)
+        options = ['--domain-id', domain.number, '--follow-clock']
+        run = launched(*command(path, folder, *options))
+        ticks = itertools.count(round(1000.0 / STEP))
+        bag = folder / 'bag' / 'bag.mcap'
+
+        def tick():
+            clock.publish(Clock(clock=stamp_to_ros(round(next(ticks) * STEP * 1e9))))
+            return bag.exists() and bag.stat().st_size > 100_000
+
+        operator.until(tick, 'the run moves')
+        done = finished(run, folder)
+        operator.close()
+    assert done.code == 3, done.output
+    assert '/clock, which this run follows, stands still for 4 s' in done.output
+    assert done.report['end_reason'] == 'clock_stopped'
+    with Bag(folder) as recorded:
+        *_, last = recorded.messages(['/mambo/cmd_vel'])
+    assert last.message.twist.linear.x == last.message.twist.linear.y == 0.0
+
+
+def test_the_recording_of_a_team_can_be_replayed(teams, tmp_path):
+    done = replay(teams['team_b'], tmp_path)
+    assert done.returncode == 0, done.stdout
+    assert 'equal to the bit' in done.stdout
+
+
+@pytest.mark.parametrize(
+    'options, words',
+    [
+        (['--follow-clock'], '--follow-clock needs the --domain-id'),
+        (['--follow-clock', '--domain-id', '7', '--lockstep'], 'allowed without --lockstep'),
+        (['--namespace', '1a'], "read '1a', allowed are letters"),
+        (['--namespace', 'team/mambo'], "read 'team/mambo', allowed is a name that is none of"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(options, words, capsys):
+    from maasi_sim.run_scenario import main
+
+    try:
+        code = main(['mambo_turtlebot', *options])
+    except SystemExit as ended:
+        code = ended.code
+    assert code == 2
+    assert words in capsys.readouterr().err
