@@ -252,6 +252,9 @@ class MavlinkRobot(AgentDriver[DataT]):
 
     def _take_telemetry(self, telemetry: Telemetry) -> None:
         stamp = self._arrivals.stamp(telemetry.arrival - self._mavlink.latency)
+        if stamp is None:
+            # A simulated time has not begun: nothing is late.
+            self._silence.end()
         latest = (self._locals if self._localised else self._history).latest
         if stamp is None or (latest is not None and stamp <= latest.stamp):
             return

@@ -211,6 +211,15 @@ def test_a_vehicle_that_does_not_rise_lands_and_says_why():
     assert not play.autopilot.armed
 
 
+def test_a_take_off_that_was_accepted_is_not_asked_for_again():
+    play = Play(rise_timeout=20.0)
+    play.autopilot.body.limits = replace(play.autopilot.body.limits, climb=0.03)
+    play.until(lambda: play.vehicle.phase is Phase.RISING)
+    play.run(8.0)
+    assert len(play.commands(mavlink.MAV_CMD_NAV_TAKEOFF)) == 1
+    assert 'MAV_CMD_NAV_TAKEOFF' not in play.said
+
+
 def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on():
     play = Play(autopilot={'charge': 0.01})
     play.until(lambda: play.vehicle.phase is Phase.ARMING)

@@ -77,6 +77,8 @@ def test_three_vehicles_find_all_through_the_real_protocol(tmp_path):
         log = (run.folder / f'{name}_driver.log').read_text()
         assert f'{firmware} is there as system {system}' in log
         assert 'the autopilot has not said' not in log
+        # Positions came, before the simulated time did.
+        assert 'no LOCAL_POSITION_NED yet' not in log
 
 
 def test_a_link_in_real_time_is_not_run_in_lockstep(tmp_path):

@@ -114,6 +114,8 @@ class Vehicle:
         self._asked_at = -math.inf
         # Least way left to its height so far, and when [m, s].
         self._nearest, self._nearer_at = math.inf, -math.inf
+        # Whether the autopilot has accepted the take-off: it refuses another one.
+        self._taking_off = False
         self._setpoint: FloatArray | None = None
         self._yaw: float | None = None
         self._ending: Ending | None = None
@@ -390,7 +392,7 @@ class Vehicle:
         if self.phase is Phase.ENDING:
             self._enter(Phase.STOPPED, f'it has landed{self._reason}, {UNTIL_ARM}')
         elif self.phase not in (Phase.PREPARING, Phase.WAITING):
-            text = self._recent_text(now)
+            text = self._recent_text(now, 2)
             why = f'by the autopilot or the pilot{f" ({text})" if text else ""}'
             self._report(_WARNING, f'it has been disarmed {why}')
             self._enter(Phase.STOPPED, f'{why}, {UNTIL_ARM}')
@@ -561,6 +563,7 @@ class Vehicle:
             # It stands on the ground; the barometer may have drifted since the estimator started.
             self._estimate.origin[2] = self._setpoint[2]
         self._nearest, self._nearer_at = math.inf, now
+        self._taking_off = False
         self._enter(Phase.RISING)
 
     @property
@@ -591,12 +594,7 @@ class Vehicle:
             self.finish('land', reason)
         elif self.firmware.rise == 'setpoint':
             self._setpoint[2] = self._top
-        elif (
-            now - self._tried_at >= _ARMING_PERIOD
-            and not self._commands
-            and abs(height - float(self.origin[2])) < _RISEN
-        ):
-            # ArduCopter refuses it once it is in the air.
+        elif now - self._tried_at >= _ARMING_PERIOD and not self._commands and not self._taking_off:
             self._tried_at = now
             self._ask(mavlink.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.height))
 
@@ -640,6 +638,8 @@ class Vehicle:
             if result == mavlink.MAV_RESULT_ACCEPTED:
                 if number == mavlink.MAV_CMD_DO_SET_MODE:
                     self._ending_taken = self.phase is Phase.ENDING
+                elif number == mavlink.MAV_CMD_NAV_TAKEOFF:
+                    self._taking_off = True
                 return
             if number == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
                 name = mavlink.mavlink_map[int(parameters[0])].msgname
@@ -688,10 +688,10 @@ class Vehicle:
     def _report(self, severity: int, text: str) -> None:
         self._reports.append((severity, text))
 
-    def _recent_text(self, now: float) -> str:
-        return '; '.join(
-            dict.fromkeys(text for time, text in self._texts if now - time < _TEXT_AGE)
-        )
+    def _recent_text(self, now: float, most: int = 8) -> str:
+        """Return what the autopilot has just said, the last of it."""
+        texts = list(dict.fromkeys(text for time, text in self._texts if now - time < _TEXT_AGE))
+        return '; '.join(texts[-most:])
 
 
 _HANDLERS: dict[str, Callable[[Vehicle, Any, float], None]] = {
