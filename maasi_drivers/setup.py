@@ -26,6 +26,7 @@ setup(
             'mavlink_driver = maasi_entry:maasi_drivers.mavlink_driver',
             'mavlink_camera_driver = maasi_entry:maasi_drivers.mavlink_camera_driver',
             'calibrate_sensor = maasi_entry:maasi_drivers.calibrate_sensor',
+            'mambo_onboard_driver = maasi_entry:maasi_drivers.mambo_onboard_driver',
             'measure_mambo = maasi_entry:maasi_drivers.measure_mambo',
             'guard_node = maasi_entry:maasi_drivers.guard_node',
         ],

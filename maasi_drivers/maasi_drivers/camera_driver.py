@@ -19,7 +19,7 @@ from maasi_drivers.camera_settings import CameraSettings, load_calibration
 from maasi_drivers.image_encoding import decode_image, image_to_array
 from maasi_drivers.image_source import ImageSourceError, VideoSource
 from maasi_drivers.marker_detector import MarkerDetector
-from maasi_drivers.measurement_feed import FeedReceiver
+from maasi_drivers.measurement_feed import FeedPose, FeedReceiver
 from maasi_drivers.odometry import StampedPose
 from maasi_drivers.projection import box_view_margin
 from maasi_drivers.segmentation import Blobs
@@ -142,12 +142,19 @@ class CameraDriver(AgentDriver[Picture]):
             return
         address, port = self.settings.feed_address, self.settings.feed_port
         try:
-            self._feed = FeedReceiver(port, address)
+            self._feed = FeedReceiver(port, address, self.feed_sender())
         except OSError as error:
             raise OSError(
                 f'feed_address, feed_port: UDP port {port} of {address}: {error.strerror}, allowed '
                 'is a free port of an address of this host'
             ) from error
+
+    def feed_sender(self) -> str | None:
+        """Return the address of the only one whose feed is heard; none: anybody's."""
+        return None
+
+    def take_feed_pose(self, stamp: int, pose: FeedPose) -> None:
+        """Take where the robot was at an image of the feed; not used here."""
 
     def tear_down(self) -> None:
         """Disconnect, and let go of video or feed."""
@@ -200,6 +207,8 @@ class CameraDriver(AgentDriver[Picture]):
                     f'the size of the calibration, {camera.width} x {camera.height} px',
                 )
                 continue
+            if packet.pose is not None:
+                self.take_feed_pose(stamp, packet.pose)
             self.take_frame('feed', stamp, partial(_known, packet.blobs))
         for reason, number in feed.counts.items():
             new = number - self._counted[reason]

@@ -15,7 +15,7 @@ from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, S
 from maasi_planner.settings import MotionSettings
 
 CommandType = Literal['auto', 'stamped', 'twist']
-LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mavlink']
+LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink']
 # The same in lockstep, where robots stand still until their drivers answer: a busy machine may keep
 # a driver waiting, and zeros in between would make the run another one [s].
 LOCKSTEP_LEASE = 20.0
@@ -65,11 +65,12 @@ class DriverSettings(NodeSettings):
     link: LinkName = Field(
         default='topics',
         description='How it is reached: ROS topics; pyparrot over WiFi or Bluetooth '
-        '(mambo_driver); MAVLink (mavlink_driver)',
+        '(mambo_driver); a program of its own by UDP (mambo_onboard_driver); MAVLink '
+        '(mavlink_driver)',
     )
     mambo: MamboSettings | None = Field(
         default=None,
-        description='With link mambo_wifi or mambo_ble: how, and what it may be made to do',
+        description='With a link mambo_...: how, and what it may be made to do',
     )
     mavlink: MavlinkSettings | None = Field(
         default=None, description='With link mavlink: how, and what it may be made to do'

@@ -10,6 +10,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.action.server import CancelResponse, ServerGoalHandle
 
+from maasi_drivers import geofence
 from maasi_drivers.agent_driver import FloatArray
 from maasi_drivers.camera_driver import CameraDriver
 from maasi_drivers.mambo_link import MamboLink, MamboLinkError
@@ -26,8 +27,6 @@ from maasi_planner.motion import RobotState
 
 # Longest time from one look at the link to the next [s].
 _POLL_PERIOD = 0.05
-# Between the height at the start and the geofence, where none is given [m].
-_FENCE_HEIGHT = 1.0
 # At the end: how long it waits for the drone to say that it lands [s].
 _FAREWELL, _FAREWELL_POLL = 1.0, 0.02
 # Part of a new difference of positions in the velocity.
@@ -65,7 +64,13 @@ class MamboDriver(CameraDriver):
         settings = self.settings
         self._mambo = settings.mambo or MamboSettings()
         self._phase = Phase.CONNECTING
-        self._fence = self._make_fence()
+        self._fence = geofence.make_fence(
+            self._mambo.geofence,
+            self._bounds,
+            self.settings.radius,
+            self._mambo.ground,
+            self.settings.start[2],
+        )
         if settings.link != 'topics':
             if settings.motion.model == 'unicycle':
                 raise SettingsError(
@@ -87,17 +92,6 @@ class MamboDriver(CameraDriver):
             mambo.climb,
             mambo.land_after,
         )
-
-    def _make_fence(self) -> FloatArray:
-        """Return the lowest and highest x, y, z (3, 2) of goals [m, map]."""
-        if self._mambo.geofence is not None:
-            return np.array(self._mambo.geofence)
-        radius = self.settings.radius
-        fence = np.array(
-            [[0.0, 0.0], [0.0, 0.0], [self._mambo.ground, self.settings.start[2] + _FENCE_HEIGHT]]
-        )
-        fence[: self.dimension] = self._bounds + np.array([-radius, radius])
-        return fence
 
     # ---- the link ----------------------------------------------------------------------------
 
@@ -296,14 +290,7 @@ class MamboDriver(CameraDriver):
         if problem is not None or self._link is None:
             return problem
         point = request.waypoint.pose.position
-        for axis, value in enumerate((point.x, point.y, point.z)):
-            low, high = self._fence[axis].tolist()
-            if not low <= value <= high:
-                return (
-                    f'waypoint.pose.position.{"xyz"[axis]}: read {value}, allowed is {low:g} to '
-                    f'{high:g} [m], the geofence'
-                )
-        return None
+        return geofence.goal_problem(self._fence, (point.x, point.y, point.z))
 
     def _take_goal(self, handle: ServerGoalHandle) -> None:
         if self._pilot is not None:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_drivers import geofence
 from maasi_drivers.mambo_link import PositionEvent
 from maasi_drivers.mambo_reckoning import DeadReckoning
 from maasi_drivers.mambo_settings import LEAST_TILT, MOST_TILT, MamboSettings
@@ -29,8 +30,6 @@ _NEAR_RATE = 1.0
 _UNKNOWN_SPEED = 1.0
 # How far from its altitude the drone counts as there after take-off [m].
 _ALTITUDE_TOLERANCE = 0.1
-# How far outside the geofence it may drift before it lands [m].
-_FENCE_MARGIN = 0.5
 # An event that says the same to the bit under a command faster than this is no new position [m/s].
 _LEAST_SPEED = 0.05
 _STILL = np.zeros(4)
@@ -352,7 +351,7 @@ class MamboPilot:
         state = self.state
         if state is None:
             return 'no position'
-        outside = self._outside(state.pose.position)
+        outside = geofence.outside(self.fence, state.pose.position)
         if outside:
             return self._end_flight(outside)
         if self.phase is Phase.CLIMBING:
@@ -429,17 +428,6 @@ class MamboPilot:
             return f'no position for {_seconds(silent)}'
         still = now - self._moved_at
         return f'the position has not changed for {_seconds(still)}' if still > timeout else ''
-
-    def _outside(self, position: FloatArray) -> str:
-        for axis, (low, high) in enumerate(self.fence.tolist()):
-            # On the floor below it nothing is wrong.
-            lowest = -math.inf if axis == 2 else low - _FENCE_MARGIN
-            if not lowest <= position[axis] <= high + _FENCE_MARGIN:
-                return (
-                    f'{"xyz"[axis]} at {position[axis]:.2f} m, outside the geofence, '
-                    f'{low:g} to {high:g} m'
-                )
-        return ''
 
 
 def _seconds(age: float) -> str:

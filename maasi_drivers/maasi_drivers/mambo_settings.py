@@ -30,6 +30,12 @@ class MamboSettings(Settings):
         description='UDP port on which the drone is heard, on the address of this host that '
         'faces it',
     )
+    order_port: int = Field(
+        default=14701,
+        ge=1,
+        le=65535,
+        description='UDP port on which the program on board hears orders, with link mambo_feed',
+    )
     ground: Finite = Field(
         default=0.0, description='Height of the floor below its start in the map [m]'
     )

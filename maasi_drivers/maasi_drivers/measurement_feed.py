@@ -12,6 +12,7 @@ import time
 import zlib
 from collections import Counter
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -22,12 +23,17 @@ VERSION = 1
 #: Most blobs of one image.
 MOST = 256
 BORDER_CUT = 1
+#: Of the flags: the robot's pose follows the header.
+HAS_POSE = 1
 
 _HEADER = struct.Struct('<4sBBHHHII')
+_POSE = struct.Struct('<7fI')
 _BLOB = struct.Struct('<8fI')
 _CHECKSUM = struct.Struct('<I')
 # Images older than that are of no use [s].
 _OLDEST = 10.0
+# Farther from where it took off, or tilted by more, is no pose [m], [rad].
+_FARTHEST, _MOST_TILT = 1000.0, 1.5
 # A sequence number that is farther behind belongs to a sender that was started again.
 _FAR_BEHIND = 1000
 # So does any, after so long a silence [s].
@@ -37,6 +43,40 @@ _MOST_AT_ONCE = 64
 
 class FeedError(ValueError):
     """A datagram that is not to be used; the text says field, what was read, what is allowed."""
+
+
+class FeedState(IntEnum):
+    """What a robot that sends its pose does."""
+
+    GROUND = 0
+    AIR = 1
+    LANDING = 2
+
+
+@dataclass(frozen=True)
+class FeedPose:
+    """
+    Where a robot was when the image was taken, as it believes.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        From where it took off: forward, left, up, axes of the heading then [m].
+    roll, pitch, yaw : float
+        Right-handed about forward, left and up; yaw from the heading at take-off [rad].
+    battery : float
+        Charge, 0 to 1; negative: not known.
+    state : FeedState
+        What it does.
+
+    """
+
+    position: np.ndarray
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    battery: float = -1.0
+    state: FeedState = FeedState.GROUND
 
 
 @dataclass(frozen=True)
@@ -54,6 +94,8 @@ class FeedPacket:
         Of the image [px].
     blobs : Blobs
         In that image.
+    pose : FeedPose, optional
+        Of the robot then; none: it does not send it.
 
     """
 
@@ -62,6 +104,7 @@ class FeedPacket:
     width: int
     height: int
     blobs: Blobs
+    pose: FeedPose | None = None
 
 
 def encode(packet: FeedPacket) -> bytes:
@@ -82,13 +125,17 @@ def encode(packet: FeedPacket) -> bytes:
     data = _HEADER.pack(
         MAGIC,
         VERSION,
-        0,
+        0 if packet.pose is None else HAS_POSE,
         len(blobs),
         packet.width,
         packet.height,
         packet.sequence % 2**32,
         round(1e6 * packet.age),
     )
+    if packet.pose is not None:
+        pose = packet.pose
+        angles = pose.roll, pose.pitch, pose.yaw
+        data += _POSE.pack(*pose.position, *angles, pose.battery, pose.state)
     for index in range(len(blobs)):
         covariance = blobs.covariances[index]
         numbers = [
@@ -122,11 +169,12 @@ def decode(data: bytes) -> FeedPacket:
         raise FeedError(f'magic: read {magic!r}, allowed is {MAGIC!r}')
     if version != VERSION:
         raise FeedError(f'version: read {version}, allowed is {VERSION}')
-    if flags:
-        raise FeedError(f'flags: read {flags}, allowed is 0')
+    if flags & ~HAS_POSE:
+        raise FeedError(f'flags: read {flags}, allowed are 0 and {HAS_POSE}')
     if count > MOST:
         raise FeedError(f'count: read {count}, allowed is at most {MOST}')
-    size = least + count * _BLOB.size
+    begin = _HEADER.size + (_POSE.size if flags else 0)
+    size = begin + count * _BLOB.size + _CHECKSUM.size
     if len(data) != size:
         raise FeedError(f'length: read {len(data)} bytes, allowed are {size} with {count} blobs')
     (checksum,) = _CHECKSUM.unpack_from(data, size - _CHECKSUM.size)
@@ -137,7 +185,8 @@ def decode(data: bytes) -> FeedPacket:
         raise FeedError(f'width, height: read {width} x {height}, allowed are at least 1 x 1 px')
     if age > 1e6 * _OLDEST:
         raise FeedError(f'age: read {age} us, allowed is at most {1e6 * _OLDEST:.0f} us')
-    rows = list(_BLOB.iter_unpack(data[_HEADER.size : size - _CHECKSUM.size]))
+    pose = _read_pose(_POSE.unpack_from(data, _HEADER.size)) if flags else None
+    rows = list(_BLOB.iter_unpack(data[begin : size - _CHECKSUM.size]))
     numbers = np.array([row[:8] for row in rows], dtype=float).reshape(count, 8)
     marks = np.array([row[8] for row in rows], dtype=np.int64)
     _check(numbers, marks, width, height)
@@ -149,7 +198,22 @@ def decode(data: bytes) -> FeedPacket:
         extents=numbers[:, 6:8],
         border_cut=(marks & BORDER_CUT) != 0,
     )
-    return FeedPacket(sequence, 1e-6 * age, width, height, blobs)
+    return FeedPacket(sequence, 1e-6 * age, width, height, blobs, pose)
+
+
+def _read_pose(values: tuple[float, ...]) -> FeedPose:
+    *numbers, state = values
+    position, (roll, pitch, yaw), battery = np.array(numbers[:3]), numbers[3:6], numbers[6]
+    for good, what in (
+        (np.isfinite(numbers).all(), 'finite numbers'),
+        (np.abs(position).max() <= _FARTHEST, f'a position within {_FARTHEST:g} m'),
+        (max(abs(roll), abs(pitch)) <= _MOST_TILT, f'roll and pitch within {_MOST_TILT} rad'),
+        (battery <= 1.0, 'a charge of at most 1'),
+        (state in list(FeedState), 'states ' + ', '.join(str(int(item)) for item in FeedState)),
+    ):
+        if not good:
+            raise FeedError(f'pose: read {list(values)}, allowed are {what}')
+    return FeedPose(position, roll, pitch, yaw, battery, FeedState(int(state)))
 
 
 def _check(numbers: np.ndarray, marks: np.ndarray, width: int, height: int) -> None:
@@ -194,6 +258,8 @@ class FeedReceiver:
         UDP; 0: any that is free.
     address : str
         Of this host, on which it listens.
+    sender : str, optional
+        Address of the only one that is heard; none: anybody.
 
     Attributes
     ----------
@@ -209,7 +275,8 @@ class FeedReceiver:
 
     """
 
-    def __init__(self, port: int, address: str = '127.0.0.1') -> None:
+    def __init__(self, port: int, address: str = '127.0.0.1', sender: str | None = None) -> None:
+        self.sender = sender
         self.counts: Counter[str] = Counter()
         self.problem = ''
         self._last: int | None = None
@@ -232,9 +299,12 @@ class FeedReceiver:
         packets = []
         for _ in range(_MOST_AT_ONCE):
             try:
-                data = self._socket.recv(65536)
+                data, (host, _) = self._socket.recvfrom(65536)
             except BlockingIOError:
                 break
+            if self.sender not in (None, host):
+                self._refuse('foreign sender', f'sender: read {host}, allowed is {self.sender}')
+                continue
             now = time.monotonic()
             try:
                 packet = decode(data)

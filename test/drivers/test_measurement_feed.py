@@ -102,7 +102,7 @@ def test_anything_else_is_refused(data):
     ('offset', 'layout', 'value', 'said'),
     [
         (4, '<B', 2, 'version: read 2, allowed is 1'),
-        (5, '<B', 1, 'flags: read 1'),
+        (5, '<B', 2, 'flags: read 2'),
         (8, '<H', 0, 'width, height: read 0 x 120'),
         (16, '<I', 10_000_001, 'age: read 10000001 us'),
         (20, '<f', float('nan'), 'blob 0: .*finite'),

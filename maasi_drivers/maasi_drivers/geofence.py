@@ -1,0 +1,65 @@
+"""Where a flying robot may go. Without ROS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+# Between the height at the start and the geofence, where none is given [m].
+_HEIGHT = 1.0
+# How far outside it may drift before it lands [m].
+MARGIN = 0.5
+
+
+def make_fence(
+    given: list[list[float]] | None, bounds: FloatArray, radius: float, ground: float, start: float
+) -> FloatArray:
+    """
+    Return the lowest and highest x, y, z (3, 2) of goals [m, map].
+
+    Parameters
+    ----------
+    given : list, optional
+        By the settings; none: the bounds with the radius around them, from the ground to 1 m above
+        the start.
+    bounds : ndarray, shape (2 or 3, 2)
+        Of the environment [m].
+    radius : float
+        Of the robot [m].
+    ground, start : float
+        Heights of the floor and of the start [m].
+    """
+    if given is not None:
+        return np.array(given)
+    fence = np.array([[0.0, 0.0], [0.0, 0.0], [ground, start + _HEIGHT]])
+    fence[: len(bounds)] = bounds + np.array([-radius, radius])
+    return fence
+
+
+def goal_problem(fence: FloatArray, point: Sequence[float]) -> str | None:
+    """Return why a waypoint (x, y, z) is not allowed, or nothing."""
+    for axis, value in enumerate(point):
+        low, high = fence[axis].tolist()
+        if not low <= value <= high:
+            return (
+                f'waypoint.pose.position.{"xyz"[axis]}: read {value}, allowed is {low:g} to '
+                f'{high:g} [m], the geofence'
+            )
+    return None
+
+
+def outside(fence: FloatArray, position: FloatArray) -> str:
+    """Return where a robot is too far outside, or nothing; on the floor below nothing is wrong."""
+    for axis, (low, high) in enumerate(fence.tolist()):
+        lowest = -math.inf if axis == 2 else low - MARGIN
+        if not lowest <= position[axis] <= high + MARGIN:
+            return (
+                f'{"xyz"[axis]} at {position[axis]:.2f} m, outside the geofence, '
+                f'{low:g} to {high:g} m'
+            )
+    return ''

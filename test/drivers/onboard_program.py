@@ -1,0 +1,112 @@
+"""A drone whose own program segments its images, flies, and takes waypoints by UDP, in real time.
+
+Stands in for the Simulink program of 001, section 7: segmentation and controllers run on board,
+waypoints come by UDP. Packs and unpacks what docs/measurement_feed.md says by itself; flies as a
+double integrator under a position controller (`FlightModel`).
+"""
+
+import math
+import socket
+import struct
+import threading
+import time
+import zlib
+
+import numpy as np
+
+from maasi_sim.flight_model import FlightLimits, FlightModel
+
+_STEP, _FEED_PERIOD = 0.02, 0.1
+GROUND, AIR, LANDING = range(3)
+
+
+class OnboardProgram:
+    """
+    The drone; z is up from where it stands, x forward, y left.
+
+    Attributes
+    ----------
+    silent, deaf : bool
+        Whether nothing of it gets through, and nothing to it.
+    charge : float
+        Of its battery.
+    blobs : bytes
+        Of the next images, as the feed has them.
+    kinds : list of int
+        Orders that it has heard.
+    take_offs : int
+        How often it left the ground.
+    """
+
+    def __init__(self, address, feed):
+        self.silent = self.deaf = False
+        self.charge = 1.0
+        self.blobs, self.count = b'', 0
+        self.kinds, self.take_offs = [], 0
+        self.state = GROUND
+        self.model = FlightModel(FlightLimits(speed=0.5), False, np.zeros(3), 0.0)
+        self._feed = feed
+        self._sequence = 0
+        self._order, self._last, self._heard_at = 0, None, -math.inf
+        self._goal = np.zeros(3)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((address, 0))
+        self._socket.setblocking(False)
+        self.address, self.port = self._socket.getsockname()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._live, daemon=True)
+        self._thread.start()
+
+    def close(self):
+        self._ended.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _live(self):
+        sent_at = 0.0
+        while not self._ended.wait(_STEP):
+            now = time.monotonic()
+            self._hear(now)
+            self._fly(now)
+            if now - sent_at >= _FEED_PERIOD and not self.silent:
+                sent_at = now
+                self._send()
+
+    def _hear(self, now):
+        while True:
+            try:
+                data = self._socket.recv(2048)
+            except BlockingIOError:
+                return
+            magic, version, kind, _, sequence, *numbers = struct.unpack('<4sBBHI4f', data[:28])
+            good = data[28:] == struct.pack('<I', zlib.crc32(data[:28])) and version == 1
+            if self.deaf or magic != b'MSWO' or not good or sequence == self._last:
+                continue
+            self._last, self._heard_at = sequence, now
+            self._order, self._goal = kind, np.array(numbers[:3])
+            self.kinds.append(kind)
+
+    def _fly(self, now):
+        silence, order = now - self._heard_at, self._order
+        if silence > 3.0:
+            order = 0
+        elif silence > 0.5:
+            order = min(order, 1)
+        if self.state == GROUND:
+            if order < 2:
+                return
+            self.take_offs += 1
+        self.state = AIR if order else LANDING
+        if order == 2:
+            self.model.fly_to(self._goal, None, _STEP)
+        else:
+            self.model.fly(np.array([0.0, 0.0, 0.0 if order else -0.5]), _STEP)
+        if order == 0 and self.model.grounded:
+            self.state = GROUND
+
+    def _send(self):
+        self._sequence += 1
+        data = b'MSMF' + struct.pack('<BBHHHII', 1, 1, self.count, 160, 120, self._sequence, 20000)
+        numbers = [*self.model.position, 0.0, 0.0, 0.0, self.charge]
+        data += struct.pack('<7fI', *numbers, self.state) + self.blobs
+        self._socket.sendto(data + struct.pack('<I', zlib.crc32(data)), self._feed)

@@ -1,0 +1,228 @@
+"""A drone with a program of its own: the feed carries its pose, waypoints go back."""
+
+import struct
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from numpy.testing import assert_allclose
+from onboard_program import AIR, GROUND, OnboardProgram
+from rclpy.executors import SingleThreadedExecutor
+from robot_team import MAMBO, Team, parameters_of
+
+from maasi_drivers.mambo_onboard_driver import MamboOnboardDriver
+from maasi_drivers.measurement_feed import FeedError, FeedPose, FeedState, decode, encode
+from maasi_drivers.projection import Camera
+from maasi_drivers.waypoint_orders import Order, OrderError, OrderKind
+from maasi_drivers.waypoint_orders import decode as decode_order
+from maasi_drivers.waypoint_orders import encode as encode_order
+from maasi_filter.pose import Pose, compose
+from maasi_msgs.msg import AgentState
+from maasi_sim.fake_mambo import free_address, free_port
+
+START, YAW, GROUND_HEIGHT = [1.0, 1.2, 0.6], 0.6, 0.1
+GOAL = [1.7, 0.8, 0.7]
+ORIGIN = Pose.from_yaw([*START[:2], GROUND_HEIGHT], YAW)
+
+
+class Flight:
+    """A driver in this process, the drone, and the team."""
+
+    def __init__(self, context, executor, **mambo):
+        port = free_port()
+        self.drone = OnboardProgram(free_address(), ('127.0.0.1', port))
+        link = {'arm': True, 'address': self.drone.address, 'order_port': self.drone.port}
+        settings = MAMBO | {
+            'start': START,
+            'yaw': YAW,
+            'link': 'mambo_feed',
+            'image_source': 'feed',
+            'feed_port': port,
+            'battery_minimum': 0.0,
+            'mambo': link | {'ground': GROUND_HEIGHT, 'land_after': 1.0} | mambo,
+        }
+        self.driver = MamboOnboardDriver(
+            context=context, namespace='/rover', parameter_overrides=parameters_of(settings)
+        )
+        executor.add_node(self.driver)
+        self.team = Team(context, settings, executor, deaf=True)
+        self.team.used = [self.team.batches]
+        assert self.driver.trigger_configure().name == 'SUCCESS', self.driver.problem
+        self.until(lambda: len(self.drone.kinds) > 5)
+        # Nothing moves before it is active.
+        assert set(self.drone.kinds) == {OrderKind.LAND} and self.drone.state == GROUND
+        assert self.driver.trigger_activate().name == 'SUCCESS'
+        self.team.connect()
+
+    @property
+    def where(self):
+        return compose(ORIGIN, Pose(self.drone.model.position)).position
+
+    @property
+    def reason(self):
+        return self.team.state.reason if self.team.states else ''
+
+    def until(self, condition):
+        self.team.until(condition, f'{self.reason!r}, {self.drone.state}')
+
+    def up(self):
+        self.until(lambda: self.team.states and self.team.state.goal_status == AgentState.IDLE)
+        return self
+
+    def on_its_way(self):
+        _, result = self.up().team.send_accepted(GOAL)
+        self.until(lambda: np.linalg.norm(self.where - START) > 0.2)
+        return result
+
+    def close(self):
+        self.driver.halt()
+        self.driver.destroy_node()
+        self.team.destroy_node()
+        self.drone.close()
+
+
+@pytest.fixture
+def fly(context):
+    started = []
+    executor = SingleThreadedExecutor(context=context)
+
+    def start(**mambo):
+        started.append(Flight(context, executor, **mambo))
+        return started[-1]
+
+    yield start
+    for flight in started:
+        flight.close()
+    executor.shutdown()
+
+
+def test_it_takes_off_goes_where_it_is_sent_measures_and_lands(fly):
+    flight = fly().up()
+    assert_allclose(flight.where, START, atol=0.11)
+    _, result = flight.team.send_accepted(GOAL)
+    flight.until(result.done)
+    assert result.result().status == GoalStatus.STATUS_SUCCEEDED
+    assert_allclose(flight.where, GOAL, atol=0.1)
+    team, drone, target = flight.team, flight.drone, np.array([1.73, 0.84])
+    camera = Camera.from_settings(team.settings.camera)
+    true = Pose.from_yaw(flight.where, YAW)
+    pixel = np.asarray(camera.project(np.array([[*target, 0.0]]), true), dtype=float).ravel()
+    drone.blobs = struct.pack('<8fI', *pixel, 0.0, 0.0, 0.0, 70.0, 9.4, 9.4, 0)
+    drone.count = 1
+    team.ask(team.get_clock().now().nanoseconds + 200_000_000)
+    (seen,) = team.answer().detections
+    pose = team.answer().pose.pose.position
+    place = [pose.x + seen.range * np.cos(seen.bearing), pose.y + seen.range * np.sin(seen.bearing)]
+    assert_allclose(place, target, atol=0.06)
+    flight.driver.trigger_deactivate()
+    flight.until(lambda: drone.state == GROUND)
+    assert drone.take_offs == 1
+
+
+def test_nothing_takes_off_without_arm(fly):
+    flight = fly(arm=False)
+    flight.until(lambda: 'mambo.arm' in flight.reason)
+    assert flight.team.refused(GOAL)
+    known = len(flight.drone.kinds)
+    flight.until(lambda: len(flight.drone.kinds) > known + 10)
+    assert set(flight.drone.kinds) == {OrderKind.LAND} and flight.drone.take_offs == 0
+
+
+def test_a_drone_that_is_not_heard_is_told_to_hover_then_to_land(fly):
+    flight = fly()
+    result = flight.on_its_way()
+    flight.drone.silent = True
+    known = len(flight.drone.kinds)
+    flight.until(result.done)
+    assert result.result().status == GoalStatus.STATUS_ABORTED
+    flight.until(lambda: OrderKind.HOLD in flight.drone.kinds[known:])
+    flight.until(lambda: flight.drone.state == GROUND)
+    flight.drone.silent = False
+    flight.until(lambda: flight.reason == 'landed: nothing heard from the drone')
+    assert flight.drone.take_offs == 1
+
+
+def test_a_low_battery_lands_it_and_it_stays_down(fly):
+    flight = fly()
+    flight.on_its_way()
+    flight.drone.charge = 0.05
+    flight.until(lambda: flight.drone.state == GROUND)
+    flight.until(lambda: flight.reason == 'landed: battery at 0.05, below 0.10')
+    flight.drone.charge = 1.0
+    assert flight.team.refused(GOAL)
+    assert flight.drone.take_offs == 1
+
+
+def test_a_goal_outside_the_geofence_is_refused(fly):
+    flight = fly().up()
+    assert 'geofence' in flight.team.refused([1.7, 0.8, 1.8])
+    assert flight.drone.state == AIR
+
+
+def test_a_driver_that_hangs_is_a_drone_that_hovers_then_lands(fly):
+    """Orders come from the executor alone: one that stands still says nothing."""
+    flight = fly()
+    flight.on_its_way()
+    flight.drone._ended.wait(1.0)
+    assert np.linalg.norm(flight.drone.model.velocity) < 0.01 and flight.drone.state == AIR
+    flight.drone._ended.wait(5.0)
+    assert flight.drone.state == GROUND
+
+
+# ---- the datagrams ---------------------------------------------------------------------------
+
+
+def packet(**pose):
+    from maasi_drivers.measurement_feed import FeedPacket
+    from maasi_drivers.segmentation import Blobs
+
+    none = Blobs(
+        centroids=np.zeros((0, 2)),
+        areas=np.zeros(0),
+        extents=np.zeros((0, 2)),
+        border_cut=np.zeros(0, dtype=bool),
+        covariances=np.zeros((0, 2, 2)),
+    )
+    numbers = {'position': np.array([0.5, -0.25, 1.0]), 'yaw': 0.5, 'battery': 0.75} | pose
+    return FeedPacket(7, 0.0, 160, 120, none, FeedPose(state=FeedState.AIR, **numbers))
+
+
+def test_a_pose_is_read_as_it_is_written():
+    data = encode(packet())
+    assert data[5] == 1 and len(data) == 20 + 32 + 4
+    assert struct.unpack_from('<7fI', data, 20) == (0.5, -0.25, 1.0, 0.0, 0.0, 0.5, 0.75, 1)
+    pose = decode(data).pose
+    assert pose.state is FeedState.AIR and pose.yaw == 0.5
+    assert_allclose(pose.position, [0.5, -0.25, 1.0])
+
+
+@pytest.mark.parametrize(
+    ('pose', 'text'),
+    [
+        ({'yaw': float('nan')}, 'finite'),
+        ({'position': np.array([2000.0, 0.0, 0.0])}, 'within 1000 m'),
+        ({'roll': 1.6}, 'roll and pitch'),
+        ({'battery': 1.1}, 'charge'),
+    ],
+)
+def test_a_pose_that_cannot_be_is_refused(pose, text):
+    with pytest.raises(FeedError, match=text):
+        encode(packet(**pose))
+
+
+def test_an_order_is_read_as_it_is_written_and_no_damage_goes_unnoticed():
+    order = Order(3, OrderKind.GO, np.array([1.0, 2.0, 0.5]), 0.25)
+    data = encode_order(order)
+    assert data[:12].hex() == '4d53574f0102000003000000' and len(data) == 32
+    read = decode_order(data)
+    assert (read.sequence, read.kind, read.yaw) == (3, OrderKind.GO, 0.25)
+    assert_allclose(read.position, order.position)
+    for index in range(len(data)):
+        damaged = bytearray(data)
+        damaged[index] ^= 8
+        with pytest.raises(OrderError):
+            decode_order(bytes(damaged))
+    with pytest.raises(OrderError, match='length'):
+        decode_order(data[:-1])
+    with pytest.raises(OrderError, match='finite numbers'):
+        encode_order(Order(1, OrderKind.GO, np.array([np.nan, 0.0, 0.0])))
