@@ -242,8 +242,10 @@ class MavlinkRobot(AgentDriver[DataT]):
         if trouble:
             told = self._troubles.get(_VEHICLE)
             self.begin_trouble(_VEHICLE, trouble)
-            if trouble != told:
+            if told is None:
                 self.get_logger().warning(trouble)
+            elif trouble != told:
+                self.get_logger().info(trouble)
             self._heading = None
         elif self.end_trouble(_VEHICLE):
             self.get_logger().info('the vehicle flies where it is sent')

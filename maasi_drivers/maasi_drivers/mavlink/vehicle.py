@@ -506,6 +506,7 @@ class Vehicle:
         assert self._failsafes is not None
         if self._failsafes.complete and self._estimate.ready:
             self._enter(Phase.WAITING)
+            self._wait(now)
 
     def _wait(self, now: float) -> None:
         assert self.firmware is not None and self._failsafes is not None
