@@ -27,6 +27,7 @@ setup(
             'mavlink_camera_driver = maasi_entry:maasi_drivers.mavlink_camera_driver',
             'calibrate_sensor = maasi_entry:maasi_drivers.calibrate_sensor',
             'mambo_onboard_driver = maasi_entry:maasi_drivers.mambo_onboard_driver',
+            'robot_command = maasi_entry:maasi_drivers.robot_command',
             'measure_mambo = maasi_entry:maasi_drivers.measure_mambo',
             'guard_node = maasi_entry:maasi_drivers.guard_node',
         ],

@@ -36,6 +36,10 @@ Picture = Callable[[], ImageArray | Blobs]
 
 # Between two looks at a video or feed [s].
 _POLL_PERIOD = 0.01
+# Of each so many rows and columns one tells whether an image is overexposed.
+_EXPOSURE_STRIDE = 4
+# Largest share of pixels that may be as bright as the camera can tell.
+_MOST_CLIPPED = 0.01
 
 
 def _known(blobs: Blobs) -> Blobs:
@@ -276,6 +280,17 @@ class CameraDriver(AgentDriver[Picture]):
                 f'calibration, {camera.width} x {camera.height} px'
             )
 
+    def _watch_exposure(self, image: ImageArray) -> None:
+        """Warn of an image whose colours are cut off: markers are missed there, or misplaced."""
+        sample = image[::_EXPOSURE_STRIDE, ::_EXPOSURE_STRIDE]
+        share = float(np.mean(sample.max(axis=2) == np.iinfo(np.uint8).max))
+        if share > _MOST_CLIPPED:
+            self.warn_throttled(
+                'exposure',
+                f'image: {share:.0%} of the pixels are clipped at 255, good is at most '
+                f'{_MOST_CLIPPED:.0%}: lower the exposure, or markers are missed or misplaced',
+            )
+
     def look(self, data: Picture, pose: StampedPose) -> Sighting:
         """Find the markers in an image."""
         # Odometry that says nothing of its errors carries zeros.
@@ -285,6 +300,7 @@ class CameraDriver(AgentDriver[Picture]):
             seen = self.detector.locate(picture, pose.pose, covariance)
         else:
             seen = self.detector.detect(picture, pose.pose, covariance)
+            self._watch_exposure(picture)
         positions = seen.positions
         if self.dimension == 3:
             positions = np.pad(positions, ((0, 0), (0, 1)))

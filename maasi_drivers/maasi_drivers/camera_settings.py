@@ -19,7 +19,8 @@ class SegmentationSettings(Settings):
 
     rule: Literal['robust', 'paper'] = Field(
         default='robust',
-        description="'paper': fixed blue excess (001, eq. (16)); 'robust': adapts to light",
+        description="'paper': fixed blue excess (001, eq. (16)), blobs of any size from "
+        "minimum_area on; 'robust': adapts to light, and looks at size and shape",
     )
     threshold: float = Field(
         default=35.0,

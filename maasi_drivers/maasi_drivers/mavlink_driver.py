@@ -88,6 +88,9 @@ class MavlinkRobot(AgentDriver[DataT]):
             [[0.0, 0.0], [0.0, 0.0], [min(heights) - _FENCE_HEIGHT, max(heights) + _FENCE_HEIGHT]]
         )
         fence[: self.dimension] = self._bounds + np.array([-radius, radius])
+        if self.settings.start[2] > self._mavlink.ground:
+            # What flies is not sent into the ground.
+            fence[2, 0] = max(fence[2, 0], self._mavlink.ground)
         return fence
 
     # ---- the link ----------------------------------------------------------------------------

@@ -215,6 +215,19 @@ def test_seeing_nothing_is_said_too(play):
     assert not team.answer().detections
 
 
+def test_an_overexposed_image_is_warned_of(play, capfd):
+    _, team = play()
+    image = np.full((120, 160, 3), 254, np.uint8)
+    for number, warned in enumerate((False, True), start=1):
+        team.move()
+        team.images.publish(image_message(image, team.step * NANOSECONDS))
+        team.ask(team.step * NANOSECONDS)
+        assert not team.answer(number).detections
+        assert ('3% of the pixels are clipped' in capfd.readouterr().err) is warned
+        # A lamp on the floor.
+        image[40:64, 40:64] = 255
+
+
 def test_the_pose_is_that_of_the_image(play):
     _, team = play()
     team.move()

@@ -355,6 +355,12 @@ def test_goals_that_are_not_finite_or_outside_the_geofence_are_refused(fly, capf
     assert flight.team.takes([0.0, 2.5, 0.8])
 
 
+def test_without_a_geofence_it_is_not_sent_into_the_ground(fly):
+    flight = fly()
+    assert 'the geofence' in flight.driver._problem(flight.team.goal([0.0, 1.0, -0.1]))
+    assert flight.driver._problem(flight.team.goal([0.0, 1.0, 0.1])) is None
+
+
 def test_blown_out_of_the_geofence_it_comes_back(fly):
     flight = fly(link={'geofence': [[-3.0, 3.0], [-3.0, 3.0], [0.5, 3.0]]}).fly()
     with flight.vehicle._lock:

@@ -62,7 +62,8 @@ class MavlinkSettings(Settings):
     geofence: Annotated[list[Interval], Field(min_length=3, max_length=3)] | None = Field(
         default=None,
         description='Lowest and highest x, y and z that it is sent to; none: the environment with '
-        'the radius around it, and 1 m above and below its heights at the start [m, map]',
+        'the radius around it, in 2D 1 m above and below its heights at the start; for what '
+        'starts above the ground, not below that [m, map]',
     )
     lead: float = Field(
         default=1.0,

@@ -1,0 +1,169 @@
+"""Show what a robot says of itself, or send it to a waypoint: for trying a robot out by hand."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from maasi_filter.qos import SENSOR
+from maasi_msgs.action import GoToWaypoint
+from maasi_msgs.msg import AgentState
+
+DONE, FAILED, ABSENT = 0, 1, 2
+_STATUS = {
+    AgentState.IDLE: 'no goal',
+    AgentState.MOVING: 'on the way',
+    AgentState.REACHED: 'goal reached',
+    AgentState.CANCELED: 'goal cancelled',
+    AgentState.ABORTED: 'goal given up',
+    AgentState.UNAVAILABLE: 'cannot go on',
+}
+# For the answer to a cancelled goal [s].
+_FAREWELL = 5.0
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='robot_command',
+        description='Shows the state of a robot, or sends it to a waypoint in the map.',
+        epilog='Ctrl-C cancels the goal. Exit codes: 0 done, 1 refused, given up or cancelled, '
+        '2 wrong arguments or no such driver.',
+    )
+    parser.add_argument('robot', help='its name, with the namespace of its team if it has one')
+    parser.add_argument(
+        '--timeout', type=float, default=10.0, metavar='S', help='longest wait for the driver [s]'
+    )
+    words = parser.add_subparsers(dest='word', required=True)
+    words.add_parser('state', help='print pose, battery, what it does and why')
+    go = words.add_parser('go', help='send it to a waypoint, and wait until it is there')
+    for axis in 'xy':
+        go.add_argument(axis, type=_metres, help='[m, map]')
+    go.add_argument('z', type=_metres, nargs='?', default=0.0, help='[m, map]; default 0')
+    return parser
+
+
+def _metres(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
+def describe(state: AgentState) -> str:
+    """Return a state in words."""
+    position = state.pose.pose.position
+    battery = f'{state.battery:.0%}' if state.battery >= 0.0 else 'unknown'
+    reason = f': {state.reason}' if state.reason else ''
+    return (
+        f'{state.robot}: {_STATUS.get(state.goal_status, "unknown")}{reason}; at '
+        f'({position.x:.3f}, {position.y:.3f}, {position.z:.3f}) m in {state.header.frame_id}, '
+        f'battery {battery}'
+    )
+
+
+class _User:
+    """A node that waits for one robot."""
+
+    def __init__(self, node: Node, options: argparse.Namespace) -> None:
+        self._node = node
+        self._options = options
+        self._top = '/' + options.robot.strip('/')
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+
+    def _wait(self, condition: Callable[[], object], timeout: float = math.inf) -> bool:
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self._executor.spin_once(timeout_sec=0.05)
+        return True
+
+    def show(self) -> int:
+        """Print the next state."""
+        heard: list[AgentState] = []
+        topic = f'{self._top}/state'
+        self._node.create_subscription(AgentState, topic, heard.append, SENSOR)
+        if not self._wait(lambda: heard, self._options.timeout):
+            print(f'nothing on {topic} for {self._options.timeout:g} s: is its driver there?')
+            return ABSENT
+        print(describe(heard[-1]))
+        return DONE
+
+    def go(self) -> int:
+        """Send it to the waypoint, and wait; an interrupt cancels the goal."""
+        topic = f'{self._top}/go_to'
+        client = ActionClient(self._node, GoToWaypoint, topic)
+        if not self._wait(client.server_is_ready, self._options.timeout):
+            print(f'no {topic} for {self._options.timeout:g} s: is its driver there?')
+            return ABSENT
+        goal = GoToWaypoint.Goal(goal_id=1)
+        goal.waypoint.header.frame_id = 'map'
+        position = goal.waypoint.pose.position
+        position.x, position.y, position.z = self._options.x, self._options.y, self._options.z
+        goal.waypoint.pose.orientation.w = 1.0
+        answer = client.send_goal_async(goal)
+        handle = result = None
+        try:
+            self._wait(answer.done)
+            handle = answer.result()
+            if handle is None or not handle.accepted:
+                print('refused: the log of its driver says why')
+                return FAILED
+            result = handle.get_result_async()
+            self._wait(result.done)
+        except KeyboardInterrupt:
+            self._cancel(answer, handle)
+            if result is None or not self._wait(result.done, _FAREWELL):
+                print('cancelled; nothing was heard of its end')
+                return FAILED
+        assert result is not None
+        return self._conclude(result.result())
+
+    def _cancel(self, answer: Any, handle: Any) -> None:
+        """Cancel a goal, also one whose answer has not come yet."""
+        if handle is None and self._wait(answer.done, _FAREWELL):
+            handle = answer.result()
+        if handle is not None and handle.accepted:
+            handle.cancel_goal_async()
+
+    @staticmethod
+    def _conclude(answer: Any) -> int:
+        place, reason = answer.result.pose.position, answer.result.reason
+        reached = answer.status == GoalStatus.STATUS_SUCCEEDED
+        print(
+            ('reached' if reached else f'not reached: {reason}')
+            + f'; it stands at ({place.x:.3f}, {place.y:.3f}, {place.z:.3f}) m'
+        )
+        return DONE if reached else FAILED
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line."""
+    options = build_parser().parse_args(arguments)
+    # Ctrl-C cancels the goal before the context ends.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node('robot_command', use_global_arguments=False)
+    try:
+        user = _User(node, options)
+        return user.show() if options.word == 'state' else user.go()
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
