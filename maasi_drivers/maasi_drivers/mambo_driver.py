@@ -181,6 +181,7 @@ class MamboDriver(CameraDriver):
             status['flight'] = self._phase.value
             status['drone'] = self._link.flying_state
             status['bad position events'] = self._link.bad_events
+            status['listener started again'] = self._link.revived
             status |= {f'datagrams dropped: {key}': n for key, n in self._link.dropped.items()}
         return status
 

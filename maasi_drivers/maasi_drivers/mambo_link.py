@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_drivers.mambo_bluetooth import ask_for_answer, mend
-from maasi_drivers.mambo_socket import DroneSocket, guard
+from maasi_drivers.mambo_socket import DroneSocket, guard, revive
 
 FloatArray = NDArray[np.float64]
 
@@ -124,6 +124,8 @@ class MamboLink:
         self.heard_at = -math.inf
         #: Position events that could not be used.
         self.bad_events = 0
+        #: How often pyparrot's listener had died and was started again.
+        self.revived = 0
         self._drone: Any = None
         self._position: PositionEvent | None = None
         self._stamps: dict[str, Any] = {}
@@ -319,6 +321,7 @@ class MamboLink:
                     self._probe(drone.drone_connection)
                     drone.smart_sleep(_ROUND)
                 else:
+                    self.revived += revive(drone.drone_connection)
                     self._wake.wait(_ROUND)
                 self._wake.clear()
         except Exception as error:

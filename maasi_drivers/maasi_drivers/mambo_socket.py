@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import socket
 import struct
+import threading
 from collections import Counter
 from typing import Any
 
@@ -118,10 +119,21 @@ def guard(connection: Any, drone: str, port: int) -> None:
     def handle_data(data: bytes) -> None:
         try:
             handle(data)
-        except (struct.error, KeyError, IndexError, TypeError, ValueError) as error:
+        except Exception as error:
             receiver = connection.udp_receive_sock
             receiver.dropped['bad content'] += 1
             receiver.problem = f'content of a frame: {error}'
 
     connection._create_udp_connection = open_sockets
     connection.handle_data = handle_data
+
+
+def revive(connection: Any) -> bool:
+    """Start a connection's listener again if it has died; return whether it had."""
+    if not connection.is_listening or connection.listener_thread.is_alive():
+        return False
+    connection.listener_thread = threading.Thread(
+        target=connection._listen_socket, name='Mambo listener', daemon=True
+    )
+    connection.listener_thread.start()
+    return True

@@ -39,6 +39,7 @@ class Flight:
             'image_source': 'feed',
             'feed_port': port,
             'battery_minimum': 0.0,
+            'odometry_timeout': 0.5,
             'mambo': link | {'ground': GROUND_HEIGHT, 'land_after': 1.0} | mambo,
         }
         self.driver = MamboOnboardDriver(

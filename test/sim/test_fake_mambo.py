@@ -345,6 +345,25 @@ def test_datagrams_that_are_not_the_drones_or_are_cut_short_do_not_end_the_link(
     assert link.dropped == receiver.dropped
 
 
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
+def test_a_listener_that_dies_is_started_again(pair):
+    _, link = pair()
+    until(lambda: link.position is not None)
+    connection = link._drone.drone_connection
+    handle, dead = connection.handle_data, connection.listener_thread
+
+    def die(data):
+        connection.handle_data = handle
+        # Ends a thread without a traceback.
+        raise SystemExit
+
+    connection.handle_data = die
+    until(lambda: link.revived == 1)
+    assert not dead.is_alive()
+    received = link.position.received
+    until(lambda: link.position.received > received)
+
+
 def test_the_drone_is_heard_on_the_address_that_faces_it_alone(pair):
     _, link = pair()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
