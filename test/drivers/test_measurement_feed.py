@@ -180,6 +180,19 @@ def test_a_sender_that_was_started_again_is_heard(feed):
     assert [item.packet.sequence for item in received(receiver, 3)] == [5000, 1, 2]
 
 
+def test_only_the_sender_that_is_named_is_heard(feed):
+    receiver, send = feed
+    receiver.sender = '127.0.0.9'
+    send(encode(packet(sequence=1)))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
+        robot.bind(('127.0.0.9', 0))
+        robot.sendto(encode(packet(sequence=2)), ('127.0.0.1', receiver.port))
+        (found,) = received(receiver, 1)
+    assert found.packet.sequence == 2
+    assert receiver.counts['foreign sender'] == 1
+    assert 'read 127.0.0.1, allowed is 127.0.0.9' in receiver.problem
+
+
 def test_a_port_that_is_taken_is_said(feed):
     receiver, _ = feed
     with pytest.raises(OSError, match='in use'):
