@@ -17,7 +17,7 @@ from maasi_filter.node_settings import NodeSettings
 from maasi_filter.search_node import SearchNode
 from maasi_sim.processes import Domain
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from maasi_filter.executor import executor_of
 from maasi_filter.qos import RELIABLE
 from maasi_sim.processes import Domain
 
-PATIENCE = 30.0
+PATIENCE = 120.0
 
 
 class Pair:

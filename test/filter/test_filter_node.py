@@ -29,7 +29,7 @@ from maasi_msgs.msg import (
 )
 from maasi_sim.processes import Domain
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}
 NOISE = {'range': 0.01, 'bearing': 0.03}
 SETTINGS = FilterNodeSettings.model_validate(

@@ -19,7 +19,7 @@ from maasi_filter.node_settings import FilterNodeSettings
 from maasi_filter.parameters import flatten
 from maasi_sim.processes import Domain
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 SETTINGS = FilterNodeSettings.model_validate(
     {
         'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},

@@ -31,7 +31,7 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planner_node import PlannerNode
 from maasi_sim.processes import Domain
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 STEP = 0.05
 # Wall time of a step of the robots, where odometry is lost at most [s].
 TURN, LONGEST_TURN = 0.01, 1.0

@@ -34,7 +34,7 @@ from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
 from maasi_sim.processes import Domain
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 ROBOTS = ('a', 'b')
 START = {'a': (0.5, 0.5), 'b': (1.5, 1.5)}
 BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}

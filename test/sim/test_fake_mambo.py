@@ -29,7 +29,7 @@ from maasi_sim.robots import BatterySettings
 from maasi_sim.tilt_body import TiltBody, TiltBodySettings, TiltCommand
 
 # Longest wait for anything; the machine may be busy.
-LIMIT = 30.0
+LIMIT = 120.0
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
 # Of this process, so that several can be tested at a time on one host.
 _NUMBERS = itertools.count(os.getpid() % 1000 * 20)

@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from maasi_filter.executor import executor_of
 from maasi_sim.processes import Domain
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 CYCLES = 20
 
 

@@ -11,7 +11,7 @@ from maasi_sim.linked_robots import linked_robot, with_addresses
 from maasi_sim.scenario import ScenarioError, scenario_from_values
 
 # Longest wait for anything; the machine may be busy.
-LIMIT = 30.0
+LIMIT = 120.0
 SCENARIO = {
     'version': 1,
     'environment': {'bounds': [[-0.3, 1.2], [-0.3, 1.2]]},

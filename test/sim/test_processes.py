@@ -12,7 +12,7 @@ import pytest
 
 from maasi_sim.processes import Domain, NodeProcess, ProcessError, find_executable, stop
 
-LIMIT = 30.0
+LIMIT = 120.0
 
 
 def until(condition):

@@ -18,7 +18,7 @@ from maasi_sim.processes import Domain
 from maasi_sim.recorder_node import Recorder
 from maasi_sim.run_scenario import make_observer
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 RELIABLE = QoSProfile(
     history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
 )

@@ -17,7 +17,7 @@ from maasi_filter.qos import RELIABLE, UPDATES
 from maasi_msgs.msg import AgentState, BatchMember, FilterUpdate, MeasurementBatch, PlanDecision
 from maasi_sim.processes import Domain
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 SECOND = 1_000_000_000
 TIMEOUT = 0.3
 

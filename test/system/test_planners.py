@@ -69,8 +69,8 @@ def test_without_targets_the_planner_says_when_nothing_is_left(tmp_path):
     assert report['time_to_find_all'] is None
 
 
-@pytest.mark.parametrize('name', ['asi', 'as', 'mutual_information', 'nearest_widest', 'lawnmower'])
-def test_every_planner_runs_in_the_planner_node(tmp_path, name):
+def test_another_planner_than_the_default_runs_in_the_planner_node(tmp_path):
+    name = 'mutual_information'
     options = ('--planner', name, '--lockstep', '--no-record', '--time-limit', 12)
     run = run_scenario('ranging_drone_3d', tmp_path / 'run', *options)
     assert run.code == 1, run.output
