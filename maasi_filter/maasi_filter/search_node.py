@@ -336,6 +336,21 @@ class SearchNode(LifecycleNode, Generic[SettingsT]):
     def reset(self) -> None:
         """Forget what belongs to a time that will not come again: the clock jumped back."""
 
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[[], None], *others: Any, **options: Any
+    ) -> Any:
+        """Return a timer that is not called any more once it was destroyed.
+
+        The executor may have found it due before.
+        """
+
+        def call() -> None:
+            if any(item is made for item in self.timers):
+                callback()
+
+        made: Any = super().create_timer(timer_period_sec, call, *others, **options)
+        return made
+
     def create_wall_timer(self, period: float, callback: Callable[[], None]) -> Any:
         """Return a timer on the steady clock; `period` in seconds."""
         return self.create_timer(period, callback, clock=_STEADY)

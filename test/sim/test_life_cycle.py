@@ -137,3 +137,27 @@ def test_a_configure_that_fails_leaves_nothing_and_can_be_repeated(context):
     assert changed[0].successful
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     node.destroy_node()
+
+
+def test_a_timer_that_is_destroyed_is_not_called_any_more(context):
+    node = KINDS['guard'].make(context)
+    executor = executor_of(node, context)
+    called, timers = [], []
+
+    def fire():
+        called.append(len(timers))
+        while timers:
+            node.destroy_timer(timers.pop())
+
+    until(lambda: is_known(node))
+    executor.spin_once(0.1)
+    timers += [node.create_wall_timer(0.05, fire) for _ in range(5)]
+    executor.spin_once(0.0)
+    # All are due at once, and the first one that is called destroys the others.
+    time.sleep(0.2)
+    until(lambda: called, lambda: executor.spin_once(0.01))
+    for _ in range(20):
+        executor.spin_once(0.01)
+    assert called == [5]
+    executor.shutdown()
+    node.destroy_node()
