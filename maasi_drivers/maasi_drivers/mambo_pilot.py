@@ -22,6 +22,10 @@ FloatArray = NDArray[np.float64]
 
 # Acceleration for each m/s that the speed is wrong [1/s].
 _SPEED_GAIN = 2.5
+# Acceleration of the speed that is wished for: little tilt, as images are taken meanwhile [m/s^2].
+_RAMP = 0.4
+# A wish before this is forgotten [s].
+_OLD_WISH = 0.5
 # Share of the largest acceleration that stops it before the geofence: the rest is for wind.
 _BRAKE_SHARE = 0.5
 # Most speed for each metre to the geofence, well below what the speed follows by [1/s].
@@ -135,6 +139,8 @@ class MamboPilot:
         self._stuck = False
         self._command = _STILL
         self._now = -math.inf
+        # When, and which velocity in the map was wished for last [m/s].
+        self._wish: tuple[float, FloatArray] = (-math.inf, np.zeros(2))
         self._since = -math.inf
         self._lost_since: float | None = None
         self._cancelled_at: float | None = None
@@ -205,6 +211,7 @@ class MamboPilot:
     def hover(self) -> None:
         """Stop: the drone keeps its place by its own camera."""
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
+            self._wish = -math.inf, np.zeros(2)
             self._send(_STILL, _STILL)
 
     def _steer(self, command: FloatArray) -> None:
@@ -212,11 +219,22 @@ class MamboPilot:
         model, course = self.reckoning.model, self.reckoning.ahead()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         turned = np.array([[cosine, sine], [-sine, cosine]])
-        wish = turned @ self._stoppable(course, turned.T @ command[:2])
+        ramped = self._ramp(turned.T @ command[:2], course.velocity[:2])
+        self._wish = self._now, self._stoppable(course, ramped)
+        wish = turned @ self._wish[1]
         speed = turned @ course.velocity[:2]
         tilts = model.shares(model.drag * wish + _SPEED_GAIN * (wish - speed))
         rest = [command[2] / model.climb, command[3] / model.turn]
         self._send(command, np.clip([*tilts, *rest], -1.0, 1.0))
+
+    def _ramp(self, wish: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return how far the wished velocity in the map (2,) has come towards a new one."""
+        passed = self._now - self._wish[0]
+        before = self._wish[1] if passed <= _OLD_WISH else velocity
+        change = wish - before
+        size = float(np.hypot(*change))
+        most = _RAMP * min(passed, _OLD_WISH)
+        return before + change * (min(size, most) / size if size > 0.0 else 0.0)
 
     def _stoppable(self, course: Course, wish: FloatArray) -> FloatArray:
         """Return a velocity in the map (2,) that can be stopped before the geofence."""
