@@ -272,6 +272,12 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         """Stop the robot now, as its goal was cancelled or its pose is not known."""
         self._publish_command([0.0, 0.0, 0.0, 0.0])
 
+    def arm_problem(self) -> str:
+        """Return why a robot that flies must not take off; empty where nothing is known."""
+        if not self.active:
+            return 'the driver is not active'
+        return self._troubles.get(STOP) or self._troubles.get(BATTERY) or ''
+
     def awaits_pose(self) -> bool:
         """Return whether a first pose that does not come is worth a warning."""
         return True

@@ -12,6 +12,7 @@ from rclpy.action.server import CancelResponse, ServerGoalHandle
 
 from maasi_drivers import geofence
 from maasi_drivers.agent_driver import FloatArray
+from maasi_drivers.arm_permission import offer_arm
 from maasi_drivers.camera_driver import CameraDriver
 from maasi_drivers.mambo_link import MamboLink, MamboLinkError
 from maasi_drivers.mambo_pilot import MamboPilot, Phase, tilt_limit
@@ -103,12 +104,20 @@ class MamboDriver(CameraDriver):
         self._link = self._make_link()
         self._link.connect()
         self.create_wall_timer(min(self.settings.step, _POLL_PERIOD), self._poll)
+        offer_arm(self, self._arm)
         quality = sensor_reader(self.settings.lockstep)
         if self._mambo.pose == 'odometry':
             self.create_subscription(Odometry, 'odom', self._on_odometry, quality)
         elif self._mambo.pose == 'pose':
             self.create_subscription(PoseStamped, 'pose', self._on_pose, quality)
         self.expect(lambda: self._pilot is not None and self._pilot.phase is Phase.FLYING)
+
+    def _arm(self) -> str:
+        """Let the drone take off; return why not, empty where it may."""
+        problem = self.arm_problem()
+        if self._pilot is None or problem:
+            return problem or 'the driver is not active'
+        return self._pilot.permit(time.monotonic())
 
     def disconnect_robot(self) -> None:
         """Leave the drone to its firmware."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from maasi_drivers import geofence
+from maasi_drivers.arm_permission import UNTIL_ARM, ArmPermission, offer_arm
 from maasi_drivers.camera_driver import CameraDriver
 from maasi_drivers.mambo_settings import MamboSettings
 from maasi_drivers.measurement_feed import FeedPose, FeedState
@@ -32,7 +33,7 @@ class MamboOnboardDriver(CameraDriver):
     A drone with a program of its own; see `CameraDriver`, and docs/measurement_feed.md.
 
     The feed carries blobs and pose, orders go back ten times a second: be on the ground, hover, or
-    fly to a waypoint. It takes off when the driver is active and `mambo.arm` is true.
+    fly to a waypoint. It takes off when the service `arm` is called and `mambo.arm` is true.
     """
 
     links = ('mambo_feed',)
@@ -66,8 +67,10 @@ class MamboOnboardDriver(CameraDriver):
         self._up = False
         self._rising_since: float | None = None
         self._lost_since: float | None = None
-        # Why it landed for good.
+        # Why it landed.
         self._landed_for = ''
+        self._feed_state: FeedState | None = None
+        self._permission = ArmPermission(self._mambo.arm_timeout)
 
     def feed_sender(self) -> str | None:
         """Return the drone's address."""
@@ -80,6 +83,19 @@ class MamboOnboardDriver(CameraDriver):
         self._sender = OrderSender(self._mambo.address, self._mambo.order_port)
         self.create_wall_timer(_PERIOD, self._send)
         self.expect(lambda: self._up)
+        offer_arm(self, self._arm)
+
+    def _arm(self) -> str:
+        """Let the drone take off; return why not, empty where it may."""
+        problem = self.arm_problem()
+        if not problem and not self._mambo.arm:
+            problem = 'on the ground: it may not take off (parameter mambo.arm)'
+        if not problem and self._feed_state is not FeedState.GROUND:
+            problem = 'it is in the air, or not heard'
+        if not problem:
+            self._up, self._landed_for, self._rising_since = False, '', None
+            self._permission.give(time.monotonic())
+        return problem
 
     def disconnect_robot(self) -> None:
         """Leave the drone to its program."""
@@ -100,6 +116,7 @@ class MamboOnboardDriver(CameraDriver):
 
     def stop_robot(self) -> None:
         """Land, as the driver ends."""
+        self._permission.end()
         self._give_up('the driver stops')
         for _ in range(_FAREWELLS):
             self._send()
@@ -159,9 +176,12 @@ class MamboOnboardDriver(CameraDriver):
     def _go_on(self, pose: FeedPose, place: Pose) -> str:
         """Do what the flight asks for; return why it takes no goals, or nothing."""
         mambo, now = self._mambo, time.monotonic()
+        self._feed_state = pose.state
         if self._landed_for:
             landed = pose.state == FeedState.GROUND
-            return f'{"landed" if landed else "landing"}: {self._landed_for}'
+            if landed:
+                return f'landed: {self._landed_for}, {UNTIL_ARM}'
+            return f'landing: {self._landed_for}'
         if not mambo.arm:
             return 'on the ground: it may not take off (parameter mambo.arm)'
         if 0.0 <= pose.battery < mambo.battery_minimum:
@@ -176,9 +196,12 @@ class MamboOnboardDriver(CameraDriver):
             return (
                 self._give_up(f'the drone is {pose.state.name.lower()} by itself') if down else ''
             )
-        self._goal, self._order = self._start.position, OrderKind.GO
         if self._rising_since is None:
+            if not self._permission.holds(now):
+                return f'on the ground, {UNTIL_ARM}'
+            self._permission.end()
             self._rising_since = now
+        self._goal, self._order = self._start.position, OrderKind.GO
         height = self._start.position[2] - place.position[2]
         self._up = pose.state == FeedState.AIR and abs(height) <= _ALTITUDE_TOLERANCE
         if not self._up and now - self._rising_since > mambo.take_off_timeout:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_drivers import geofence
+from maasi_drivers.arm_permission import UNTIL_ARM, ArmPermission
 from maasi_drivers.mambo_link import PositionEvent
 from maasi_drivers.mambo_reckoning import DeadReckoning
 from maasi_drivers.mambo_settings import LEAST_TILT, MOST_TILT, MamboSettings
@@ -146,7 +147,7 @@ class MamboPilot:
         self._cancelled_at: float | None = None
         # Why it landed for good.
         self._ended = ''
-        self._resting = False
+        self._permission = ArmPermission(settings.arm_timeout)
 
     # ---- where it is -------------------------------------------------------------------------
 
@@ -250,14 +251,43 @@ class MamboPilot:
         forward, left, up, turn = shares.tolist()
         self.link.steer(forward, left, up, turn)
 
+    def permit(self, now: float) -> str:
+        """Let it take off once; return why not, empty where it may; `now` as in `update`."""
+        problem = self._objection()
+        if problem:
+            self._permission.end()
+            return problem
+        self._ended = ''
+        self._permission.give(now)
+        return ''
+
+    def _objection(self) -> str:
+        if self.phase is Phase.LANDING:
+            return 'it lands'
+        if self.phase not in (Phase.CONNECTING, Phase.GROUND):
+            return 'it is in the air already'
+        low = self._battery_text() if self._battery_low else ''
+        return self.link.error or self._unfit() or low
+
+    def _unfit(self) -> str:
+        """Return which parameter keeps it on the ground, or nothing."""
+        if not self.settings.arm:
+            return 'on the ground: it may not take off (parameter mambo.arm)'
+        if self.settings.full_speed is None:
+            return (
+                'on the ground: its speed at the largest tilt is not measured (parameter '
+                'mambo.full_speed; measure_mambo says it)'
+            )
+        return ''
+
     def goal_taken(self) -> None:
-        """Note that it has somewhere to go: if it rests on the ground it takes off again."""
+        """Note that it has somewhere to go."""
         self._cancelled_at = None
-        self._resting = False
 
     def goal_cancelled(self, now: float) -> None:
         """Note that its goal was cancelled: it hovers, and lands if no other follows."""
-        self._resting |= self.phase in (Phase.CONNECTING, Phase.GROUND)
+        if self.phase in (Phase.CONNECTING, Phase.GROUND):
+            self._permission.end()
         self.hover()
         self._cancelled_at = now
 
@@ -311,29 +341,25 @@ class MamboPilot:
         """Take off if nothing speaks against it."""
         state = self.link.flying_state
         if self._ended:
-            return self._ended
-        if not self.settings.arm:
-            return 'on the ground: it may not take off (parameter mambo.arm)'
-        if self.settings.full_speed is None:
-            return (
-                'on the ground: its speed at the largest tilt is not measured (parameter '
-                'mambo.full_speed; measure_mambo says it)'
-            )
-        if self._resting:
-            # Where its goal was cancelled it waits for another one.
-            return ''
+            return f'{self._ended}, {UNTIL_ARM}'
+        if problem := self._unfit():
+            return problem
         if state == 'emergency':
             return self._give_up('the Mambo is in emergency: restart it')
+        flies = state in ('hovering', 'flying', 'takingoff')
+        if self._battery_low:
+            self._permission.end()
+            return self._battery_text()
+        if not self._permission.holds(now):
+            return f'{"in the air, not by this driver" if flies else "on the ground"}, {UNTIL_ARM}'
         if state != 'landed':
-            if state in ('hovering', 'flying', 'takingoff'):
+            if flies:
                 # Of a driver before this one.
                 self._begin(Phase.TAKING_OFF, now)
                 return Phase.TAKING_OFF.value
             return 'on the ground: nothing heard of its state yet'
         if self.link.battery < 0.0:
             return 'on the ground: nothing heard of its battery yet'
-        if self._battery_low:
-            return self._battery_text()
         if not self.has_pose:
             return f'on the ground: {self._lost_text(now) or "no position yet"}'
         self._begin(Phase.TAKING_OFF, now)
@@ -341,16 +367,16 @@ class MamboPilot:
         return Phase.TAKING_OFF.value
 
     def _begin(self, phase: Phase, now: float) -> None:
+        self._permission.end()
         self.phase, self._since = phase, now
 
     def _come_down(self) -> str:
         if self.link.flying_state != 'landed':
             return f'landing: {self._ended or "its goal was cancelled"}'
         self.phase = Phase.GROUND
-        self._resting = not self._ended
         if self._ended:
             self._ended = f'landed: {self._ended}'
-        return self._ended
+        return f'{self._ended or "landed: its goal was cancelled"}, {UNTIL_ARM}'
 
     def _stay_up(self, now: float, lost: float | None) -> str:
         flying_state = self.link.flying_state

@@ -16,7 +16,15 @@ class MamboSettings(Settings):
     """How the driver reaches a Mambo, and what it may have it do."""
 
     arm: bool = Field(
-        default=False, description='Whether the driver lets it take off; it never does without'
+        default=False,
+        description='Whether the driver may let it take off: each time the service arm is called, '
+        'and never without',
+    )
+    arm_timeout: float = Field(
+        default=60.0,
+        gt=0.0,
+        description='Time after the service arm in which it has to take off; then it is to be '
+        'called again [s]',
     )
     address: str = Field(
         default='192.168.99.3',

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent_driver import BATTERY, ODOMETRY, STOP, AgentDriver, DataT, FloatArray
+from maasi_drivers.agent_driver import BATTERY, ODOMETRY, AgentDriver, DataT, FloatArray
 from maasi_drivers.arm_permission import offer_arm
 from maasi_drivers.arrival_clock import ArrivalClock
 from maasi_drivers.mavlink.link import VehicleLink
@@ -114,12 +114,9 @@ class MavlinkRobot(AgentDriver[DataT]):
 
     def _arm(self) -> str:
         """Let the vehicle take off; return why not, empty where it may."""
-        link = self._vehicle_link
-        if link is None or not self.active:
-            return 'the driver is not active'
-        for kind in (STOP, BATTERY):
-            if kind in self._troubles:
-                return self._troubles[kind]
+        link, problem = self._vehicle_link, self.arm_problem()
+        if link is None or problem:
+            return problem or 'the driver is not active'
         if self._localised and (self._history.latest is None or ODOMETRY in self._troubles):
             return f'no {self._posed}'
         with link.vehicle() as vehicle:

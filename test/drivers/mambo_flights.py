@@ -5,6 +5,7 @@ import socket
 
 import numpy as np
 from robot_team import MAMBO, Team, image_message
+from std_srvs.srv import Trigger
 
 from maasi_drivers.measurement_feed import FeedPacket, encode
 from maasi_filter.pose import Pose
@@ -31,6 +32,7 @@ class Flight:
     """
 
     def __init__(self, mambo=None, **settings):
+        self.permitted = False
         self.address = free_address()
         firmware = MamboFirmware(
             Pose.from_yaw([*START[:2], 0.0], YAW),
@@ -86,8 +88,22 @@ class Flight:
     def status(self):
         return self.team.state.goal_status if self.team.states else None
 
+    def permit(self):
+        """Call the service `arm` until it is granted."""
+        client = self.team.create_client(Trigger, 'arm')
+        self.until(client.service_is_ready)
+        granted = False
+        while not granted:
+            answer = client.call_async(Trigger.Request())
+            self.until(answer.done)
+            granted = answer.result().success
+        self.permitted = True
+        self.team.destroy_client(client)
+
     def up(self):
-        """Wait until it is in the air and takes goals."""
+        """Let it take off, and wait until it is in the air and takes goals."""
+        if not self.permitted:
+            self.permit()
         self.until(lambda: self.status in (AgentState.IDLE, AgentState.ABORTED))
         return self
 

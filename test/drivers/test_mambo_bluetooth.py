@@ -34,6 +34,7 @@ class Flight:
         settings = MamboSettings(**settings, link_timeout=1.5, land_after=1.0)
         self.motion = make_motion(MOTION)
         self.pilot = MamboPilot(self.link, self.motion, settings, HOME, FENCE)
+        self.pilot.permit(time.monotonic())
 
     def step(self):
         now = time.monotonic()

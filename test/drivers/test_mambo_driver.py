@@ -20,6 +20,7 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, parameters_of, rendered
 
 from maasi_drivers.agent_driver import _WATCH_PERIOD
+from maasi_drivers.arm_permission import UNTIL_ARM
 from maasi_drivers.driver_settings import DriverSettings
 from maasi_drivers.mambo_driver import _POLL_PERIOD, MamboDriver
 from maasi_drivers.mambo_settings import MamboSettings
@@ -326,7 +327,10 @@ def test_a_cancelled_goal_has_it_hover_then_land_and_another_one_takes_it_up(fly
     flight.until(lambda: flight.speed < 0.05)
     assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
     flight.until(lambda: flight.flying_state == FlyingState.LANDED)
-    flight.until(lambda: flight.status == AgentState.CANCELED)
+    flight.until(lambda: UNTIL_ARM in flight.reason)
+    assert UNTIL_ARM in flight.team.refused(GOAL)
+    flight.permit()
+    flight.up()
     _, result = flight.team.send_accepted(GOAL)
     flight.until(result.done)
     assert result.result().status == GoalStatus.STATUS_SUCCEEDED

@@ -9,7 +9,9 @@ from numpy.testing import assert_allclose
 from onboard_program import AIR, GROUND, OnboardProgram
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, Team, parameters_of
+from std_srvs.srv import Trigger
 
+from maasi_drivers.arm_permission import UNTIL_ARM
 from maasi_drivers.mambo_onboard_driver import MamboOnboardDriver
 from maasi_drivers.measurement_feed import FeedError, FeedPose, FeedState, decode, encode
 from maasi_drivers.projection import Camera
@@ -66,7 +68,20 @@ class Flight:
     def until(self, condition):
         self.team.until(condition, f'{self.reason!r}, {self.drone.state}')
 
+    def permit(self):
+        client = self.team.create_client(Trigger, 'arm')
+        self.until(client.service_is_ready)
+        granted = False
+        while not granted:
+            answer = client.call_async(Trigger.Request())
+            self.until(answer.done)
+            granted = answer.result().success
+        self.team.destroy_client(client)
+
     def up(self):
+        self.until(lambda: UNTIL_ARM in self.reason)
+        assert self.drone.take_offs == 0
+        self.permit()
         self.until(lambda: self.team.states and self.team.state.goal_status == AgentState.IDLE)
         return self
 
@@ -139,7 +154,7 @@ def test_a_drone_that_is_not_heard_is_told_to_hover_then_to_land(fly):
     flight.until(lambda: OrderKind.HOLD in flight.drone.kinds[known:])
     flight.until(lambda: flight.drone.state == GROUND)
     flight.drone.silent = False
-    flight.until(lambda: flight.reason == 'landed: nothing heard from the drone')
+    flight.until(lambda: flight.reason == f'landed: nothing heard from the drone, {UNTIL_ARM}')
     assert flight.drone.take_offs == 1
 
 
@@ -148,7 +163,7 @@ def test_a_low_battery_lands_it_and_it_stays_down(fly):
     flight.on_its_way()
     flight.drone.charge = 0.05
     flight.until(lambda: flight.drone.state == GROUND)
-    flight.until(lambda: flight.reason == 'landed: battery at 0.05, below 0.10')
+    flight.until(lambda: flight.reason == f'landed: battery at 0.05, below 0.10, {UNTIL_ARM}')
     flight.drone.charge = 1.0
     assert flight.team.refused(GOAL)
     assert flight.drone.take_offs == 1

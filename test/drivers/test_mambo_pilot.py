@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from simulated_mambo import FENCE, HOME, STEP, TILT, Flight, full_speed, measure_and_fly
 
+from maasi_drivers.arm_permission import UNTIL_ARM
 from maasi_drivers.mambo_link import PositionEvent
 from maasi_drivers.mambo_pilot import Phase
 from maasi_drivers.mambo_reckoning import DeadReckoning
@@ -32,7 +33,7 @@ def test_it_takes_off_flies_to_waypoints_and_lands():
     flight.pilot.end('the search is over')
     flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
     flight.step(5)
-    assert flight.pilot.problem == 'landed: the search is over'
+    assert flight.pilot.problem == f'landed: the search is over, {UNTIL_ARM}'
     flight.step(100)
     assert flight.firmware.take_offs == 1
 
@@ -140,6 +141,32 @@ def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown():
 # ---- safety ----------------------------------------------------------------------------------
 
 
+def test_nothing_takes_off_before_the_service_is_called():
+    flight = Flight()
+    flight.pilot.goal_cancelled(0.0)
+    flight.step(100)
+    assert flight.pilot.problem == f'on the ground, {UNTIL_ARM}'
+    assert flight.firmware.take_offs == 0
+    # A permission that is not used ends.
+    flight.cut_down = True
+    assert flight.pilot.permit(flight.time) == ''
+    flight.pilot._permission.timeout = 1.0
+    assert flight.pilot.permit(flight.time - 2.0) == ''
+    flight.cut_down = False
+    flight.step(100)
+    assert flight.firmware.take_offs == 0
+    assert flight.pilot.permit(flight.time) == ''
+    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    assert flight.pilot.permit(flight.time) == 'it is in the air already'
+    # A driver before this one left it in the air.
+    flight.pilot.phase = Phase.GROUND
+    flight.step(20)
+    assert flight.pilot.problem == f'in the air, not by this driver, {UNTIL_ARM}'
+    assert flight.pilot.permit(flight.time) == ''
+    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    assert flight.firmware.take_offs == 1
+
+
 def test_nothing_takes_off_without_arm():
     flight = Flight(arm=False)
     flight.step(200)
@@ -201,7 +228,7 @@ def test_a_low_battery_lands_it_and_keeps_it_down():
     assert flight.time - began <= AT_MOST
     flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
     flight.step(2)
-    assert flight.pilot.problem == 'landed: battery at 0.08, below 0.10'
+    assert flight.pilot.problem == f'landed: battery at 0.08, below 0.10, {UNTIL_ARM}'
     other = Flight(battery=0.05)
     other.step(100)
     assert other.firmware.take_offs == 0 and 'battery' in other.pilot.problem
@@ -217,8 +244,11 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
     assert flight.time - began >= flight.pilot.settings.cancel_landing
     flight.step(50)
-    assert flight.pilot.problem == '' and flight.firmware.take_offs == 1
     flight.pilot.goal_taken()
+    flight.step(50)
+    assert flight.pilot.problem == f'on the ground, {UNTIL_ARM}'
+    assert flight.firmware.take_offs == 1
+    assert flight.pilot.permit(flight.time) == ''
     flight.until(lambda: flight.pilot.phase is Phase.FLYING)
     assert flight.firmware.take_offs == 2
 
