@@ -257,7 +257,7 @@ class MamboPilot:
         if problem:
             self._permission.end()
             return problem
-        self._ended = ''
+        self._ended, self._cancelled_at = '', None
         self._permission.give(now)
         return ''
 

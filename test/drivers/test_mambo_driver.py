@@ -330,7 +330,7 @@ def test_a_cancelled_goal_has_it_hover_then_land_and_another_one_takes_it_up(fly
     flight.until(lambda: UNTIL_ARM in flight.reason)
     assert UNTIL_ARM in flight.team.refused(GOAL)
     flight.permit()
-    flight.up()
+    flight.until(lambda: flight.status == AgentState.CANCELED)
     _, result = flight.team.send_accepted(GOAL)
     flight.until(result.done)
     assert result.result().status == GoalStatus.STATUS_SUCCEEDED
