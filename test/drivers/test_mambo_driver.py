@@ -315,7 +315,8 @@ def test_a_low_battery_lands_it(fly):
     flight.fake.firmware.charge.charge = 0.08
     hears_why(flight, result, 'battery at 0.08, below 0.10')
     flight.until(lambda: flight.flying_state == FlyingState.LANDED)
-    flight.until(lambda: flight.reason == 'landed: battery at 0.08, below 0.10')
+    low = 'landed: battery at 0.08, below 0.10, until the service arm is called'
+    flight.until(lambda: flight.reason == low)
 
 
 def test_a_cancelled_goal_has_it_hover_then_land_and_another_one_takes_it_up(fly):
