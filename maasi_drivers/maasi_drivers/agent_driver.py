@@ -727,7 +727,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         elif age > timeout or ODOMETRY in self._troubles:
             text = f'no {self._posed} for {age:.1f} s'
             if self.begin_trouble(ODOMETRY, text):
-                self.get_logger().warning(f'{text}: the robot is stopped')
+                self.get_logger().warning(f'{text}: the robot is told to stop')
                 self._watches = 0
             self.hold_robot()
             if self._watches % _WATCHES_PER_STATE == 0:
@@ -750,7 +750,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if age > timeout:
             text = f'the pose has not changed for {age:.1f} s'
             if self.begin_trouble(_FROZEN_POSE, text):
-                self.get_logger().warning(f'odom: {text}: the robot is stopped')
+                self.get_logger().warning(f'odom: {text}: the robot is told to stop')
 
     def _watch_sensor(self, placed: StampedPose) -> None:
         """Stop a robot whose sensor is silent."""
@@ -761,7 +761,7 @@ class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
         if timeout and age > timeout:
             text = f'no new {self.sensed} for {age:.1f} s'
             if self.begin_trouble(_SENSOR, text):
-                self.get_logger().warning(f'{text}: the robot is stopped')
+                self.get_logger().warning(f'{text}: the robot is told to stop')
 
     def _on_battery(self, message: BatteryState) -> None:
         if self.settings.lockstep:

@@ -205,7 +205,8 @@ class MamboDriver(CameraDriver):
             return
         pilot.update(now)
         self._judge(pilot)
-        if link.battery >= 0.0 and link.battery != self._battery:
+        if link.battery >= 0.0:
+            # The drone says it when it changes.
             self.take_charge(link.battery)
         state, stamp = pilot.state, self.arrivals.stamp(now)
         if stamp is None:

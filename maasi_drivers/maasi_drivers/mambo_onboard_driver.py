@@ -158,7 +158,7 @@ class MamboOnboardDriver(CameraDriver):
         """Take where the drone says that it was."""
         if not self.active or not self._is_new('feed', stamp):
             return
-        if pose.battery >= 0.0 and pose.battery != self._battery:
+        if pose.battery >= 0.0:
             self.take_charge(pose.battery)
         place = compose(self._origin, Pose(pose.position, _orientation(pose)))
         problem = self._go_on(pose, place)

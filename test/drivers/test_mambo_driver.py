@@ -281,6 +281,9 @@ def test_what_is_lost_has_it_hover_then_land(fly, fault, reason):
     hears_why(flight, result, reason)
     flight.until(lambda: flight.flying_state != FlyingState.FLYING)
     flight.until(lambda: flight.flying_state == FlyingState.LANDED)
+    # The drone may have landed by itself before its driver gives up.
+    ends = f'landing: {reason}', f'landed: {reason}'
+    flight.until(lambda: flight.reason.startswith(ends))
     flight.fake.cut_up = flight.fake.cut_down = False
     flight.fake.position_sent = 'true'
     flight.until(lambda: flight.reason.startswith(f'landed: {reason}'))

@@ -65,10 +65,10 @@ def is_known(node):
     return all(counts[key] == number for key, number in own.items() if '/_' not in key[1])
 
 
-def until(condition, wait=lambda: time.sleep(0.01)):
+def until(condition, wait=lambda: time.sleep(0.01), what=lambda: ''):
     deadline = time.monotonic() + PATIENCE
     while not condition():
-        assert time.monotonic() < deadline
+        assert time.monotonic() < deadline, what()
         wait()
 
 
@@ -90,7 +90,11 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
         for step in ('activate', 'deactivate', 'cleanup', 'configure'):
             assert getattr(node, f'trigger_{step}')().name == 'SUCCESS', (step, node.problem)
             executor.spin_once(0.0)
-    until(lambda: (made_by(node), in_graph(node)) == configured, spin)
+    until(
+        lambda: (made_by(node), in_graph(node)) == configured,
+        spin,
+        lambda: f'{made_by(node)}, {in_graph(node)}, configured: {configured}',
+    )
     assert node.trigger_cleanup().name == 'SUCCESS'
     until(lambda: (made_by(node), in_graph(node)) == unconfigured, spin)
     executor.shutdown()
