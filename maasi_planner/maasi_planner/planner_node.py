@@ -65,6 +65,8 @@ from maasi_planner.team_goals import Course, HeardState, TeamGoals
 FloatArray = NDArray[np.float64]
 
 _LOOK_PERIOD = 0.1
+# With a longer gap it was the planner itself that stood still [s].
+_LONGEST_LOOK = 1.0
 # At the end: rounds in which results are sent.
 _LAST_TASKS = 5
 # In lockstep: longest wait for an update until its batch is published once more [s].
@@ -616,7 +618,7 @@ class PlannerNode(SearchNode[PlannerNodeSettings]):
     def _watch_filter(self, now: float) -> None:
         """Hold the robots while the filter does not answer."""
         since, self._looked_at = now - self._looked_at, now
-        if since > 2.0 * _LOOK_PERIOD:
+        if since > _LONGEST_LOOK:
             self._filter_watch.stalled(since)
         if now - self._names_at >= 1.0:
             self._names_at = now
