@@ -1,0 +1,183 @@
+"""Stores recordings of golden runs, and compares a run with its recording."""
+
+from __future__ import annotations
+
+import json
+import lzma
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from golden_runs import Recording
+
+FOLDER = Path(__file__).resolve().parent / 'stored'
+# Of lengths, as a share of the longest side of the environment; of other numbers, relative to
+# them where they are above 1. Whole numbers and names are compared exactly.
+TOLERANCE = 1e-6
+# Rounded to less than a tenth of the tolerance.
+_ROUNDED = 0.1 * TOLERANCE
+# Columns of lengths [m].
+LENGTHS = ('waypoint', 'mean', 'position')
+# Only in recordings to the bit.
+_BITS = 'bits'
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A quantity of a run that is not as it was.
+
+    Attributes
+    ----------
+    run : str
+        Which.
+    step : int, optional
+        At which it differs first; None: at the end.
+    quantity : str
+        Which.
+    text : str
+        By how much.
+    """
+
+    run: str
+    step: int | None
+    quantity: str
+    text: str
+
+    def __str__(self) -> str:
+        where = 'at the end' if self.step is None else f'step {self.step}'
+        return f'{self.run}: {where}: {self.quantity}: {self.text}'
+
+
+def path_of(name: str) -> Path:
+    """Return where the recordings of a scenario or an experiment are stored."""
+    return FOLDER / f'{name}.json.xz'
+
+
+def rounded(recording: Recording) -> Recording:
+    """Return a recording as it is stored: rounded, and without hashes."""
+    scale = recording['size']
+    result: Recording = {'size': scale}
+    for kind, table in recording.items():
+        if kind != 'size':
+            result[kind] = {
+                column: _round(values, scale if column in LENGTHS else 1.0)
+                for column, values in table.items()
+                if column != _BITS
+            }
+    return result
+
+
+def _round(value: Any, scale: float) -> Any:
+    if isinstance(value, list):
+        return [_round(item, scale) for item in value]
+    if isinstance(value, float) and math.isfinite(value):
+        return round(value, math.ceil(-math.log10(_ROUNDED * scale)))
+    return value
+
+
+def write(path: Path, recordings: dict[str, Recording]) -> None:
+    """Store recordings of runs by their names."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(recordings, separators=(',', ':'))
+    path.write_bytes(lzma.compress(text.encode(), preset=9 | lzma.PRESET_EXTREME))
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Return what was stored."""
+    return json.loads(lzma.decompress(path.read_bytes()))
+
+
+def differences(
+    run: str, stored: Recording, now: Recording, tolerance: float = TOLERANCE
+) -> list[Difference]:
+    """Return what differs between two recordings of a run: of each quantity the first place.
+
+    Parameters
+    ----------
+    run : str
+        Its name, for the messages.
+    stored, now : Recording
+        Before and now.
+    tolerance : float
+        See `TOLERANCE`; 0 compares to the bit.
+    """
+    found = []
+    for kind in [*stored, *(kind for kind in now if kind not in stored)]:
+        before, after = stored.get(kind, {}), now.get(kind, {})
+        if kind == 'size':
+            if before != after:
+                found.append(Difference(run, None, 'size', f'{before:g} m before, {after:g} m now'))
+        elif kind == 'end':
+            found += _at_end(run, stored['size'], before, after, tolerance)
+        else:
+            found += _in_table(run, kind, stored['size'], before, after, tolerance)
+    return sorted(found, key=lambda item: math.inf if item.step is None else item.step)
+
+
+def _at_end(
+    run: str, size: float, before: dict[str, Any], after: dict[str, Any], tolerance: float
+) -> Iterator[Difference]:
+    for quantity in [*before, *(name for name in after if name not in before)]:
+        scale = size if quantity in LENGTHS else None
+        wrong = _difference(before.get(quantity), after.get(quantity), scale, tolerance)
+        if wrong is not None:
+            yield Difference(run, None, quantity, wrong[1])
+
+
+def _in_table(
+    run: str,
+    kind: str,
+    size: float,
+    before: dict[str, list[Any]],
+    after: dict[str, list[Any]],
+    tolerance: float,
+) -> Iterator[Difference]:
+    steps = before.get('step', []), after.get('step', [])
+    for quantity in before or after:
+        rows = before.get(quantity, []), after.get(quantity, [])
+        # Stored recordings have no hashes.
+        if quantity == _BITS and not all(_BITS in table for table in (before, after) if table):
+            continue
+        scale = size if quantity in LENGTHS else None
+        every = [_difference(old, new, scale, tolerance) for old, new in zip(*rows)]
+        wrong = [(step, item[1]) for step, item in zip(steps[0], every) if item is not None]
+        if wrong:
+            step, text = wrong[0]
+            text += f'; so in {len(wrong)} of {len(every)}'
+            yield Difference(run, step, f'{kind}.{quantity}', text)
+    numbers = len(steps[0]), len(steps[1])
+    if numbers[0] != numbers[1]:
+        longer = max(steps, key=len)
+        text = f'{numbers[0]} before, {numbers[1]} now'
+        yield Difference(run, longer[min(numbers)], f'number of {kind}', text)
+
+
+def _difference(
+    before: Any, after: Any, scale: float | None, tolerance: float
+) -> tuple[float, str] | None:
+    """Return by how much two values differ, also in words; None if they do not.
+
+    Parameters
+    ----------
+    before, after : number, text, or lists of them
+        The values.
+    scale : float, optional
+        Of lengths [m]; None: of numbers that are none.
+    tolerance : float
+        See `TOLERANCE`.
+    """
+    if isinstance(before, list) and isinstance(after, list):
+        if len(before) != len(after):
+            return math.inf, f'{len(before)} before, {len(after)} now'
+        every = [_difference(old, new, scale, tolerance) for old, new in zip(before, after)]
+        return max((item for item in every if item is not None), default=None)
+    if isinstance(before, float) and isinstance(after, float):
+        moved = abs(after - before)
+        allowed = tolerance * (max(1.0, abs(before)) if scale is None else scale)
+        if before == after or moved <= allowed or (math.isnan(before) and math.isnan(after)):
+            return None
+        share = '' if scale is None else f' m, {moved / scale:.2g} of the size'
+        return moved, f'moved by {moved:.3g}{share} ({before:.9g} before, {after:.9g} now)'
+    return None if before == after else (math.inf, f'{before} before, {after} now')

@@ -1,0 +1,206 @@
+"""Runs whose decisions, filter updates and found targets are stored, and what is noted of each."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from maasi_filter import SearchFilter
+from maasi_planner.coordinator import Coordinator
+from maasi_sim.cuboid_mission import CuboidMission
+from maasi_sim.cuboid_scenario import CuboidScenario, load_any_scenario, mission_of
+from maasi_sim.experiments.registry import Experiment, experiments
+from maasi_sim.search import search
+from maasi_sim.yaml_files import ScenarioError
+
+SCENARIOS = Path(__file__).resolve().parents[2] / 'config' / 'scenarios'
+SEEDS = (1, 2, 3)
+# Simulated time of a search at most [s], and steps of a search of buildings.
+TIME_LIMIT = 120.0
+STEP_LIMIT = 300
+
+# Of one run: 'size' is the longest side of the environment [m], 'end' what the run came to, and
+# every other entry a table of events, columns by name.
+Recording = dict[str, Any]
+
+
+class Log:
+    """Notes what a run does.
+
+    Attributes
+    ----------
+    size : float
+        Longest side of the environment [m].
+    tables : dict
+        Rows by kind of event; 'bits' is a hash of all numbers of the row.
+    """
+
+    def __init__(self) -> None:
+        self.size = 0.0
+        self.tables: dict[str, list[dict[str, Any]]] = {}
+        self._step = 0
+
+    def add(self, kind: str, **row: Any) -> None:
+        """Add an event."""
+        self.tables.setdefault(kind, []).append(row)
+
+    def planned(self, step: int, decision: Any) -> None:
+        """Note what a planner decided at a step, if anything."""
+        self._step = step
+        for name, robot in [] if decision is None else decision.robots.items():
+            self.add(
+                'decisions',
+                step=step,
+                robot=name,
+                chosen=int(robot.chosen),
+                waypoint=robot.waypoint.tolist(),
+                objective=0.0 if robot.stays else float(robot.objective[robot.chosen]),
+                bits=bits(robot.waypoint, robot.positions, robot.yaws, robot.objective),
+            )
+
+    def updated(self, search_filter: SearchFilter, members: list[str], result: Any) -> None:
+        """Note a filter update of the step at which was planned last."""
+        self.size = float(np.ptp(search_filter.bounds, axis=1).max())
+        found = search_filter.own_found_targets()
+        self.add(
+            'updates',
+            step=self._step,
+            members=members,
+            clusters=len(result.clusters),
+            found=len(found),
+            expected=float(result.expected_number),
+            explored=search_filter.exploration.explored_fraction(),
+            mean=[cluster.position.tolist() for cluster in result.clusters],
+            bits=bits(
+                *(item for c in result.clusters for item in (c.position, c.covariance, c.mass)),
+                *(item for target in found for item in (target.position, target.covariance)),
+                search_filter.exploration.values,
+            ),
+        )
+        for target in result.newly_found:
+            position = target.position.tolist()
+            self.add('found', step=self._step, robot=target.robot, position=position)
+
+    def flown(self, record: Any) -> None:
+        """Note a whole search of buildings."""
+        self.size = float(np.ptp(record.mission.area, axis=1).max())
+        for step in range(record.steps + 1):
+            places = {name: path[step] for name, path in sorted(record.paths.items())}
+            self.add(
+                'flights',
+                step=step,
+                visited=int(record.visited[step]),
+                searching=int(record.active[step]),
+                position=[place.tolist() for place in places.values()],
+                bits=bits(*places.values()),
+            )
+        for shot in record.snapshots:
+            self.add('snapshots', step=shot.step, robot=shot.robot, cuboid=int(shot.cuboid))
+
+    def recording(self, end: dict[str, Any]) -> Recording:
+        """Return what was noted, and what the run came to."""
+        tables = {
+            kind: {column: [row[column] for row in rows] for column in rows[0]}
+            for kind, rows in self.tables.items()
+        }
+        return {'size': self.size, **tables, 'end': end}
+
+
+def bits(*values: Any) -> str:
+    """Return a short hash of numbers, which is another one if a bit of them is."""
+    digest = hashlib.sha256()
+    for value in values:
+        digest.update(np.ascontiguousarray(value).tobytes())
+    return digest.hexdigest()[:12]
+
+
+@contextmanager
+def noted() -> Iterator[Log]:
+    """Note what the filters, planners and searches of buildings in this process do meanwhile."""
+    log = Log()
+    update, plan, fly = SearchFilter.step, Coordinator.plan, CuboidMission.run
+
+    def noted_update(self: Any, measurements: Any, *arguments: Any, **options: Any) -> Any:
+        result = update(self, measurements, *arguments, **options)
+        log.updated(self, [item.robot for item in measurements], result)
+        return result
+
+    def noted_plan(self: Any, step: int, *arguments: Any, **options: Any) -> Any:
+        decision = plan(self, step, *arguments, **options)
+        log.planned(step, decision)
+        return decision
+
+    def noted_flight(self: Any, *arguments: Any, **options: Any) -> Any:
+        record = fly(self, *arguments, **options)
+        log.flown(record)
+        return record
+
+    with (
+        patch.object(SearchFilter, 'step', noted_update),
+        patch.object(Coordinator, 'plan', noted_plan),
+        patch.object(CuboidMission, 'run', noted_flight),
+    ):
+        yield log
+
+
+def run_scenario(path: Path, seed: int) -> Recording:
+    """Run a scenario in this process and return what it did."""
+    seeded = {'seed': (('seed',), seed)}
+    scenario = load_any_scenario(path, seeded)
+    if isinstance(scenario, CuboidScenario):
+        # A limit on wall time would make a decision depend on the machine.
+        unhurried = {'time': (('planner', 'time_limit'), 1e9)}
+        scenario = load_any_scenario(path, {**seeded, **unhurried})
+        assert isinstance(scenario, CuboidScenario)
+        with noted() as log:
+            record = mission_of(scenario).run(STEP_LIMIT)
+        return log.recording({'steps': record.steps, 'complete': record.complete, **record.how})
+    limit = min(TIME_LIMIT, scenario.limits.time)
+    scenario = load_any_scenario(path, {**seeded, 'limit': (('limits', 'time'), limit)})
+    with noted() as log:
+        result = search(scenario, seed)  # type: ignore[arg-type]
+    end = {
+        'reason': result.end_reason,
+        'steps': result.steps,
+        'measurements': result.measurements,
+        'position': [target.position.tolist() for target in result.found_targets],
+    }
+    return log.recording(end)
+
+
+def run_case(experiment: Experiment, index: int) -> Recording:
+    """Run a small case of an experiment on its first map and return what it did."""
+    with noted() as log:
+        outcome = experiment.run(experiment.cases(True)[index].settings, experiment.seed(0))
+    end = {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in outcome.summary.items()
+    }
+    return log.recording(end)
+
+
+def runs() -> dict[str, dict[str, Callable[[], Recording]]]:
+    """Return all golden runs: name of scenario or experiment, then what tells its runs apart."""
+    known: dict[str, dict[str, Callable[[], Recording]]] = {}
+    for path in sorted(SCENARIOS.glob('*.yaml')):
+        try:
+            load_any_scenario(path).check_pace(True, None)
+        except ScenarioError:
+            continue
+        known[path.stem] = {
+            f'seed {seed}': lambda path=path, seed=seed: run_scenario(path, seed) for seed in SEEDS
+        }
+    for name, experiment in experiments().items():
+        cases = experiment.cases(True)
+        # Often a fixed path, and the paper's own method.
+        known[name] = {
+            cases[index].name: lambda e=experiment, index=index: run_case(e, index)
+            for index in (0, len(cases) - 1)
+        }
+    return known
