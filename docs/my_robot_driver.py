@@ -10,10 +10,10 @@ import json
 import socket
 from typing import Any
 
+from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.camera_driver import CameraDriver
-from maasi_drivers.odometry import MapOdometry, StampedPose
-from maasi_filter.pose import Pose
-from maasi_filter.search_node import run
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.lifecycle_node import run
 
 ROVER = ('192.168.4.1', 9000)
 

@@ -21,7 +21,7 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'cuboid_planner_node = maasi_entry:maasi_planner.cuboid_planner_node',
+            'cuboid_planner_node = maasi_entry:maasi_planner.buildings.cuboid_planner_node',
             'planner_node = maasi_entry:maasi_planner.planner_node',
             'search_command = maasi_entry:maasi_planner.search_command',
         ],

@@ -6,7 +6,7 @@ setup(
     name='maasi_sim',
     version='0.1.0',
     packages=find_packages(),
-    package_data={'maasi_sim': ['discovery.xml']},
+    package_data={'maasi_sim.run': ['discovery.xml']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/maasi_sim']),
         ('share/maasi_sim', ['package.xml']),
@@ -20,11 +20,11 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'cuboid_sim_node = maasi_entry:maasi_sim.cuboid_sim_node',
+            'cuboid_sim_node = maasi_entry:maasi_sim.buildings.cuboid_sim_node',
             'sim_node = maasi_entry:maasi_sim.sim_node',
-            'fake_mambo = maasi_entry:maasi_sim.fake_mambo',
-            'fake_mavlink_vehicle = maasi_entry:maasi_sim.fake_mavlink_vehicle',
-            'run_scenario = maasi_entry:maasi_sim.run_scenario',
+            'fake_mambo = maasi_entry:maasi_sim.emulators.mambo.fake_mambo',
+            'fake_mavlink_vehicle = maasi_entry:maasi_sim.emulators.mavlink.fake_mavlink_vehicle',
+            'run_scenario = maasi_entry:maasi_sim.run.run_scenario',
         ],
     },
 )

@@ -4,7 +4,7 @@ import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
-from maasi_sim.processes import DOMAINS, Domain, ProcessError
+from maasi_sim.run.processes import DOMAINS, Domain, ProcessError
 
 
 @contextmanager

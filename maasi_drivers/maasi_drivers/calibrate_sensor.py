@@ -13,15 +13,15 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from maasi_drivers.bag_reader import BagError, BagReader
-from maasi_drivers.camera_settings import load_calibration
-from maasi_drivers.driver_settings import DriverSettings
-from maasi_drivers.image_encoding import decode_image, image_to_array
-from maasi_drivers.marker_detector import MarkerDetector
-from maasi_drivers.odometry import MapOdometry, PoseHistory, StampedPose
-from maasi_drivers.sensor_calibration import Look, SensorNoise, sensor_noise
-from maasi_filter.parameters import parameter_fields, unflatten
-from maasi_filter.pose import Pose
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
+from maasi_drivers.calibration.bag_reader import BagError, BagReader
+from maasi_drivers.calibration.sensor_calibration import Look, SensorNoise, sensor_noise
+from maasi_drivers.vision.camera_settings import load_calibration
+from maasi_drivers.vision.image_encoding import decode_image, image_to_array
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.parameters import parameter_fields, unflatten
 
 _IMAGES = ('camera/image_raw', 'camera/image_raw/compressed')
 _DETECTIONS = 'detections'

@@ -13,22 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from maasi_drivers.agent_driver import AgentDriver, Sighting
-from maasi_drivers.arrival_clock import ArrivalClock
-from maasi_drivers.camera_settings import CameraSettings, load_calibration
-from maasi_drivers.image_encoding import decode_image, image_to_array
-from maasi_drivers.image_source import ImageSourceError, VideoSource
-from maasi_drivers.marker_detector import MarkerDetector
-from maasi_drivers.measurement_feed import FeedPose, FeedReceiver
-from maasi_drivers.odometry import StampedPose
-from maasi_drivers.projection import box_view_margin
-from maasi_drivers.segmentation import Blobs
+from maasi_drivers.agent.agent_driver import AgentDriver, Sighting
+from maasi_drivers.agent.arrival_clock import ArrivalClock
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.vision.camera_settings import CameraSettings, load_calibration
+from maasi_drivers.vision.camera_view import box_view_margin
+from maasi_drivers.vision.image_encoding import decode_image, image_to_array
+from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_drivers.vision.measurement_feed import FeedPose, FeedReceiver
+from maasi_drivers.vision.segmentation import Blobs
 from maasi_drivers.warm_up import warm_up
-from maasi_filter.conversions import stamp_from_ros
-from maasi_filter.detection_model import BoxDetection
-from maasi_filter.pose import Pose
-from maasi_filter.qos import RELIABLE, SENSOR, sensor_reader
-from maasi_filter.search_node import SettingsError
+from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.conversions import stamp_from_ros
+from maasi_filter.ros.lifecycle_node import SettingsError
+from maasi_filter.ros.qos import RELIABLE, SENSOR, sensor_reader
 
 ImageArray = NDArray[np.uint8]
 # An image that may still have to be decoded, or what was found in it on board.

@@ -11,9 +11,9 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
-from maasi_drivers.command_publisher import CommandPublisher
-from maasi_drivers.driver_settings import LOCKSTEP_LEASE, GuardSettings
-from maasi_filter.search_node import SearchNode, run
+from maasi_drivers.agent.driver_settings import LOCKSTEP_LEASE, GuardSettings
+from maasi_drivers.links.command_publisher import CommandPublisher
+from maasi_filter.ros.lifecycle_node import SearchNode, run
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1

@@ -10,19 +10,19 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.action.server import CancelResponse, ServerGoalHandle
 
-from maasi_drivers import geofence
-from maasi_drivers.agent_driver import FloatArray
-from maasi_drivers.arm_permission import offer_arm
+from maasi_drivers.agent import geofence
+from maasi_drivers.agent.agent_driver import FloatArray
+from maasi_drivers.agent.arm_permission import offer_arm
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_drivers.camera_driver import CameraDriver
-from maasi_drivers.mambo_link import MamboLink, MamboLinkError
-from maasi_drivers.mambo_pilot import MamboPilot, Phase, tilt_limit
-from maasi_drivers.mambo_settings import MamboSettings
-from maasi_drivers.odometry import StampedPose
-from maasi_drivers.waypoint_follower import Goal
-from maasi_filter.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
-from maasi_filter.pose import Pose
-from maasi_filter.qos import sensor_reader
-from maasi_filter.search_node import SettingsError, run
+from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
+from maasi_drivers.links.mambo.pilot import MamboPilot, Phase, tilt_limit
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.lifecycle_node import SettingsError, run
+from maasi_filter.ros.qos import sensor_reader
 from maasi_msgs.action import GoToWaypoint
 from maasi_planner.motion import RobotState
 

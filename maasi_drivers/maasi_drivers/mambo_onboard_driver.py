@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers import geofence
-from maasi_drivers.arm_permission import UNTIL_ARM, ArmPermission, offer_arm
+from maasi_drivers.agent import geofence
+from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission, offer_arm
+from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.camera_driver import CameraDriver
-from maasi_drivers.mambo_settings import MamboSettings
-from maasi_drivers.measurement_feed import FeedPose, FeedState
-from maasi_drivers.odometry import StampedPose
-from maasi_drivers.waypoint_orders import OrderKind, OrderSender
-from maasi_filter.pose import Pose, compose, inverse, quaternion_product
-from maasi_filter.search_node import SettingsError, run
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.waypoint_orders import OrderKind, OrderSender
+from maasi_drivers.vision.measurement_feed import FeedPose, FeedState
+from maasi_filter.models.pose import Pose, compose, inverse, quaternion_product
+from maasi_filter.ros.lifecycle_node import SettingsError, run
 from maasi_msgs.action import GoToWaypoint
 
 # From one order to the next [s]; without them the program on board hovers, then lands.

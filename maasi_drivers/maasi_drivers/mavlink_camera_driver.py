@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from maasi_drivers.camera_driver import CameraDriver, Picture
 from maasi_drivers.mavlink_driver import MavlinkRobot
-from maasi_filter.search_node import run
+from maasi_filter.ros.lifecycle_node import run
 
 
 class MavlinkCameraDriver(MavlinkRobot[Picture], CameraDriver):

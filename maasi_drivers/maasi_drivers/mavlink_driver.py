@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent_driver import BATTERY, ODOMETRY, AgentDriver, DataT, FloatArray
-from maasi_drivers.arm_permission import offer_arm
-from maasi_drivers.arrival_clock import ArrivalClock
-from maasi_drivers.mavlink.link import VehicleLink
-from maasi_drivers.mavlink.settings import MavlinkSettings
-from maasi_drivers.mavlink.vehicle import Telemetry
-from maasi_drivers.odometry import PoseHistory, StampedPose
+from maasi_drivers.agent.agent_driver import BATTERY, ODOMETRY, AgentDriver, DataT, FloatArray
+from maasi_drivers.agent.arm_permission import offer_arm
+from maasi_drivers.agent.arrival_clock import ArrivalClock
+from maasi_drivers.agent.odometry import PoseHistory, StampedPose
+from maasi_drivers.links.mavlink.link import VehicleLink
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.links.mavlink.vehicle import Telemetry
 from maasi_drivers.ranging_driver import RangingDriver
-from maasi_filter.conversions import stamp_to_ros
-from maasi_filter.pose import Pose, compose
-from maasi_filter.search_node import run
+from maasi_filter.models.pose import Pose, compose
+from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_filter.ros.lifecycle_node import run
 from maasi_msgs.action import GoToWaypoint
 
 _POLL_PERIOD = 0.02

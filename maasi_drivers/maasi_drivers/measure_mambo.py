@@ -8,9 +8,9 @@ import sys
 import threading
 import time
 
-from maasi_drivers.mambo_link import MamboLink, MamboLinkError
-from maasi_drivers.mambo_settings import LEAST_TILT, MOST_TILT
-from maasi_drivers.speed_measurement import MeasurementError, MeasuringFlight, fit_speed
+from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
+from maasi_drivers.links.mambo.settings import LEAST_TILT, MOST_TILT
+from maasi_drivers.links.mambo.speed_measurement import MeasurementError, MeasuringFlight, fit_speed
 
 _PERIOD = 0.05
 # Longest wait for it to land [s].

@@ -11,10 +11,10 @@ import time
 
 from pydantic import ValidationError
 
-from maasi_drivers.camera_settings import SegmentationSettings
-from maasi_drivers.image_source import ImageSourceError, VideoSource
-from maasi_drivers.measurement_feed import MOST, FeedPacket, encode
-from maasi_drivers.segmentation import segment
+from maasi_drivers.vision.camera_settings import SegmentationSettings
+from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
+from maasi_drivers.vision.measurement_feed import MOST, FeedPacket, encode
+from maasi_drivers.vision.segmentation import segment
 
 _ROUND = 0.002
 

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from maasi_drivers.agent_driver import AgentDriver, FloatArray, Sighting
-from maasi_drivers.odometry import StampedPose
-from maasi_drivers.ranging_mount import RangingMount
-from maasi_filter.conversions import stamp_from_ros
-from maasi_filter.qos import sensor_reader
-from maasi_filter.search_node import run
+from maasi_drivers.agent.agent_driver import AgentDriver, FloatArray, Sighting
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.ranging_mount import RangingMount
+from maasi_filter.ros.conversions import stamp_from_ros
+from maasi_filter.ros.lifecycle_node import run
+from maasi_filter.ros.qos import sensor_reader
 from maasi_msgs.msg import RangeArray
 
 

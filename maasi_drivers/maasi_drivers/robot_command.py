@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from maasi_filter.qos import SENSOR
+from maasi_filter.ros.qos import SENSOR
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 

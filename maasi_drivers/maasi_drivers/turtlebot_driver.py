@@ -13,14 +13,14 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.scan_avoidance import ScanUnicycle, scan_points
+from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
 from maasi_drivers.camera_driver import CameraDriver
-from maasi_drivers.odometry import StampedPose
-from maasi_drivers.scan_avoidance import ScanUnicycle, scan_points
-from maasi_drivers.waypoint_follower import Goal, GoalStatus
-from maasi_filter.conversions import point_to_ros, stamp_from_ros
-from maasi_filter.qos import sensor_reader
-from maasi_filter.search_node import SettingsError, run
-from maasi_filter.silence import Silence
+from maasi_filter.ros.conversions import point_to_ros, stamp_from_ros
+from maasi_filter.ros.lifecycle_node import SettingsError, run
+from maasi_filter.ros.qos import sensor_reader
+from maasi_filter.ros.silence import Silence
 from maasi_msgs.action import GoToWaypoint
 from maasi_planner.motion import MotionModel, RobotState
 from maasi_planner.obstacles import Obstacles

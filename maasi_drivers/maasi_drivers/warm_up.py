@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from maasi_drivers.camera_settings import CameraSettings, SegmentationSettings
-from maasi_drivers.marker_detector import MarkerDetector
-from maasi_filter.pose import Pose
+from maasi_drivers.vision.camera_settings import CameraSettings, SegmentationSettings
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.models.pose import Pose
 
 
 def warm_up() -> None:

@@ -8,28 +8,26 @@ from __future__ import annotations
 
 import importlib
 import signal
-from functools import partial
 from typing import Any
 
 
-class _Scripts:
-    """Each attribute is the function that runs the module of that name."""
+class _Script:
+    """Runs `main` of a module; each attribute is the script of a module inside it."""
 
-    def __init__(self, package: str) -> None:
-        self._package = package
+    def __init__(self, module: str) -> None:
+        self._module = module
 
-    def __getattr__(self, module: str) -> Any:
-        return partial(_run, f'{self._package}.{module}')
+    def __getattr__(self, name: str) -> _Script:
+        return _Script(f'{self._module}.{name}')
+
+    def __call__(self) -> Any:
+        # Nothing has been created yet, so there is nothing to clean up. A node, and whatever has
+        # to clean up, sets its own handler in `main`.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        return importlib.import_module(self._module).main()
 
 
-def _run(module: str) -> Any:
-    # Nothing has been created yet, so there is nothing to clean up. A node, and whatever has to
-    # clean up, sets its own handler in `main`.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    return importlib.import_module(module).main()
-
-
-def __getattr__(package: str) -> _Scripts:
+def __getattr__(package: str) -> _Script:
     if package.startswith('_'):
         raise AttributeError(package)
-    return _Scripts(package)
+    return _Script(package)

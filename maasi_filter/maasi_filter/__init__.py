@@ -1,22 +1,9 @@
 """What the team believes: sensors, exploration, the particle PHD filter and found targets."""
 
-from maasi_filter.clusters import Cluster
-from maasi_filter.detection_model import (
-    BoxDetection,
-    DetectionModel,
-    ExponentialDetection,
-    FunctionDetection,
-    GaussianDetection,
-    detection_probability,
-)
 from maasi_filter.exploration import Exploration
-from maasi_filter.found_targets import FoundTarget
-from maasi_filter.measurement_model import (
-    MeasurementModel,
-    RangeBearing,
-    RangeBearingElevation,
-    wrap_angle,
-)
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.ic_phd.found_targets import FoundTarget
+from maasi_filter.ic_phd.search_filter import AgentMeasurement, FilterResult, SearchFilter
 from maasi_filter.metrics import (
     Gospa,
     Match,
@@ -26,9 +13,22 @@ from maasi_filter.metrics import (
     ospa,
     restricted_mean,
 )
-from maasi_filter.pose import Pose, compose, inverse
-from maasi_filter.search_filter import AgentMeasurement, FilterResult, SearchFilter
-from maasi_filter.sensor import Sensor
+from maasi_filter.models.detection import (
+    BoxDetection,
+    DetectionModel,
+    ExponentialDetection,
+    FunctionDetection,
+    GaussianDetection,
+    detection_probability,
+)
+from maasi_filter.models.measurement import (
+    MeasurementModel,
+    RangeBearing,
+    RangeBearingElevation,
+    wrap_angle,
+)
+from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import (
     DetectionSettings,
     EnvironmentSettings,

@@ -12,12 +12,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.detection_model import (
+from maasi_filter.models.detection import (
     DetectionModel,
     detection_probability_at,
     fill_probabilities,
 )
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 
 FloatArray = NDArray[np.float64]
 MAXIMUM_NODES = 20_000_000
@@ -26,7 +26,7 @@ MAXIMUM_NODES = 20_000_000
 @njit(cache=True, error_model='numpy')
 def interpolate(
     values: FloatArray, lower: FloatArray, step: FloatArray, position: FloatArray
-) -> float:  # pragma: no cover - compiled
+) -> float:
     """Return the multilinear interpolation of a grid at one position.
 
     Parameters
@@ -45,7 +45,7 @@ def interpolate(
 @njit(cache=True, error_model='numpy')
 def interpolate_at(
     values: FloatArray, lower: FloatArray, step: FloatArray, x: float, y: float, z: float
-) -> float:  # pragma: no cover - compiled
+) -> float:
     """Return the same as `interpolate` for a position given by its coordinates; z plays no part
     in 2D.
     """
@@ -72,7 +72,7 @@ def interpolate_at(
 @njit(cache=True, error_model='numpy')
 def _interpolate_many(
     values: FloatArray, lower: FloatArray, step: FloatArray, positions: FloatArray
-) -> FloatArray:  # pragma: no cover - compiled
+) -> FloatArray:
     out = np.empty(positions.shape[0])
     solid = positions.shape[1] == 3
     for i in range(positions.shape[0]):
@@ -82,7 +82,7 @@ def _interpolate_many(
 
 
 @njit(cache=True, error_model='numpy')
-def _decrease(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _decrease(  # type: ignore[no-untyped-def]
     values, lower, step, kind, parameters, sensor_position, yaw, dimension
 ):
     cos_yaw = math.cos(yaw)
@@ -117,7 +117,7 @@ def _expected_unseen_seen(
     sensor_positions: FloatArray,
     yaws: FloatArray,
     dimension: int,
-) -> float:  # pragma: no cover - compiled
+) -> float:
     cos_yaw = np.cos(yaws)
     sin_yaw = np.sin(yaws)
     total = 0.0

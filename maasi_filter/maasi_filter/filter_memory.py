@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.search_filter import SearchFilter
+from maasi_filter.ic_phd.search_filter import SearchFilter
 from maasi_filter.state_file import StateFileError, read_state, text, untext, write_state
 
 # Of the arrays in the file: what the filter itself does not know.

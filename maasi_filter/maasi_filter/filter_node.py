@@ -18,7 +18,10 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from maasi_filter import warm_up
-from maasi_filter.conversions import (
+from maasi_filter.filter_memory import FilterMemory, Progress
+from maasi_filter.ic_phd.search_filter import AgentMeasurement, SearchFilter
+from maasi_filter.kept_found_targets import KeptFoundTargets, checked_found
+from maasi_filter.ros.conversions import (
     cluster_to_ros,
     filter_markers,
     found_target_from_ros,
@@ -28,15 +31,12 @@ from maasi_filter.conversions import (
     stamp_from_ros,
     stamp_to_ros,
 )
-from maasi_filter.filter_memory import FilterMemory, Progress
-from maasi_filter.kept_found_targets import KeptFoundTargets, checked_found
-from maasi_filter.marker_board import MarkerBoard
-from maasi_filter.node_settings import FilterNodeSettings
-from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
-from maasi_filter.search_filter import AgentMeasurement, SearchFilter
-from maasi_filter.search_node import SearchNode, SettingsError, run
-from maasi_filter.silence import Silence
-from maasi_filter.stamps import batch_id_limit
+from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError, run
+from maasi_filter.ros.marker_board import MarkerBoard
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
+from maasi_filter.ros.silence import Silence
+from maasi_filter.ros.stamps import batch_id_limit
 from maasi_filter.state_file import StateFileError
 from maasi_msgs.msg import (
     BatchMember,

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from maasi_filter.detection_model import (
+from maasi_filter.models.detection import (
     BoxDetection,
     DetectionModel,
     ExponentialDetection,
     GaussianDetection,
 )
-from maasi_filter.measurement_model import RangeBearing, RangeBearingElevation
-from maasi_filter.sensor import Sensor
+from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
+from maasi_filter.models.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from maasi_filter.detection_model import PARAMETERS, detection_probability
-from maasi_filter.lost_targets import LostTargets
-from maasi_filter.phd import prepare_measurements
-from maasi_filter.pose import Pose
-from maasi_filter.search_filter import LEAST_CLUSTER_MASS, AgentMeasurement, SearchFilter
+from maasi_filter.ic_phd.phd import prepare_measurements
+from maasi_filter.ic_phd.search_filter import LEAST_CLUSTER_MASS, AgentMeasurement, SearchFilter
+from maasi_filter.ic_phd.unconfirmed_targets import LostTargets
+from maasi_filter.models.detection import PARAMETERS, detection_probability
+from maasi_filter.models.pose import Pose
 from maasi_filter.settings import (
     DetectionSettings,
     FilterSettings,

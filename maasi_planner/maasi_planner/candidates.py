@@ -10,11 +10,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.detection_model import detection_probability_at
 from maasi_filter.exploration import Exploration, check_bounds
-from maasi_filter.pose import Pose
-from maasi_filter.sensor import Sensor
-from maasi_planner.objective import reach_of
+from maasi_filter.models.detection import detection_probability_at
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_planner.objective.predicted_measurements import reach_of
 from maasi_planner.settings import CandidateSettings
 
 FloatArray = NDArray[np.float64]
@@ -260,7 +260,7 @@ def _mark_seen(
     parameters: FloatArray,
     reach: float,
     probability: float,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Mark the nodes that some pose sees; `seen` is flat, in the order of the grid's nodes."""
     low = np.zeros(3, np.int64)
     high = np.ones(3, np.int64)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_filter.conversions import FASTEST, bounded, colour, point_to_ros, pose_from_ros
 from maasi_filter.exploration import Exploration
+from maasi_filter.ros.conversions import FASTEST, bounded, colour, point_to_ros, pose_from_ros
 from maasi_msgs.msg import AgentState, Candidate, PlanDecision
 from maasi_msgs.msg import RobotDecision as RobotDecisionMessage
 from maasi_planner.motion import RobotState

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.clusters import Cluster
 from maasi_filter.exploration import Exploration
-from maasi_filter.pose import Pose
-from maasi_filter.search_filter import EXPLORATION_CELLS
-from maasi_filter.sensor import Sensor
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.ic_phd.search_filter import EXPLORATION_CELLS
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
 from maasi_planner.candidates import CandidateSet
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion

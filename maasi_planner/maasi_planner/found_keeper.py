@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rclpy.node import Node
 
-from maasi_filter.qos import LATCHED
+from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTarget, FoundTargetArray
 
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_filter.clusters import Cluster
 from maasi_filter.exploration import Exploration
-from maasi_filter.pose import Pose
-from maasi_filter.sensor import Sensor
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
 from maasi_planner.settings import PlannerSettings
 
 

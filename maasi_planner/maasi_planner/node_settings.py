@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from maasi_filter.node_settings import NodeSettings
+from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
-from maasi_planner.objective import resolve
+from maasi_planner.objective.weights import resolve
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 
 

@@ -69,7 +69,7 @@ class Obstacles:
 @njit(cache=True)
 def segment_distance(
     px: float, py: float, pz: float, qx: float, qy: float, qz: float, circle: FloatArray
-) -> float:  # pragma: no cover - compiled
+) -> float:
     """Return the distance of the centre of `circle` (x, y, z, radius, sphere) from a segment."""
     flat = 1.0 if circle[4] > 0.5 else 0.0
     dx = qx - px
@@ -99,7 +99,7 @@ def is_clear(
     circles: FloatArray,
     extra: float,
     cylinders_only: bool,
-) -> bool:  # pragma: no cover - compiled
+) -> bool:
     """Return whether a segment keeps `extra` beyond the radius from every circle."""
     for i in range(circles.shape[0]):
         if cylinders_only and circles[i, 4] > 0.5:
@@ -110,9 +110,7 @@ def is_clear(
 
 
 @njit(cache=True)
-def _all_pairs(
-    vertices: FloatArray, circles: FloatArray, extra: float
-) -> FloatArray:  # pragma: no cover - compiled
+def _all_pairs(vertices: FloatArray, circles: FloatArray, extra: float) -> FloatArray:
     number = vertices.shape[0]
     distance = np.full((number, number), np.inf)
     for i in range(number):
@@ -148,7 +146,7 @@ def _all_pairs(
 @njit(cache=True)
 def goal_distances(
     goal: FloatArray, circles: FloatArray, vertices: FloatArray, pairs: FloatArray
-) -> FloatArray:  # pragma: no cover - compiled
+) -> FloatArray:
     """Return the length of the shortest clear way from each vertex to `goal`, (m,), or inf."""
     number = vertices.shape[0]
     out = np.full(number, np.inf)
@@ -171,7 +169,7 @@ def next_point(
     to_goal: FloatArray,
     clearance: float,
     out: FloatArray,
-) -> float:  # pragma: no cover - compiled
+) -> float:
     """Write the point to head for into `out` (3,) and return the length of the way left.
 
     The point is the goal itself where the straight line is clear.
@@ -303,9 +301,7 @@ def next_point(
 
 
 @njit(cache=True)
-def hold_back(
-    position: FloatArray, circles: FloatArray, rate: float, velocity: FloatArray
-) -> None:  # pragma: no cover - compiled
+def hold_back(position: FloatArray, circles: FloatArray, rate: float, velocity: FloatArray) -> None:
     """Limit in place the part of `velocity` (3,) that points into circles.
 
     Towards a circle at distance d at most `rate` * d is left, and inside of one at least that

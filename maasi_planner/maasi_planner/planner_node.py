@@ -18,8 +18,9 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from maasi_filter.clusters import Cluster
-from maasi_filter.conversions import (
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.conversions import (
     cluster_from_ros,
     particles_to_ros,
     point_to_ros,
@@ -28,12 +29,11 @@ from maasi_filter.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
-from maasi_filter.marker_board import MarkerBoard
-from maasi_filter.pose import Pose
-from maasi_filter.qos import LATCHED, RELIABLE, UPDATES
-from maasi_filter.search_node import SearchNode, run
-from maasi_filter.silence import Silence
-from maasi_filter.stamps import LAST_STAMP, StampGate, batch_id_limit
+from maasi_filter.ros.lifecycle_node import SearchNode, run
+from maasi_filter.ros.marker_board import MarkerBoard
+from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
+from maasi_filter.ros.silence import Silence
+from maasi_filter.ros.stamps import LAST_STAMP, StampGate, batch_id_limit
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,
@@ -57,10 +57,10 @@ from maasi_planner.filter_watch import FilterWatch
 from maasi_planner.found_keeper import FoundKeeper
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners.base import check_clusters
-from maasi_planner.search_action import Progress, SearchAction
-from maasi_planner.search_modes import Mode, SearchModes
-from maasi_planner.search_services import offer_services
-from maasi_planner.team_goals import Course, HeardState, TeamGoals
+from maasi_planner.search_control.search_action import Progress, SearchAction
+from maasi_planner.search_control.search_modes import Mode, SearchModes
+from maasi_planner.search_control.search_services import offer_services
+from maasi_planner.search_control.team_goals import Course, HeardState, TeamGoals
 
 FloatArray = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from maasi_planner.search_modes import COMMANDS
+from maasi_planner.search_control.search_modes import COMMANDS
 
 DONE, REFUSED, ABSENT = 0, 1, 2
 # Commands of drivers alone.

@@ -12,7 +12,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
 
-from maasi_sim.launch_arguments import ARGUMENTS, ending, is_true, scenario_options
+from maasi_sim.run.launch_arguments import ARGUMENTS, ending, is_true, scenario_options
 
 # Wall time for stopping the robots and writing the results before it is terminated or killed [s].
 PATIENCE = '60'
@@ -27,9 +27,9 @@ def end_launch(event: ProcessExited, context: LaunchContext) -> EmitEvent:
 
 def show(scenario: str, team: str) -> Node:
     """Return RViz with the view of a scenario, for a team in a namespace."""
-    from maasi_sim.cuboid_scenario import load_any_scenario
-    from maasi_sim.rviz_view import shown_topics
-    from maasi_sim.scenario import config_folder, find_scenario
+    from maasi_sim.buildings.scenario import load_any_scenario
+    from maasi_sim.run.rviz_view import shown_topics
+    from maasi_sim.scenario.loading import config_folder, find_scenario
 
     three = load_any_scenario(find_scenario(scenario), {}).dimension == 3
     view = config_folder() / 'rviz' / ('search_3d.rviz' if three else 'search.rviz')

@@ -10,20 +10,24 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_drivers.marker_detector import MarkerDetector
-from maasi_drivers.odometry import MapOdometry, StampedPose
-from maasi_drivers.waypoint_follower import Goal, GoalStatus, WaypointFollower
-from maasi_filter.found_targets import FoundTarget
-from maasi_filter.pose import Pose
-from maasi_filter.search_filter import AgentMeasurement, SearchFilter
+from maasi_drivers.agent.odometry import MapOdometry, StampedPose
+from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.ic_phd.found_targets import FoundTarget
+from maasi_filter.ic_phd.search_filter import AgentMeasurement, SearchFilter
+from maasi_filter.models.pose import Pose
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.team import Decision
-from maasi_sim.scenario import Scenario, planner_settings, steps_of
-from maasi_sim.scoring import score, scoring_radius
-from maasi_sim.simulation import simulated_robot, step_of_event
-from maasi_sim.world import World
+from maasi_sim.run.scoring import score, scoring_radius
+from maasi_sim.scenario.schema import (
+    Scenario,
+    planner_settings,
+    steps_of,
+)
+from maasi_sim.world.simulation import simulated_robot, step_of_event
+from maasi_sim.world.world import World
 
 FloatArray = NDArray[np.float64]
 

@@ -20,9 +20,10 @@ from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_drivers.camera_settings import CameraSettings
-from maasi_drivers.projection import Camera
-from maasi_filter.conversions import (
+from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.conversions import (
     colour,
     point_to_ros,
     pose_to_ros,
@@ -31,19 +32,23 @@ from maasi_filter.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
-from maasi_filter.marker_board import MarkerBoard
-from maasi_filter.pose import Pose
-from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
-from maasi_filter.search_node import SearchNode, SettingsError, run
+from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError, run
+from maasi_filter.ros.marker_board import MarkerBoard
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray, RangeMeasurement
-from maasi_sim.external_robot import ExternalRobot
-from maasi_sim.laser_scan import LaserSettings
-from maasi_sim.linked_robots import LinkedRobot, linked_robot
-from maasi_sim.robots import SimulatedRobot
-from maasi_sim.scenario import Scenario, ScenarioError, load_scenario, steps_of
+from maasi_sim.emulators.linked_robots import LinkedRobot, linked_robot
+from maasi_sim.scenario.layering import Key
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import (
+    Scenario,
+    ScenarioError,
+    steps_of,
+)
 from maasi_sim.sim_settings import SimNodeSettings
-from maasi_sim.simulation import Simulation
-from maasi_sim.yaml_files import Key
+from maasi_sim.world.external_robot import ExternalRobot
+from maasi_sim.world.laser_scan import LaserSettings
+from maasi_sim.world.robots import SimulatedRobot
+from maasi_sim.world.simulation import Simulation
 
 RECORDER = 'recorder'
 

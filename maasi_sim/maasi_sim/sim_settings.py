@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from maasi_filter.node_settings import NodeSettings
+from maasi_filter.ros.node_settings import NodeSettings
 
 
 class SimNodeSettings(NodeSettings):

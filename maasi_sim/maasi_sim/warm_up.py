@@ -10,9 +10,9 @@ from typing import Any
 import maasi_filter
 import maasi_planner
 from maasi_drivers.warm_up import warm_up as warm_up_drivers
-from maasi_sim.cuboid_scenario import CuboidScenario, load_any_scenario, mission_of
-from maasi_sim.scenario import load_scenario
-from maasi_sim.simulation import simulated_robot
+from maasi_sim.buildings.scenario import CuboidScenario, load_any_scenario, mission_of
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.world.simulation import simulated_robot
 
 _PACKAGES = ('maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
 

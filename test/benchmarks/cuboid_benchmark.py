@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'planner'))
 from cuboid_instances import joint_problems, problems_of_missions
 from literal_cuboid import TightProblem, solve_with_highs, solve_with_scip
 
-from maasi_planner.planners.cuboid import solve_jointly
+from maasi_planner.buildings import solve_jointly
 
 GAP, LIMIT = 1e-4, 20.0
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.camera_settings import CameraSettings
-from maasi_drivers.marker_detector import MarkerDetector
-from maasi_drivers.projection import Camera
-from maasi_filter.pose import Pose
+from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
-from maasi_sim.world import TargetSettings, World
+from maasi_sim.world.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.world.world import TargetSettings, World
 
 
 def _time(function: Callable[[], object], repeats: int) -> float:

@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from maasi_filter.clusters import Cluster
-from maasi_filter.detection_model import ExponentialDetection
 from maasi_filter.exploration import Exploration
-from maasi_filter.pose import Pose
-from maasi_filter.sensor import Sensor
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.models.detection import ExponentialDetection
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,
@@ -28,7 +28,7 @@ from maasi_planner import (
     make_planner,
     warm_up,
 )
-from maasi_planner.objective import resolve
+from maasi_planner.objective.weights import resolve
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)

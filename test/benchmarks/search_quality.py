@@ -22,7 +22,8 @@ from scipy.stats import beta, chi2, t
 
 from maasi_filter import NoiseSettings, warm_up
 from maasi_filter.metrics import match_targets, normalised_error, restricted_mean
-from maasi_sim.scenario import Scenario, load_scenario
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
 
 # R = diag[1.5, 0.175, 0.295] of 000 does not say what it holds: two readings.

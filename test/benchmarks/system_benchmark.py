@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from maasi_sim.node_plan import NodePlan
-from maasi_sim.processes import Domain, NodeProcess, find_executable, stop
-from maasi_sim.replay import FILTER, REPLAYED, read_recording
-from maasi_sim.replay_node import ReplayNode
+from maasi_sim.run.node_plan import NodePlan
+from maasi_sim.run.processes import Domain, NodeProcess, find_executable, stop
+from maasi_sim.run.replay import FILTER, REPLAYED, read_recording
+from maasi_sim.run.replay_node import ReplayNode
 
 SECONDS = 40.0
 # For an answer of the filter node [s].
@@ -35,7 +35,8 @@ def scenario(name: str, folder: Path, limit: float) -> float:
     begin = time.time()
     done = subprocess.run(
         [
-            *(sys.executable, '-m', 'maasi_sim.run_scenario', name, '--lockstep', '--seed', '1'),
+            *(sys.executable, '-m', 'maasi_sim.run.run_scenario', name),
+            *('--lockstep', '--seed', '1'),
             *('--out', str(folder), '--time-limit', str(limit)),
         ],
         capture_output=True,

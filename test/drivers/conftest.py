@@ -21,16 +21,16 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from robot_team import KINDS, TURTLEBOT, Team, parameters_of
 
-from maasi_drivers.camera_settings import CameraSettings
-from maasi_drivers.driver_settings import DriverSettings
-from maasi_drivers.marker_detector import MarkerDetector
-from maasi_drivers.projection import Camera
-from maasi_filter.parameters import flatten
-from maasi_filter.pose import Pose, quaternion_product
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.models.pose import Pose, quaternion_product
+from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
-from maasi_sim.processes import Domain
-from maasi_sim.world import TargetSettings, World
+from maasi_sim.run.processes import Domain
+from maasi_sim.world.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.world.world import TargetSettings, World
 
 BOX = 0.2
 

@@ -7,12 +7,12 @@ import numpy as np
 from robot_team import MAMBO, Team, image_message
 from std_srvs.srv import Trigger
 
-from maasi_drivers.measurement_feed import FeedPacket, encode
-from maasi_filter.pose import Pose
+from maasi_drivers.vision.measurement_feed import FeedPacket, encode
+from maasi_filter.models.pose import Pose
 from maasi_msgs.msg import AgentState
-from maasi_sim.fake_mambo import FakeMambo, free_address, free_port
-from maasi_sim.mambo_firmware import FirmwareSettings, MamboFirmware
-from maasi_sim.odometry_model import OdometrySettings
+from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
+from maasi_sim.emulators.mambo.firmware import FirmwareSettings, MamboFirmware
+from maasi_sim.world.odometry import OdometrySettings
 
 START = [1.0, 1.2, 0.4]
 YAW = 0.6

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from maasi_drivers.mavlink.protocol import mavlink
-from maasi_drivers.mavlink.settings import MavlinkSettings
-from maasi_drivers.mavlink.vehicle import Phase, Vehicle
-from maasi_sim.autopilot_settings import AutopilotSettings
-from maasi_sim.fake_autopilot import FakeAutopilot
+from maasi_drivers.links.mavlink.protocol import mavlink
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.links.mavlink.vehicle import Phase, Vehicle
+from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
 
 PERIOD = 0.02
 FIRMWARES = ('arducopter', 'px4', 'ardusub')

@@ -12,16 +12,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, CameraInfo, Image
 
-from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.guard_node import GuardNode
 from maasi_drivers.mambo_driver import MamboDriver
-from maasi_drivers.projection import Camera
 from maasi_drivers.ranging_driver import RangingDriver
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import pose_to_ros, stamp_to_ros
-from maasi_filter.parameters import flatten
-from maasi_filter.pose import Pose, compose, inverse
-from maasi_filter.qos import LATCHED_ALL, RELIABLE
+from maasi_drivers.vision.camera_model import Camera
+from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
+from maasi_filter.ros.parameters import flatten
+from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_filter.settings import EnvironmentSettings
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import (
@@ -34,8 +34,8 @@ from maasi_msgs.msg import (
     RangeArray,
 )
 from maasi_planner.motion import RobotState, make_motion
-from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
-from maasi_sim.world import TargetSettings, World
+from maasi_sim.world.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.world.world import TargetSettings, World
 
 STEP = 0.05
 NANOSECONDS = round(STEP * 1e9)

@@ -5,17 +5,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from maasi_drivers.mambo_link import PositionEvent
-from maasi_drivers.mambo_pilot import MamboPilot, Phase
-from maasi_drivers.mambo_settings import MamboSettings
-from maasi_drivers.speed_measurement import MeasuredSpeed, MeasuringFlight, fit_speed
-from maasi_filter.pose import Pose
+from maasi_drivers.links.mambo.link import PositionEvent
+from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.mambo.speed_measurement import MeasuredSpeed, MeasuringFlight, fit_speed
+from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
 from maasi_planner.settings import MotionSettings
-from maasi_sim.mambo_firmware import FirmwareSettings, FlyingState, MamboFirmware, Piloting
-from maasi_sim.odometry_model import OdometrySettings
-from maasi_sim.robots import BatterySettings
-from maasi_sim.tilt_body import TiltBodySettings
+from maasi_sim.emulators.mambo.firmware import (
+    FirmwareSettings,
+    FlyingState,
+    MamboFirmware,
+    Piloting,
+)
+from maasi_sim.emulators.mambo.tilt_body import TiltBodySettings
+from maasi_sim.world.odometry import OdometrySettings
+from maasi_sim.world.robots import BatterySettings
 
 STEP = 0.05
 TILT = 0.1

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from maasi_drivers.battery_gauge import BatteryGauge, BatteryReadings
+from maasi_drivers.agent.battery_gauge import BatteryGauge, BatteryReadings
 
 
 def charges(readings):

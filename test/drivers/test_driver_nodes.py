@@ -17,9 +17,9 @@ from robot_team import (
 )
 from sensor_msgs.msg import CameraInfo
 
-from maasi_drivers.driver_settings import DriverSettings
-from maasi_filter.conversions import pose_from_ros, stamp_to_ros
-from maasi_filter.qos import RELIABLE
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_filter.ros.conversions import pose_from_ros, stamp_to_ros
+from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import (
     AgentState,
     DetectionArray,

@@ -13,8 +13,8 @@ import yaml
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import KINDS, Team, numbers, start_guard
 
-from maasi_drivers.driver_settings import DriverSettings
-from maasi_filter.parameters import flatten
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_filter.ros.parameters import flatten
 
 HANGING = Path(__file__).parent / 'hanging_driver.py'
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from simulated_mambo import FENCE, HOME, MOTION, TILT, full_speed
 
-from maasi_drivers.mambo_link import MamboLink
-from maasi_drivers.mambo_pilot import MamboPilot, Phase
-from maasi_drivers.mambo_settings import MamboSettings
-from maasi_filter.pose import Pose
+from maasi_drivers.links.mambo.link import MamboLink
+from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
-from maasi_sim.mambo_firmware import FirmwareSettings, FlyingState, MamboFirmware
+from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware
 
 # Longest wait for anything; the machine may be busy.
 LIMIT = 30.0

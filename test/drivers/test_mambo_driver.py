@@ -19,21 +19,21 @@ from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, parameters_of, rendered
 
-from maasi_drivers.agent_driver import _WATCH_PERIOD
-from maasi_drivers.arm_permission import UNTIL_ARM
-from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.agent.agent_driver import _WATCH_PERIOD
+from maasi_drivers.agent.arm_permission import UNTIL_ARM
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.mambo_driver import _POLL_PERIOD, MamboDriver
-from maasi_drivers.mambo_settings import MamboSettings
-from maasi_drivers.measurement_feed import FeedPacket
-from maasi_drivers.projection import Camera
-from maasi_drivers.segmentation import Blobs
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import pose_to_ros, stamp_from_ros, stamp_to_ros
-from maasi_filter.parameters import flatten
-from maasi_filter.pose import Pose
+from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.measurement_feed import FeedPacket
+from maasi_drivers.vision.segmentation import Blobs
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.conversions import pose_to_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.parameters import flatten
 from maasi_msgs.msg import AgentState
-from maasi_sim.fake_mambo import FakeMambo, free_address, free_port
-from maasi_sim.mambo_firmware import FirmwareSettings, FlyingState
+from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
+from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState
 
 # After a fault the drone hovers or lands by then [s].
 LATEST = 1.5

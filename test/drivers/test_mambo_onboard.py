@@ -11,16 +11,16 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, Team, parameters_of
 from std_srvs.srv import Trigger
 
-from maasi_drivers.arm_permission import UNTIL_ARM
+from maasi_drivers.agent.arm_permission import UNTIL_ARM
+from maasi_drivers.links.waypoint_orders import Order, OrderError, OrderKind
+from maasi_drivers.links.waypoint_orders import decode as decode_order
+from maasi_drivers.links.waypoint_orders import encode as encode_order
 from maasi_drivers.mambo_onboard_driver import MamboOnboardDriver
-from maasi_drivers.measurement_feed import FeedError, FeedPose, FeedState, decode, encode
-from maasi_drivers.projection import Camera
-from maasi_drivers.waypoint_orders import Order, OrderError, OrderKind
-from maasi_drivers.waypoint_orders import decode as decode_order
-from maasi_drivers.waypoint_orders import encode as encode_order
-from maasi_filter.pose import Pose, compose
+from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.measurement_feed import FeedError, FeedPose, FeedState, decode, encode
+from maasi_filter.models.pose import Pose, compose
 from maasi_msgs.msg import AgentState
-from maasi_sim.fake_mambo import free_address, free_port
+from maasi_sim.emulators.mambo.fake_mambo import free_address, free_port
 
 START, YAW, GROUND_HEIGHT = [1.0, 1.2, 0.6], 0.6, 0.1
 GOAL = [1.7, 0.8, 0.7]
@@ -189,8 +189,8 @@ def test_a_driver_that_hangs_is_a_drone_that_hovers_then_lands(fly):
 
 
 def packet(**pose):
-    from maasi_drivers.measurement_feed import FeedPacket
-    from maasi_drivers.segmentation import Blobs
+    from maasi_drivers.vision.measurement_feed import FeedPacket
+    from maasi_drivers.vision.segmentation import Blobs
 
     none = Blobs(
         centroids=np.zeros((0, 2)),

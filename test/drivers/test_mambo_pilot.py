@@ -7,14 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 from simulated_mambo import FENCE, HOME, STEP, TILT, Flight, full_speed, measure_and_fly
 
-from maasi_drivers.arm_permission import UNTIL_ARM
-from maasi_drivers.mambo_link import PositionEvent
-from maasi_drivers.mambo_pilot import Phase
-from maasi_drivers.mambo_reckoning import DeadReckoning
-from maasi_drivers.mambo_settings import MamboSettings
-from maasi_drivers.tilt_model import Course, TiltModel
-from maasi_filter.pose import Pose
-from maasi_sim.mambo_firmware import FlyingState
+from maasi_drivers.agent.arm_permission import UNTIL_ARM
+from maasi_drivers.links.mambo.link import PositionEvent
+from maasi_drivers.links.mambo.pilot import Phase
+from maasi_drivers.links.mambo.reckoning import DeadReckoning
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.mambo.tilt_model import Course, TiltModel
+from maasi_filter.models.pose import Pose
+from maasi_sim.emulators.mambo.firmware import FlyingState
 
 # What a fault may take until the robot hovers or lands [s].
 AT_MOST = 1.5

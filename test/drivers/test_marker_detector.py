@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from maasi_drivers.marker_detector import MarkerDetector
-from maasi_filter.pose import Pose
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.camera import CameraRenderer, RenderSettings, scene_of
-from maasi_sim.world import TargetSettings, World
+from maasi_sim.world.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.world.world import TargetSettings, World
 
 
 def one_image(settings, targets, pose, floor=None, seed=1):

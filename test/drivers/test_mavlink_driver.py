@@ -19,20 +19,20 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
 from std_srvs.srv import Trigger
 
-from maasi_drivers import agent_driver
-from maasi_drivers.arm_permission import UNTIL_ARM
-from maasi_drivers.driver_settings import DriverSettings
-from maasi_drivers.mavlink.settings import MavlinkSettings
+from maasi_drivers.agent import agent_driver
+from maasi_drivers.agent.arm_permission import UNTIL_ARM
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.agent.robot_stop import STOPPED as STOPPED_BY_SERVICE
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
 from maasi_drivers.mavlink_driver import _POLL_PERIOD, MavlinkDriver
-from maasi_drivers.robot_stop import STOPPED as STOPPED_BY_SERVICE
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
-from maasi_filter.parameters import flatten
-from maasi_filter.pose import Pose, compose
+from maasi_filter.models.pose import Pose, compose
+from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.parameters import flatten
 from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
-from maasi_sim.autopilot_settings import AutopilotSettings
-from maasi_sim.fake_mavlink_vehicle import FakeVehicle
+from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import FakeVehicle
 
 SPEED, STOPPED = 1.0, 0.1
 START, DEEP = [1.0, 2.0, 0.8], [1.0, 2.0, -0.8]

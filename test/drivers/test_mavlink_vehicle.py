@@ -9,12 +9,17 @@ from mavlink_play import FIRMWARES, HEIGHTS, Play, mavlink
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
-from maasi_drivers.arm_permission import UNTIL_ARM
-from maasi_drivers.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, identify
-from maasi_drivers.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation, swap_yaw
-from maasi_drivers.mavlink.settings import MavlinkSettings
-from maasi_drivers.mavlink.vehicle import Phase
-from maasi_filter.pose import Pose
+from maasi_drivers.agent.arm_permission import UNTIL_ARM
+from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, identify
+from maasi_drivers.links.mavlink.frames import (
+    swap_enu_ned,
+    swap_flu_frd,
+    swap_orientation,
+    swap_yaw,
+)
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.links.mavlink.vehicle import Phase
+from maasi_filter.models.pose import Pose
 
 # What the robot may take until it has stopped [s], and what counts as that [m/s].
 AT_MOST, STOPPED = 1.5, 0.1

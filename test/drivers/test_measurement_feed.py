@@ -14,11 +14,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from maasi_drivers.camera_settings import SegmentationSettings
-from maasi_drivers.image_source import ImageSourceError, VideoSource
-from maasi_drivers.measurement_feed import FeedError, FeedPacket, FeedReceiver, decode, encode
 from maasi_drivers.measurement_feed_sender import main
-from maasi_drivers.segmentation import Blobs, segment
+from maasi_drivers.vision.camera_settings import SegmentationSettings
+from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
+from maasi_drivers.vision.measurement_feed import (
+    FeedError,
+    FeedPacket,
+    FeedReceiver,
+    decode,
+    encode,
+)
+from maasi_drivers.vision.segmentation import Blobs, segment
 
 # Longest wait for anything; the machine may be busy.
 LIMIT = 30.0

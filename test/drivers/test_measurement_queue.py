@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from maasi_drivers.measurement_queue import Frame, MeasurementQueue, MeasurementRequest
-from maasi_drivers.odometry import PoseHistory, StampedPose
-from maasi_filter.pose import Pose
+from maasi_drivers.agent.measurement_queue import Frame, MeasurementQueue, MeasurementRequest
+from maasi_drivers.agent.odometry import PoseHistory, StampedPose
+from maasi_filter.models.pose import Pose
 
 
 def pose(stamp):

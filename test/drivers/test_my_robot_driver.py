@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import TURTLEBOT, Team, parameters_of, rendered, stamped
 
-from maasi_filter.conversions import pose_from_ros, stamp_from_ros
-from maasi_filter.pose import Pose, compose, inverse
+from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros
 from maasi_msgs.msg import AgentState
 
 FILE = Path(__file__).parents[2] / 'docs' / 'my_robot_driver.py'

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from maasi_drivers.odometry import MapOdometry, PoseHistory, StampedPose, interpolate
-from maasi_filter.pose import Pose
+from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose, interpolate
+from maasi_filter.models.pose import Pose
 
 
 def stamped(stamp, position=(0.0, 0.0, 0.0), yaw=0.0):

@@ -7,16 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from maasi_drivers.camera_settings import CameraSettings
-from maasi_drivers.projection import (
-    Camera,
-    box_in_view,
-    box_view_margin,
-    range_bearing,
-    rotation_from_rpy,
-)
-from maasi_filter.measurement_model import RangeBearing, RangeBearingElevation
-from maasi_filter.pose import Pose
+from maasi_drivers.vision.camera_model import Camera, rotation_from_rpy
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.vision.camera_view import box_in_view, box_view_margin
+from maasi_drivers.vision.projection import range_bearing
+from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
+from maasi_filter.models.pose import Pose
 
 DISTORTION = [-0.21, 0.06, 0.002, -0.003, 0.01]
 DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)

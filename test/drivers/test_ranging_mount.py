@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from maasi_drivers.odometry import StampedPose
-from maasi_drivers.projection import rotation_from_rpy
-from maasi_drivers.ranging_mount import RangingMount, RangingSettings
-from maasi_filter.pose import Pose
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.ranging_mount import RangingMount, RangingSettings
+from maasi_drivers.vision.camera_model import rotation_from_rpy
+from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
 
 MOUNT = {'frame': 'body', 'position': [0.3, -0.1, -0.2], 'rpy': [0.1, 0.6, -0.4]}

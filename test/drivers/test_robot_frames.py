@@ -16,14 +16,14 @@ from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from maasi_drivers.driver_settings import DriverSettings
-from maasi_drivers.pose_speed import PoseSpeed
-from maasi_drivers.projection import Camera
-from maasi_drivers.transform_buffer import TransformBuffer
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.agent.pose_speed import PoseSpeed
+from maasi_drivers.agent.transform_buffer import TransformBuffer
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
-from maasi_filter.pose import Pose, compose, inverse
-from maasi_filter.qos import LATCHED, LATCHED_ALL, RELIABLE
+from maasi_drivers.vision.camera_model import Camera
+from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE
 from maasi_msgs.msg import AgentState
 
 BASE = 'rover/base_link'

@@ -6,7 +6,7 @@ from action_msgs.msg import GoalStatus
 from numpy.testing import assert_array_equal
 from std_srvs.srv import Trigger
 
-from maasi_drivers.robot_stop import STOPPED
+from maasi_drivers.agent.robot_stop import STOPPED
 from maasi_msgs.msg import AgentState
 
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from maasi_drivers.driver_settings import ScanSettings
-from maasi_drivers.odometry import StampedPose
-from maasi_drivers.scan_avoidance import ScanUnicycle, scan_points
-from maasi_filter.pose import Pose
+from maasi_drivers.agent.driver_settings import ScanSettings
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.scan_avoidance import ScanUnicycle, scan_points
+from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
-from maasi_sim.laser_scan import LaserScanner, LaserSettings
+from maasi_sim.world.laser_scan import LaserScanner, LaserSettings
 
 RADIUS = 0.11
 STEP = 0.05

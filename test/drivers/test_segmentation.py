@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pydantic import ValidationError
 from scipy import ndimage
 
-from maasi_drivers.camera_settings import SegmentationSettings
-from maasi_drivers.segmentation import paper_mask, segment
+from maasi_drivers.vision.camera_settings import SegmentationSettings
+from maasi_drivers.vision.segmentation import paper_mask, segment
 
 PAPER = SegmentationSettings(rule='paper')
 EVERY_PIXEL = SegmentationSettings(rule='paper', minimum_area=0.0)

@@ -8,15 +8,15 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose
 
+from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.calibrate_sensor import main
-from maasi_drivers.driver_settings import DriverSettings
-from maasi_drivers.sensor_calibration import Look, sensor_noise
-from maasi_filter.parameters import flatten
-from maasi_filter.pose import Pose
+from maasi_drivers.calibration.sensor_calibration import Look, sensor_noise
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import SensorSettings
-from maasi_sim.bag import BagWriter, load_types
-from maasi_sim.scenario import scenario_from_values
-from maasi_sim.simulation import Simulation
+from maasi_sim.run.bag import BagWriter, load_types
+from maasi_sim.scenario.loading import scenario_from_values
+from maasi_sim.world.simulation import Simulation
 
 TARGET = [0.8, 0.9]
 NOISE, HEADING_NOISE = 0.008, 0.02

@@ -11,11 +11,16 @@ import pytest
 from numpy.testing import assert_allclose
 from simulated_mambo import TILT, Flight, full_speed, measure
 
+from maasi_drivers.links.mambo.speed_measurement import (
+    Leg,
+    MeasurementError,
+    MeasuringFlight,
+    fit_speed,
+)
 from maasi_drivers.measure_mambo import main
-from maasi_drivers.speed_measurement import Leg, MeasurementError, MeasuringFlight, fit_speed
-from maasi_filter.pose import Pose
-from maasi_sim.fake_mambo import FakeMambo, free_address, free_port
-from maasi_sim.mambo_firmware import FlyingState, MamboFirmware
+from maasi_filter.models.pose import Pose
+from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
+from maasi_sim.emulators.mambo.firmware import FlyingState, MamboFirmware
 
 WAY = 1.0
 # Longest wait for anything; the machine may be busy.

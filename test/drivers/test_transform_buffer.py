@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from maasi_drivers.transform_buffer import TransformBuffer, TransformError
-from maasi_filter.pose import Pose, compose
+from maasi_drivers.agent.transform_buffer import TransformBuffer, TransformError
+from maasi_filter.models.pose import Pose, compose
 
 SECOND = 1_000_000_000
 MAP_FROM_ODOM = Pose.from_yaw([1.0, 2.0, 0.0], 0.5)

@@ -18,12 +18,12 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers, parameters_of, start_guard
 from sensor_msgs.msg import LaserScan
 
-from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import stamp_from_ros, stamp_to_ros
-from maasi_filter.qos import RELIABLE
+from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState
-from maasi_sim.laser_scan import LaserScanner, LaserSettings
+from maasi_sim.world.laser_scan import LaserScanner, LaserSettings
 
 HERE = Path(__file__).parent
 SCANNING = {'scan': {'timeout': 1.0, 'blocked_timeout': 3.0}}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from maasi_drivers.waypoint_follower import Goal, GoalStatus, WaypointFollower
+from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.settings import MotionSettings
 

@@ -12,10 +12,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from maasi_filter.executor import executor_of
-from maasi_filter.node_settings import NodeSettings
-from maasi_filter.search_node import SearchNode
-from maasi_sim.processes import Domain
+from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.lifecycle_node import SearchNode
+from maasi_filter.ros.node_settings import NodeSettings
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 

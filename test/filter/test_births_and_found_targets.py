@@ -11,17 +11,22 @@ from maasi_filter import (
     RangeBearing,
     RangeBearingElevation,
 )
-from maasi_filter.births import gaussian_births, measurement_births, thin_births, uniform_births
-from maasi_filter.clusters import group_clusters, kmeans, kmeans_clusters
-from maasi_filter.found_targets import (
+from maasi_filter.ic_phd.births import (
+    gaussian_births,
+    measurement_births,
+    thin_births,
+    uniform_births,
+)
+from maasi_filter.ic_phd.clusters import group_clusters, kmeans, kmeans_clusters
+from maasi_filter.ic_phd.found_targets import (
     exclusive,
     extended_information,
     found_intensity,
     refine,
     remove_measurements,
 )
+from maasi_filter.ic_phd.phd import prepare_measurements
 from maasi_filter.metrics import normalised_error
-from maasi_filter.phd import prepare_measurements
 
 POSE = Pose.from_yaw([40.0, 50.0, 45.0], 0.3)
 MODELS = {2: RangeBearing(), 3: RangeBearingElevation()}

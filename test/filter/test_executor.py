@@ -9,9 +9,9 @@ from rclpy.node import Node
 from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 
-from maasi_filter.executor import executor_of
-from maasi_filter.qos import RELIABLE
-from maasi_sim.processes import Domain
+from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.qos import RELIABLE
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 

@@ -13,12 +13,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from maasi_filter import FilterSettings, SearchFilter
-from maasi_filter.conversions import MOST_DETECTIONS
-from maasi_filter.executor import executor_of
 from maasi_filter.filter_node import FilterNode
-from maasi_filter.node_settings import FilterNodeSettings
-from maasi_filter.parameters import flatten
-from maasi_filter.qos import LATCHED, RELIABLE, UPDATES
+from maasi_filter.ros.conversions import MOST_DETECTIONS
+from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.parameters import flatten
+from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
 from maasi_msgs.msg import (
     BatchMember,
     Detection,
@@ -27,7 +27,7 @@ from maasi_msgs.msg import (
     FoundTargetArray,
     MeasurementBatch,
 )
-from maasi_sim.processes import Domain
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}

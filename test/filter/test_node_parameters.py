@@ -15,9 +15,9 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 from maasi_filter.filter_node import FilterNode
-from maasi_filter.node_settings import FilterNodeSettings
-from maasi_filter.parameters import flatten
-from maasi_sim.processes import Domain
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.parameters import flatten
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 SETTINGS = FilterNodeSettings.model_validate(

@@ -2,8 +2,8 @@
 
 import pytest
 
-from maasi_filter.node_settings import FilterNodeSettings
-from maasi_filter.parameters import flatten, parameter_fields, unflatten
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
 
 CONTENT = {
     'step': 0.1,

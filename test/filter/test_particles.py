@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from maasi_filter.particles import (
+from maasi_filter.ic_phd.particles import (
     clear,
     gather,
     group_moments,

@@ -10,8 +10,13 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 
 from maasi_filter import ExponentialDetection, Pose, RangeBearing, RangeBearingElevation
-from maasi_filter.elementary import arctan2, exponential, sines
-from maasi_filter.phd import Workspace, associate, position_measurements, prepare_measurements
+from maasi_filter.ic_phd.phd import (
+    Workspace,
+    associate,
+    position_measurements,
+    prepare_measurements,
+)
+from maasi_filter.vector_math import arctan2, exponential, sines
 
 ORIGIN = Pose([0.0, 0.0, 0.0])
 MODELS = {2: RangeBearing(), 3: RangeBearingElevation()}

@@ -397,7 +397,7 @@ def test_whatever_is_measured_the_expected_number_stays_sound(seed, preset, dime
 
 def test_warm_up_leaves_nothing_to_compile():
     """A second call only runs what the first one compiled."""
-    from maasi_filter import births, clusters, found_targets, particles, phd
+    from maasi_filter.ic_phd import births, clusters, found_targets, particles, phd
 
     warm_up()
     kernels = [

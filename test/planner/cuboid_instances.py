@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from maasi_planner.planners.cuboid import CuboidSettings, HazardSettings, Objective, PlanSolver
-from maasi_planner.planners.cuboid.agent import inflated
-from maasi_planner.planners.cuboid.dynamics import Dynamics
-from maasi_planner.planners.cuboid.problem import Problem
-from maasi_sim.cuboid_mission import CuboidMission, SearchRobot
+from maasi_planner.buildings import CuboidSettings, HazardSettings, Objective, PlanSolver
+from maasi_planner.buildings.agent import inflated
+from maasi_planner.buildings.dynamics import Dynamics
+from maasi_planner.buildings.problem import Problem
+from maasi_sim.buildings.mission import CuboidMission, SearchRobot
 
 AREA = np.array([[0.0, 250.0], [0.0, 400.0], [0.0, 80.0]])
 OBJECTS = [

@@ -18,18 +18,18 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 from test_planner_node import ROBOTS, SETTINGS, START
 
-from maasi_drivers.driver_settings import DriverSettings
+from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_filter.conversions import pose_to_ros, stamp_to_ros
-from maasi_filter.executor import executor_of
-from maasi_filter.parameters import flatten
-from maasi_filter.pose import Pose, compose, inverse
-from maasi_filter.qos import LATCHED, RELIABLE
+from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
+from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.parameters import flatten
+from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import AgentState, FilterUpdate, PlanDecision
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planner_node import PlannerNode
-from maasi_sim.processes import Domain
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 STEP = 0.05

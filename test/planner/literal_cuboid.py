@@ -11,7 +11,7 @@ import time
 import highspy
 import numpy as np
 
-from maasi_planner.planners.cuboid.problem import TOUCH
+from maasi_planner.buildings.problem import TOUCH
 
 BIG = 1000.0
 

@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 
-from maasi_filter.pose import Pose
-from maasi_planner.objective import resolve
+from maasi_filter.models.pose import Pose
+from maasi_planner.objective.weights import resolve
 
 
 def measurement_steps(team, name, trajectories, choice, weights, horizon):

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from maasi_filter.clusters import Cluster
-from maasi_filter.detection_model import BoxDetection, ExponentialDetection, GaussianDetection
 from maasi_filter.exploration import Exploration
-from maasi_filter.sensor import Sensor
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.models.detection import BoxDetection, ExponentialDetection, GaussianDetection
+from maasi_filter.models.sensor import Sensor
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings

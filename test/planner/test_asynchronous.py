@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maasi_filter.detection_model import BoxDetection
 from maasi_filter.exploration import Exploration
-from maasi_filter.sensor import Sensor
+from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.sensor import Sensor
 from maasi_planner import (
     MotionSettings,
     PlannerSettings,

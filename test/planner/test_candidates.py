@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from planner_helpers import CUBE, FLOOR, floor_members
 
-from maasi_filter.detection_model import BoxDetection
-from maasi_filter.sensor import Sensor
+from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.sensor import Sensor
 from maasi_planner import CandidateSet, CandidateSettings, Viewer, unseen_parts
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cuboid_instances import AREA, two_buildings
 
-from maasi_planner.planners.cuboid import (
+from maasi_planner.buildings import (
     Activity,
     Broadcast,
     Dynamics,
@@ -15,8 +15,8 @@ from maasi_planner.planners.cuboid import (
     SearchAgent,
     plan_mission,
 )
-from maasi_planner.planners.cuboid.battery import Hazard, HeardPlan, rewards
-from maasi_planner.planners.cuboid.guidance import WayFinder, assigned
+from maasi_planner.buildings.battery import Hazard, HeardPlan, rewards
+from maasi_planner.buildings.guidance import WayFinder, assigned
 
 HOME = [166.0, 235.0, 5.0]
 NEVER = HazardSettings(failures=False)

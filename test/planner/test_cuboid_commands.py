@@ -11,14 +11,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from maasi_filter.conversions import stamp_to_ros
-from maasi_filter.executor import executor_of
-from maasi_filter.parameters import flatten
-from maasi_filter.qos import RELIABLE
+from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.parameters import flatten
+from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState, SearchLink, SearchLinkArray
-from maasi_planner.cuboid_planner_node import CuboidPlannerNode
-from maasi_planner.planners.cuboid.node_settings import CuboidPlannerSettings
-from maasi_sim.processes import Domain
+from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
+from maasi_planner.buildings.node_settings import CuboidPlannerSettings
+from maasi_sim.run.processes import Domain
 
 SETTINGS = CuboidPlannerSettings.model_validate(
     {

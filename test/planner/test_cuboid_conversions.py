@@ -5,13 +5,13 @@ import pytest
 from cuboid_instances import AREA, two_buildings
 from std_msgs.msg import Header
 
-from maasi_planner.planners.cuboid import (
+from maasi_planner.buildings import (
     Dynamics,
     HazardSettings,
     SearchAgent,
     plan_mission,
 )
-from maasi_planner.planners.cuboid.conversions import (
+from maasi_planner.buildings.conversions import (
     agent_markers,
     broadcast_from_ros,
     broadcast_to_ros,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from maasi_planner.planners.cuboid import CuboidSettings, plan_mission
-from maasi_planner.planners.cuboid.preplanning import detection_probability, footprint
-from maasi_planner.planners.cuboid.settings import SearchCameraSettings
+from maasi_planner.buildings import CuboidSettings, plan_mission
+from maasi_planner.buildings.preplanning import detection_probability, footprint
+from maasi_planner.buildings.settings import SearchCameraSettings
 
 AREA = [[0, 300], [0, 300], [0, 80]]
 BUILDING = {'centre': [175, 130], 'size': [60, 60, 60]}

@@ -16,9 +16,9 @@ from cuboid_instances import (
 )
 from literal_cuboid import LiteralProblem, solve_with_highs, solve_with_scip
 
-from maasi_planner.planners.cuboid import Dynamics, Objective, Problem, solve_jointly
-from maasi_planner.planners.cuboid import problem as problem_module
-from maasi_planner.planners.cuboid.preplanning import segment_cuts
+from maasi_planner.buildings import Dynamics, Objective, Problem, solve_jointly
+from maasi_planner.buildings import problem as problem_module
+from maasi_planner.buildings.preplanning import segment_cuts
 
 
 def same_optimum(solver, problem, oracle=solve_with_highs):

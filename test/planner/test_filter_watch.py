@@ -5,7 +5,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.action import CancelResponse
 from test_planner_node import ROBOTS, begin, running
 
-from maasi_filter.qos import LATCHED
+from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTarget, FoundTargetArray
 from maasi_planner.filter_watch import FilterWatch
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planner_helpers import random_team
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner import MeasurementTrigger, PlannerSettings
 from maasi_planner.measurement_trigger import expected_use
 

@@ -7,10 +7,10 @@ import pytest
 from plain_objective import all_choices, plain_information_terms, plain_terms
 from planner_helpers import random_team
 
-from maasi_filter.detection_model import BoxDetection
 from maasi_filter.exploration import Exploration
+from maasi_filter.models.detection import BoxDetection
 from maasi_planner import PlannerSettings, RobotState, make_planner
-from maasi_planner.objective import TeamObjective
+from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import free_of_robots, waiting_places
 
 

@@ -15,9 +15,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from maasi_filter.executor import executor_of
-from maasi_filter.parameters import flatten
-from maasi_filter.qos import RELIABLE, UPDATES
+from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.parameters import flatten
+from maasi_filter.ros.qos import RELIABLE, UPDATES
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,
@@ -32,7 +32,7 @@ from maasi_msgs.msg import (
 )
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
-from maasi_sim.processes import Domain
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 ROBOTS = ('a', 'b')

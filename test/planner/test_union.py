@@ -9,9 +9,10 @@ import pytest
 from plain_objective import all_choices, information, measurement_steps
 from planner_helpers import random_team
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner import PlannerSettings, RobotState, make_motion, make_planner
-from maasi_planner.objective import TeamObjective, resolve
+from maasi_planner.objective.team_objective import TeamObjective
+from maasi_planner.objective.weights import resolve
 
 SETTINGS = PlannerSettings(control_weight=0.0, exploration_nodes=1_000_000)
 WEIGHTS = resolve(SETTINGS)

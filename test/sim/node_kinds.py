@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 from rclpy.parameter import Parameter
 
-from maasi_drivers.driver_settings import DriverSettings, GuardSettings
+from maasi_drivers.agent.driver_settings import DriverSettings, GuardSettings
 from maasi_drivers.guard_node import GuardNode
 from maasi_drivers.mambo_driver import MamboDriver
 from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
@@ -14,13 +14,13 @@ from maasi_drivers.mavlink_driver import MavlinkDriver
 from maasi_drivers.ranging_driver import RangingDriver
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.filter_node import FilterNode
-from maasi_filter.node_settings import FilterNodeSettings
-from maasi_filter.parameters import flatten
-from maasi_planner.cuboid_planner_node import CuboidPlannerNode
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.parameters import flatten
+from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
+from maasi_planner.buildings.node_settings import CuboidPlannerSettings
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
-from maasi_planner.planners.cuboid.node_settings import CuboidPlannerSettings
-from maasi_sim.cuboid_sim_node import CuboidSimNode
+from maasi_sim.buildings.cuboid_sim_node import CuboidSimNode
 from maasi_sim.sim_node import SimNode
 from maasi_sim.sim_settings import SimNodeSettings
 

@@ -4,7 +4,7 @@ import json
 import sys
 from pathlib import Path
 
-from maasi_sim import node_plan, processes, run_scenario
+from maasi_sim.run import node_plan, processes, run_scenario
 
 FAKES = Path(__file__).with_name('fake_nodes.py')
 

@@ -15,7 +15,7 @@ import yaml
 from ament_index_python.packages import get_package_share_directory
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from maasi_sim.bag import Bag, BagError, BagWriteError, BagWriter, TopicQos, load_types
+from maasi_sim.run.bag import Bag, BagError, BagWriteError, BagWriter, TopicQos, load_types
 
 
 @pytest.fixture(scope='module')

@@ -5,13 +5,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pydantic import ValidationError
 
-from maasi_drivers.camera_settings import CameraSettings
-from maasi_drivers.projection import Camera
-from maasi_filter.pose import Pose, quaternion_product
+from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.camera import CameraRenderer, RenderSettings, disc, draw_distractors, scene_of
-from maasi_sim.noise_streams import noise_stream
-from maasi_sim.world import TargetSettings, World
+from maasi_sim.world.camera import CameraRenderer, RenderSettings, disc, draw_distractors, scene_of
+from maasi_sim.world.noise_streams import noise_stream
+from maasi_sim.world.world import TargetSettings, World
 
 IDEAL = RenderSettings.ideal()
 DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)

@@ -22,11 +22,11 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from maasi_filter.conversions import stamp_from_ros, stamp_to_ros
-from maasi_filter.qos import RELIABLE
+from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
-from maasi_sim.processes import Domain
+from maasi_sim.run.processes import Domain
 
 # Far more than eleven nodes need to start, for a machine that is busy with something else.
 PATIENCE = 400.0

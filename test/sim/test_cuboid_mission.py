@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from maasi_planner.planners.cuboid import (
+from maasi_planner.buildings import (
     CuboidSettings,
     DynamicsSettings,
     HazardSettings,
     SearchAgent,
 )
-from maasi_sim.cuboid_mission import CuboidMission, SearchRobot, summary, within_range
+from maasi_sim.buildings.mission import CuboidMission, SearchRobot, summary, within_range
 
 AREA = [[0, 300], [0, 300], [0, 80]]
 BUILDING = {'centre': [175, 130], 'size': [60, 60, 60]}

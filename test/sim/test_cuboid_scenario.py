@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 import yaml
 
-from maasi_filter.parameters import unflatten
-from maasi_filter.pose import Pose
-from maasi_planner.planners.cuboid import Dynamics
-from maasi_planner.planners.cuboid.node_settings import CuboidPlannerSettings
-from maasi_sim.cuboid_observer import CuboidRecord, Moment, SnapshotRecord
-from maasi_sim.cuboid_report import cuboid_summary, write_cuboid_report
-from maasi_sim.cuboid_scenario import (
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.parameters import unflatten
+from maasi_planner.buildings import Dynamics
+from maasi_planner.buildings.node_settings import CuboidPlannerSettings
+from maasi_sim.buildings.observer import CuboidRecord, Moment, SnapshotRecord
+from maasi_sim.buildings.report import cuboid_summary, write_cuboid_report
+from maasi_sim.buildings.scenario import (
     any_scenario_from_content,
     load_any_scenario,
     mission_of,
 )
-from maasi_sim.cuboid_simulation import CuboidSimulation, MassPointBody
-from maasi_sim.node_plan import plan_nodes
-from maasi_sim.scenario import Scenario, ScenarioError
+from maasi_sim.buildings.simulation import CuboidSimulation, MassPointBody
+from maasi_sim.run.node_plan import plan_nodes
+from maasi_sim.scenario.schema import Scenario, ScenarioError
 
 NAMES = ['buildings_four', 'buildings_obstacles', 'buildings_one']
 

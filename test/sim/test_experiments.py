@@ -16,8 +16,7 @@ import pytest
 import yaml
 from scipy import stats
 
-from maasi_sim import reproduce
-from maasi_sim.experiments import campaign, registry, results, statistics, tables
+from maasi_sim.experiments import campaign, registry, reproduce, results, statistics, tables
 from maasi_sim.experiments.campaign import Here, carry_out, plan
 from maasi_sim.experiments.registry import (
     Case,

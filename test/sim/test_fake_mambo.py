@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from maasi_drivers.mambo_link import MamboLink, MamboLinkError
-from maasi_filter.pose import Pose
-from maasi_sim.fake_mambo import FakeMambo, main
-from maasi_sim.mambo_firmware import (
+from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
+from maasi_filter.models.pose import Pose
+from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, main
+from maasi_sim.emulators.mambo.firmware import (
     FirmwareSettings,
     FlyingState,
     MamboFirmware,
     Piloting,
 )
-from maasi_sim.mambo_frames import Frame, FrameError, frames
-from maasi_sim.robots import BatterySettings
-from maasi_sim.tilt_body import TiltBody, TiltBodySettings, TiltCommand
+from maasi_sim.emulators.mambo.frames import Frame, FrameError, frames
+from maasi_sim.emulators.mambo.tilt_body import TiltBody, TiltBodySettings, TiltCommand
+from maasi_sim.world.robots import BatterySettings
 
 # Longest wait for anything; the machine may be busy.
 LIMIT = 120.0
@@ -434,7 +434,15 @@ def test_the_fake_refuses_what_is_no_handshake(pair):
 def test_the_command_runs_a_fake_that_a_link_finds():
     address, lines = own_address(), []
     process = subprocess.Popen(
-        [sys.executable, '-m', 'maasi_sim.fake_mambo', '--address', address, '--charge', '0.4'],
+        [
+            sys.executable,
+            '-m',
+            'maasi_sim.emulators.mambo.fake_mambo',
+            '--address',
+            address,
+            '--charge',
+            '0.4',
+        ],
         stdout=subprocess.PIPE,
         text=True,
     )

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from maasi_drivers.mavlink.link import open_connection
-from maasi_sim.fake_mavlink_vehicle import main
+from maasi_drivers.links.mavlink.link import open_connection
+from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import main
 
 
 @pytest.mark.parametrize('firmware, kind', [('arducopter', 2), ('ardusub', 12)])
@@ -17,7 +17,13 @@ def test_it_is_heard_in_mavlink_2(firmware, kind):
         probe.bind(('127.0.0.1', 0))
         port = probe.getsockname()[1]
     connection = open_connection(f'udpin:127.0.0.1:{port}', 255, 190)
-    command = [sys.executable, '-m', 'maasi_sim.fake_mavlink_vehicle', '--system', '7']
+    command = [
+        sys.executable,
+        '-m',
+        'maasi_sim.emulators.mavlink.fake_mavlink_vehicle',
+        '--system',
+        '7',
+    ]
     command += ['--firmware', firmware, '--url', f'udpout:127.0.0.1:{port}']
     vehicle = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:

@@ -14,7 +14,7 @@ LIMIT = 120.0
 BEGIN = """
 import os, signal, sys, threading, time
 from pathlib import Path
-from maasi_sim.processes import NodeProcess, stop
+from maasi_sim.run.processes import NodeProcess, stop
 log = Path(sys.argv[1]) / 'log'
 
 def node(main, **environment):

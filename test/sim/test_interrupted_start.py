@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from node_kinds import KINDS
 
-from maasi_sim.processes import Domain, find_executable
+from maasi_sim.run.processes import Domain, find_executable
 
 PATIENCE = 120.0
 # What a process has mapped at a moment of its start.
@@ -28,7 +28,7 @@ NODES = {
 FORK = """
 import sys, time
 from pathlib import Path
-from maasi_sim.processes import NodeProcess
+from maasi_sim.run.processes import NodeProcess
 from maasi_sim.warm_up import main_of
 main = main_of('maasi_filter', 'filter_node')
 node = NodeProcess('/node', sys.argv[2:], Path(sys.argv[1]), {}, main)

@@ -9,8 +9,8 @@ from node_kinds import KINDS
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
-from maasi_filter.executor import executor_of
-from maasi_sim.processes import Domain
+from maasi_filter.ros.executor import executor_of
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 CYCLES = 20

@@ -6,9 +6,10 @@ from copy import deepcopy
 import pytest
 from numpy.testing import assert_allclose
 
-from maasi_drivers.mambo_link import MamboLink
-from maasi_sim.linked_robots import linked_robot, with_addresses
-from maasi_sim.scenario import ScenarioError, scenario_from_values
+from maasi_drivers.links.mambo.link import MamboLink
+from maasi_sim.emulators.linked_robots import linked_robot, with_addresses
+from maasi_sim.scenario.loading import scenario_from_values
+from maasi_sim.scenario.schema import ScenarioError
 
 # Longest wait for anything; the machine may be busy.
 LIMIT = 120.0

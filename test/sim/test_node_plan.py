@@ -5,12 +5,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from maasi_drivers.driver_settings import DriverSettings
-from maasi_filter.node_settings import FilterNodeSettings
-from maasi_filter.parameters import unflatten
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_sim.node_plan import NodePlan, in_team, plan_nodes, with_followed_clock
-from maasi_sim.scenario import ScenarioError, config_folder, load_scenario
+from maasi_sim.run.node_plan import NodePlan, in_team, plan_nodes, with_followed_clock
+from maasi_sim.scenario.loading import config_folder, load_scenario
+from maasi_sim.scenario.schema import ScenarioError
 from maasi_sim.sim_settings import SimNodeSettings
 
 SCENARIOS = sorted(

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
-from maasi_sim import reproduce
-from maasi_sim.experiments import results, searches, terrain
+from maasi_sim.experiments import reproduce, results, searches, terrain
 from maasi_sim.experiments.campaign import Here, carry_out, plan
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.registry import experiments

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from maasi_sim.processes import Domain, NodeProcess, ProcessError, find_executable, stop
+from maasi_sim.run.processes import Domain, NodeProcess, ProcessError, find_executable, stop
 
 LIMIT = 120.0
 
@@ -107,7 +107,7 @@ def test_a_domain_with_other_nodes_is_left_to_them(tmp_path):
 
 def test_the_lock_ends_with_the_process(tmp_path):
     code = (
-        'import os, sys\nfrom pathlib import Path\nfrom maasi_sim.processes import Domain\n'
+        'import os, sys\nfrom pathlib import Path\nfrom maasi_sim.run.processes import Domain\n'
         'Domain(33, Path(sys.argv[1]))\nos.kill(os.getpid(), 9)\n'
     )
     done = subprocess.run([sys.executable, '-c', code, str(tmp_path)], check=False, timeout=LIMIT)
@@ -187,7 +187,7 @@ def test_ctrl_c_in_the_terminal_does_not_reach_the_node(tmp_path):
 def test_nodes_do_not_outlive_a_killed_run(tmp_path, number):
     code = (
         'import signal, sys\nfrom pathlib import Path\n'
-        'from maasi_sim.processes import NodeProcess\n'
+        'from maasi_sim.run.processes import NodeProcess\n'
         f'node = NodeProcess("/node", [sys.executable, "-u", "-c", {IGNORE_ALL!r}],'
         ' Path(sys.argv[1]) / "log")\n'
         'node.start()\nprint(node.pid, flush=True)\nsignal.pause()\n'

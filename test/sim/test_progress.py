@@ -2,7 +2,7 @@
 
 import io
 
-from maasi_sim.progress import ProgressDisplay, Status
+from maasi_sim.run.progress import ProgressDisplay, Status
 
 
 def status(found=0, time=1.0):

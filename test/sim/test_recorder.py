@@ -11,12 +11,12 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from maasi_filter.conversions import stamp_to_ros
-from maasi_sim.bag import Bag, BagWriter, load_types
-from maasi_sim.cuboid_scenario import load_any_scenario
-from maasi_sim.processes import Domain
-from maasi_sim.recorder_node import Recorder
-from maasi_sim.run_scenario import make_observer
+from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_sim.buildings.scenario import load_any_scenario
+from maasi_sim.run.bag import Bag, BagWriter, load_types
+from maasi_sim.run.processes import Domain
+from maasi_sim.run.recorder_node import Recorder
+from maasi_sim.run.run_scenario import make_observer
 
 PATIENCE = 120.0
 RELIABLE = QoSProfile(
@@ -116,7 +116,7 @@ def session(tmp_path, monkeypatch):
 
 def test_no_stamp_is_ahead_of_the_time_of_its_message(session, monkeypatch):
     # However slow this machine is: the time comes before it would be waited for no longer.
-    monkeypatch.setattr('maasi_sim.recorder_node._LONGEST_HOLD', PATIENCE, raising=False)
+    monkeypatch.setattr('maasi_sim.run.recorder_node._LONGEST_HOLD', PATIENCE, raising=False)
     session.connect()
     session.tell(10**9)
     session.move(2 * 10**9)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
-from maasi_sim.bag import Bag, BagWriter, load_types
-from maasi_sim.observer import RunObserver, observe_bag, within
-from maasi_sim.report import END_REASONS, build_report, path_length, plot_report, summary
-from maasi_sim.report import write_report as write
-from maasi_sim.scenario import load_scenario
-from maasi_sim.scoring import matching_radius, score
+from maasi_sim.run.bag import Bag, BagWriter, load_types
+from maasi_sim.run.observer import RunObserver, observe_bag, within
+from maasi_sim.run.report import END_REASONS, build_report, path_length, plot_report, summary
+from maasi_sim.run.report import write_report as write
+from maasi_sim.run.scoring import matching_radius, score
+from maasi_sim.scenario.loading import load_scenario
 
 KEYS = [
     'scenario',

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from maasi_drivers.camera_settings import CameraSettings
-from maasi_drivers.marker_detector import MarkerDetector
-from maasi_drivers.odometry import MapOdometry
-from maasi_filter.pose import Pose
+from maasi_drivers.agent.odometry import MapOdometry
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings, SensorSettings
 from maasi_planner.motion import RobotState
 from maasi_planner.settings import MotionSettings
-from maasi_sim.camera import RenderSettings
-from maasi_sim.laser_scan import LaserSettings
-from maasi_sim.odometry_model import OdometryModel, OdometrySettings
-from maasi_sim.robots import BatterySettings, Equipment, SimulatedRobot
-from maasi_sim.world import TargetSettings, World
+from maasi_sim.world.camera import RenderSettings
+from maasi_sim.world.laser_scan import LaserSettings
+from maasi_sim.world.odometry import OdometryModel, OdometrySettings
+from maasi_sim.world.robots import BatterySettings, Equipment, SimulatedRobot
+from maasi_sim.world.world import TargetSettings, World
 
 PERFECT = OdometrySettings(position_noise=0.0, heading_noise=0.0, velocity_noise=0.0)
 DRONE = Pose.from_yaw([1.0, 1.0, 1.0], 0.3)

@@ -17,11 +17,11 @@ from rclpy.node import Node
 from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
 
-from maasi_sim.bag import Bag
-from maasi_sim.results import make_folder
-from maasi_sim.run_options import Options, build_parser
-from maasi_sim.run_scenario import ScenarioRun
-from maasi_sim.yaml_files import ScenarioError
+from maasi_sim.run.bag import Bag
+from maasi_sim.run.run_folder import make_folder
+from maasi_sim.run.run_options import Options, build_parser
+from maasi_sim.run.run_scenario import ScenarioRun
+from maasi_sim.scenario.layering import ScenarioError
 
 WITH_FAKES = Path(__file__).with_name('run_with_fakes.py')
 LIMIT = 120.0

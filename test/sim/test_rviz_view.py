@@ -12,11 +12,11 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_filter.marker_board import MarkerBoard
-from maasi_sim.cuboid_scenario import load_any_scenario
-from maasi_sim.processes import Domain
-from maasi_sim.rviz_view import view_text
-from maasi_sim.scenario import config_folder, find_scenario
+from maasi_filter.ros.marker_board import MarkerBoard
+from maasi_sim.buildings.scenario import load_any_scenario
+from maasi_sim.run.processes import Domain
+from maasi_sim.run.rviz_view import view_text
+from maasi_sim.scenario.loading import config_folder, find_scenario
 
 
 def topics_of(text):

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import yaml
 
-from maasi_sim.scenario import (
-    ScenarioError,
+from maasi_sim.scenario.loading import (
     config_folder,
     find_scenario,
     load_scenario,
-    never_seen,
-    robot_candidates,
 )
+from maasi_sim.scenario.schema import ScenarioError
+from maasi_sim.scenario.visibility import never_seen, robot_candidates
 
 # Those of buildings are of another kind: test_cuboid_scenario.py.
 SCENARIOS = sorted(

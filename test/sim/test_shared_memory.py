@@ -4,8 +4,8 @@ import os
 import threading
 import time
 
-from maasi_sim.processes import Domain
-from maasi_sim.shared_memory import LONGEST_CREATION, remove_dead_ports
+from maasi_sim.run.processes import Domain
+from maasi_sim.run.shared_memory import LONGEST_CREATION, remove_dead_ports
 
 
 def write(folder, name, word, age):

@@ -24,13 +24,13 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_drivers.mavlink.link import VehicleLink
-from maasi_drivers.mavlink.settings import MavlinkSettings
-from maasi_filter.conversions import pose_to_ros
-from maasi_filter.pose import Pose
-from maasi_filter.qos import LATCHED, RELIABLE
+from maasi_drivers.links.mavlink.link import VehicleLink
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.conversions import pose_to_ros
+from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray
-from maasi_sim.processes import Domain
+from maasi_sim.run.processes import Domain
 from maasi_sim.sim_node import SimNode
 
 STEP = 0.05

@@ -11,11 +11,11 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from test_life_cycle import in_graph, made_by
 
-from maasi_filter.conversions import stamp_to_ros
-from maasi_filter.executor import executor_of
-from maasi_filter.qos import RELIABLE, UPDATES
+from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.qos import RELIABLE, UPDATES
 from maasi_msgs.msg import AgentState, BatchMember, FilterUpdate, MeasurementBatch, PlanDecision
-from maasi_sim.processes import Domain
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 SECOND = 1_000_000_000

@@ -2,7 +2,7 @@
 
 import pytest
 
-from maasi_sim.yaml_files import ScenarioError, read_layer
+from maasi_sim.scenario.layering import ScenarioError, read_layer
 
 BOMB = 'a0: &a0 [x, x, x, x, x, x, x, x, x]\n' + ''.join(
     f'a{n}: &a{n} [{", ".join([f"*a{n - 1}"] * 9)}]\n' for n in range(1, 12)

@@ -7,8 +7,8 @@ import sys
 import time
 from pathlib import Path
 
-from maasi_sim.bag import Bag
-from maasi_sim.replay import plain
+from maasi_sim.run.bag import Bag
+from maasi_sim.run.replay import plain
 
 # Far more than any of the runs takes, for a machine that is busy with something else.
 PATIENCE = 400.0
@@ -35,7 +35,7 @@ def command(scenario, folder, *options):
     return [
         sys.executable,
         '-m',
-        'maasi_sim.run_scenario',
+        'maasi_sim.run.run_scenario',
         str(scenario),
         '--out',
         str(folder),

@@ -17,7 +17,7 @@ import select
 import sys
 from pathlib import Path
 
-from maasi_sim.processes import NodeProcess, find_executable
+from maasi_sim.run.processes import NodeProcess, find_executable
 from maasi_sim.warm_up import main_of, warm_up_all
 
 warm_up_all()

@@ -9,9 +9,9 @@ import pytest
 import yaml
 from scenario_runs import PATIENCE, command, of_topic, processes_with, run_scenario
 
-from maasi_sim.bag import Bag
-from maasi_sim.cuboid_scenario import load_any_scenario, mission_of
-from maasi_sim.replay import plain
+from maasi_sim.buildings.scenario import load_any_scenario, mission_of
+from maasi_sim.run.bag import Bag
+from maasi_sim.run.replay import plain
 
 pytestmark = pytest.mark.system
 

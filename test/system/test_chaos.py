@@ -7,7 +7,6 @@ import sys
 import numpy as np
 import pytest
 
-from maasi_sim.bag import BagWriter, TopicQos, load_types
 from maasi_sim.chaos.campaign import (
     PASSED,
     WRONG_INPUT,
@@ -19,6 +18,7 @@ from maasi_sim.chaos.campaign import (
 from maasi_sim.chaos.cases import SEARCH_NODES, Case, all_cases
 from maasi_sim.chaos.execution import Outcome
 from maasi_sim.chaos.verdict import judge
+from maasi_sim.run.bag import BagWriter, TopicQos, load_types
 
 pytestmark = pytest.mark.system
 

@@ -21,8 +21,8 @@ from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
 from scenario_runs import PATIENCE, command, processes_with, wait_for
 
-from maasi_filter.conversions import stamp_from_ros
-from maasi_sim.bag import Bag
+from maasi_filter.ros.conversions import stamp_from_ros
+from maasi_sim.run.bag import Bag
 
 pytestmark = pytest.mark.system
 # The run takes more steps than it records before its disk is full.

@@ -16,10 +16,10 @@ import yaml
 from reserved_domain import reserved_domain
 from scenario_runs import PATIENCE, processes_with
 
-from maasi_sim.bag import Bag
-from maasi_sim.launch_arguments import ARGUMENTS, scenario_options
-from maasi_sim.processes import find_executable
-from maasi_sim.run_options import build_parser
+from maasi_sim.run.bag import Bag
+from maasi_sim.run.launch_arguments import ARGUMENTS, scenario_options
+from maasi_sim.run.processes import find_executable
+from maasi_sim.run.run_options import build_parser
 
 LAUNCH_FILE = Path(__file__).parents[2] / 'maasi_sim' / 'launch' / 'scenario.launch.py'
 HAS_LAUNCH = bool(importlib.util.find_spec('launch') and importlib.util.find_spec('launch_ros'))

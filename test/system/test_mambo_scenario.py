@@ -4,7 +4,8 @@ import pytest
 import yaml
 from scenario_runs import run_scenario
 
-from maasi_sim.scenario import ScenarioError, load_scenario
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import ScenarioError
 
 pytestmark = pytest.mark.system
 

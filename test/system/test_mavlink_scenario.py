@@ -6,7 +6,7 @@ import pytest
 import yaml
 from scenario_runs import run_scenario
 
-from maasi_sim.scenario import load_scenario
+from maasi_sim.scenario.loading import load_scenario
 
 pytestmark = pytest.mark.system
 

@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'sim'))
 
 from node_kinds import KINDS
 
-from maasi_filter.qos import RELIABLE, SENSOR_READER, UPDATES
-from maasi_filter.stamps import stamp_problem
+from maasi_filter.ros.qos import RELIABLE, SENSOR_READER, UPDATES
+from maasi_filter.ros.stamps import stamp_problem
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,
@@ -39,7 +39,7 @@ from maasi_msgs.msg import (
     LockstepDone,
     MeasurementBatch,
 )
-from maasi_sim.processes import Domain
+from maasi_sim.run.processes import Domain
 
 PATIENCE = 120.0
 ROUNDS = 24

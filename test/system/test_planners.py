@@ -4,7 +4,7 @@ import pytest
 import yaml
 from scenario_runs import of_topic, replay, run_scenario
 
-from maasi_sim.scenario import load_scenario
+from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
 pytestmark = pytest.mark.system

@@ -5,8 +5,8 @@ import json
 import pytest
 from scenario_runs import of_topic, replay, run_scenario
 
-from maasi_sim.bag import Bag
-from maasi_sim.scenario import load_scenario
+from maasi_sim.run.bag import Bag
+from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
 pytestmark = pytest.mark.system

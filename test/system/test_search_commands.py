@@ -14,7 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from reserved_domain import reserved_domain
 
-from maasi_filter.qos import sensor_reader
+from maasi_filter.ros.qos import sensor_reader
 
 pytestmark = pytest.mark.system
 PATIENCE = 120.0
@@ -93,7 +93,7 @@ def test_robots_of_a_free_run_stand_while_paused_and_go_on_when_resumed(tmp_path
         str(tmp_path / 'run'),
     ]
     run = subprocess.Popen(
-        [sys.executable, '-m', 'maasi_sim.run_scenario', *words, '--domain-id', str(number)],
+        [sys.executable, '-m', 'maasi_sim.run.run_scenario', *words, '--domain-id', str(number)],
         env=environment,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.STDOUT,

@@ -9,8 +9,8 @@ import pytest
 import yaml
 from scenario_runs import PATIENCE, command, of_topic, processes_with, run_scenario, wait_for
 
-from maasi_sim.bag import Bag
-from maasi_sim.scenario import load_scenario
+from maasi_sim.run.bag import Bag
+from maasi_sim.scenario.loading import load_scenario
 
 pytestmark = pytest.mark.system
 

@@ -14,8 +14,8 @@ from rosgraph_msgs.msg import Clock
 from scenario_runs import PATIENCE, Run, command, replay
 from std_srvs.srv import Trigger
 
-from maasi_filter.conversions import stamp_from_ros, stamp_to_ros
-from maasi_sim.bag import Bag
+from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
+from maasi_sim.run.bag import Bag
 
 pytestmark = pytest.mark.system
 STEP = 0.05
@@ -210,7 +210,7 @@ def test_the_recording_of_a_team_can_be_replayed(teams, tmp_path):
     ],
 )
 def test_what_does_not_go_together_is_refused(options, words, capsys):
-    from maasi_sim.run_scenario import main
+    from maasi_sim.run.run_scenario import main
 
     try:
         code = main(['mambo_turtlebot', *options])

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner.obstacles import KeepOut, Obstacles, hold_back, next_point, segment_distance
 from maasi_planner.settings import MotionSettings
 
@@ -256,7 +256,7 @@ def check_step(step: float) -> float:
 @njit(cache=True)
 def _trim(
     positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: NDArray[np.bool_]
-) -> int:  # pragma: no cover - compiled
+) -> int:
     """Fill what was reached, cut lengths, extend trajectories; return the longest length."""
     limit = positions.shape[1] - 1
     longest = 0
@@ -289,7 +289,7 @@ def trimmed(out: Trajectories) -> Trajectories:
 
 
 @njit(cache=True)
-def _farthest(points: FloatArray, place: FloatArray) -> float:  # pragma: no cover - compiled
+def _farthest(points: FloatArray, place: FloatArray) -> float:
     """Return the largest distance of points (n, 3) from a place (3,)."""
     most = 0.0
     for i in range(points.shape[0]):
@@ -301,9 +301,7 @@ def _farthest(points: FloatArray, place: FloatArray) -> float:  # pragma: no cov
 
 
 @njit(cache=True)
-def turn_towards(
-    dx: float, dy: float, yaw: float, yaw_rate: float
-) -> float:  # pragma: no cover - compiled
+def turn_towards(dx: float, dy: float, yaw: float, yaw_rate: float) -> float:
     """Return the yaw rate that turns the heading towards (dx, dy)."""
     turn = math.atan2(dy, dx) - yaw
     turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
@@ -320,7 +318,7 @@ def straight_command(
     speed: float,
     face_travel: bool,
     yaw_rate: float,
-) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
+) -> tuple[float, float, float, float]:
     """Return the command vx, vy, vz (body axes), yaw rate towards a waypoint at (dx, dy, dz).
 
     The speed is `rate` times the distance, at most `speed`.
@@ -358,7 +356,7 @@ def sideways_command(
     clearance: float,
     work: FloatArray,
     out: FloatArray,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Write the command of a robot that can move in any direction into `out` (4,), body axes.
 
     The velocity is `rate` times the way left, at most `speed`, and next to obstacles what

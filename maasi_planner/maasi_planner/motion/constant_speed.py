@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
     MotionModel,
@@ -41,7 +41,7 @@ def point_step(
     acceleration: float,
     yaw_rate: float,
     dt: float,
-) -> tuple[float, float, float, float, float, float, float]:  # pragma: no cover - compiled
+) -> tuple[float, float, float, float, float, float, float]:
     """Move a point for `dt`; return its new position, velocity and heading.
 
     The velocity changes by at most `acceleration` per second, and the position by its mean.
@@ -107,7 +107,7 @@ def _roll_out(
     yaws: FloatArray,
     lengths: NDArray[np.int64],
     costs: FloatArray,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     work = np.zeros((2, 3))
     out = np.zeros(4)
     position = np.zeros(3)

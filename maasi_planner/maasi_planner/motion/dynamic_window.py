@@ -27,9 +27,7 @@ TURN_SAMPLES = 13
 
 
 @njit(cache=True)
-def way_ahead(
-    x: float, y: float, yaw: float, reach: float, circles: FloatArray
-) -> float:  # pragma: no cover - compiled
+def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray) -> float:
     """Return how far straight ahead is free of circles, at most `reach` metres."""
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
@@ -58,7 +56,7 @@ def window_command(
     limits: FloatArray,
     circles: FloatArray,
     clearance: float,
-) -> tuple[float, float]:  # pragma: no cover - compiled
+) -> tuple[float, float]:
     """Return forward speed and turn rate.
 
     Parameters

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
     MotionModel,
@@ -41,9 +41,7 @@ PERIOD = 0.005
 
 
 @njit(cache=True)
-def _riccati(
-    a: FloatArray, b: FloatArray, q: FloatArray, r: float
-) -> FloatArray:  # pragma: no cover - compiled
+def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: float) -> FloatArray:
     """Return the gain of a discrete LQR with one input, by iterating the Riccati equation.
 
     Plain loops in a fixed order, so that the gain does not depend on a linear algebra library.
@@ -176,7 +174,7 @@ def _chain(
     inertia: float,
     periods: int,
     h: float,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Fill one row of `closed_loop` from the response to each unit deviation."""
     states = np.zeros((3, 3))
     inputs = np.zeros(3)
@@ -204,9 +202,7 @@ def _chain(
 
 
 @njit(cache=True)
-def closed_loop(
-    parameters: FloatArray, periods: int, h: float
-) -> FloatArray:  # pragma: no cover - compiled
+def closed_loop(parameters: FloatArray, periods: int, h: float) -> FloatArray:
     """Return what `periods` control periods do at once while nothing is cut off, (3, 24).
 
     For deviations s = (velocity - command, angle, rate) of a chain: the matrix of the deviations
@@ -235,7 +231,7 @@ def closed_loop(
 @njit(cache=True)
 def _lateral(
     row: FloatArray, v: float, a: float, w: float
-) -> tuple[float, float, float, float, float]:  # pragma: no cover - compiled
+) -> tuple[float, float, float, float, float]:
     """Return the deviations afterwards, the travel, and the sum of u'u of one chain."""
     return (
         row[0] * v + row[1] * a + row[2] * w,
@@ -257,7 +253,7 @@ def mambo_step(
     table: FloatArray,
     periods: int,
     h: float,
-) -> float:  # pragma: no cover - compiled
+) -> float:
     """Fly `periods` control periods of `h` seconds, in place; return the sum of u'u.
 
     Parameters
@@ -418,7 +414,7 @@ def _roll_out(
     yaws: FloatArray,
     lengths: NDArray[np.int64],
     costs: FloatArray,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     work = np.zeros((2, 3))
     command = np.zeros(4)
     state = np.zeros(12)

@@ -29,7 +29,7 @@ def add_obstacle_term(
     gain: float,
     parameters: FloatArray,
     command: FloatArray,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Add the term to `command` (4,) in place.
 
     Parameters

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
     MotionModel,
@@ -47,7 +47,7 @@ SPEED, LEVEL, VERTICAL, TILT, YAW_RATE, COUNT_FORCE = range(6)
 @njit(cache=True)
 def quadrotor_step(
     state: FloatArray, command: FloatArray, limits: FloatArray, periods: int, h: float
-) -> float:  # pragma: no cover - compiled
+) -> float:
     """Fly `periods` control periods of `h` seconds, in place; return the sum of u'u.
 
     Parameters
@@ -153,7 +153,7 @@ def quadrotor_step(
 
 
 @njit(cache=True)
-def heading_of(state: FloatArray) -> float:  # pragma: no cover - compiled
+def heading_of(state: FloatArray) -> float:
     """Return the heading of a (13,) state, radians."""
     w, x, y, z = state[3], state[4], state[5], state[6]
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -179,7 +179,7 @@ def _roll_out(
     yaws: FloatArray,
     lengths: NDArray[np.int64],
     costs: FloatArray,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     work = np.zeros((2, 3))
     command = np.zeros(4)
     state = np.zeros(13)

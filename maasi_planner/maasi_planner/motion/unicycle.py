@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
     MotionModel,
@@ -61,7 +61,7 @@ def unicycle_step(
     yaw_rate: float,
     yaw_acceleration: float,
     dt: float,
-) -> tuple[float, float, float, float, float]:  # pragma: no cover - compiled
+) -> tuple[float, float, float, float, float]:
     """Move for `dt`; return new x, y, heading, forward speed and turn rate.
 
     Both speeds change by at most their acceleration, and the robot follows the arc of the mean
@@ -98,7 +98,7 @@ def drive(
     speed: float,
     yaw_rate: float,
     least: float,
-) -> tuple[float, float]:  # pragma: no cover - compiled
+) -> tuple[float, float]:
     """Return forward speed and turn rate towards a point at (dx, dy), with `left` m to go.
 
     At a point on the way the robot keeps its speed, but for turning it counts at least `least`.
@@ -135,7 +135,7 @@ def unicycle_command(
     to_goal: FloatArray,
     clearance: float,
     work: FloatArray,
-) -> tuple[float, float]:  # pragma: no cover - compiled
+) -> tuple[float, float]:
     """Return the command of a robot among obstacles: forward speed and turn rate.
 
     Parameters
@@ -195,7 +195,7 @@ def _roll_out(
     yaws: FloatArray,
     lengths: NDArray[np.int64],
     costs: FloatArray,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     work = np.zeros((2, 3))
     obstacles = circles.shape[0] > 0
     rate, speed, yaw_rate = limits[RATE], limits[SPEED], limits[YAW_RATE]

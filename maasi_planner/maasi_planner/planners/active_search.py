@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
     Options,
     Planner,

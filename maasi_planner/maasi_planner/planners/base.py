@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.clusters import Cluster
+from maasi_filter.ic_phd.clusters import Cluster
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotView, TeamView
@@ -157,9 +157,7 @@ def state_problem(view: RobotView) -> str | None:
 
 
 @njit(cache=True)
-def _in_bounds(
-    points: FloatArray, bounds: FloatArray, out: BoolArray
-) -> int:  # pragma: no cover - compiled
+def _in_bounds(points: FloatArray, bounds: FloatArray, out: BoolArray) -> int:
     """Fill which points are finite and within the bounds; return how many are not finite."""
     bad = 0
     for i in range(points.shape[0]):

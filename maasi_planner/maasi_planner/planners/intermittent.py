@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_planner.motion.base import Trajectories
-from maasi_planner.objective import TeamObjective
+from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import (
     Planner,
     check_team,
@@ -80,7 +80,7 @@ class Intermittent(Planner):
         weights = objective.weights
         if weights.information:
             gains = weights.alpha * terms[:, 0] + weights.beta * terms[:, 1]
-            possible = objective.joint.allowed[rows]
+            possible = objective.table.allowed[rows]
             self._prospects[name] = float(gains[possible].max(initial=0.0))
         if chosen[index] < 0:
             result = stay(team.robots[name], 'stays: another robot is sent to every candidate')

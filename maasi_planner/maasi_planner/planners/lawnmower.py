@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.detection_model import BOX
+from maasi_filter.models.detection import BOX
 from maasi_planner.planners.base import Planner, check_team, explain, state_problem
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay

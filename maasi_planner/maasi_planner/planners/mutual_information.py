@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
     Options,
     Planner,
@@ -39,7 +39,7 @@ DOUBLINGS = 40
 
 
 @njit(cache=True)
-def mutual_information(missed: FloatArray, weights: FloatArray) -> float:  # pragma: no cover
+def mutual_information(missed: FloatArray, weights: FloatArray) -> float:
     """Return the mutual information of targets and the empty measurement set, in nats.
 
     Parameters

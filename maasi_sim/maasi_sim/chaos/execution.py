@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from maasi_sim.chaos.cases import PAUSE, Case
-from maasi_sim.yaml_files import to_yaml
+from maasi_sim.scenario.layering import to_yaml
 
 # Longest wait for a run to come to where the fault strikes, and for its end after that [s].
 _TRIGGER_PATIENCE, _END_PATIENCE = 120.0, 120.0
@@ -79,7 +79,7 @@ def execute(case: Case, folder: Path, seed: int) -> Outcome:
     folder.mkdir(parents=True)
     file, run = folder / 'scenario.yaml', folder / 'run'
     file.write_text(to_yaml(case.scenario()), encoding='utf-8')
-    command = [sys.executable, '-m', 'maasi_sim.run_scenario', str(file), '--out', str(run)]
+    command = [sys.executable, '-m', 'maasi_sim.run.run_scenario', str(file), '--out', str(run)]
     process = subprocess.Popen(
         [*command, '--seed', str(seed), *case.options()],
         stdin=subprocess.DEVNULL,

@@ -8,9 +8,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_sim.bag import Bag, BagError
 from maasi_sim.chaos.cases import SIM, Case
 from maasi_sim.chaos.execution import Outcome
+from maasi_sim.run.bag import Bag, BagError
 
 FloatArray = NDArray[np.float64]
 

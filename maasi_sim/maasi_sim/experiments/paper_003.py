@@ -21,7 +21,7 @@ from maasi_sim.experiments.searches import (
     search_case,
 )
 from maasi_sim.experiments.terrain import HURST, chunk, littered
-from maasi_sim.noise_streams import noise_stream
+from maasi_sim.world.noise_streams import noise_stream
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

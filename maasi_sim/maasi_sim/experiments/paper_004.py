@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from maasi_planner.planners.cuboid import (
+from maasi_planner.buildings import (
     CuboidSettings,
     DynamicsSettings,
     HazardSettings,
     Mission,
     plan_mission,
 )
-from maasi_sim.cuboid_mission import CuboidMission, SearchRobot, summary
-from maasi_sim.cuboid_picture import draw_mission, legend
+from maasi_sim.buildings.mission import CuboidMission, SearchRobot, summary
+from maasi_sim.buildings.picture import draw_mission, legend
 from maasi_sim.experiments.registry import (
     Case,
     Choice,

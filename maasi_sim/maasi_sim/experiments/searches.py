@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.pose import Pose
+from maasi_filter.models.pose import Pose
 from maasi_sim.experiments.registry import Case, Outcome, Quantity
-from maasi_sim.scenario import scenario_from_content, scenario_from_values
+from maasi_sim.scenario.loading import scenario_from_content, scenario_from_values
 from maasi_sim.search import SearchResult, search
 
 MEASUREMENTS = Quantity(

@@ -1,0 +1,1 @@
+"""What every driver does: goals, odometry, measurement batches, health, safety."""

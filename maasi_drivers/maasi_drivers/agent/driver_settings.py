@@ -1,0 +1,278 @@
+"""Settings of a robot's driver and of its guard."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from maasi_drivers.agent.ranging_mount import RangingSettings
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.ros.node_settings import LIVELINESS_LEASE, NodeSettings
+from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
+from maasi_planner.settings import MotionSettings
+
+CommandType = Literal['auto', 'stamped', 'twist']
+LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink']
+# The same in lockstep, where robots stand still until their drivers answer: a busy machine may keep
+# a driver waiting, and zeros in between would make the run another one [s].
+LOCKSTEP_LEASE = 20.0
+
+
+class ScanSettings(Settings):
+    """How a ground robot keeps clear of what its laser scanner sees."""
+
+    position: list[Finite] = Field(
+        default_factory=lambda: [0.0, 0.0],
+        min_length=2,
+        max_length=2,
+        description="Of the scanner in the robot's frame, x and y [m]",
+    )
+    yaw: Finite = Field(default=0.0, description="Of the scanner in the robot's frame [rad]")
+    reach: float = Field(
+        default=0.7, gt=0.0, le=10.0, description='How far ahead the way has to be free [m]'
+    )
+    timeout: float = Field(
+        default=1.0,
+        gt=0.0,
+        description='Time by the odometry without a scan after which the robot is stopped [s]',
+    )
+    blocked_timeout: float = Field(
+        default=15.0,
+        gt=0.0,
+        description='Time by the odometry without getting nearer to a waypoint after which it is '
+        'given up [s]',
+    )
+
+
+class DriverSettings(NodeSettings):
+    """What the driver of a robot needs to know."""
+
+    live: ClassVar[frozenset[str]] = frozenset(
+        {
+            'odometry_timeout',
+            'frozen_pose_timeout',
+            'sensor_timeout',
+            'battery_minimum',
+            'scan.timeout',
+            'scan.blocked_timeout',
+        }
+    )
+
+    environment: EnvironmentSettings = Field(description='Where the robot may go')
+    link: LinkName = Field(
+        default='topics',
+        description='How it is reached: ROS topics; pyparrot over WiFi or Bluetooth '
+        '(mambo_driver); a program of its own by UDP (mambo_onboard_driver); MAVLink '
+        '(mavlink_driver)',
+    )
+    mambo: MamboSettings | None = Field(
+        default=None,
+        description='With a link mambo_...: how, and what it may be made to do',
+    )
+    mavlink: MavlinkSettings | None = Field(
+        default=None, description='With link mavlink: how, and what it may be made to do'
+    )
+    start: list[Finite] = Field(
+        default_factory=lambda: [0.0, 0.0, 0.0],
+        min_length=3,
+        max_length=3,
+        description='Position in the map where its odometry is zero [m]',
+    )
+    yaw: Finite = Field(default=0.0, description='Heading there, from the x axis of the map [rad]')
+    radius: float = Field(default=0.1, gt=0.0, description='Of the robot [m]')
+    motion: MotionSettings = Field(
+        default_factory=MotionSettings, description='Motion model and controller'
+    )
+    sensor: SensorSettings = Field(
+        default_factory=SensorSettings, description='What it measures targets with'
+    )
+    camera: CameraSettings | None = Field(default=None, description='Its camera; none: it has none')
+    ranging: RangingSettings = Field(
+        default_factory=RangingSettings,
+        description='What the angles of `ranges` are relative to; of drivers with a ranging sensor',
+    )
+    scan: ScanSettings | None = Field(
+        default=None,
+        description='How a ground robot uses its laser scan; none: it drives by the known '
+        'obstacles alone; not in lockstep',
+    )
+    navigation: Literal['own', 'nav2'] = Field(
+        default='own',
+        description="Who drives a ground robot to its waypoints: the driver, or Nav2's "
+        'NavigateToPose; not in lockstep',
+    )
+    nav2_timeout: float = Field(
+        default=2.0,
+        gt=0.0,
+        description='Longest silence of Nav2 while it has a goal, answer or feedback: then the '
+        'goal is aborted and the robot stopped [s]',
+    )
+    image_source: Literal['topic', 'video', 'feed'] = Field(
+        default='topic',
+        description='Where images come from: a topic, what `video` names, or blobs that the robot '
+        'finds on board and sends to `feed_port` (docs/measurement_feed.md)',
+    )
+    video: str = Field(
+        default='',
+        description='Address (rtsp://...), device (/dev/video0) or file, as OpenCV opens it',
+    )
+    feed_port: int = Field(
+        default=14700, ge=1, le=65535, description='UDP port of the measurement feed'
+    )
+    feed_address: str = Field(
+        default='127.0.0.1',
+        min_length=1,
+        description='Address of this host on which the measurement feed is heard; 0.0.0.0: all, '
+        'from a robot on the network',
+    )
+    image_transport: Literal['raw', 'compressed'] = Field(
+        default='raw',
+        description='Images as camera/image_raw, or as camera/image_raw/compressed',
+    )
+    image_reliability: Literal['best_effort', 'reliable'] = Field(
+        default='best_effort',
+        description='Quality of service with which images are read; best_effort matches every '
+        'camera',
+    )
+    calibration_file: str = Field(
+        default='',
+        description="Calibration of the camera as ROS's camera_calibration writes it (YAML); "
+        'none: the parameters of the camera',
+    )
+    odometry_frame: str = Field(
+        default='',
+        description='What odom.header.frame_id has to be; none: odom, with this namespace or '
+        'without one',
+    )
+    odometry_origin: Literal['zero', 'first', 'map'] = Field(
+        default='zero',
+        description='What the odometry shows at the start: zero, or what its first message says; '
+        'map: it is in the map already, and so is its header.frame_id',
+    )
+    pose_source: Literal['odometry', 'tf', 'pose'] | None = Field(
+        default=None,
+        description='Where poses come from: `odom` (with link mavlink the autopilot), the '
+        'transform from the frame map to `base_frame` on /tf, or the topic `pose` '
+        '(geometry_msgs/PoseStamped, in the map); none: tf with navigation nav2, so that targets '
+        'are placed where the robot drives, else odometry; the others not in lockstep, and with '
+        'link topics or mavlink',
+    )
+    base_frame: str = Field(
+        default='', description="The robot's own frame on /tf; none: <robot>/base_link"
+    )
+    tf_rate: float = Field(
+        default=20.0,
+        ge=0.0,
+        le=1000.0,
+        description="How often the robot's pose is published on /tf, at most; 0: neither its "
+        'frames nor robot_description are published [Hz]',
+    )
+    odometry_timeout: float = Field(
+        default=0.5,
+        ge=0.1,
+        description='Time without odometry, or without a pose on /tf, after which the robot is '
+        'stopped; not in lockstep [s]',
+    )
+    frozen_pose_timeout: float = Field(
+        default=1.0,
+        ge=0.0,
+        description='Time by the odometry for which its pose may be the same to the bit under a '
+        'command to move, before the robot is stopped; 0: not looked at; not in lockstep [s]',
+    )
+    sensor_timeout: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='Time by the odometry without a new image or sweep after which the robot is '
+        'stopped; none: three periods of the sensor, at least 1 s; 0: not looked at; not in '
+        'lockstep [s]',
+    )
+    command_type: CommandType = Field(
+        default='auto',
+        description='Type of cmd_vel: TwistStamped, Twist, or what the robot listens to; auto is '
+        'stamped in lockstep',
+    )
+    battery_minimum: float = Field(
+        default=0.0,
+        ge=0.0,
+        lt=1.0,
+        description='Charge below which the robot goes nowhere any more; 0: not looked at [1]',
+    )
+
+    @property
+    def poses(self) -> str:
+        """Where poses come from: odometry, tf or pose."""
+        if self.pose_source is not None:
+            return self.pose_source
+        return 'tf' if self.navigation == 'nav2' else 'odometry'
+
+    @property
+    def sensor_patience(self) -> float:
+        """Time without a new image or sweep after which the robot is stopped [s]; 0: never."""
+        if self.sensor_timeout is not None:
+            return self.sensor_timeout
+        return max(1.0, 3.0 * self.sensor.period)
+
+    @model_validator(mode='after')
+    def _consistent(self) -> DriverSettings:
+        external = self.pose_source in ('tf', 'pose')
+        if external and (self.lockstep or self.link not in ('topics', 'mavlink')):
+            raise ValueError(
+                f'pose_source: got {self.pose_source!r}, allowed with link {self.link!r}'
+                f'{" in lockstep" if self.lockstep else ""} is odometry'
+            )
+        if self.lockstep and self.link != 'topics':
+            raise ValueError(
+                f'link: got {self.link!r}, which runs in real time; allowed is topics in lockstep'
+            )
+        if self.lockstep and self.image_source != 'topic':
+            raise ValueError(
+                f'image_source: got {self.image_source!r}, which runs in real time; allowed is '
+                'topic in lockstep'
+            )
+        if (self.image_source == 'video') != bool(self.video):
+            raise ValueError(
+                f'video: got {self.video!r}, allowed is a source with image_source video, and '
+                'nothing with another one'
+            )
+        if self.lockstep and self.command_type == 'twist':
+            raise ValueError(
+                f'command_type: got {self.command_type!r}, allowed is stamped (or auto) in lockstep'
+            )
+        if self.lockstep and (self.scan is not None or self.navigation != 'own'):
+            name = 'navigation' if self.scan is None else 'scan'
+            raise ValueError(
+                f'{name}: got {self.navigation if self.scan is None else "settings"}, allowed in '
+                'lockstep is that the driver drives by the known obstacles alone'
+            )
+        if self.scan is not None and self.motion.model != 'unicycle':
+            raise ValueError(
+                f"scan: got settings, allowed with motion.model 'unicycle', not "
+                f'{self.motion.model!r}'
+            )
+        if self.lockstep and self.camera is not None and self.camera.stamp_offset > 0.0:
+            raise ValueError(
+                f'camera.stamp_offset: got {self.camera.stamp_offset}, allowed is at most 0 in '
+                'lockstep: the pose after an image is not awaited there'
+            )
+        return self
+
+
+class GuardSettings(NodeSettings):
+    """What the guard of a robot needs to know."""
+
+    lease: float = Field(
+        default=LIVELINESS_LEASE,
+        ge=LIVELINESS_LEASE,
+        le=60.0,
+        description='Time without an assertion of liveliness after which the driver is dead; not '
+        'in lockstep [s of wall time]',
+    )
+
+    command_type: CommandType = Field(
+        default='auto',
+        description='Type of cmd_vel: TwistStamped, Twist, or what the robot listens to; auto is '
+        'stamped in lockstep',
+    )

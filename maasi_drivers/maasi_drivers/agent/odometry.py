@@ -1,0 +1,207 @@
+"""Odometry in the map: a robot's own odometry placed by its initial pose, and poses at a stamp."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.models.pose import Pose, compose, inverse
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StampedPose:
+    """
+    Where a robot was at a stamp.
+
+    Attributes
+    ----------
+    stamp : int
+        [ns]; whole, so that equal stamps are equal.
+    pose : Pose
+        In the map frame.
+    covariance : ndarray, shape (6, 6)
+        Of x, y, z [m] and rotations about the map's axes [rad].
+    velocity : ndarray, shape (3,)
+        Map frame [m/s].
+    angular_velocity : ndarray, shape (3,)
+        The robot's frame [rad/s].
+
+    """
+
+    stamp: int
+    pose: Pose
+    covariance: Array
+    velocity: Array
+    angular_velocity: Array
+
+
+def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = np.array(value, dtype=float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(
+            f'{name}: got {array.tolist()}, allowed are finite numbers of shape {shape}'
+        )
+    return array
+
+
+class MapOdometry:
+    """
+    Turns a robot's odometry, which starts at zero, into poses in the map.
+
+    Parameters
+    ----------
+    initial : Pose
+        Of the robot in the map when its odometry stood at ``origin``.
+    origin : Pose, optional
+        What the odometry showed then; without it, zero. A robot that was not restarted shows
+        something else: give its first message.
+
+    """
+
+    def __init__(self, initial: Pose, origin: Pose | None = None) -> None:
+        self.map_from_odom = initial if origin is None else compose(initial, inverse(origin))
+        self._turn = self.map_from_odom.rotation()
+
+    def apply(
+        self,
+        stamp: int,
+        pose: Pose,
+        covariance: ArrayLike | None = None,
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> StampedPose:
+        """
+        Place one odometry message in the map.
+
+        Parameters
+        ----------
+        stamp : int
+            [ns].
+        pose : Pose
+            Of the robot in its odometry frame.
+        covariance : array_like, shape (6, 6), optional
+            Of the pose, in the odometry frame, as in ``nav_msgs/Odometry``; none: zero.
+        velocity, angular_velocity : array_like, shape (3,)
+            The twist, in the robot's frame [m/s, rad/s].
+
+        Raises
+        ------
+        ValueError
+            Where a number is not finite.
+
+        """
+        matrix = np.zeros((6, 6))
+        if covariance is not None:
+            turn = np.zeros((6, 6))
+            turn[:3, :3] = turn[3:, 3:] = self._turn
+            matrix = turn @ _finite('covariance', covariance, (6, 6)) @ turn.T
+        placed = compose(self.map_from_odom, pose)
+        return StampedPose(
+            stamp,
+            placed,
+            matrix,
+            placed.rotation() @ _finite('velocity', velocity, (3,)),
+            _finite('angular_velocity', angular_velocity, (3,)),
+        )
+
+
+def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedPose:
+    """
+    Return the pose at a stamp between two others: position linear, orientation the short way round.
+
+    Raises
+    ------
+    ValueError
+        If the stamp is not between theirs.
+
+    """
+    if not first.stamp <= stamp <= second.stamp:
+        raise ValueError(f'stamp: got {stamp}, allowed from {first.stamp} to {second.stamp} [ns]')
+    if stamp == first.stamp:
+        return first
+    if stamp == second.stamp:
+        return second
+    part = (stamp - first.stamp) / (second.stamp - first.stamp)
+
+    def mix(a: Array, b: Array) -> Array:
+        return (1.0 - part) * a + part * b
+
+    a, b = first.pose.orientation, second.pose.orientation
+    cosine = float((a * b).sum())
+    if cosine < 0.0:
+        b, cosine = -b, -cosine
+    angle = float(np.arccos(min(cosine, 1.0)))
+    if angle < 1e-6:
+        orientation = mix(a, b)
+    else:
+        orientation = (np.sin((1.0 - part) * angle) * a + np.sin(part * angle) * b) / np.sin(angle)
+    return StampedPose(
+        stamp,
+        Pose(mix(first.pose.position, second.pose.position), orientation),
+        mix(first.covariance, second.covariance),
+        mix(first.velocity, second.velocity),
+        mix(first.angular_velocity, second.angular_velocity),
+    )
+
+
+class PoseHistory:
+    """
+    A robot's latest poses, to look up where it was when an image was taken.
+
+    Parameters
+    ----------
+    length : int
+        How many are kept.
+
+    """
+
+    def __init__(self, length: int = 512) -> None:
+        if length < 2:
+            raise ValueError(f'length: got {length}, allowed is at least 2')
+        self.length = length
+        self._stamps: list[int] = []
+        self._poses: list[StampedPose] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def latest(self) -> StampedPose | None:
+        """The last pose added, or None."""
+        return self._poses[-1] if self._poses else None
+
+    def add(self, pose: StampedPose) -> bool:
+        """Add a pose; False, and nothing added, where its stamp is not after the last one's."""
+        if self._stamps and pose.stamp <= self._stamps[-1]:
+            return False
+        self._stamps.append(pose.stamp)
+        self._poses.append(pose)
+        if len(self._stamps) > self.length:
+            del self._stamps[0], self._poses[0]
+        return True
+
+    def clear(self) -> None:
+        """Forget everything, as after a jump of the clock."""
+        self._stamps.clear()
+        self._poses.clear()
+
+    def at(self, stamp: int) -> StampedPose | None:
+        """
+        Return the pose at a stamp [ns], interpolated between its neighbours.
+
+        None where the stamp is before the first pose kept or after the last one: nothing is
+        extrapolated, the caller waits for the next odometry.
+        """
+        index = bisect_left(self._stamps, stamp)
+        if index == len(self._stamps):
+            return None
+        if self._stamps[index] == stamp:
+            return self._poses[index]
+        if index == 0:
+            return None
+        return interpolate(self._poses[index - 1], self._poses[index], stamp)

@@ -1,0 +1,285 @@
+"""A robot's frames on /tf and /tf_static, its description, and poses that others publish there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.robot_model import base_frame, robot_description, sensor_frames
+from maasi_drivers.agent.transform_buffer import TransformBuffer, TransformError
+from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.ros.conversions import (
+    FARTHEST,
+    bounded,
+    point_from_ros,
+    stamp_from_ros,
+    stamp_to_ros,
+)
+from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
+from maasi_filter.ros.stamps import stamp_problem
+
+# As tf2 reads and writes.
+_TF = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
+_NO_TYPE = (
+    'the package tf2_msgs is not installed (sudo apt install ros-$ROS_DISTRO-tf2-msgs): nothing is '
+    'published on tf and tf_static, and goals have to be in the frame '
+)
+
+
+class RobotFrames:
+    """
+    The frames of one robot.
+
+    Publishes
+    ---------
+    `tf`, `tf_static` of the team (tf2_msgs/TFMessage); `robot_description` (std_msgs/String)
+
+    Subscribes
+    ----------
+    `tf`, `tf_static` of the team, not in lockstep: there only the robot's own frames are known
+
+    Parameters
+    ----------
+    node : SearchNode
+        The robot's driver.
+    robot : str
+        Its name.
+    on_pose : callable
+        Takes stamp [ns] and pose in the map, with `pose_source: tf`.
+
+    Raises
+    ------
+    SettingsError
+        If poses are to come from tf and tf2_msgs is not installed.
+
+    """
+
+    def __init__(
+        self,
+        node: SearchNode[DriverSettings],
+        robot: str,
+        on_pose: Callable[[int, Pose], None],
+    ) -> None:
+        self._node = node
+        self._settings = node.settings
+        self._robot = robot
+        self._on_pose = on_pose
+        self._base = base_frame(robot, self._settings)
+        self._odom = f'{robot}/odom'
+        self._buffer = TransformBuffer()
+        self._static: list[TransformStamped] = []
+        self._map_from_odom: Pose | None = None
+        self._odom_from_map = Pose(np.zeros(3))
+        self._slot: int | None = None
+        self._taken: int | None = None
+        self._publisher: Publisher | None = None
+        self._static_publisher: Publisher | None = None
+        self._moving = TransformStamped(child_frame_id=self._base)
+        self._moving.header.frame_id = self._odom
+        self._type = self._message_type()
+        self._message = None if self._type is None else self._type(transforms=[self._moving])
+
+    def _message_type(self) -> Any:
+        """Return tf2_msgs/TFMessage, or None where it is not installed."""
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as error:
+            if self._settings.poses == 'tf':
+                raise SettingsError(
+                    "parameter pose_source: read 'tf', but the package tf2_msgs is not installed "
+                    "(sudo apt install ros-$ROS_DISTRO-tf2-msgs); allowed without it is 'odometry'"
+                ) from error
+            self._node.get_logger().warning(_NO_TYPE + repr(self._settings.frame))
+            return None
+        return TFMessage
+
+    def set_up(self) -> None:
+        """Connect, and publish what does not change, in *configure*."""
+        node, settings, kind = self._node, self._settings, self._type
+        if settings.tf_rate:
+            description = node.create_publisher(String, 'robot_description', LATCHED)
+            description.publish(String(data=robot_description(self._robot, settings)))
+        if kind is None:
+            return
+        if settings.tf_rate:
+            self._static_publisher = node.create_publisher(
+                kind, node.team_topic('tf_static'), LATCHED
+            )
+            if settings.poses != 'tf':
+                self._publisher = node.create_publisher(kind, node.team_topic('tf'), _TF)
+        for frame in sensor_frames(self._robot, settings):
+            self._add_static(frame.parent, frame.name, frame.pose())
+        self._publish_static()
+        if not settings.lockstep:
+            node.create_subscription(kind, node.team_topic('tf'), self._on_moving, _TF)
+            node.create_subscription(
+                kind, node.team_topic('tf_static'), self._on_static, LATCHED_ALL
+            )
+
+    def clear(self) -> None:
+        """Forget what moves, as after a jump of the clock."""
+        self._buffer.clear()
+        self._slot = self._taken = None
+
+    # ---- what is published -------------------------------------------------------------------
+
+    def publish(self, placed: StampedPose, map_from_odom: Pose) -> None:
+        """
+        Publish where the robot is, `tf_rate` times a second of its stamps at most.
+
+        Parameters
+        ----------
+        placed : StampedPose
+            As in `state`.
+        map_from_odom : Pose
+            Of the odometry's frame in the map.
+        """
+        settings = self._settings
+        if settings.poses == 'tf' or not settings.tf_rate:
+            return
+        # Of the stamp alone, so that runs in lockstep are equal.
+        slot = math.floor(placed.stamp * settings.tf_rate * 1e-9 + 1e-6)
+        if slot == self._slot:
+            return
+        self._slot = slot
+        if map_from_odom != self._map_from_odom:
+            self._map_from_odom, self._odom_from_map = map_from_odom, inverse(map_from_odom)
+            self._add_static(settings.frame, self._odom, map_from_odom)
+            self._publish_static()
+        pose = compose(self._odom_from_map, placed.pose)
+        self._know(self._odom, self._base, pose, placed.stamp)
+        self._moving.header.stamp = stamp_to_ros(placed.stamp)
+        _fill(self._moving, pose)
+        if self._publisher is not None:
+            self._publisher.publish(self._message)
+
+    def _add_static(self, parent: str, child: str, pose: Pose) -> None:
+        self._know(parent, child, pose)
+        # The stamp of a static transform has no meaning.
+        transform = TransformStamped(child_frame_id=child)
+        transform.header.frame_id = parent
+        _fill(transform, pose)
+        self._static = [item for item in self._static if item.child_frame_id != child]
+        self._static.append(transform)
+
+    def _know(self, parent: str, child: str, pose: Pose, stamp: int | None = None) -> None:
+        try:
+            self._buffer.add(parent, child, pose, stamp or 0, static=stamp is None)
+        except ValueError as error:
+            # As where somebody else has a frame of the same name above this one.
+            self._node.drop('transform', f'frames of this robot: {error}')
+
+    def _publish_static(self) -> None:
+        # All of them each time: only the last message is latched.
+        if self._static_publisher is not None and self._static and self._type is not None:
+            self._static_publisher.publish(self._type(transforms=self._static))
+
+    # ---- what others publish -----------------------------------------------------------------
+
+    def _on_static(self, message: Any) -> None:
+        self._read('tf_static', message, static=True)
+
+    def _on_moving(self, message: Any) -> None:
+        self._read('tf', message, static=False)
+        if self._settings.poses == 'tf':
+            self._take_pose()
+
+    def _read(self, topic: str, message: Any, *, static: bool) -> None:
+        for item in message.transforms:
+            try:
+                if (problem := stamp_problem(item)) is not None:
+                    raise ValueError(problem)
+                place, turn = item.transform.translation, item.transform.rotation
+                bounded('translation', (place.x, place.y, place.z), FARTHEST)
+                bounded('rotation', (turn.w, turn.x, turn.y, turn.z), 1e6)
+                self._buffer.add(
+                    item.header.frame_id.strip('/'),
+                    item.child_frame_id.strip('/'),
+                    Pose(point_from_ros(place), np.array([turn.w, turn.x, turn.y, turn.z])),
+                    stamp_from_ros(item.header.stamp),
+                    static=static,
+                )
+            except ValueError as error:
+                self._node.drop(
+                    'transform',
+                    f'{topic}: {item.header.frame_id[:40]!r} to {item.child_frame_id[:40]!r}: '
+                    f'{error}',
+                )
+
+    def _take_pose(self) -> None:
+        """Hand the robot's pose on if tf has a newer one that is not stale."""
+        settings = self._settings
+        try:
+            stamp = self._buffer.latest(settings.frame, self._base)
+            if stamp is None or stamp == self._taken:
+                return
+            pose = self._buffer.pose(settings.frame, self._base, stamp)
+        except TransformError:
+            # The driver says that it has no pose.
+            return
+        self._taken = stamp
+        age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
+        if age > settings.odometry_timeout:
+            self._node.drop(
+                'stale transform',
+                f'tf: {self._base!r} in {settings.frame!r} is {age:.1f} s old, allowed is up to '
+                f'{settings.odometry_timeout:g} s (odometry_timeout)',
+            )
+            return
+        self._on_pose(stamp, pose)
+
+    def to_map(self, waypoint: PoseStamped, now: int) -> str | None:
+        """
+        Bring a waypoint into the map; return what is wrong where that is not possible.
+
+        A waypoint without a stamp is one in its frame as it is now.
+
+        Parameters
+        ----------
+        waypoint : geometry_msgs/PoseStamped
+            Its position and frame are changed.
+        now : int
+            Stamp of the robot's latest pose [ns].
+        """
+        header, settings = waypoint.header, self._settings
+        frame = header.frame_id.strip('/')
+        if header.frame_id == settings.frame:
+            return None
+        problem = f'waypoint.header.frame_id: read {header.frame_id!r}, allowed is '
+        problem += f'{settings.frame!r} or a frame that tf connects with it: '
+        try:
+            latest = self._buffer.latest(settings.frame, frame)
+            if latest is None:
+                pose = self._buffer.pose(settings.frame, frame)
+            else:
+                stamp = stamp_from_ros(header.stamp) or now
+                age = 1e-9 * (stamp - latest)
+                if age > settings.odometry_timeout:
+                    return (
+                        f'{problem}the transform is {age:.1f} s too old, allowed are '
+                        f'{settings.odometry_timeout:g} s (odometry_timeout)'
+                    )
+                pose = self._buffer.pose(settings.frame, frame, min(stamp, latest))
+        except TransformError as error:
+            return problem + str(error)
+        point = waypoint.pose.position
+        position = pose.position + pose.rotation() @ point_from_ros(point)
+        point.x, point.y, point.z = position.tolist()
+        header.frame_id = settings.frame
+        return None
+
+
+def _fill(transform: TransformStamped, pose: Pose) -> None:
+    place, turn = transform.transform.translation, transform.transform.rotation
+    place.x, place.y, place.z = pose.position.tolist()
+    turn.w, turn.x, turn.y, turn.z = pose.orientation.tolist()

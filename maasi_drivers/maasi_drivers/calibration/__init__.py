@@ -1,0 +1,1 @@
+"""A sensor calibrated from recordings of one target. Without ROS."""

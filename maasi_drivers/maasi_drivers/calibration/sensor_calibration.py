@@ -1,0 +1,177 @@
+"""A sensor's noise R from looks at one target, as in 000, section 5.2."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+
+FloatArray = NDArray[np.float64]
+
+# Fewer looks say nothing of a covariance.
+LEAST_LOOKS = 10
+# What is so many times farther from the target than the median is something else.
+_FAR = 8.0
+# Below this all detections agree to rounding [m].
+_ROUNDING = 1e-9
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Look:
+    """
+    What a sensor saw at one instant.
+
+    Attributes
+    ----------
+    pose : Pose
+        Of the robot, in the map.
+    values : ndarray, shape (m, d)
+        Range [m], bearing and, in 3D, elevation [rad] of what it saw.
+    """
+
+    pose: Pose
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """
+    A sensor's noise.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (d, d)
+        R: of the errors of range [m], bearing and, in 3D, elevation [rad].
+    bias : ndarray, shape (d,)
+        Their mean.
+    target : ndarray, shape (d,)
+        Where the target is [m, map]: as given, or the mean of where it was seen.
+    ranges : tuple of float
+        Smallest and largest range of the looks that were used [m].
+    used : int
+        Looks from which R comes.
+    near : int
+        Looks left out because the target was too near for a bearing.
+    others : int
+        Detections of something else.
+    inside : int
+        Looks with the target in the field of view.
+    missed : int
+        Of those, the ones that did not show it.
+    """
+
+    covariance: FloatArray
+    bias: FloatArray
+    target: FloatArray
+    ranges: tuple[float, float]
+    used: int
+    near: int
+    others: int
+    inside: int
+    missed: int
+
+    @property
+    def deviations(self) -> FloatArray:
+        """Square roots of the diagonal of R, shape (d,)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def probability(self) -> float:
+        """Share of the looks with the target in the field of view that showed it."""
+        return 1.0 - self.missed / self.inside if self.inside else float('nan')
+
+
+def sensor_noise(
+    looks: Sequence[Look],
+    sensor: Sensor,
+    target: ArrayLike | None = None,
+    least_range: float = 0.05,
+) -> SensorNoise:
+    """
+    Return a sensor's noise.
+
+    In each look the detection nearest to the target counts, unless it is eight times as far as the
+    median.
+
+    Parameters
+    ----------
+    looks : sequence of Look
+        At one target, from different places.
+    sensor : Sensor
+        Its measurement model, and the field of view in which misses are counted.
+    target : array_like, shape (d,), optional
+        Where it is [m, map]; none: the mean of where it was seen, which hides a bias.
+    least_range : float
+        Looks nearer than this are left out: the bearing means nothing there [m].
+
+    Raises
+    ------
+    ValueError
+        If fewer than ten looks show it, or the target is not finite.
+    """
+    model = sensor.measurement
+    seen = [model.inverse(look.values, look.pose) for look in looks]
+    if target is not None:
+        place = np.asarray(target, dtype=float)
+        if place.shape != (model.dimension,) or not np.isfinite(place).all():
+            raise ValueError(
+                f'target: got {place.tolist()}, allowed are {model.dimension} finite numbers [m]'
+            )
+    else:
+        every = np.concatenate([np.zeros((0, model.dimension)), *seen])
+        if not len(every):
+            raise ValueError(f'target: it was seen 0 times, allowed is at least {LEAST_LOOKS}')
+        place = np.median(every, axis=0)
+    nearest: list[int | None] = []
+    # Without a given target, from the median to the mean of what is near it.
+    for _ in range(1 if target is not None else _ROUNDS):
+        nearest = _nearest(seen, place)
+        chosen = [spots[i] for spots, i in zip(seen, nearest) if i is not None]
+        if target is None and chosen:
+            place = np.mean(chosen, axis=0)
+    errors, ranges, near, inside, missed = [], [], 0, 0, 0
+    for look, index in zip(looks, nearest):
+        expected = model.measure(place[None, :], look.pose)[0]
+        if sensor.detection.probability(place[None, :], look.pose)[0] > 0.0:
+            inside += 1
+            missed += index is None
+        if index is None:
+            continue
+        if expected[0] < least_range:
+            near += 1
+            continue
+        errors.append(model.residual(look.values[index], expected))
+        ranges.append(float(expected[0]))
+    if len(errors) < LEAST_LOOKS:
+        raise ValueError(
+            f'target: it was seen {len(errors)} times from {least_range:g} m or farther, '
+            f'allowed is at least {LEAST_LOOKS}'
+        )
+    array = np.array(errors)
+    return SensorNoise(
+        covariance=np.atleast_2d(np.cov(array, rowvar=False)),
+        bias=array.mean(axis=0),
+        target=place,
+        ranges=(min(ranges), max(ranges)),
+        used=len(errors),
+        near=near,
+        others=sum(map(len, seen)) - sum(index is not None for index in nearest),
+        inside=inside,
+        missed=missed,
+    )
+
+
+def _nearest(seen: Sequence[FloatArray], place: FloatArray) -> list[int | None]:
+    """Return for each look which of its detections is the target's; none: none is."""
+    distances = [np.linalg.norm(spots - place, axis=1) for spots in seen]
+    least = [float(item.min()) for item in distances if len(item)]
+    limit = max(_FAR * float(np.median(least)), _ROUNDING) if least else 0.0
+    return [
+        int(np.argmin(item)) if len(item) and item.min() <= limit else None for item in distances
+    ]

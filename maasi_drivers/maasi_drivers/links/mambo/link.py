@@ -1,0 +1,441 @@
+"""The wire to a Parrot Mambo: pyparrot over WiFi or Bluetooth, behind one thread. Without ROS.
+
+Over WiFi pyparrot keeps handing out its last packet after the link is cut, and the stamp in a
+position event is the time since the one before. So an event counts as new only when one of the
+acquisition stamps that come with it (of speed, altitude or orientation) has changed. Bluetooth
+delivers few of them, each notification once (pyparrot, docs/minidronecommands.rst: "more
+information via wifi than via BLE"): there each one counts, and so does the acknowledgement of a
+command, which is sent for that purpose when nothing else is heard.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import math
+import re
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_drivers.links.mambo.bluetooth import ask_for_answer, mend
+from maasi_drivers.links.mambo.guarded_socket import DroneSocket, guard, revive
+
+FloatArray = NDArray[np.float64]
+
+HANDSHAKE_PORT = 44444
+AIRBORNE = ('takingoff', 'hovering', 'flying', 'landing')
+
+_STAMPS = ('DroneSpeed_ts', 'DroneAltitude_ts', 'DroneQuaternion_ts')
+# Between two rounds of the thread [s]; what is handed over wakes it.
+_ROUND = 0.05
+# Silence of its caller after which the drone is told to hover [s].
+CALLER_TIMEOUT = 0.5
+# From one take-off or landing command to the next while the drone does not obey [s].
+_REPEAT = 0.7
+_RETRIES = 3
+# Over Bluetooth: silence after which a command is sent that the drone has to acknowledge [s].
+_PROBE_PERIOD = 0.3
+# From one try to connect to the next [s].
+_RECONNECT = 1.0
+_BLUETOOTH = re.compile(r'([0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}')
+# Farthest that a position can be from the take-off point [m].
+_FARTHEST = 1000.0
+
+
+class MamboLinkError(RuntimeError):
+    """No way to the drone; the text says why and what can be done."""
+
+
+@dataclass(frozen=True)
+class PositionEvent:
+    """
+    Where the drone says that it is.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        From the take-off point: forward, left, up, axes of the heading then [m].
+    yaw : float
+        From the heading at take-off, anticlockwise [rad].
+    received : float
+        Monotonic clock [s].
+
+    """
+
+    position: FloatArray
+    yaw: float
+    received: float
+
+
+class MamboLink:
+    """
+    A connection to one Mambo.
+
+    All calls return at once; a thread of its own talks to pyparrot, which sleeps in its commands. A
+    piloting command is sent once. That thread is a dead man's switch too: once the caller has not
+    called `keep_alive` for `CALLER_TIMEOUT`, the drone is told to hover, and to land after
+    `land_after` more.
+
+    Parameters
+    ----------
+    kind : {'wifi', 'ble'}
+        How it is reached.
+    address : str
+        IP address, or Bluetooth address.
+    port : int
+        UDP port on which the drone's events are heard, on the address of this host that faces it.
+    tilt : float
+        Of 100 per cent roll or pitch [rad]; the drone takes 5 to 25 degrees.
+    climb : float
+        Of 100 per cent climb [m/s]; the drone takes 0.5 to 2.
+    land_after : float
+        Time without its caller after which the drone is told to land, from when it hovers [s].
+
+    """
+
+    def __init__(
+        self,
+        kind: Literal['wifi', 'ble'] = 'wifi',
+        address: str = '192.168.99.3',
+        port: int = 43210,
+        tilt: float = math.radians(10.0),
+        climb: float = 0.5,
+        land_after: float = 3.0,
+    ) -> None:
+        self.kind = kind
+        self.address = address
+        self.port = port
+        self.tilt = tilt
+        self.climb = climb
+        self.land_after = land_after
+        #: What is wrong with the link; while it is not connected it goes on trying.
+        self.error = ''
+        #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...
+        self.flying_state = ''
+        #: Charge, 0 to 1; negative: not heard yet.
+        self.battery = -1.0
+        #: When something new, or an acknowledgement, was last heard from it, monotonic clock [s].
+        self.heard_at = -math.inf
+        #: Position events that could not be used.
+        self.bad_events = 0
+        #: How often pyparrot's listener had died and was started again.
+        self.revived = 0
+        self._drone: Any = None
+        self._position: PositionEvent | None = None
+        self._stamps: dict[str, Any] = {}
+        self._fresh = False
+        self._lock = threading.Lock()
+        self._wake = threading.Event()
+        self._connected = threading.Event()
+        self._closing = threading.Event()
+        self._closed = threading.Event()
+        self._steering: tuple[int, int, int, int] | None = None
+        self._wanted: Literal['', 'take_off', 'land'] = ''
+        self._asked_at = -math.inf
+        self._called_at = math.inf
+        self._probed_at = -math.inf
+        self._thread: threading.Thread | None = None
+
+    # ---- what the caller asks for ------------------------------------------------------------
+
+    def connect(self) -> None:
+        """
+        Begin to connect.
+
+        Raises
+        ------
+        MamboLinkError
+            If it is clear at once that this cannot work.
+
+        """
+        make = self._make_drone()
+        # pyparrot's own thread inherits that this one does not keep the process alive.
+        self._thread = threading.Thread(
+            target=self._work, args=(make,), name='Mambo link', daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the drone has answered."""
+        return self._connected.is_set()
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the drone says that it is in the air, landing included."""
+        return self.flying_state in AIRBORNE
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Datagrams that were not used: reason to number."""
+        receiver = getattr(self._drone, 'drone_connection', None)
+        return Counter(getattr(getattr(receiver, 'udp_receive_sock', None), 'dropped', {}))
+
+    @property
+    def position(self) -> PositionEvent | None:
+        """The last position event, or None."""
+        return self._position
+
+    def take_off(self) -> None:
+        """Have it take off; said again until it does, or until something else is asked for."""
+        self._want('take_off')
+
+    def land(self) -> None:
+        """Have it land; said again until it does, also when nothing is heard from it."""
+        self._want('land')
+
+    def steer(self, forward: float, left: float, up: float, turn: float) -> None:
+        """
+        Send one piloting command, each as a share of the largest, -1 to 1; turn anticlockwise.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+
+        """
+        values = (-left, forward, -turn, up)
+        if not all(math.isfinite(value) for value in values):
+            raise ValueError(
+                f'steer: got {(forward, left, up, turn)}, allowed are finite numbers from -1 to 1'
+            )
+        roll, pitch, yaw, climb = (round(100.0 * max(-1.0, min(value, 1.0))) for value in values)
+        with self._lock:
+            self._steering = (roll, pitch, yaw, climb)
+        self._wake.set()
+
+    def keep_alive(self) -> None:
+        """Note that the caller still looks after the drone; the first call arms the switch."""
+        self._called_at = time.monotonic()
+
+    def hover(self) -> None:
+        """Send the piloting command with which the drone keeps its place by itself."""
+        self.steer(0.0, 0.0, 0.0, 0.0)
+
+    def close(self, patience: float = 3.0) -> None:
+        """Leave the drone to its firmware, waiting for `patience` seconds at most."""
+        self._closing.set()
+        self._wake.set()
+        if self._thread is not None:
+            self._thread.join(patience)
+
+    def _want(self, what: Literal['take_off', 'land']) -> None:
+        with self._lock:
+            if self._wanted != what:
+                self._wanted = what
+                self._asked_at = -math.inf
+                self._steering = None
+        self._wake.set()
+
+    def check(self) -> Any:
+        """
+        Return pyparrot's module for such drones, if it can be used here.
+
+        Raises
+        ------
+        MamboLinkError
+            If it cannot, with what can be done.
+
+        """
+        try:
+            # Only a driver that has such a robot needs it.
+            minidrone = importlib.import_module('pyparrot.Minidrone')
+        except ImportError as error:
+            raise MamboLinkError(
+                f'link to a Mambo: {error}; pyparrot and zeroconf are needed '
+                '(pip install pyparrot zeroconf)'
+            ) from error
+        if self.kind == 'ble' and not minidrone.BLEAvailable:
+            raise MamboLinkError(
+                'link to a Mambo by Bluetooth: bluepy is not installed (pip install bluepy; it '
+                "needs GLib's headers, libglib2.0-dev, to build), or use WiFi"
+            )
+        if self.kind == 'ble' and not _BLUETOOTH.fullmatch(self.address):
+            raise MamboLinkError(
+                f'address of a Mambo by Bluetooth: read {self.address!r}, allowed is one such as '
+                "e0:14:d0:63:3d:d0 (pyparrot's findMinidrone shows it)"
+            )
+        if self.kind == 'wifi':
+            _check_port(self.port, self.address)
+        return minidrone
+
+    # ---- the thread --------------------------------------------------------------------------
+
+    def _make_drone(self) -> Any:
+        minidrone = self.check()
+        link = self
+
+        class Sensors(minidrone.MinidroneSensors):  # type: ignore[name-defined, misc]
+            """Those of pyparrot, which also say what has just come in."""
+
+            def update(self, name: str, value: Any, sensor_enum: Any) -> None:
+                super().update(name, value, sensor_enum)
+                link._take(name, value, self)
+
+        drone = minidrone.Mambo(address=self.address, use_wifi=self.kind == 'wifi')
+        drone.sensors = Sensors()
+        received = drone.drone_connection._set_command_received
+
+        def take_answer(channel: str, value: bool, *sequence: int) -> None:
+            received(channel, value, *sequence)
+            if value:
+                link.heard_at = time.monotonic()
+
+        drone.drone_connection._set_command_received = take_answer
+        if self.kind == 'wifi':
+            connection = drone.drone_connection
+            # With its own name for the type it would know no other address than 192.168.99.3.
+            connection.drone_type = 'Minidrone'
+            connection.ip_address = self.address
+            connection.udp_receive_port = self.port
+            guard(connection, self.address, self.port)
+        else:
+            mend(drone.drone_connection)
+        return drone
+
+    def _work(self, drone: Any) -> None:
+        where = self.address if self.kind == 'ble' else f'{self.address}, TCP {HANDSHAKE_PORT}'
+        while (why := self._try_to_connect(drone)) and not self._closing.is_set():
+            self.error = f'no Mambo at {where}: {why}'
+            self._closing.wait(_RECONNECT)
+        if why:
+            return
+        self.error = ''
+        self._drone = drone
+        try:
+            drone.set_max_tilt(math.degrees(self.tilt))
+            drone.set_max_vertical_speed(self.climb)
+            drone.ask_for_state_update()
+            self._connected.set()
+            while not self._closing.is_set():
+                self._watch_caller()
+                self._do_wanted()
+                self._send_steering()
+                if self.kind == 'ble':
+                    self._probe(drone.drone_connection)
+                    drone.smart_sleep(_ROUND)
+                else:
+                    self.revived += revive(drone.drone_connection)
+                    self._wake.wait(_ROUND)
+                self._wake.clear()
+        except Exception as error:
+            self.error = f'the link to the Mambo broke: {error}'
+        finally:
+            self._connected.clear()
+            self._leave(drone)
+
+    def _watch_caller(self) -> None:
+        """Have the drone hover, and then land, where the caller hangs."""
+        late = time.monotonic() - self._called_at - CALLER_TIMEOUT
+        if late <= 0.0 or not self.airborne:
+            return
+        if late > self.land_after:
+            self.land()
+        else:
+            with self._lock:
+                self._steering = (0, 0, 0, 0)
+
+    def _try_to_connect(self, drone: Any) -> str:
+        """Return why there is no connection, or nothing."""
+        try:
+            return '' if drone.connect(num_retries=_RETRIES) else 'it refused the connection'
+        except Exception as error:
+            # pyparrot raises whatever comes up below it.
+            return str(error) or type(error).__name__
+
+    def _do_wanted(self) -> None:
+        with self._lock:
+            wanted = self._wanted
+            state = self.flying_state
+            obeyed = (
+                state in AIRBORNE
+                if wanted == 'take_off'
+                else state in ('landed', 'landing', 'emergency')
+            )
+            if wanted == 'land' and state != 'landed' and self._stale():
+                # What it said last may not be so any more.
+                obeyed = False
+            if wanted == 'take_off' and obeyed:
+                # Once is enough: one that lands by itself stays down.
+                self._wanted = ''
+            if not wanted or obeyed or time.monotonic() - self._asked_at < _REPEAT:
+                return
+            self._asked_at = time.monotonic()
+        if wanted == 'take_off':
+            self._drone.takeoff()
+        else:
+            self._drone.land()
+
+    def _stale(self) -> bool:
+        return time.monotonic() - self.heard_at > 1.0
+
+    def _send_steering(self) -> None:
+        with self._lock:
+            steering, self._steering = self._steering, None
+        if steering is not None:
+            self._drone.fly_direct(*steering)
+
+    def _probe(self, connection: Any) -> None:
+        now = time.monotonic()
+        if now - max(self.heard_at, self._probed_at) >= _PROBE_PERIOD:
+            self._probed_at = now
+            ask_for_answer(connection, self.tilt)
+
+    def _leave(self, drone: Any) -> None:
+        if self.kind == 'ble':
+            drone.disconnect()
+            return
+        connection = drone.drone_connection
+        connection.is_listening = False
+        # Its listener closes the sockets itself.
+        connection.listener_thread.join(2.0)
+
+    # ---- what comes in -----------------------------------------------------------------------
+
+    def _take(self, name: str, value: Any, sensors: Any) -> None:
+        """Take one number of an event; called by pyparrot's thread."""
+        if self.kind == 'ble':
+            self._fresh = True
+            self.heard_at = time.monotonic()
+        if name in _STAMPS:
+            if self._stamps.get(name) != value:
+                self._stamps[name] = value
+                self._fresh = True
+                self.heard_at = time.monotonic()
+        elif name == 'FlyingStateChanged_state':
+            self.flying_state = str(sensors.flying_state)
+        elif name == 'BatteryStateChanged_battery_percent':
+            self.battery = min(max(0.01 * float(value), 0.0), 1.0)
+        elif name == 'DronePosition_ts' and self._fresh:
+            # The last number of its event.
+            self._fresh = False
+            read = sensors.sensors_dict
+            numbers = [float(read[f'DronePosition_{key}']) for key in ('posx', 'posy', 'posz')]
+            psi = float(read['DronePosition_psi'])
+            position = 0.01 * np.array(numbers)
+            if not (np.isfinite(position).all() and math.isfinite(psi)) or (
+                np.abs(position).max() > _FARTHEST
+            ):
+                self.bad_events += 1
+                return
+            self._position = PositionEvent(position, -math.radians(psi), time.monotonic())
+
+
+def _check_port(port: int, drone: str) -> None:
+    """Raise where somebody has the port."""
+    try:
+        DroneSocket(drone, port).close()
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            # No way to the drone yet: its network may come.
+            return
+        raise MamboLinkError(
+            f'UDP port {port}: {error.strerror}; allowed is one that is free: one Mambo per '
+            'process and host'
+        ) from error

@@ -1,0 +1,478 @@
+"""A Mambo's flight: what it is told, from take-off to landing. Without ROS."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_drivers.agent import geofence
+from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission
+from maasi_drivers.links.mambo.link import PositionEvent
+from maasi_drivers.links.mambo.reckoning import DeadReckoning
+from maasi_drivers.links.mambo.settings import LEAST_TILT, MOST_TILT, MamboSettings
+from maasi_drivers.links.mambo.tilt_model import Course, TiltModel
+from maasi_filter.models.pose import Pose
+from maasi_planner.motion import MotionModel, RobotState
+from maasi_planner.settings import MotionSettings
+
+FloatArray = NDArray[np.float64]
+
+# Acceleration for each m/s that the speed is wrong [1/s].
+_SPEED_GAIN = 2.5
+# Acceleration of the speed that is wished for: little tilt, as images are taken meanwhile [m/s^2].
+_RAMP = 0.4
+# A wish before this is forgotten [s].
+_OLD_WISH = 0.5
+# Share of the largest acceleration that stops it before the geofence: the rest is for wind.
+_BRAKE_SHARE = 0.5
+# Most speed for each metre to the geofence, well below what the speed follows by [1/s].
+_NEAR_RATE = 1.0
+# Reckoned with until the speed at the largest tilt is measured; it does not fly by it [m/s].
+_UNKNOWN_SPEED = 1.0
+# How far from its altitude the drone counts as there after take-off [m].
+_ALTITUDE_TOLERANCE = 0.1
+# An event that says the same to the bit under a command faster than this is no new position [m/s].
+_LEAST_SPEED = 0.05
+_STILL = np.zeros(4)
+
+
+class Link(Protocol):
+    """What the pilot needs of a `MamboLink`."""
+
+    error: str
+    flying_state: str
+    battery: float
+    heard_at: float
+    tilt: float
+    climb: float
+
+    @property
+    def connected(self) -> bool:
+        """Whether the drone has answered."""
+
+    @property
+    def position(self) -> PositionEvent | None:
+        """The last position event, or None."""
+
+    def take_off(self) -> None:
+        """Have it take off."""
+
+    def land(self) -> None:
+        """Have it land."""
+
+    def steer(self, forward: float, left: float, up: float, turn: float) -> None:
+        """Send one piloting command, in shares of the largest."""
+
+
+def tilt_limit(motion: MotionSettings) -> float:
+    """Return the tilt to set in the drone for a robot's settings [rad]."""
+    return min(max(motion.tilt, LEAST_TILT), MOST_TILT)
+
+
+class Phase(Enum):
+    """Of a flight."""
+
+    CONNECTING = 'connecting'
+    GROUND = 'on the ground'
+    TAKING_OFF = 'taking off'
+    CLIMBING = 'climbing'
+    FLYING = 'flying'
+    LANDING = 'landing'
+
+
+class MamboPilot:
+    """
+    Flies a Mambo from take-off to landing, and lands it when something is wrong.
+
+    Parameters
+    ----------
+    link : Link
+        To the drone.
+    motion : MotionModel
+        Its controller and model.
+    settings : MamboSettings
+        Limits and times.
+    home : Pose
+        Where it hovers after take-off, in the map; it stands below that at the start.
+    fence : ndarray, shape (3, 2)
+        Lowest and highest x, y, z [m, map].
+
+    Attributes
+    ----------
+    phase : Phase
+        Of the flight.
+    problem : str
+        Why it takes no goals now; empty where it does.
+
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        motion: MotionModel,
+        settings: MamboSettings,
+        home: Pose,
+        fence: FloatArray,
+    ) -> None:
+        self.link = link
+        self.motion = motion
+        self.settings = settings
+        self.home = home
+        self.fence = fence
+        self.phase = Phase.CONNECTING
+        self.problem = 'connecting to the Mambo'
+        place = home.position.copy()
+        place[2] = settings.ground
+        speed = settings.full_speed or _UNKNOWN_SPEED
+        model = TiltModel(link.tilt, speed, link.climb, settings.full_turn)
+        self.reckoning = DeadReckoning(model, Pose.from_yaw(place, home.yaw), settings)
+        # When the pose of another system came.
+        self._other_at = -math.inf
+        self._event: PositionEvent | None = None
+        # Since when the position is what it is; monotonic clock.
+        self._moved_at = -math.inf
+        self._place: FloatArray | None = None
+        # Once it was the same in spite of commands, only another one is believed.
+        self._stuck = False
+        self._command = _STILL
+        self._now = -math.inf
+        # When, and which velocity in the map was wished for last [m/s].
+        self._wish: tuple[float, FloatArray] = (-math.inf, np.zeros(2))
+        self._since = -math.inf
+        self._lost_since: float | None = None
+        self._cancelled_at: float | None = None
+        # Why it landed for good.
+        self._ended = ''
+        self._permission = ArmPermission(settings.arm_timeout)
+
+    # ---- where it is -------------------------------------------------------------------------
+
+    @property
+    def flying(self) -> bool:
+        """Whether it follows commands."""
+        return self.phase in (Phase.CLIMBING, Phase.FLYING)
+
+    @property
+    def state(self) -> RobotState | None:
+        """Where it is; None where that is not known."""
+        return self.reckoning.state if math.isfinite(self._positioned_at()) else None
+
+    def ahead(self) -> RobotState:
+        """Return where it will be, level, when a command that is sent now acts."""
+        course = self.reckoning.ahead()
+        return RobotState(Pose.from_yaw(course.position, course.yaw), course.velocity)
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the position is known, and new enough to fly by."""
+        return self.state is not None and self._lost_since is None
+
+    def take_pose(self, now: float, state: RobotState) -> None:
+        """Take a pose of another system, at `now` of the monotonic clock [s]."""
+        self._note_place(now, state.pose.position)
+        self._now = self._other_at = now
+        self.reckoning.take(state, now)
+
+    def _note_place(self, now: float, place: FloatArray) -> None:
+        told_to_move = float(np.abs(self._command[:3]).max()) > _LEAST_SPEED
+        if self._place is None or not np.array_equal(place, self._place):
+            self._stuck = False
+            self._moved_at = now
+        elif not told_to_move and not self._stuck:
+            self._moved_at = now
+        self._place = place
+
+    # ---- what it is to do --------------------------------------------------------------------
+
+    def fly(self, command: FloatArray) -> None:
+        """
+        Fly a velocity command, once; without another one the drone hovers.
+
+        Parameters
+        ----------
+        command : ndarray, shape (4,)
+            vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite; then it hovers.
+
+        """
+        if not np.isfinite(command).all():
+            self.hover()
+            raise ValueError(f'command: got {command.tolist()}, allowed are finite numbers')
+        if self.phase is Phase.FLYING and self.has_pose:
+            self._steer(command)
+
+    def hover(self) -> None:
+        """Stop: the drone keeps its place by its own camera."""
+        if self.phase in (Phase.CLIMBING, Phase.FLYING):
+            self._wish = -math.inf, np.zeros(2)
+            self._send(_STILL, _STILL)
+
+    def _steer(self, command: FloatArray) -> None:
+        """Tilt it so that its speed comes to that of the command, as far as it can stop."""
+        model, course = self.reckoning.model, self.reckoning.ahead()
+        cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
+        turned = np.array([[cosine, sine], [-sine, cosine]])
+        ramped = self._ramp(turned.T @ command[:2], course.velocity[:2])
+        self._wish = self._now, self._stoppable(course, ramped)
+        wish = turned @ self._wish[1]
+        speed = turned @ course.velocity[:2]
+        tilts = model.shares(model.drag * wish + _SPEED_GAIN * (wish - speed))
+        rest = [command[2] / model.climb, command[3] / model.turn]
+        self._send(command, np.clip([*tilts, *rest], -1.0, 1.0))
+
+    def _ramp(self, wish: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return how far the wished velocity in the map (2,) has come towards a new one."""
+        passed = self._now - self._wish[0]
+        before = self._wish[1] if passed <= _OLD_WISH else velocity
+        change = wish - before
+        size = float(np.hypot(*change))
+        most = _RAMP * min(passed, _OLD_WISH)
+        return before + change * (min(size, most) / size if size > 0.0 else 0.0)
+
+    def _stoppable(self, course: Course, wish: FloatArray) -> FloatArray:
+        """Return a velocity in the map (2,) that can be stopped before the geofence."""
+        brake = 2.0 * _BRAKE_SHARE * self.reckoning.model.thrust
+        room = np.abs(self.fence[:2].T - course.position[:2])
+        inside = (course.position[:2] > self.fence[:2, 0], course.position[:2] < self.fence[:2, 1])
+        most = inside * np.minimum(np.sqrt(brake * room), _NEAR_RATE * room)
+        return np.clip(wish, -most[0], most[1])
+
+    def _send(self, command: FloatArray, shares: FloatArray) -> None:
+        self._command = command
+        self.reckoning.command(self._now, shares)
+        forward, left, up, turn = shares.tolist()
+        self.link.steer(forward, left, up, turn)
+
+    def permit(self, now: float) -> str:
+        """Let it take off once; return why not, empty where it may; `now` as in `update`."""
+        problem = self._objection()
+        if problem:
+            self._permission.end()
+            return problem
+        self._ended, self._cancelled_at = '', None
+        self._permission.give(now)
+        return ''
+
+    def _objection(self) -> str:
+        if self.phase is Phase.LANDING:
+            return 'it lands'
+        if self.phase not in (Phase.CONNECTING, Phase.GROUND):
+            return 'it is in the air already'
+        low = self._battery_text() if self._battery_low else ''
+        return self.link.error or self._unfit() or low
+
+    def _unfit(self) -> str:
+        """Return which parameter keeps it on the ground, or nothing."""
+        if not self.settings.arm:
+            return 'on the ground: it may not take off (parameter mambo.arm)'
+        if self.settings.full_speed is None:
+            return (
+                'on the ground: its speed at the largest tilt is not measured (parameter '
+                'mambo.full_speed; measure_mambo says it)'
+            )
+        return ''
+
+    def goal_taken(self) -> None:
+        """Note that it has somewhere to go."""
+        self._cancelled_at = None
+
+    def goal_cancelled(self, now: float) -> None:
+        """Note that its goal was cancelled: it hovers, and lands if no other follows."""
+        if self.phase in (Phase.CONNECTING, Phase.GROUND):
+            self._permission.end()
+        self.hover()
+        self._cancelled_at = now
+
+    def end(self, reason: str) -> None:
+        """Land, and do not take off again."""
+        self._ended = self._ended or reason
+        if self.phase not in (Phase.CONNECTING, Phase.GROUND):
+            self._land()
+
+    def _land(self) -> None:
+        self.phase = Phase.LANDING
+        self._command = _STILL
+        self.reckoning.command(self._now, _STILL)
+        self.link.land()
+
+    # ---- the flight --------------------------------------------------------------------------
+
+    def update(self, now: float) -> None:
+        """Go on, at `now` of the monotonic clock [s]: call it at least ten times a second."""
+        self._now = now
+        self.reckoning.go_on(now, self.flying)
+        event = self.link.position
+        if event is not None and event is not self._event:
+            self._event = event
+            if self.settings.pose == 'events':
+                self.reckoning.correct(event, self.flying)
+                self._note_place(event.received, event.position)
+        self.problem = self._go_on(now)
+
+    def _go_on(self, now: float) -> str:
+        """Do what the phase asks for; return why it takes no goals, or nothing."""
+        link = self.link
+        if self.phase is Phase.CONNECTING:
+            if not link.connected:
+                return link.error or 'connecting to the Mambo'
+            self.phase = Phase.GROUND
+        if link.error:
+            return self._give_up(link.error)
+        lost = self._see_to_pose(now)
+        if self.phase is Phase.GROUND:
+            return self._stand(now)
+        if self.phase is Phase.LANDING:
+            return self._come_down()
+        return self._stay_up(now, lost)
+
+    def _give_up(self, reason: str) -> str:
+        self._ended = reason
+        return reason
+
+    def _stand(self, now: float) -> str:
+        """Take off if nothing speaks against it."""
+        state = self.link.flying_state
+        if self._ended:
+            return f'{self._ended}, {UNTIL_ARM}'
+        if problem := self._unfit():
+            return problem
+        if state == 'emergency':
+            return self._give_up('the Mambo is in emergency: restart it')
+        flies = state in ('hovering', 'flying', 'takingoff')
+        if self._battery_low:
+            self._permission.end()
+            return self._battery_text()
+        if not self._permission.holds(now):
+            return f'{"in the air, not by this driver" if flies else "on the ground"}, {UNTIL_ARM}'
+        if state != 'landed':
+            if flies:
+                # Of a driver before this one.
+                self._begin(Phase.TAKING_OFF, now)
+                return Phase.TAKING_OFF.value
+            return 'on the ground: nothing heard of its state yet'
+        if self.link.battery < 0.0:
+            return 'on the ground: nothing heard of its battery yet'
+        if not self.has_pose:
+            return f'on the ground: {self._lost_text(now) or "no position yet"}'
+        self._begin(Phase.TAKING_OFF, now)
+        self.link.take_off()
+        return Phase.TAKING_OFF.value
+
+    def _begin(self, phase: Phase, now: float) -> None:
+        self._permission.end()
+        self.phase, self._since = phase, now
+
+    def _come_down(self) -> str:
+        if self.link.flying_state != 'landed':
+            return f'landing: {self._ended or "its goal was cancelled"}'
+        self.phase = Phase.GROUND
+        if self._ended:
+            self._ended = f'landed: {self._ended}'
+        return f'{self._ended or "landed: its goal was cancelled"}, {UNTIL_ARM}'
+
+    def _stay_up(self, now: float, lost: float | None) -> str:
+        flying_state = self.link.flying_state
+        if flying_state == 'emergency':
+            return self._give_up('the Mambo is in emergency: restart it')
+        if self._battery_low:
+            return self._end_flight(self._battery_text())
+        if lost is not None:
+            self.hover()
+            text = self._lost_text(now)
+            return self._end_flight(text) if lost >= self.settings.land_after else text
+        if self.phase is Phase.TAKING_OFF:
+            return self._rise(now)
+        if flying_state in ('landed', 'landing'):
+            return self._end_flight(f'the Mambo is {flying_state} by itself')
+        state = self.state
+        if state is None:
+            return 'no position'
+        outside = geofence.outside(self.fence, state.pose.position)
+        if outside:
+            return self._end_flight(outside)
+        if self.phase is Phase.CLIMBING:
+            return self._climb(now, state)
+        cancelled = self._cancelled_at
+        if cancelled is not None and now - cancelled >= self.settings.cancel_landing:
+            self._cancelled_at = None
+            self._land()
+            return 'landing: its goal was cancelled'
+        return ''
+
+    def _end_flight(self, reason: str) -> str:
+        self.end(reason)
+        return reason
+
+    def _rise(self, now: float) -> str:
+        if self.link.flying_state in ('hovering', 'flying'):
+            self._begin(Phase.CLIMBING, now)
+        elif now - self._since > self.settings.take_off_timeout:
+            return self._end_flight(
+                f'it did not take off in {self.settings.take_off_timeout:g} s: '
+                f'{self.link.flying_state}'
+            )
+        return Phase.TAKING_OFF.value
+
+    def _climb(self, now: float, state: RobotState) -> str:
+        offset = state.pose.position[2] - self.home.position[2]
+        if abs(offset) <= _ALTITUDE_TOLERANCE:
+            self._begin(Phase.FLYING, now)
+            return ''
+        if now - self._since > self.settings.take_off_timeout:
+            return self._end_flight(
+                f'it did not come to its altitude in {self.settings.take_off_timeout:g} s'
+            )
+        ahead = self.ahead()
+        above = ahead.pose.position.copy()
+        above[2] = self.home.position[2]
+        self._steer(self.motion.command(ahead, above))
+        return f'{Phase.CLIMBING.value}, {offset:+.2f} m from its altitude'
+
+    # ---- what can be wrong -------------------------------------------------------------------
+
+    @property
+    def _battery_low(self) -> bool:
+        return 0.0 <= self.link.battery < self.settings.battery_minimum
+
+    def _battery_text(self) -> str:
+        return f'battery at {self.link.battery:.2f}, below {self.settings.battery_minimum:.2f}'
+
+    def _see_to_pose(self, now: float) -> float | None:
+        """Return for how long link or position have been missing, beyond the timeout [s]."""
+        timeout = self.settings.link_timeout
+        self._stuck |= now - self._moved_at > timeout and now - self._positioned_at() <= timeout
+        age = max(now - self.link.heard_at, now - self._positioned_at(), now - self._moved_at)
+        if age <= timeout:
+            self._lost_since = None
+            return None
+        if self._lost_since is None:
+            self._lost_since = now
+        return now - self._lost_since
+
+    def _positioned_at(self) -> float:
+        if self.settings.pose != 'events':
+            return self._other_at
+        return -math.inf if self._event is None else self._event.received
+
+    def _lost_text(self, now: float) -> str:
+        timeout = self.settings.link_timeout
+        silent = now - self.link.heard_at
+        if silent > timeout:
+            return f'link lost: nothing from the Mambo for {_seconds(silent)}'
+        silent = now - self._positioned_at()
+        if silent > timeout:
+            return f'no position for {_seconds(silent)}'
+        still = now - self._moved_at
+        return f'the position has not changed for {_seconds(still)}' if still > timeout else ''
+
+
+def _seconds(age: float) -> str:
+    return f'{age:.1f} s' if math.isfinite(age) else 'all the time'

@@ -1,0 +1,180 @@
+"""Where a Mambo is between its position events. Without ROS.
+
+Position events come twice a second. In between, a model flies the commands that were sent (dead
+reckoning), and each event corrects it where it was when the event was made.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_drivers.links.mambo.link import PositionEvent
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.mambo.tilt_model import Course, TiltModel
+from maasi_filter.models.pose import Pose
+from maasi_planner.motion import RobotState
+from maasi_planner.motion.mambo import pose_of
+
+FloatArray = NDArray[np.float64]
+
+# Share of the difference to an event by which position and velocity are corrected.
+_POSITION_GAIN, _VELOCITY_GAIN = 0.8, 0.25
+_EVENT_PERIOD = 0.5
+# A difference beyond this is no error of dead reckoning: the event is taken as it is [m].
+_JUMP = 0.5
+# Longest time that is reckoned at once [s].
+_LONGEST = 1.0
+_HISTORY = 64
+_STILL = np.zeros(4)
+
+
+class DeadReckoning:
+    """
+    Where the drone is between its position events.
+
+    Parameters
+    ----------
+    model : TiltModel
+        That flies the commands.
+    origin : Pose
+        Of the take-off point, in the map: what the events are relative to.
+    settings : MamboSettings
+        Delay, latency and noise.
+
+    Attributes
+    ----------
+    course : Course
+        Where it is now.
+
+    """
+
+    def __init__(self, model: TiltModel, origin: Pose, settings: MamboSettings) -> None:
+        self.model = model
+        self.origin = origin
+        self.settings = settings
+        self.course = Course(origin.position, np.zeros(3), origin.yaw)
+        #: Time of flight since the last correction [s].
+        self.age = 0.0
+        self._turn = origin.rotation()
+        # Commands of late, and from when on each acts.
+        self._sent: deque[tuple[float, FloatArray]] = deque([(-math.inf, _STILL)])
+        self._now: float | None = None
+        # Monotonic time, position and heading of late.
+        self._past: deque[tuple[float, FloatArray, float]] = deque(maxlen=_HISTORY)
+
+    @property
+    def state(self) -> RobotState:
+        """Pose, velocity and angular velocity in the map; it is tilted as it was told."""
+        course, shares = self.course, self._acting()
+        state = np.zeros(12)
+        state[:3] = course.position
+        state[3:6] = -self.model.tilt * shares[1], self.model.tilt * shares[0], course.yaw
+        turn = np.array([0.0, 0.0, self.model.turn * shares[3]])
+        return RobotState(pose_of(state), course.velocity, turn)
+
+    def covariance(self) -> FloatArray:
+        """Return that of the pose, (6, 6): x, y, z [m^2], rotations about the map's axes."""
+        settings = self.settings
+        position = settings.position_noise**2 + (settings.position_growth * self.age) ** 2
+        attitude = settings.attitude_noise**2
+        tilt = attitude + self._tilt_doubt() ** 2
+        return np.diag([position] * 3 + [tilt, tilt, attitude])
+
+    def _tilt_doubt(self) -> float:
+        """Return by how much the tilt may be another one because a command acts sooner or later."""
+        now, delay = self._now or 0.0, self.settings.delay
+        recent = [shares[:2] for acts, shares in self._sent if abs(now - acts) <= delay]
+        if not recent:
+            return 0.0
+        spread = np.abs(np.array(recent) - self._acting()[:2]).max()
+        # The largest of a uniform distribution, as a deviation.
+        return float(self.model.tilt * spread) / math.sqrt(3.0)
+
+    def _acting(self) -> FloatArray:
+        """Return the shares that the drone flies now."""
+        now = -math.inf if self._now is None else self._now
+        return next(shares for acts, shares in reversed(self._sent) if acts <= now)
+
+    def command(self, now: float, shares: FloatArray) -> None:
+        """Take a command, (4,): forward, left, up, turn as shares of the largest."""
+        delay, sent = self.settings.delay, self._sent
+        sent.append((now + delay, shares))
+        while len(sent) > 1 and sent[1][0] <= now - delay:
+            sent.popleft()
+
+    def go_on(self, now: float, flying: bool) -> None:
+        """Reckon up to `now` of the monotonic clock [s]; on the ground it stays where it is."""
+        before = now if self._now is None else max(self._now, now - _LONGEST)
+        self._now = now
+        if now <= before:
+            return
+        self.age += now - before
+        if flying:
+            self.course = self._fly(self.course, before, now)
+        self._past.append((now, self.course.position, self.course.yaw))
+
+    def ahead(self) -> Course:
+        """Return where it will be when a command that is sent now acts."""
+        now = 0.0 if self._now is None else self._now
+        return self._fly(self.course, now, now + self.settings.delay)
+
+    def _fly(self, course: Course, begin: float, end: float) -> Course:
+        sent = list(self._sent)
+        ends = [acts for acts, _ in sent[1:]] + [math.inf]
+        for (acts, shares), until in zip(sent, ends, strict=True):
+            h = min(until, end) - max(acts, begin)
+            if h > 0.0:
+                course = self.model.advance(course, shares, h)
+        return course
+
+    def take(self, state: RobotState, now: float) -> None:
+        """Take the pose of another system, of `now` on the monotonic clock [s]."""
+        self._now = now
+        self.course = Course(state.pose.position, state.velocity, state.pose.yaw)
+
+    def correct(self, event: PositionEvent, flying: bool) -> None:
+        """Take a position event."""
+        measured = self.origin.position + self._turn @ event.position
+        heading = self.origin.yaw + event.yaw
+        self.age = self.settings.latency
+        position, yaw = self._at(event.received - self.settings.latency)
+        error = measured - position
+        if not flying or float(np.abs(error).max()) > _JUMP:
+            velocity = self.course.velocity if flying else np.zeros(3)
+            self.course = Course(measured, velocity, heading)
+            self._past.clear()
+            return
+        turn = _wrapped(heading - yaw)
+        move = _POSITION_GAIN * error
+        course = self.course
+        self.course = Course(
+            course.position + move,
+            course.velocity + _VELOCITY_GAIN / _EVENT_PERIOD * error,
+            course.yaw + turn,
+        )
+        moved = [(at, place + move, yaw + turn) for at, place, yaw in self._past]
+        self._past = deque(moved, maxlen=_HISTORY)
+
+    def _at(self, now: float) -> tuple[FloatArray, float]:
+        """Return position and heading at a time of the monotonic clock."""
+        later: tuple[float, FloatArray, float] | None = None
+        for item in reversed(self._past):
+            if item[0] <= now:
+                if later is None:
+                    ahead = min(now - item[0], _LONGEST)
+                    return item[1] + ahead * self.course.velocity, item[2]
+                share = (now - item[0]) / (later[0] - item[0])
+                turn = share * _wrapped(later[2] - item[2])
+                return item[1] + share * (later[1] - item[1]), item[2] + turn
+            later = item
+        if later is not None:
+            return later[1], later[2]
+        return self.course.position, self.course.yaw
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi

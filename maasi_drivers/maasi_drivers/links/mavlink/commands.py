@@ -1,0 +1,114 @@
+"""Commands to an autopilot: one at a time, said again until it is answered."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from maasi_drivers.links.mavlink.protocol import mavlink
+
+# A command that is not answered is said again after so long, so often [s, 1].
+_ANSWER_PATIENCE, _TRIES = 0.5, 5
+
+
+@dataclass
+class _Command:
+    number: int
+    parameters: tuple[float, ...]
+    answer: Callable[[int | None], None]
+    sent: float = -math.inf
+    tries: int = 0
+
+
+class CommandQueue:
+    """
+    COMMAND_LONG, in the order in which they were asked for.
+
+    Parameters
+    ----------
+    system : int
+        System id of the vehicle.
+    sender : MAVLink
+        Packs messages and writes them to the wire.
+
+    """
+
+    def __init__(self, system: int, sender: Any) -> None:
+        self._system = system
+        self._sender = sender
+        self._commands: deque[_Command] = deque()
+
+    def __bool__(self) -> bool:
+        """Tell whether one has not been answered."""
+        return bool(self._commands)
+
+    def ask(
+        self,
+        number: int,
+        parameters: tuple[float, ...],
+        answer: Callable[[int | None], None],
+    ) -> None:
+        """
+        Add a command.
+
+        Parameters
+        ----------
+        number : int
+            Of MAV_CMD.
+        parameters : tuple of float
+            The first of seven; the others are zero.
+        answer : callable
+            Takes the MAV_RESULT, None if it was never answered.
+
+        """
+        self._commands.append(_Command(number, parameters, answer))
+
+    def clear(self) -> None:
+        """Forget what was not answered."""
+        self._commands.clear()
+
+    def take_answer(self, message: Any, now: float) -> None:
+        """Take a COMMAND_ACK."""
+        if not self._commands or self._commands[0].number != message.command:
+            return
+        if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
+            self._commands[0].sent = now
+            return
+        self._commands.popleft().answer(int(message.result))
+
+    def say(self, now: float) -> None:
+        """Send what is due."""
+        if not self._commands:
+            return
+        command = self._commands[0]
+        if now - command.sent < _ANSWER_PATIENCE:
+            return
+        if command.tries == _TRIES:
+            self._commands.popleft().answer(None)
+            return
+        parameters = [*command.parameters, *[0.0] * (7 - len(command.parameters))]
+        self._sender.command_long_send(
+            self._system,
+            mavlink.MAV_COMP_ID_AUTOPILOT1,
+            command.number,
+            command.tries,
+            *parameters,
+        )
+        command.sent = now
+        command.tries += 1
+
+
+def command_name(number: int) -> str:
+    """Return the name of a MAV_CMD."""
+    return str(mavlink.enums['MAV_CMD'][number].name)
+
+
+def result_name(result: int | None) -> str:
+    """Return the name of a MAV_RESULT."""
+    if result is None:
+        return 'not answered'
+    item = mavlink.enums['MAV_RESULT'].get(result)
+    return f'result {result}' if item is None else str(item.name).removeprefix('MAV_RESULT_')

@@ -1,0 +1,196 @@
+"""What an autopilot tells of its vehicle: where it is, batteries, fix, whether it stands."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_drivers.links.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation
+from maasi_drivers.links.mavlink.protocol import mavlink
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+
+FloatArray = NDArray[np.float64]
+
+# A clock further back than this is that of an autopilot that was started again [ms].
+_RESTART = 1000
+# Of GPS_RAW_INT: the least fix with a height.
+_FIX_3D = 3
+# Of EKF_STATUS_REPORT: a level or absolute position, and none that is only assumed.
+_EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """
+    Where a vehicle was, in the local frame of its autopilot turned to ENU.
+
+    Attributes
+    ----------
+    number : int
+        Of the message; one that says nothing new does not count.
+    arrival : float
+        On the steady clock [s].
+    position, velocity : ndarray, shape (3,)
+        [m, m/s].
+    orientation : ndarray, shape (4,)
+        Of FLU in ENU, w first.
+    rates : ndarray, shape (3,)
+        Angular velocity in FLU [rad/s].
+
+    """
+
+    number: int
+    arrival: float
+    position: FloatArray
+    velocity: FloatArray
+    orientation: FloatArray
+    rates: FloatArray
+
+
+class Estimate:
+    """
+    The newest of what an autopilot tells.
+
+    Parameters
+    ----------
+    settings : MavlinkSettings
+        Of the link.
+    on_restart : callable
+        Called when the autopilot was started again; what it told before is forgotten.
+
+    Attributes
+    ----------
+    telemetry : Telemetry or None
+        Newest.
+    origin : ndarray, shape (3,)
+        Of the settings, in the local frame, ENU [m].
+    heard_at : float
+        When position or attitude were heard last, on the steady clock [s].
+    landed : int
+        MAV_LANDED_STATE.
+    charge_reports : int
+        Messages on batteries so far.
+    dropped : Counter
+        Messages that could not be used.
+
+    """
+
+    def __init__(self, settings: MavlinkSettings, on_restart: Callable[[], None]) -> None:
+        self._settings = settings
+        self._on_restart = on_restart
+        self.dropped: Counter[str] = Counter()
+        self._number = -1
+        self.charge_reports = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all."""
+        self.telemetry: Telemetry | None = None
+        self.heard_at = -math.inf
+        self.origin = np.zeros(3)
+        self.landed = mavlink.MAV_LANDED_STATE_UNDEFINED
+        self._good: bool | None = None
+        self._fix: int | None = None
+        self._charges: dict[int, float] = {}
+        self._from_batteries = False
+        self._boot_time: int | None = None
+        self._position: tuple[int, tuple[float, ...]] | None = None
+        self._attitude = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is a position, and nothing against it."""
+        return self.telemetry is not None and self._good is not False
+
+    @property
+    def has_fix(self) -> bool:
+        """Whether GNSS has a fix."""
+        return self._fix is not None and self._fix >= _FIX_3D
+
+    @property
+    def charge(self) -> float:
+        """Of the battery that counts, 0 to 1; -1 where it is not known."""
+        if self._settings.battery >= 0:
+            return self._charges.get(self._settings.battery, -1.0)
+        return min((value for value in self._charges.values() if value >= 0.0), default=-1.0)
+
+    def problem(self, fix_needed: bool) -> str:
+        """Return why the position is not to be trusted in flight; empty where it is."""
+        if self._good is False:
+            return 'the autopilot has lost its position estimate'
+        if fix_needed and self._fix is not None and not self.has_fix:
+            return f'GNSS is lost (GPS_RAW_INT.fix_type {self._fix})'
+        return ''
+
+    def take(self, message: Any, now: float, armed: bool) -> None:
+        """Take a message; those of other kinds are left out."""
+        kind = message.get_type()
+        if kind == 'LOCAL_POSITION_NED':
+            self._take_position(message, now, armed)
+        elif kind == 'ATTITUDE_QUATERNION':
+            self._take_attitude(message, now)
+        elif kind == 'BATTERY_STATUS':
+            self._from_batteries = True
+            left = message.battery_remaining
+            self._charges[int(message.id)] = left / 100.0 if 0 <= left <= 100 else -1.0
+            self.charge_reports += 1
+        elif kind == 'SYS_STATUS':
+            # The first battery's charge, where BATTERY_STATUS does not come.
+            left = message.battery_remaining
+            if 0 <= left <= 100 and not (self._from_batteries and 0 in self._charges):
+                self._charges[0] = left / 100.0
+                self.charge_reports += 1
+        elif kind == 'EXTENDED_SYS_STATE':
+            self.landed = int(message.landed_state)
+        elif kind == 'GPS_RAW_INT':
+            self._fix = int(message.fix_type)
+        elif kind == 'EKF_STATUS_REPORT':
+            flags = message.flags
+            self._good = bool(flags & _EKF_POSITION) and not flags & _EKF_ASSUMED
+
+    def _note_time(self, milliseconds: int, now: float) -> None:
+        """Look at the time since the autopilot was started; its clock never goes back else."""
+        if self._boot_time is not None and milliseconds < self._boot_time - _RESTART:
+            self.forget()
+            self._on_restart()
+        else:
+            self.heard_at = now
+        self._boot_time = max(milliseconds, self._boot_time or 0)
+
+    def _take_position(self, message: Any, now: float, armed: bool) -> None:
+        values = (message.x, message.y, message.z, message.vx, message.vy, message.vz)
+        if not all(map(math.isfinite, values)):
+            self.dropped['LOCAL_POSITION_NED that is not finite'] += 1
+            return
+        self._note_time(message.time_boot_ms, now)
+        before = self._position
+        if before is not None and message.time_boot_ms <= before[0]:
+            # Heard again.
+            return
+        self._position = (message.time_boot_ms, values)
+        if before is not None and before[1] == values and armed:
+            # An estimate that moves at all never says the same twice: it is frozen.
+            self.dropped['LOCAL_POSITION_NED that is frozen'] += 1
+            return
+        if self.telemetry is None and self._settings.origin == 'here':
+            self.origin = swap_enu_ned(values[:3])
+        self._number += 1
+        self.telemetry = Telemetry(
+            self._number, now, swap_enu_ned(values[:3]), swap_enu_ned(values[3:]), *self._attitude
+        )
+
+    def _take_attitude(self, message: Any, now: float) -> None:
+        quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
+        rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+        norm = float(np.sqrt((quaternion * quaternion).sum()))
+        if not (np.isfinite(rates).all() and math.isfinite(norm) and 0.9 < norm < 1.1):
+            self.dropped['ATTITUDE_QUATERNION that is none'] += 1
+            return
+        self._note_time(message.time_boot_ms, now)
+        self._attitude = (swap_orientation(quaternion / norm), swap_flu_frd(rates))

@@ -1,0 +1,1 @@
+"""From camera images to measurements, and the settings of cameras."""

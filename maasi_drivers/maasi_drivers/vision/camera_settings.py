@@ -1,0 +1,261 @@
+"""Settings of a robot's camera: intrinsics, mount, noise and how markers are segmented."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import Field, model_validator
+
+from maasi_filter.settings import Finite, Settings
+
+# Of a calibration: beyond these the camera cannot be one [px, px, -].
+_LARGEST_IMAGE, _LARGEST_INTRINSIC, _LARGEST_DISTORTION = 32_768, 1e6, 1e4
+
+
+class SegmentationSettings(Settings):
+    """How marker pixels are told from the floor; see `maasi_drivers.vision.segmentation`."""
+
+    rule: Literal['robust', 'paper'] = Field(
+        default='robust',
+        description="'paper': fixed blue excess (001, eq. (16)), blobs of any size from "
+        "minimum_area on; 'robust': adapts to light, and looks at size and shape",
+    )
+    threshold: float = Field(
+        default=35.0,
+        ge=0,
+        le=255,
+        description='Paper rule: blue excess over this is marker [grey levels]',
+    )
+    minimum_area: float = Field(
+        default=2e-4,
+        ge=0,
+        lt=1,
+        description="Paper rule: smallest blob kept, as a share of the image's pixels; 4 px of "
+        '160 x 120; 0 keeps single pixels [-]',
+    )
+    saturation: float = Field(
+        default=0.40,
+        gt=0,
+        le=3,
+        description='Robust rule: least blueness (B - max(R, G)) / mean of a marker pixel, after '
+        'white balance [-]',
+    )
+    peak_saturation: float = Field(
+        default=0.70, gt=0, le=3, description='Robust rule: blueness reached inside a marker [-]'
+    )
+    noise_factor: float = Field(
+        default=7.0,
+        gt=0,
+        description="Robust rule: threshold in deviations (MAD) of the floor's blueness",
+    )
+    maximum_aspect: float = Field(
+        default=2.5,
+        ge=1,
+        description='Robust rule: longest allowed length over width of a blob [-]',
+    )
+    minimum_solidity: float = Field(
+        default=0.80, gt=0, le=1, description='Robust rule: least area over that of its ellipse [-]'
+    )
+    minimum_diameter: float = Field(
+        default=0.55,
+        gt=0,
+        description='Robust rule: least diameter on the floor, in marker diameters [-]',
+    )
+    maximum_diameter: float = Field(
+        default=1.6,
+        gt=0,
+        description='Robust rule: largest diameter on the floor, in marker diameters [-]',
+    )
+
+    @model_validator(mode='after')
+    def _ordered(self) -> SegmentationSettings:
+        if self.peak_saturation < self.saturation:
+            raise ValueError(
+                f'peak_saturation: got {self.peak_saturation}, '
+                f'allowed at least saturation ({self.saturation})'
+            )
+        if self.maximum_diameter <= self.minimum_diameter:
+            raise ValueError(
+                f'maximum_diameter: got {self.maximum_diameter}, '
+                f'allowed more than minimum_diameter ({self.minimum_diameter})'
+            )
+        return self
+
+
+class MountSettings(Settings):
+    """
+    Where the camera sits on the robot (frames as in REP-103: x forward, y left, z up).
+
+    With ``rpy`` zero the camera looks along the robot's x axis, image top up. A pitch of pi/2 looks
+    straight down, the image's top towards the robot's front.
+    """
+
+    position: list[Finite] = Field(
+        default_factory=lambda: [0.0, 0.0, 0.0],
+        min_length=3,
+        max_length=3,
+        description="Optical centre in the robot's frame [m]",
+    )
+    rpy: list[Finite] = Field(
+        default_factory=lambda: [0.0, 1.5707963267948966, 0.0],
+        min_length=3,
+        max_length=3,
+        description='Roll, pitch, yaw of the camera about fixed axes of the robot [rad]',
+    )
+
+
+class CameraSettings(Settings):
+    """
+    A camera that looks at the floor.
+
+    The defaults are those of a drone at 1 m: 160 x 120 px, looking down, the image's width across
+    the robot. With 260 px of focal length the papers' field of view of +-0.2 m lies in the image,
+    markers of 3 cm included and 1.6 cm to spare. (At the nominal 300 px the image's height is just
+    0.40 m at 1 m, and markers at its edge are cut.)
+    """
+
+    width: int = Field(default=160, ge=8, le=16384, description='Image width [px]')
+    height: int = Field(default=120, ge=8, le=16384, description='Image height [px]')
+    focal_length: list[Finite] = Field(
+        default_factory=lambda: [260.0, 260.0],
+        min_length=2,
+        max_length=2,
+        description='Focal length along image x and y (beta_x, beta_y of 001, eq. (18)) [px]',
+    )
+    principal_point: list[Finite] | None = Field(
+        default=None,
+        min_length=2,
+        max_length=2,
+        description="Optical centre, pixel centres at whole numbers; none: the image's centre [px]",
+    )
+    distortion: list[Finite] = Field(
+        default_factory=list,
+        description='Plumb-bob coefficients k1, k2, p1, p2[, k3]; none: none [-]',
+    )
+    mount: MountSettings = Field(
+        default_factory=MountSettings, description='Where the camera sits on the robot'
+    )
+    rate: float = Field(default=10.0, gt=0, description='Images per second [Hz]')
+    stamp_offset: float = Field(
+        default=0.0,
+        description='Added to an image stamp: minus the latency where stamps are late [s]',
+    )
+    marker_diameter: float = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
+    pixel_noise: float = Field(
+        default=0.1,
+        gt=0,
+        description='Deviation of a centroid beyond what image noise explains; about 0.03 for raw '
+        'images and the robust rule, 0.1 for JPEG or the paper rule [px]',
+    )
+    position_noise: float = Field(
+        default=0.0,
+        ge=0,
+        description="Deviation of each of the pose's coordinates if it carries none [m]",
+    )
+    orientation_noise: float = Field(
+        default=0.0,
+        ge=0,
+        description="Deviation of each of the pose's angles if it carries none [rad]",
+    )
+    cut_blobs: Literal['keep', 'drop'] = Field(
+        default='keep',
+        description='Blobs that the image border cuts: kept with more covariance, or dropped',
+    )
+    segmentation: SegmentationSettings = Field(
+        default_factory=SegmentationSettings, description='How markers are told apart'
+    )
+
+    @model_validator(mode='after')
+    def _consistent(self) -> CameraSettings:
+        if min(self.focal_length) <= 0:
+            raise ValueError(f'focal_length: got {self.focal_length}, allowed is more than 0')
+        if len(self.distortion) not in (0, 4, 5):
+            raise ValueError(
+                f'distortion: got {len(self.distortion)} coefficients, '
+                'allowed 0, 4 or 5 (plumb bob)'
+            )
+        return self
+
+    def with_calibration(
+        self,
+        width: int,
+        height: int,
+        k: list[float],
+        d: list[float],
+        distortion_model: str = 'plumb_bob',
+    ) -> CameraSettings:
+        """
+        Return these settings with the intrinsics of a ``sensor_msgs/CameraInfo``.
+
+        Parameters
+        ----------
+        width, height : int
+            Size of the calibrated image [px].
+        k : sequence of 9 floats
+            Camera matrix, row by row [px].
+        d : sequence of 0, 4 or 5 floats
+            Distortion coefficients.
+        distortion_model : str
+            'plumb_bob', or empty for none.
+
+        Raises
+        ------
+        ValueError
+            On another distortion model, a skewed or non-finite matrix, or a wrong length.
+
+        """
+        if distortion_model not in ('plumb_bob', ''):
+            raise ValueError(f"distortion_model: got '{distortion_model}', allowed 'plumb_bob'")
+        if len(k) != 9:
+            raise ValueError(f'k: got {len(k)} numbers, allowed 9')
+        matrix = [float(value) for value in k]
+        if any(matrix[i] != 0 for i in (1, 3, 6, 7)) or matrix[8] != 1:
+            raise ValueError(f'k: got {matrix}, allowed [fx, 0, cx, 0, fy, cy, 0, 0, 1]')
+        for name, numbers, limit in (
+            ('width, height', (width, height), _LARGEST_IMAGE),
+            ('k (focal_length, principal_point)', matrix, _LARGEST_INTRINSIC),
+            ('d (distortion)', d, _LARGEST_DISTORTION),
+        ):
+            if not all(abs(number) <= limit for number in numbers):
+                raise ValueError(
+                    f'{name}: got {list(numbers)}, allowed are finite numbers up to {limit:g} in '
+                    'magnitude'
+                )
+        values = self.model_dump()
+        values.update(
+            width=width,
+            height=height,
+            focal_length=[matrix[0], matrix[4]],
+            principal_point=[matrix[2], matrix[5]],
+            distortion=[float(value) for value in d],
+        )
+        return CameraSettings.model_validate(values)
+
+
+def load_calibration(path: str | Path, settings: CameraSettings) -> CameraSettings:
+    """
+    Return settings with the intrinsics of a calibration file of ROS's ``camera_calibration``.
+
+    Raises
+    ------
+    ValueError
+        Where a key is missing or a value is not allowed, with the file's name.
+
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        return settings.with_calibration(
+            int(content['image_width']),
+            int(content['image_height']),
+            list(content['camera_matrix']['data']),
+            list(content['distortion_coefficients']['data']),
+            str(content.get('distortion_model', 'plumb_bob')),
+        )
+    except KeyError as error:
+        raise ValueError(f'{path}: key {error} is missing') from error
+    except (TypeError, AttributeError, yaml.YAMLError) as error:
+        raise ValueError(f'{path}: not a calibration file ({error})') from error
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from error

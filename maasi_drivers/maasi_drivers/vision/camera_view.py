@@ -1,0 +1,87 @@
+"""How far inside the view of a camera a box of positions is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maasi_drivers.vision.camera_model import RIM_POINTS, Camera
+from maasi_drivers.vision.projection import quaternion_from_rotation_vector
+from maasi_filter.models.pose import Pose
+
+
+def box_view_margin(
+    camera: Camera,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    robot_height: float,
+    marker_radius: float = 0.0,
+    tilt: float = 0.0,
+) -> float:
+    """
+    Return how far inside the image a box field of view lies, markers at its rim included.
+
+    Parameters
+    ----------
+    camera : Camera
+        On the robot.
+    lower, upper : array_like, at least 2 values
+        Offsets of the box from the robot, in its frame, of which x and y are used [m].
+    robot_height : float
+        Height of the robot's origin over the floor [m].
+    marker_radius : float
+        Markers whose centre lies in the box must be seen as a whole [m].
+    tilt : float
+        Largest roll and pitch of the robot for which the box must still be seen [rad].
+
+    Returns
+    -------
+    float
+        Smallest distance to the image's border, over the box and the tilts [px]; negative where a
+        part of the box is not seen, minus infinity where it lies behind the camera.
+
+    Raises
+    ------
+    ValueError
+        Where a bound is not finite, or a lower one is not below its upper one.
+
+    """
+    low = np.asarray(lower, dtype=np.float64)[:2]
+    high = np.asarray(upper, dtype=np.float64)[:2]
+    if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high)):
+        raise ValueError(
+            f'box field of view: got lower {low.tolist()}, upper {high.tolist()}, '
+            'allowed finite offsets with lower below upper'
+        )
+    along = np.linspace(0.0, 1.0, 33)[:, None]
+    corners = np.array([[low[0], low[1]], [high[0], low[1]], high, [low[0], high[1]]])
+    rim = np.concatenate(
+        [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0))]
+    )
+    angles = np.arange(RIM_POINTS) * (2.0 * np.pi / RIM_POINTS)
+    circle = marker_radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    outline = (rim[:, None, :] + circle).reshape(-1, 2)
+    outline = np.concatenate([outline, np.zeros((len(outline), 1))], axis=1)
+    tilts = [(0.0, 0.0)]
+    if tilt > 0:
+        directions = np.arange(8) * (np.pi / 4)
+        tilts += [(tilt * float(np.cos(a)), tilt * float(np.sin(a))) for a in directions]
+    margins = []
+    for roll, pitch in tilts:
+        pose = Pose(
+            np.array([0.0, 0.0, robot_height]), quaternion_from_rotation_vector(roll, pitch, 0.0)
+        )
+        margins.append(float(camera.margin(outline, pose).min()))
+    return min(margins)
+
+
+def box_in_view(
+    camera: Camera,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    robot_height: float,
+    marker_radius: float = 0.0,
+    tilt: float = 0.0,
+) -> bool:
+    """Say whether a box field of view lies inside what the camera sees; see `box_view_margin`."""
+    return box_view_margin(camera, lower, upper, robot_height, marker_radius, tilt) >= 0.0

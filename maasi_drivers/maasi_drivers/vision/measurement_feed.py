@@ -1,0 +1,336 @@
+"""Blobs over UDP: for a robot that segments its images on board. Without ROS.
+
+One datagram is what was seen in one image. The layout is in docs/measurement_feed.md; everything
+is little-endian.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+import zlib
+from collections import Counter
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from maasi_drivers.vision.segmentation import Blobs
+
+MAGIC = b'MSMF'
+VERSION = 1
+#: Most blobs of one image.
+MOST = 256
+BORDER_CUT = 1
+#: Of the flags: the robot's pose follows the header.
+HAS_POSE = 1
+
+_HEADER = struct.Struct('<4sBBHHHII')
+_POSE = struct.Struct('<7fI')
+_BLOB = struct.Struct('<8fI')
+_CHECKSUM = struct.Struct('<I')
+# Images older than that are of no use [s].
+_OLDEST = 10.0
+# Farther from where it took off, or tilted by more, is no pose [m], [rad].
+_FARTHEST, _MOST_TILT = 1000.0, 1.5
+# A sequence number that is farther behind belongs to a sender that was started again.
+_FAR_BEHIND = 1000
+# So does any, after so long a silence [s].
+_SILENCE = 2.0
+_MOST_AT_ONCE = 64
+
+
+class FeedError(ValueError):
+    """A datagram that is not to be used; the text says field, what was read, what is allowed."""
+
+
+class FeedState(IntEnum):
+    """What a robot that sends its pose does."""
+
+    GROUND = 0
+    AIR = 1
+    LANDING = 2
+
+
+@dataclass(frozen=True)
+class FeedPose:
+    """
+    Where a robot was when the image was taken, as it believes.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        From where it took off: forward, left, up, axes of the heading then [m].
+    roll, pitch, yaw : float
+        Right-handed about forward, left and up; yaw from the heading at take-off [rad].
+    battery : float
+        Charge, 0 to 1; negative: not known.
+    state : FeedState
+        What it does.
+
+    """
+
+    position: np.ndarray
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    battery: float = -1.0
+    state: FeedState = FeedState.GROUND
+
+
+@dataclass(frozen=True)
+class FeedPacket:
+    """
+    What was seen in one image.
+
+    Attributes
+    ----------
+    sequence : int
+        Of the image, counted up by the sender, 0 to 2^32 - 1.
+    age : float
+        From the middle of the exposure to the sending [s].
+    width, height : int
+        Of the image [px].
+    blobs : Blobs
+        In that image.
+    pose : FeedPose, optional
+        Of the robot then; none: it does not send it.
+
+    """
+
+    sequence: int
+    age: float
+    width: int
+    height: int
+    blobs: Blobs
+    pose: FeedPose | None = None
+
+
+def encode(packet: FeedPacket) -> bytes:
+    """
+    Return a packet as a datagram.
+
+    Raises
+    ------
+    FeedError
+        If it holds too many blobs, or numbers that are not allowed.
+
+    """
+    blobs = packet.blobs
+    if len(blobs) > MOST:
+        raise FeedError(f'blobs: got {len(blobs)}, allowed are at most {MOST}')
+    if not 0.0 <= packet.age <= _OLDEST:
+        raise FeedError(f'age: got {packet.age} s, allowed is 0 to {_OLDEST:g} s')
+    data = _HEADER.pack(
+        MAGIC,
+        VERSION,
+        0 if packet.pose is None else HAS_POSE,
+        len(blobs),
+        packet.width,
+        packet.height,
+        packet.sequence % 2**32,
+        round(1e6 * packet.age),
+    )
+    if packet.pose is not None:
+        pose = packet.pose
+        angles = pose.roll, pose.pitch, pose.yaw
+        data += _POSE.pack(*pose.position, *angles, pose.battery, pose.state)
+    for index in range(len(blobs)):
+        covariance = blobs.covariances[index]
+        numbers = [
+            *blobs.centroids[index],
+            *(covariance[0, 0], covariance[0, 1], covariance[1, 1]),
+            blobs.areas[index],
+            *blobs.extents[index],
+        ]
+        data += _BLOB.pack(*numbers, BORDER_CUT if blobs.border_cut[index] else 0)
+    data += _CHECKSUM.pack(zlib.crc32(data))
+    # What is sent can be read.
+    decode(data)
+    return data
+
+
+def decode(data: bytes) -> FeedPacket:
+    """
+    Return the packet of a datagram.
+
+    Raises
+    ------
+    FeedError
+        If it is none, or damaged, or of another version, or holds what cannot be.
+
+    """
+    least = _HEADER.size + _CHECKSUM.size
+    if len(data) < least:
+        raise FeedError(f'length: read {len(data)} bytes, allowed are at least {least}')
+    magic, version, flags, count, width, height, sequence, age = _HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise FeedError(f'magic: read {magic!r}, allowed is {MAGIC!r}')
+    if version != VERSION:
+        raise FeedError(f'version: read {version}, allowed is {VERSION}')
+    if flags & ~HAS_POSE:
+        raise FeedError(f'flags: read {flags}, allowed are 0 and {HAS_POSE}')
+    if count > MOST:
+        raise FeedError(f'count: read {count}, allowed is at most {MOST}')
+    begin = _HEADER.size + (_POSE.size if flags else 0)
+    size = begin + count * _BLOB.size + _CHECKSUM.size
+    if len(data) != size:
+        raise FeedError(f'length: read {len(data)} bytes, allowed are {size} with {count} blobs')
+    (checksum,) = _CHECKSUM.unpack_from(data, size - _CHECKSUM.size)
+    expected = zlib.crc32(data[: -_CHECKSUM.size])
+    if checksum != expected:
+        raise FeedError(f'checksum: read {checksum:#010x}, allowed is {expected:#010x}')
+    if not width or not height:
+        raise FeedError(f'width, height: read {width} x {height}, allowed are at least 1 x 1 px')
+    if age > 1e6 * _OLDEST:
+        raise FeedError(f'age: read {age} us, allowed is at most {1e6 * _OLDEST:.0f} us')
+    pose = _read_pose(_POSE.unpack_from(data, _HEADER.size)) if flags else None
+    rows = list(_BLOB.iter_unpack(data[begin : size - _CHECKSUM.size]))
+    numbers = np.array([row[:8] for row in rows], dtype=float).reshape(count, 8)
+    marks = np.array([row[8] for row in rows], dtype=np.int64)
+    _check(numbers, marks, width, height)
+    covariances = numbers[:, [2, 3, 3, 4]].reshape(count, 2, 2)
+    blobs = Blobs(
+        centroids=numbers[:, :2],
+        covariances=covariances,
+        areas=numbers[:, 5],
+        extents=numbers[:, 6:8],
+        border_cut=(marks & BORDER_CUT) != 0,
+    )
+    return FeedPacket(sequence, 1e-6 * age, width, height, blobs, pose)
+
+
+def _read_pose(values: tuple[float, ...]) -> FeedPose:
+    *numbers, state = values
+    position, (roll, pitch, yaw), battery = np.array(numbers[:3]), numbers[3:6], numbers[6]
+    for good, what in (
+        (np.isfinite(numbers).all(), 'finite numbers'),
+        (np.abs(position).max() <= _FARTHEST, f'a position within {_FARTHEST:g} m'),
+        (max(abs(roll), abs(pitch)) <= _MOST_TILT, f'roll and pitch within {_MOST_TILT} rad'),
+        (battery <= 1.0, 'a charge of at most 1'),
+        (state in list(FeedState), 'states ' + ', '.join(str(int(item)) for item in FeedState)),
+    ):
+        if not good:
+            raise FeedError(f'pose: read {list(values)}, allowed are {what}')
+    return FeedPose(position, roll, pitch, yaw, battery, FeedState(int(state)))
+
+
+def _check(numbers: np.ndarray, marks: np.ndarray, width: int, height: int) -> None:
+    """Raise for the first blob that cannot be."""
+    finite = np.isfinite(numbers).all(axis=1)
+    # Pixel centres are at whole numbers.
+    inside = (numbers[:, :2] >= -0.5).all(axis=1) & (
+        numbers[:, :2] <= np.array([width, height]) - 0.5
+    ).all(axis=1)
+    uu, uv, vv = numbers[:, 2], numbers[:, 3], numbers[:, 4]
+    # Room for the rounding of single precision.
+    proper = (uu >= 0.0) & (vv >= 0.0) & (uv * uv <= uu * vv * (1.0 + 1e-5) + 1e-12)
+    sized = (numbers[:, 5:] >= 0.0).all(axis=1)
+    for good, what in (
+        (finite, 'finite numbers'),
+        (inside, f'a centroid inside {width} x {height} px'),
+        (proper, 'a covariance uu, uv, vv that is positive semidefinite'),
+        (sized, 'area and extents from 0'),
+        ((marks & ~BORDER_CUT) == 0, f'marks 0 or {BORDER_CUT}'),
+    ):
+        if not good.all():
+            index = int(np.flatnonzero(~good)[0])
+            read = [*numbers[index].tolist(), int(marks[index])]
+            raise FeedError(f'blob {index}: read {read}, allowed are {what}')
+
+
+@dataclass(frozen=True)
+class ReceivedPacket:
+    """A packet, and when its image was taken by the monotonic clock of this host [s]."""
+
+    packet: FeedPacket
+    taken: float
+
+
+class FeedReceiver:
+    """
+    Hears a feed; to be asked often.
+
+    Parameters
+    ----------
+    port : int
+        UDP; 0: any that is free.
+    address : str
+        Of this host, on which it listens.
+    sender : str, optional
+        Address of the only one that is heard; none: anybody.
+
+    Attributes
+    ----------
+    counts : Counter
+        Packets that came ('received'), were lost or not used: reason to number.
+    problem : str
+        Text of the last one that was not used.
+
+    Raises
+    ------
+    OSError
+        If the port is taken.
+
+    """
+
+    def __init__(self, port: int, address: str = '127.0.0.1', sender: str | None = None) -> None:
+        self.sender = sender
+        self.counts: Counter[str] = Counter()
+        self.problem = ''
+        self._last: int | None = None
+        self._heard_at = -1e9
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((address, port))
+        except OSError:
+            self._socket.close()
+            raise
+        self._socket.setblocking(False)
+        self.port = int(self._socket.getsockname()[1])
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.close()
+
+    def take(self) -> list[ReceivedPacket]:
+        """Return what has come since the last call, in order."""
+        packets = []
+        for _ in range(_MOST_AT_ONCE):
+            try:
+                data, (host, _) = self._socket.recvfrom(65536)
+            except BlockingIOError:
+                break
+            if self.sender not in (None, host):
+                self._refuse('foreign sender', f'sender: read {host}, allowed is {self.sender}')
+                continue
+            now = time.monotonic()
+            try:
+                packet = decode(data)
+            except FeedError as error:
+                self._refuse('bad packet', str(error))
+                continue
+            if self._is_new(packet.sequence, now):
+                self.counts['received'] += 1
+                packets.append(ReceivedPacket(packet, now - packet.age))
+        return packets
+
+    def _refuse(self, reason: str, text: str) -> None:
+        self.counts[reason] += 1
+        self.problem = text
+
+    def _is_new(self, sequence: int, now: float) -> bool:
+        last, silent = self._last, now - self._heard_at
+        if last is not None and silent < _SILENCE:
+            # As a signed difference, so that it may wrap.
+            ahead = (sequence - last + 2**31) % 2**32 - 2**31
+            if -_FAR_BEHIND < ahead <= 0:
+                self._refuse(
+                    'old packet', f'sequence: read {sequence}, allowed is what follows {last}'
+                )
+                return False
+            if 1 < ahead < _FAR_BEHIND:
+                self.counts['lost packet'] += ahead - 1
+        self._last, self._heard_at = sequence, now
+        return True

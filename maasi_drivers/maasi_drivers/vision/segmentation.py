@@ -1,0 +1,462 @@
+"""
+Blue markers in an image: the papers' rule, and one that adapts to the light.
+
+Both rules take an RGB image and return `Blobs`; `segment` chooses by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_drivers.vision.camera_settings import SegmentationSettings
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+# Labels of pixels that are no marker, and of those not yet reached.
+_BACKGROUND, _UNLABELLED = -1, -2
+# About how many pixels the colour of the floor is taken from.
+_FLOOR_SAMPLES = 4096
+# Added to the mean of the channels before dividing by it: noise in the dark is not blue.
+_DARK = 6.0
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """
+    Connected marker pixels, in the order of their topmost and then leftmost pixel.
+
+    Attributes
+    ----------
+    centroids : ndarray, shape (n, 2)
+        (column, row), pixel centres at whole numbers [px].
+    areas : ndarray, shape (n,)
+        [px].
+    extents : ndarray, shape (n, 2)
+        Width and height of the bounding box [px].
+    border_cut : ndarray of bool, shape (n,)
+        True where the blob touches the image's border, so that its centroid is biased inwards.
+    covariances : ndarray, shape (n, 2, 2)
+        Of the centroids, as far as image noise explains them; zero where the rule does not tell
+        [px^2].
+
+    """
+
+    centroids: Array
+    areas: Array
+    extents: Array
+    border_cut: NDArray[np.bool_]
+    covariances: Array
+
+    def __len__(self) -> int:
+        return len(self.areas)
+
+    def select(self, mask: NDArray[np.bool_]) -> Blobs:
+        """Return the blobs where ``mask`` (n,) is true."""
+        return Blobs(
+            self.centroids[mask],
+            self.areas[mask],
+            self.extents[mask],
+            self.border_cut[mask],
+            self.covariances[mask],
+        )
+
+
+def check_image(image: NDArray[np.generic]) -> Image:
+    """
+    Return an image fit for segmentation.
+
+    Raises
+    ------
+    ValueError
+        Unless it is an (h, w, 3) array of bytes with h, w of at least 1.
+
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+        raise ValueError(
+            f'image: got an array of shape {image.shape} and type {image.dtype}, '
+            'allowed (height, width, 3) of uint8, channels R, G, B'
+        )
+    # One memory layout: kernels are compiled for the layouts that they meet.
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+@njit(cache=True)
+def _paper_mask(red, green, blue, limit, mask):  # type: ignore[no-untyped-def]
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
+            excess = (
+                np.int16(2) * np.int16(blue[row, column])
+                - np.int16(red[row, column])
+                - np.int16(green[row, column])
+            )
+            mask[row, column] = np.uint8(excess > limit)
+
+
+def paper_mask(image: Image, threshold: float = 35.0) -> NDArray[np.uint8]:
+    """
+    Return 1 where B - R/2 - G/2 > threshold, else 0 (001, eq. (16)).
+
+    Computed in whole numbers of half grey levels, so nothing is rounded or clipped.
+    """
+    red, green, blue = _planes(check_image(image))
+    mask = np.empty(image.shape[:2], dtype=np.uint8)
+    _paper_mask(red, green, blue, np.int16(np.floor(2.0 * threshold)), mask)
+    return mask
+
+
+def _planes(image: Image) -> list[Image]:
+    # The masks are computed plane by plane: that is what compilers make fast code of.
+    return [np.asarray(plane, dtype=np.uint8) for plane in cv2.split(image)]
+
+
+@njit(cache=True)
+def _fill(marked, labels, members, starts, boxes):  # type: ignore[no-untyped-def]
+    """See `_components`; returns their number."""
+    height, width = labels.shape
+    count = 0
+    reached = 0
+    for index in marked:
+        if labels[index // width, index % width] != _UNLABELLED:
+            continue
+        starts[count] = reached
+        row, column = index // width, index % width
+        labels[row, column] = count
+        members[reached] = index
+        done = reached
+        reached += 1
+        left, right, bottom = column, column, row
+        while done < reached:
+            r, c = members[done] // width, members[done] % width
+            done += 1
+            left, right, bottom = min(left, c), max(right, c), max(bottom, r)
+            for nr in range(max(r - 1, 0), min(r + 2, height)):
+                for nc in range(max(c - 1, 0), min(c + 2, width)):
+                    if labels[nr, nc] == _UNLABELLED:
+                        labels[nr, nc] = count
+                        members[reached] = nr * width + nc
+                        reached += 1
+        boxes[count, 0], boxes[count, 1] = left, row
+        boxes[count, 2], boxes[count, 3] = right - left + 1, bottom - row + 1
+        count += 1
+    starts[count] = reached
+    return count
+
+
+def _components(
+    mask: NDArray[np.uint8],
+) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """
+    Find the 8-connected components of a mask (h, w), in the order of rows.
+
+    Markers are few pixels of an image: filling each from its first pixel beats the passes over the
+    whole image that a general algorithm takes.
+
+    Returns
+    -------
+    labels : ndarray, shape (h, w)
+        Component from 0 on, or _BACKGROUND.
+    members : ndarray
+        Pixels, as row * w + column, one component after the other.
+    starts : ndarray, shape (n + 1,)
+        Where each component's members start.
+    boxes : ndarray, shape (n, 4)
+        Left, top, width, height.
+
+    """
+    marked = np.flatnonzero(mask.view(np.bool_))
+    labels = np.full(mask.shape, _BACKGROUND, dtype=np.int32)
+    labels.reshape(-1)[marked] = _UNLABELLED
+    members = np.empty(len(marked), dtype=np.int64)
+    starts = np.empty(len(marked) + 1, dtype=np.int64)
+    boxes = np.empty((len(marked), 4), dtype=np.int64)
+    count = _fill(marked, labels, members, starts, boxes)
+    return labels, members, starts[: count + 1], boxes[:count]
+
+
+def _border_cut(boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    return np.asarray(((low <= 0) | (high >= np.array([shape[1], shape[0]]))).any(axis=1))
+
+
+def segment_paper(image: Image, settings: SegmentationSettings) -> Blobs:
+    """
+    Find blobs of a fixed blue excess, with the plain centroid of their pixels (001, section 6.1).
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w, 3), uint8
+        R, G, B.
+    settings : SegmentationSettings
+        ``threshold`` and ``minimum_area`` are used.
+
+    """
+    mask = paper_mask(image, settings.threshold)
+    _, members, starts, boxes = _components(mask)
+    areas = np.diff(starts).astype(np.float64)
+    centroids = np.empty((len(areas), 2))
+    if len(areas):
+        rows, columns = np.divmod(members, mask.shape[1])
+        centroids[:, 0] = np.add.reduceat(columns, starts[:-1]) / areas
+        centroids[:, 1] = np.add.reduceat(rows, starts[:-1]) / areas
+    blobs = Blobs(
+        centroids,
+        areas,
+        boxes[:, 2:].astype(np.float64),
+        _border_cut(boxes, mask.shape),
+        np.zeros((len(areas), 2, 2)),
+    )
+    return blobs.select(areas >= settings.minimum_area * mask.size)
+
+
+@njit(cache=True)
+def _histogram_median(histogram):  # type: ignore[no-untyped-def]
+    """Median of counted values, interpolated within its bin; bins are centred on whole numbers."""
+    half = 0.5 * histogram.sum()
+    below = 0.0
+    for value in range(histogram.shape[0]):
+        count = histogram[value]
+        if count > 0 and below + count >= half:
+            return value - 0.5 + (half - below) / count
+        below += count
+    return float(histogram.shape[0] - 1)
+
+
+@njit(cache=True)
+def _floor_statistics(image, samples):  # type: ignore[no-untyped-def]
+    """White-balance gains (3,) from the floor; median and deviation of its blueness."""
+    height, width = image.shape[0], image.shape[1]
+    stride = max(1, int(np.sqrt(height * width / samples)))
+    histograms = np.zeros((3, 256), dtype=np.int64)
+    for row in range(stride // 2, height, stride):
+        for column in range(stride // 2, width, stride):
+            for channel in range(3):
+                histograms[channel, image[row, column, channel]] += 1
+    medians = np.empty(3)
+    for channel in range(3):
+        medians[channel] = max(_histogram_median(histograms[channel]), 1.0)
+    mean = (medians[0] + medians[1] + medians[2]) / 3.0
+    gains = np.empty(3)
+    for channel in range(3):
+        # A frame that is mostly a marker or a coloured sheet must not turn into the reference.
+        gains[channel] = min(max(mean / medians[channel], 0.6), 1.7)
+    # Blueness is between -3 and 3: bins of 1/256.
+    blueness = np.zeros(1536, dtype=np.int64)
+    for row in range(stride // 2, height, stride):
+        for column in range(stride // 2, width, stride):
+            value = _blueness(image, row, column, gains[0], gains[1], gains[2])
+            blueness[min(max(int(np.floor(value * 256.0)) + 768, 0), 1535)] += 1
+    centre = (_histogram_median(blueness) + 0.5 - 768.0) / 256.0
+    deviations = np.zeros(1536, dtype=np.int64)
+    for index in range(1536):
+        if blueness[index] > 0:
+            offset = abs((index + 0.5 - 768.0) / 256.0 - centre)
+            deviations[min(int(np.floor(offset * 256.0)), 1535)] += blueness[index]
+    deviation = 1.4826 * (_histogram_median(deviations) + 0.5) / 256.0
+    return gains, centre, deviation
+
+
+@njit(cache=True)
+def _blueness(image, row, column, gain_r, gain_g, gain_b):  # type: ignore[no-untyped-def]
+    red = gain_r * image[row, column, 0]
+    green = gain_g * image[row, column, 1]
+    blue = gain_b * image[row, column, 2]
+    return 3.0 * (blue - max(red, green)) / (red + green + blue + 3.0 * _DARK)
+
+
+@njit(cache=True)
+def _robust_mask(red, green, blue, gains, threshold, mask):  # type: ignore[no-untyped-def]
+    """Set mask to 1 where the blueness exceeds the threshold (no division per pixel)."""
+    red_gain, green_gain, blue_gain = (
+        np.float32(gains[0]),
+        np.float32(gains[1]),
+        np.float32(gains[2]),
+    )
+    slope = np.float32(threshold / 3.0)
+    offset = np.float32(threshold * _DARK)
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
+            r = red_gain * np.float32(red[row, column])
+            g = green_gain * np.float32(green[row, column])
+            b = blue_gain * np.float32(blue[row, column])
+            excess = b - max(r, g) - offset
+            mask[row, column] = np.uint8(excess > slope * (r + g + b))
+
+
+@njit(cache=True)
+def _excess(image, row, column, gains):  # type: ignore[no-untyped-def]
+    """Blue excess O_p of the white-balanced image: linear in how much of a pixel is marker."""
+    return gains[2] * image[row, column, 2] - 0.5 * (
+        gains[0] * image[row, column, 0] + gains[1] * image[row, column, 1]
+    )
+
+
+@njit(cache=True)
+def _measure_blobs(  # type: ignore[no-untyped-def]
+    image, labels, members, starts, boxes, gains, gates, keep, centroids, areas, variances
+):
+    """
+    Measure each blob, and keep those within the gates: least peak blueness, aspect, solidity.
+
+    centroids (n, 2) and areas (n,) are weighted by the part of each pixel that is marker;
+    variances (n, 2) of the centroids follow from the noise of the surroundings.
+    """
+    height, width = labels.shape
+    for blob in range(boxes.shape[0]):
+        left, top = boxes[blob, 0], boxes[blob, 1]
+        right, bottom = left + boxes[blob, 2], top + boxes[blob, 3]
+        first, last = starts[blob], starts[blob + 1]
+        count = last - first
+        keep[blob] = False
+        # Moments of the mask, for the shape, and the peak.
+        values = np.empty(count)
+        sx = sy = sxx = syy = sxy = 0.0
+        peak = 0.0
+        for index in range(first, last):
+            row, column = members[index] // width, members[index] % width
+            x, y = float(column - left), float(row - top)
+            sx += x
+            sy += y
+            sxx += x * x
+            syy += y * y
+            sxy += x * y
+            peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
+            values[index - first] = _excess(image, row, column, gains)
+        mx, my = sx / count, sy / count
+        # A pixel is a square: it has a second moment of 1/12 of its own.
+        vxx = sxx / count - mx * mx + 1.0 / 12.0
+        vyy = syy / count - my * my + 1.0 / 12.0
+        vxy = sxy / count - mx * my
+        middle = 0.5 * (vxx + vyy)
+        apart = np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
+        long, short = middle + apart, max(middle - apart, 1e-9)
+        # Lengths of the axes go as the roots of the moments; an ellipse has area 4 pi root(l s).
+        if peak < gates[0] or long > gates[1] * gates[1] * short:
+            continue
+        if count < gates[2] * 4.0 * np.pi * np.sqrt(long * short):
+            continue
+        # The excess of a pixel that is all marker: the mean of the upper half inside the blob.
+        upper = np.sort(values)[count // 2 :].mean()
+        # The floor around: the frame of the box widened by three pixels, other blobs left out.
+        around = 0
+        square = total = 0.0
+        for row in range(max(top - 3, 0), min(bottom + 3, height)):
+            for column in range(max(left - 3, 0), min(right + 3, width)):
+                frame = row < top - 1 or row > bottom or column < left - 1 or column > right
+                if frame and labels[row, column] == _BACKGROUND:
+                    value = _excess(image, row, column, gains)
+                    around += 1
+                    total += value
+                    square += value * value
+        background = total / around if around > 0 else 0.0
+        noise = square / around - background * background if around > 1 else 0.0
+        contrast = max(upper - background, 1e-6)
+        # Weights in the blob and the ring of one pixel around it, other blobs left out.
+        weight_sum = wx = wy = 0.0
+        spread_x = spread_y = 0.0
+        for row in range(max(top - 1, 0), min(bottom + 1, height)):
+            for column in range(max(left - 1, 0), min(right + 1, width)):
+                near = labels[row, column] == blob
+                if labels[row, column] == _BACKGROUND:
+                    for r in range(max(row - 1, 0), min(row + 2, height)):
+                        for c in range(max(column - 1, 0), min(column + 2, width)):
+                            near |= labels[r, c] == blob
+                if near:
+                    weight = (_excess(image, row, column, gains) - background) / contrast
+                    x, y = float(column - left), float(row - top)
+                    weight_sum += weight
+                    wx += weight * x
+                    wy += weight * y
+                    spread_x += (x - mx) * (x - mx)
+                    spread_y += (y - my) * (y - my)
+        if weight_sum < 0.25 * count:
+            continue
+        keep[blob] = True
+        areas[blob] = weight_sum
+        centroids[blob, 0] = left + wx / weight_sum
+        centroids[blob, 1] = top + wy / weight_sum
+        scale = max(noise, 0.0) / (contrast * weight_sum) ** 2
+        variances[blob, 0], variances[blob, 1] = scale * spread_x, scale * spread_y
+
+
+def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
+    """
+    Find compact blobs that are bluer than the floor, whatever the light.
+
+    White balance from the median of the image (the floor); blueness (B - max(R, G)) over the mean
+    of the channels, which neither gradients nor exposure change, and which tells purple and pale
+    blue from blue; a threshold on it, raised where the floor is noisy (median absolute deviation);
+    gates on the blueness at the peak, on aspect and solidity; centroids weighted by how much of
+    each pixel is marker. Sizes are gated where the geometry is known, in
+    `maasi_drivers.vision.marker_detector`.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w, 3), uint8
+        R, G, B.
+    settings : SegmentationSettings
+        All but ``threshold`` and ``minimum_area`` are used.
+
+    """
+    image = check_image(image)
+    gains, centre, deviation = _floor_statistics(image, _FLOOR_SAMPLES)
+    threshold = max(settings.saturation, centre + settings.noise_factor * deviation)
+    mask = np.empty(image.shape[:2], dtype=np.uint8)
+    red, green, blue = _planes(image)
+    _robust_mask(red, green, blue, gains, threshold, mask)
+    labels, members, starts, boxes = _components(mask)
+    count = len(boxes)
+    keep = np.zeros(count, dtype=np.bool_)
+    centroids, areas, variances = np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2))
+    gates = np.array(
+        [
+            max(settings.peak_saturation, threshold),
+            settings.maximum_aspect,
+            settings.minimum_solidity,
+        ]
+    )
+    _measure_blobs(
+        image, labels, members, starts, boxes, gains, gates, keep, centroids, areas, variances
+    )
+    covariances = np.zeros((count, 2, 2))
+    covariances[:, 0, 0], covariances[:, 1, 1] = variances[:, 0], variances[:, 1]
+    blobs = Blobs(
+        centroids,
+        areas,
+        boxes[:, 2:].astype(np.float64),
+        _border_cut(boxes, mask.shape),
+        covariances,
+    )
+    return blobs.select(keep)
+
+
+RULES: dict[str, Callable[[Image, SegmentationSettings], Blobs]] = {
+    'paper': segment_paper,
+    'robust': segment_robust,
+}
+
+
+def segment(image: Image, settings: SegmentationSettings) -> Blobs:
+    """
+    Find marker blobs by the rule that the settings name.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w, 3), uint8
+        R, G, B.
+    settings : SegmentationSettings
+        Rule and its numbers.
+
+    Raises
+    ------
+    ValueError
+        If the image has another shape or type.
+
+    """
+    return RULES[settings.rule](image, settings)

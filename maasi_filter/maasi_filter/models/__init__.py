@@ -1,0 +1,1 @@
+"""Poses, sensors, detection probabilities and measurement models."""

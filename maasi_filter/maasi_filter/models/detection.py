@@ -1,0 +1,337 @@
+"""Probability that a sensor detects a target, pi(x, q).
+
+Every model has a kernel that other numba kernels evaluate inline, except a user's own function.
+Arrays of the sensor's parameters always have PARAMETERS entries, so that one compiled kernel
+serves all kinds.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.models.pose import Pose
+from maasi_filter.vector_math import exponential
+
+FloatArray = NDArray[np.float64]
+
+EXPONENTIAL = 0
+GAUSSIAN = 1
+BOX = 2
+PARAMETERS = 9
+
+
+@njit(cache=True, error_model='numpy')
+def detection_probability(
+    kind: int,
+    parameters: FloatArray,
+    position: FloatArray,
+    sensor_position: FloatArray,
+    yaw: float,
+) -> float:
+    """Return pi(x, q) of one target; see `detection_probability_at` for the arguments."""
+    return detection_probability_at(
+        kind,
+        parameters,
+        position[0] - sensor_position[0],
+        position[1] - sensor_position[1],
+        position[2] - sensor_position[2],
+        math.cos(yaw),
+        math.sin(yaw),
+    )
+
+
+@njit(cache=True, error_model='numpy')
+def detection_probability_at(
+    kind: int,
+    parameters: FloatArray,
+    dx: float,
+    dy: float,
+    dz: float,
+    cos_yaw: float,
+    sin_yaw: float,
+) -> float:
+    """Return pi for a target at offset (dx, dy, dz) [m, map axes] from the sensor.
+
+    `kind` is EXPONENTIAL (000, eq. (3), (4)), GAUSSIAN (003, section 2.2) or BOX (000, eq. (25)
+    and (34)); `parameters` come from the model's `kernel()`.
+    """
+    if kind == BOX:
+        x = dx
+        y = dy
+        if parameters[8] > 0.5:
+            x = cos_yaw * dx + sin_yaw * dy
+            y = cos_yaw * dy - sin_yaw * dx
+        inside = min(x - parameters[1], parameters[4] - x)
+        inside = min(inside, min(y - parameters[2], parameters[5] - y))
+        inside = min(inside, min(dz - parameters[3], parameters[6] - dz))
+        edge = parameters[7]
+        if edge > 0.0:
+            if inside >= edge:
+                return parameters[0]
+            if inside <= -edge:
+                return 0.0
+            return parameters[0] * 0.5 * (1.0 + inside / edge)
+        return parameters[0] if inside >= 0.0 else 0.0
+    square = (dx * parameters[1]) ** 2 + (dy * parameters[2]) ** 2 + (dz * parameters[3]) ** 2
+    if kind == GAUSSIAN:
+        return parameters[0] * math.exp(-0.5 * square)
+    return parameters[0] * math.exp(-0.5 * math.sqrt(square))
+
+
+@njit(cache=True, error_model='numpy')
+def fill_probabilities(  # type: ignore[no-untyped-def]
+    kind, parameters, x, y, z, number, cos_yaw, sin_yaw, out
+):
+    """Fill pi for the first `number` offsets (x, y, z) [m, map axes] from the sensor."""
+    if kind == BOX:
+        for i in range(number):
+            out[i] = detection_probability_at(kind, parameters, x[i], y[i], z[i], cos_yaw, sin_yaw)
+        return
+    gain = parameters[0]
+    p = parameters[1]
+    q = parameters[2]
+    r = parameters[3]
+    if kind == GAUSSIAN:
+        for i in range(number):
+            u = x[i] * p
+            v = y[i] * q
+            w = z[i] * r
+            out[i] = gain * exponential(-0.5 * (u * u + v * v + w * w))
+    else:
+        for i in range(number):
+            u = x[i] * p
+            v = y[i] * q
+            w = z[i] * r
+            out[i] = gain * exponential(-0.5 * math.sqrt(u * u + v * v + w * w))
+
+
+@njit(cache=True, error_model='numpy')
+def offsets(  # type: ignore[no-untyped-def]
+    positions, start, number, sensor_position, x, y, z
+):
+    """Fill the offsets of `number` positions (n, d) from `start` on from the sensor, axes apart.
+
+    In two dimensions the height of the sensor plays no part, as in the papers: z is 0.
+    """
+    x0 = sensor_position[0]
+    y0 = sensor_position[1]
+    part = positions[start : start + number]
+    if positions.shape[1] == 3:
+        z0 = sensor_position[2]
+        # All axes in one loop: whole rows are read, and sorted in registers.
+        for i in range(number):
+            x[i] = part[i, 0] - x0
+            y[i] = part[i, 1] - y0
+            z[i] = part[i, 2] - z0
+    else:
+        for i in range(number):
+            x[i] = part[i, 0] - x0
+            y[i] = part[i, 1] - y0
+        for i in range(number):
+            z[i] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def probabilities(  # type: ignore[no-untyped-def]
+    kind, parameters, positions, sensor_position, yaw
+):
+    """Return pi(x, q) at positions (n, d)."""
+    number = positions.shape[0]
+    cos_yaw = math.cos(yaw)
+    sin_yaw = math.sin(yaw)
+    out = np.empty(number)
+    size = min(number, 512)
+    x = np.empty(size)
+    y = np.empty(size)
+    z = np.empty(size)
+    for start in range(0, number, 512):
+        part = min(512, number - start)
+        offsets(positions, start, part, sensor_position, x, y, z)
+        fill_probabilities(
+            kind,
+            parameters,
+            x,
+            y,
+            z,
+            part,
+            cos_yaw,
+            sin_yaw,
+            out[start : start + part],
+        )
+    return out
+
+
+class DetectionModel(ABC):
+    """Probability of detection of a target at x by a sensor at pose q."""
+
+    @abstractmethod
+    def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
+        """Return pi(x, q), shape (n,), in [0, 1].
+
+        Parameters
+        ----------
+        positions : (n, d) array
+            Target positions, metres, frame `map`, d = 2 or 3. With d = 2 the sensor's height
+            plays no part.
+        pose : Pose
+            Of the sensor.
+        """
+
+    def kernel(self) -> tuple[int, FloatArray] | None:
+        """Return (kind, parameters) for `detection_probability`, or None if there is none."""
+        return None
+
+
+def _positions(positions: ArrayLike) -> FloatArray:
+    array = np.ascontiguousarray(positions, dtype=float)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise ValueError(f'positions: got shape {array.shape}, allowed are (n, 2) and (n, 3)')
+    return array
+
+
+def _check_probability(probability: float) -> float:
+    if not (math.isfinite(probability) and 0.0 <= probability <= 1.0):
+        raise ValueError(f'probability: got {probability}, allowed are numbers in [0, 1]')
+    return float(probability)
+
+
+class _KernelDetection(DetectionModel):
+    """A model whose formula is in `detection_probability`."""
+
+    _kind: int
+    _parameters: FloatArray
+
+    def kernel(self) -> tuple[int, FloatArray]:
+        return self._kind, self._parameters
+
+    def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
+        return probabilities(
+            self._kind, self._parameters, _positions(positions), pose.position, pose.yaw
+        )
+
+
+class _RadialDetection(_KernelDetection):
+    def __init__(self, probability: float, size: Sequence[float]) -> None:
+        values = np.array(size, dtype=float)
+        if values.shape not in ((2,), (3,)) or not (values > 0.0).all():
+            raise ValueError(f'size: got {list(size)}, allowed are 2 or 3 positive numbers')
+        self.gain = _check_probability(probability)
+        self.size = values
+        self._parameters = np.zeros(PARAMETERS)
+        self._parameters[0] = self.gain
+        self._parameters[1 : 1 + len(values)] = 1.0 / values
+
+
+class ExponentialDetection(_RadialDetection):
+    """pi = G exp(-|zeta| / 2), zeta the distance divided by F on each axis (000, eq. (3), (4)).
+
+    Parameters
+    ----------
+    probability : float
+        G, in [0, 1].
+    size : sequence of 2 or 3 floats
+        F on each map axis, metres. With two numbers height plays no part.
+    """
+
+    _kind = EXPONENTIAL
+
+
+class GaussianDetection(_RadialDetection):
+    """pi = G exp(-|zeta|^2 / 2) (003, section 2.2); arguments as `ExponentialDetection`."""
+
+    _kind = GAUSSIAN
+
+
+class BoxDetection(_KernelDetection):
+    """pi = G inside a box around the sensor and 0 outside (000, eq. (25) and (34)).
+
+    Parameters
+    ----------
+    lower, upper : sequences of 2 or 3 floats
+        Corners of the box as offsets from the sensor, metres; it need not be centred. With two
+        numbers height plays no part.
+    probability : float
+        G inside; the papers have 1.
+    frame : {'robot', 'world'}
+        Whether the box turns with the robot's heading or stays aligned with the map.
+    edge : float
+        Half width of a linear ramp across the box's faces, metres; 0 is the papers' hard edge.
+    """
+
+    _kind = BOX
+
+    def __init__(
+        self,
+        lower: Sequence[float],
+        upper: Sequence[float],
+        probability: float = 1.0,
+        frame: str = 'robot',
+        edge: float = 0.0,
+    ) -> None:
+        low = np.array(lower, dtype=float)
+        high = np.array(upper, dtype=float)
+        if low.shape not in ((2,), (3,)) or low.shape != high.shape or not (low < high).all():
+            raise ValueError(
+                f'lower, upper: got {list(lower)}, {list(upper)}, allowed are 2 or 3 numbers '
+                'each, with lower below upper'
+            )
+        if frame not in ('robot', 'world'):
+            raise ValueError(f"frame: got {frame!r}, allowed are 'robot' and 'world'")
+        if not (math.isfinite(edge) and edge >= 0.0):
+            raise ValueError(f'edge: got {edge}, allowed are finite numbers from 0')
+        self.gain = _check_probability(probability)
+        self.lower = low
+        self.upper = high
+        self.frame = frame
+        self.edge = float(edge)
+        self._parameters = np.empty(PARAMETERS)
+        self._parameters[0] = self.gain
+        self._parameters[1:4] = -np.inf
+        self._parameters[4:7] = np.inf
+        self._parameters[1 : 1 + len(low)] = low
+        self._parameters[4 : 4 + len(high)] = high
+        self._parameters[7] = self.edge
+        self._parameters[8] = 1.0 if frame == 'robot' else 0.0
+
+    def softened(self, edge: float) -> BoxDetection:
+        """Return the same box with a ramp of at least `edge` metres."""
+        if edge <= self.edge:
+            return self
+        return BoxDetection(self.lower.tolist(), self.upper.tolist(), self.gain, self.frame, edge)
+
+
+class FunctionDetection(DetectionModel):
+    """A user's own probability of detection.
+
+    Parameters
+    ----------
+    function : callable
+        Takes positions (n, d) [m, map] and a Pose, returns n numbers in [0, 1].
+    """
+
+    def __init__(self, function: Callable[[FloatArray, Pose], ArrayLike]) -> None:
+        self._function = function
+
+    def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
+        """Return the function's values.
+
+        Raises
+        ------
+        ValueError
+            If it returns another number of values, or one outside [0, 1].
+        """
+        array = _positions(positions)
+        values = np.array(self._function(array, pose), dtype=float)
+        if values.shape != (len(array),):
+            raise ValueError(
+                f'detection function: got shape {values.shape}, allowed is ({len(array)},)'
+            )
+        if not ((values >= 0.0) & (values <= 1.0)).all():
+            raise ValueError('detection function: got values outside [0, 1], or not finite')
+        return values

@@ -1,0 +1,118 @@
+"""A robot's sensor: what it detects, and how badly it measures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.models.detection import DetectionModel
+from maasi_filter.models.measurement import MeasurementModel, RangeBearing, RangeBearingElevation
+
+FloatArray = NDArray[np.float64]
+
+
+def check_covariance(name: str, covariance: FloatArray, dimension: int) -> None:
+    """Refuse a covariance that is not symmetric positive definite.
+
+    Raises
+    ------
+    ValueError
+        Naming `name`, what was read, and what is allowed.
+    """
+    if covariance.shape != (dimension, dimension):
+        raise ValueError(
+            f'{name}: got shape {covariance.shape}, allowed is ({dimension}, {dimension})'
+        )
+    if not np.isfinite(covariance).all():
+        raise ValueError(f'{name}: got {covariance.tolist()}, allowed are finite numbers only')
+    if not is_covariance(covariance):
+        raise ValueError(
+            f'{name}: got {covariance.tolist()}, allowed is a symmetric positive definite matrix'
+        )
+
+
+def is_covariance(covariance: FloatArray) -> bool:
+    """Return whether a finite square matrix is symmetric positive definite, well above rounding."""
+    scale = np.sqrt(np.abs(np.diagonal(covariance)))
+    if not (np.isfinite(covariance).all() and (scale > 0.0).all()):
+        return False
+    if (np.diagonal(covariance) <= 0.0).any():
+        return False
+    correlation = covariance / np.outer(scale, scale)
+    if np.abs(correlation - correlation.T).max() > 1e-6:
+        return False
+    return bool(np.linalg.eigvalsh(correlation)[0] > 1e-10)
+
+
+@dataclass
+class Sensor:
+    """What a robot measures targets with.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    detection : DetectionModel
+        pi(x, q).
+    measurement : MeasurementModel
+        g(x, q): range and bearing in 2D; range, bearing and elevation in 3D.
+    covariance : (d, d) array
+        R, of a measurement; m and rad, squared.
+    clutter : float
+        Intensity of false detections, per unit of measurement space (m rad in 2D, m rad^2 in 3D).
+    period : float
+        Seconds between possible measurements; 0 where there is no limit.
+    maximum_range : float
+        Detections from farther away are dropped and counted, metres.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or the covariance is not positive definite.
+    """
+
+    name: str
+    detection: DetectionModel
+    measurement: MeasurementModel
+    covariance: FloatArray
+    clutter: float = 0.0
+    period: float = 0.0
+    maximum_range: float = field(default=math.inf)
+
+    def __post_init__(self) -> None:
+        self.covariance = np.array(self.covariance, dtype=float)
+        check_covariance(f'{self.name}: covariance', self.covariance, self.measurement.dimension)
+        if not (math.isfinite(self.clutter) and self.clutter >= 0.0):
+            raise ValueError(
+                f'{self.name}: clutter: got {self.clutter}, allowed are finite numbers from 0'
+            )
+        if not (math.isfinite(self.period) and self.period >= 0.0):
+            raise ValueError(
+                f'{self.name}: period: got {self.period}, allowed are finite numbers from 0'
+            )
+        if not self.maximum_range > 0.0:
+            raise ValueError(
+                f'{self.name}: maximum_range: got {self.maximum_range}, allowed are numbers above 0'
+            )
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.measurement.dimension
+
+    @classmethod
+    def ranging(
+        cls,
+        name: str,
+        detection: DetectionModel,
+        covariance: FloatArray,
+        clutter: float = 0.0,
+        period: float = 0.0,
+    ) -> Sensor:
+        """Return a sensor of range and angles whose dimension is that of `covariance`."""
+        dimension = len(np.atleast_2d(covariance))
+        model: MeasurementModel = RangeBearing() if dimension == 2 else RangeBearingElevation()
+        return cls(name, detection, model, covariance, clutter, period)

@@ -1,0 +1,1 @@
+"""The runtime that all nodes share: life cycle, lockstep, parameters, QoS, conversions."""

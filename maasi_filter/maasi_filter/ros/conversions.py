@@ -1,0 +1,388 @@
+"""Between messages and the library's records, in pairs."""
+
+from __future__ import annotations
+
+import array
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Quaternion
+from geometry_msgs.msg import Pose as PoseMessage
+from numpy.typing import NDArray
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.ic_phd.found_targets import FoundTarget
+from maasi_filter.ic_phd.search_filter import AgentMeasurement
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_msgs.msg import Cluster as ClusterMessage
+from maasi_msgs.msg import Detection, DetectionArray
+from maasi_msgs.msg import FoundTarget as FoundTargetMessage
+
+FloatArray = NDArray[np.float64]
+
+#: Detections of one message that are used at most, the first ones. A step's time grows with their
+#: number; no sensor of a search sees so many targets at once.
+MOST_DETECTIONS = 200
+
+#: Coordinates beyond this are no place [m]: the circumference of the Earth.
+FARTHEST = 4e7
+#: Speeds beyond this are none of a robot [m/s, rad/s].
+FASTEST = 1e5
+
+# Relative, for what is called symmetric and positive.
+_ROUNDING = 1e-9
+
+
+def stamp_to_ros(nanoseconds: int) -> Time:
+    """Return a stamp."""
+    seconds, rest = divmod(int(nanoseconds), 1_000_000_000)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def stamp_from_ros(stamp: Time) -> int:
+    """Return a stamp in nanoseconds."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def stamp_of_step(step: int, duration: float) -> int:
+    """Return the time of a step of `duration` seconds in nanoseconds."""
+    return round(step * duration * 1e9)
+
+
+def bounded(name: str, values: Iterable[float], limit: float) -> None:
+    """Refuse numbers that are not finite or so large that the arithmetic with them fails.
+
+    Raises
+    ------
+    ValueError
+        The message names `name`.
+    """
+    # Not so for NaN either.
+    if not all(abs(value) <= limit for value in values):
+        raise ValueError(
+            f'{name}: got {list(values)}, allowed are finite numbers up to {limit:g} in magnitude'
+        )
+
+
+def point_to_ros(position: Sequence[float] | FloatArray) -> Point:
+    """Return a position of two or three coordinates [m]."""
+    z = float(position[2]) if len(position) == 3 else 0.0
+    return Point(x=float(position[0]), y=float(position[1]), z=z)
+
+
+def point_from_ros(point: Point) -> FloatArray:
+    """Return a position, (3,) [m]."""
+    return np.array([point.x, point.y, point.z])
+
+
+def pose_to_ros(pose: Pose) -> PoseMessage:
+    """Return a pose."""
+    w, x, y, z = (float(value) for value in pose.orientation)
+    return PoseMessage(
+        position=point_to_ros(pose.position), orientation=Quaternion(x=x, y=y, z=z, w=w)
+    )
+
+
+def pose_from_ros(message: PoseMessage) -> Pose:
+    """Return a pose.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, the quaternion is zero, or the position is farther away than any
+        on Earth.
+    """
+    turn = message.orientation
+    place = message.position
+    bounded('position', (place.x, place.y, place.z), FARTHEST)
+    bounded('orientation', (turn.w, turn.x, turn.y, turn.z), 1e6)
+    return Pose(point_from_ros(message.position), np.array([turn.w, turn.x, turn.y, turn.z]))
+
+
+def covariance_to_ros(covariance: FloatArray) -> list[float]:
+    """Return a covariance of two or three coordinates as nine numbers, row-major."""
+    full = np.zeros((3, 3))
+    d = len(covariance)
+    full[:d, :d] = covariance
+    return [float(value) for value in full.ravel()]
+
+
+def covariance_from_ros(values: Sequence[float], dimension: int) -> FloatArray:
+    """Return the first `dimension` rows and columns of nine numbers."""
+    return np.array(values, dtype=float).reshape(3, 3)[:dimension, :dimension]
+
+
+def cluster_to_ros(cluster: Cluster) -> ClusterMessage:
+    """Return a cluster."""
+    return ClusterMessage(
+        position=point_to_ros(cluster.position),
+        covariance=covariance_to_ros(cluster.covariance),
+        radius=float(cluster.radius),
+        mass=float(cluster.mass),
+    )
+
+
+def cluster_from_ros(message: ClusterMessage, dimension: int) -> Cluster:
+    """Return a cluster.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or absurdly large, or the mass is negative.
+    """
+    place = message.position
+    bounded('clusters: position', (place.x, place.y, place.z), FARTHEST)
+    bounded('clusters: covariance', message.covariance, FARTHEST**2)
+    bounded('clusters: radius, mass', (message.radius, message.mass), FARTHEST)
+    if message.mass < 0.0:
+        raise ValueError(f'clusters: mass: read {message.mass}, allowed is from 0')
+    return Cluster(
+        position=point_from_ros(message.position)[:dimension],
+        covariance=covariance_from_ros(message.covariance, dimension),
+        radius=message.radius,
+        mass=message.mass,
+    )
+
+
+def found_target_to_ros(target: FoundTarget, batch: int) -> FoundTargetMessage:
+    """Return a found target and the batch that settled it."""
+    return FoundTargetMessage(
+        id=target.id,
+        position=point_to_ros(target.position),
+        covariance=covariance_to_ros(target.covariance),
+        robot=target.robot,
+        measurement=target.measurement,
+        batch_id=batch,
+        stamp=stamp_to_ros(round(target.time * 1e9)),
+    )
+
+
+def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundTarget:
+    """Return a found target."""
+    return FoundTarget(
+        id=int(message.id),
+        position=point_from_ros(message.position)[:dimension],
+        covariance=covariance_from_ros(message.covariance, dimension),
+        robot=message.robot,
+        measurement=int(message.measurement),
+        time=stamp_from_ros(message.stamp) * 1e-9,
+    )
+
+
+def detections_to_ros(values: FloatArray, covariances: FloatArray | None) -> list[Detection]:
+    """Return detections.
+
+    Parameters
+    ----------
+    values : (m, d) array
+        Range, bearing and, in 3D, elevation [m, rad].
+    covariances : (m, d, d) array, optional
+        Of the values.
+    """
+    messages = []
+    for index, value in enumerate(values):
+        messages.append(
+            Detection(
+                range=float(value[0]),
+                bearing=float(value[1]),
+                elevation=float(value[2]) if len(value) == 3 else 0.0,
+                covariance=[]
+                if covariances is None
+                else [float(item) for item in covariances[index].ravel()],
+            )
+        )
+    return messages
+
+
+def detection_problem(detection: Detection, dimension: int) -> str | None:
+    """Return what is wrong with a detection: field, what was read, what is allowed."""
+    if not (math.isfinite(detection.range) and detection.range >= 0.0):
+        return f'range: read {detection.range}, allowed are finite numbers from 0 [m]'
+    for name, limit in (('bearing', math.pi), ('elevation', 0.5 * math.pi)):
+        value = getattr(detection, name)
+        if not (math.isfinite(value) and abs(value) <= limit + 1e-6):
+            return f'{name}: read {value}, allowed is {-limit:.4f} to {limit:.4f} [rad]'
+    size = len(detection.covariance)
+    if not size:
+        return None
+    if size != dimension * dimension:
+        return f'covariance: read {size} numbers, allowed are {dimension * dimension}, or none'
+    matrix = np.array(detection.covariance).reshape(dimension, dimension)
+    if not np.isfinite(matrix).all():
+        return f'covariance: read {list(detection.covariance)}, allowed are finite numbers'
+    size_of = max(float(np.abs(matrix).max()), 1e-300)
+    if np.abs(matrix - matrix.T).max() > _ROUNDING * size_of:
+        return f'covariance: read {list(detection.covariance)}, allowed is a symmetric matrix'
+    if np.linalg.eigvalsh(matrix).min() <= 0.0:
+        return f'covariance: read {list(detection.covariance)}, allowed is a positive matrix'
+    return None
+
+
+def _usable(
+    detections: Sequence[Detection], dimension: int
+) -> tuple[list[Detection], dict[str, Counter[str]]]:
+    """Return the detections that are used; of the others reasons, texts and how many."""
+    kept: list[Detection] = []
+    problems: dict[str, Counter[str]] = {}
+
+    def leave_out(reason: str, text: str, number: int = 1) -> None:
+        problems.setdefault(reason, Counter())[text] += number
+
+    seen: set[tuple[float, ...]] = set()
+    for index, detection in enumerate(detections):
+        if len(kept) == MOST_DETECTIONS:
+            leave_out(
+                'too many detections',
+                f'detections: read {len(detections)}, allowed are {MOST_DETECTIONS} that can be '
+                'used',
+                len(detections) - index,
+            )
+            break
+        problem = detection_problem(detection, dimension)
+        if problem is not None:
+            leave_out('bad detection', f'detections[{index}].{problem}')
+            continue
+        key = (detection.range, detection.bearing, detection.elevation)
+        if key in seen:
+            leave_out(
+                'equal detection', f'detections[{index}]: read {key}, allowed is each one once'
+            )
+            continue
+        seen.add(key)
+        kept.append(detection)
+    return kept, problems
+
+
+def measurement_from_ros(
+    message: DetectionArray, sensor: Sensor, dimension: int
+) -> tuple[AgentMeasurement, dict[str, Counter[str]]]:
+    """Return what a robot measured, and what is wrong with the detections left out.
+
+    Detections that cannot be used, those that are equal to one before, and those beyond
+    `MOST_DETECTIONS` are left out: reason to texts and their numbers.
+
+    Raises
+    ------
+    ValueError
+        If the pose is not finite, or its covariance.
+    """
+    pose = pose_from_ros(message.pose.pose)
+    position_covariance = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
+    if not np.isfinite(position_covariance).all():
+        raise ValueError(f'pose.covariance: read {position_covariance.tolist()}, allowed is finite')
+    kept, problems = _usable(message.detections, dimension)
+    values = np.array(
+        [[item.range, item.bearing, item.elevation][:dimension] for item in kept], dtype=float
+    ).reshape(-1, dimension)
+    covariances = None
+    if any(len(item.covariance) for item in kept):
+        covariances = np.array(
+            [
+                np.array(item.covariance).reshape(dimension, dimension)
+                if len(item.covariance)
+                else sensor.covariance
+                for item in kept
+            ]
+        )
+    return (
+        AgentMeasurement(
+            robot=message.robot,
+            pose=pose,
+            sensor=sensor,
+            values=values,
+            covariances=covariances,
+            index=int(message.measurement),
+            # A negative variance stands for an error that is not known.
+            position_covariance=(
+                position_covariance if np.diagonal(position_covariance).min() >= 0.0 else None
+            ),
+        ),
+        problems,
+    )
+
+
+def particles_to_ros(positions: FloatArray, weights: FloatArray, header: Header) -> PointCloud2:
+    """Return particles as a cloud of x, y, z [m] and weight, each float32."""
+    number, dimension = positions.shape
+    data = np.zeros((number, 4), dtype='<f4')
+    data[:, :dimension] = positions
+    data[:, 3] = weights
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=number,
+        fields=[
+            PointField(name=name, offset=4 * index, datatype=PointField.FLOAT32, count=1)
+            for index, name in enumerate(('x', 'y', 'z', 'weight'))
+        ],
+        is_bigendian=False,
+        point_step=16,
+        row_step=16 * number,
+        data=array.array('B', data.tobytes()),
+        is_dense=True,
+    )
+
+
+def colour(red: float, green: float, blue: float, alpha: float = 1.0) -> ColorRGBA:
+    """Return a colour."""
+    return ColorRGBA(r=red, g=green, b=blue, a=alpha)
+
+
+def sphere_marker(
+    header: Header,
+    namespace: str,
+    number: int,
+    position: FloatArray,
+    diameter: float,
+    tint: ColorRGBA,
+) -> Marker:
+    """Return a sphere; namespace and number stay the same for the same thing."""
+    marker = Marker(header=header, ns=namespace, id=number, type=Marker.SPHERE, action=Marker.ADD)
+    marker.pose.position = point_to_ros(position)
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = marker.scale.y = marker.scale.z = diameter
+    marker.color = tint
+    return marker
+
+
+def filter_markers(
+    header: Header,
+    clusters: Iterable[Cluster],
+    found: Iterable[FoundTarget],
+    size: float,
+) -> MarkerArray:
+    """Return markers of clusters (orange, as large as they are wide) and found targets (red).
+
+    Parameters
+    ----------
+    header : Header
+        Stamp and frame.
+    clusters, found : iterables
+        What to show.
+    size : float
+        Diameter of a found target [m].
+    """
+    markers = []
+    for number, cluster in enumerate(clusters, start=1):
+        markers.append(
+            sphere_marker(
+                header,
+                'clusters',
+                number,
+                cluster.position,
+                max(2.0 * cluster.radius, 0.5 * size),
+                colour(1.0, 0.6, 0.0, 0.2 + 0.6 * min(cluster.mass, 1.0)),
+            )
+        )
+    for target in found:
+        markers.append(
+            sphere_marker(header, 'found', target.id, target.position, size, colour(0.8, 0.0, 0.1))
+        )
+    return MarkerArray(markers=markers)

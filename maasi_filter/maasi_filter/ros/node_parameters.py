@@ -1,0 +1,247 @@
+"""The ROS parameters of a node: declared from its settings, read in *configure*."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection, Mapping
+from difflib import get_close_matches
+from typing import Any, Generic, TypeVar
+
+from pydantic import ValidationError
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from maasi_filter.ros.node_settings import NodeSettings
+from maasi_filter.ros.parameters import (
+    ParameterField,
+    flatten,
+    parameter_fields,
+    parameter_name,
+    unflatten,
+)
+
+SettingsT = TypeVar('SettingsT', bound=NodeSettings)
+
+
+_MOST = 2**63 - 1
+
+
+class SettingsError(Exception):
+    """Parameters that are not allowed; the text says which and why."""
+
+
+class NodeParameters(Generic[SettingsT]):
+    """Declares the parameters of a node, and reads its settings from them.
+
+    Values that nobody gave are those of the settings: once the node is configured they are the
+    resolved ones (of a preset, for example), and they change with what was given.
+
+    Parameters
+    ----------
+    node : Node
+        Whose parameters they are. It has to allow undeclared ones: what is optional is declared
+        only where it has a value, as a file of `ros2 param dump` cannot hold nothing.
+    model : type
+        The settings; each becomes a parameter.
+    """
+
+    def __init__(self, node: Node, model: type[SettingsT]) -> None:
+        self._node = node
+        self._model = model
+        # Those in use, until `release`.
+        self._settings: SettingsT | None = None
+        self._own_change = False
+        # rclpy's own, as use_sim_time and start_type_description_service.
+        self._foreign = set(node.list_parameters([], 0).names)
+        given = {
+            name: item.value
+            for name, item in node._parameter_overrides.items()
+            if not self._is_foreign(name) and item.value is not None
+        }
+        known = {item.name for item in parameter_fields(model, given)}
+        #: Names of those that were given, by a file or at run time.
+        self._given = set(given) & known
+        self._declare(given)
+        for name in sorted(set(given) - known):
+            close = get_close_matches(name, sorted(known), 1)
+            hint = f'; did you mean {close[0]}?' if close else ''
+            node.get_logger().warning(f'parameter {name}: is not known, and ignored{hint}')
+        node.add_on_set_parameters_callback(self._judge)
+        node.add_post_set_parameters_callback(self._note)
+
+    # ---- what the node reads -----------------------------------------------------------------
+
+    def read(self) -> SettingsT:
+        """Return the settings; from now on they are in use, until `release`.
+
+        Raises
+        ------
+        SettingsError
+            If some are not allowed: each with its name, what was read and what is allowed.
+        """
+        settings, problems = check(self._model, self._values())
+        if settings is None:
+            raise SettingsError('\n'.join(problems.values()))
+        self._show(settings)
+        self._settings = settings
+        return settings
+
+    def release(self) -> None:
+        """Let all of them be set again."""
+        self._settings = None
+
+    def _values(self) -> dict[str, Any]:
+        """Return what was given."""
+        return {name: self._node.get_parameter(name).value for name in sorted(self._given)}
+
+    def _show(self, settings: SettingsT) -> None:
+        """Set what was not given to what it is resolved to."""
+        changes = []
+        for name, value in flatten(settings.resolved()).items():
+            if name in self._given:
+                continue
+            if not self._node.has_parameter(name) or self._node.get_parameter(name).value != value:
+                changes.append(Parameter(name, value=value))
+        if changes:
+            self._own_change = True
+            try:
+                self._node.set_parameters_atomically(changes)
+            finally:
+                self._own_change = False
+
+    # ---- what others set ---------------------------------------------------------------------
+
+    def _is_foreign(self, name: str) -> bool:
+        return name in self._foreign or name.startswith('qos_overrides.')
+
+    def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Return whether parameters may be set, and why not."""
+        own = [item for item in parameters if not self._is_foreign(item.name)]
+        if self._own_change or not own:
+            return SetParametersResult(successful=True)
+        values = self._values()
+        for item in own:
+            values[item.name] = item.value
+        values = {name: value for name, value in values.items() if value is not None}
+        known = {item.name for item in parameter_fields(self._model, values)}
+        known |= {item.name for item in own if self._node.has_parameter(item.name)}
+        _, problems = check(self._model, values)
+        for item in own:
+            if item.name not in known:
+                return _refused(f'parameter {item.name}: is not known')
+            if self._settings is not None and item.name not in self._model.live:
+                return _refused(
+                    f'parameter {item.name}: is read in configure; set it while the node is '
+                    'unconfigured (deactivate and cleanup before)'
+                )
+            # What is wrong with another one, or with several together, may still be put right.
+            wrong = [item.name] if self._settings is None else list(problems)
+            for name in wrong:
+                if name in problems and item.value is not None:
+                    return _refused(problems[name])
+        return SetParametersResult(successful=True)
+
+    def _note(self, parameters: list[Parameter]) -> None:
+        """Note and use what was given, and declare what it brings with it, as a robot more."""
+        if self._own_change:
+            return
+        for item in parameters:
+            if self._is_foreign(item.name):
+                continue
+            if item.value is None:
+                self._given.discard(item.name)
+            else:
+                self._given.add(item.name)
+        if self._settings is not None:
+            self._use([item.name for item in parameters if not self._is_foreign(item.name)])
+            return
+        self._own_change = True
+        try:
+            self._declare(self._values())
+        finally:
+            self._own_change = False
+
+    def _use(self, names: Collection[str]) -> None:
+        """Change settings that are in use, where they stand."""
+        changed, _ = check(self._model, self._values())
+        for name in names:
+            source: Any = changed
+            target: Any = self._settings
+            *path, last = name.split('.')
+            for part in path:
+                source, target = getattr(source, part, None), getattr(target, part, None)
+            if source is not None and target is not None:
+                setattr(target, last, getattr(source, last))
+
+    def _declare(self, given: Mapping[str, Any]) -> None:
+        _, problems = check(self._model, given)
+        for item in parameter_fields(self._model, given):
+            present = self._node.has_parameter(item.name)
+            if not present and (item.default is not None or item.name in given):
+                # rclpy would not let a value out of range be read, to say what is wrong with it.
+                ranged = item.name not in problems
+                self._node.declare_parameter(item.name, item.default, _descriptor(item, ranged))
+
+
+def check(
+    model: type[SettingsT], values: Mapping[str, Any]
+) -> tuple[SettingsT | None, dict[str, str]]:
+    """Return the settings of flat parameters, or None and by name what is wrong.
+
+    Parameters
+    ----------
+    model : type
+        The settings.
+    values : mapping
+        Flat parameters.
+    """
+    try:
+        return model.model_validate(unflatten(model, values)), {}
+    except ValidationError as error:
+        items = error.errors()
+    except ValueError as error:
+        return None, {str(error).partition(':')[0]: f'parameter {error}'}
+    problems: dict[str, str] = {}
+    missing = []
+    for item in items:
+        name = parameter_name(model, item['loc'])
+        if item['type'] == 'missing' or not values:
+            missing.append(name)
+        else:
+            problems[name] = f'parameter {name}: {item["msg"]}, read {item["input"]!r}'
+    if missing:
+        several = 's' if len(missing) > 1 else ''
+        problems[missing[0]] = (
+            f'parameter{several} {", ".join(missing)}: needed, but not set; '
+            'start the node with --ros-args --params-file FILE'
+        )
+    return None, problems
+
+
+def _refused(reason: str) -> SetParametersResult:
+    return SetParametersResult(successful=False, reason=reason)
+
+
+def _descriptor(item: ParameterField, ranged: bool) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=item.description,
+        additional_constraints=item.constraints,
+        dynamic_typing=True,
+    )
+    if not ranged or item.number is None or item.lowest is item.highest is None:
+        return descriptor
+    if item.number is float:
+        low = -sys.float_info.max if item.lowest is None else item.lowest
+        high = sys.float_info.max if item.highest is None else item.highest
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    else:
+        lowest = -_MOST - 1 if item.lowest is None else int(item.lowest)
+        highest = _MOST if item.highest is None else int(item.highest)
+        descriptor.integer_range = [IntegerRange(from_value=lowest, to_value=highest)]
+    return descriptor

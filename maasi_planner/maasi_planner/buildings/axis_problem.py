@@ -1,0 +1,226 @@
+"""The quadratic problem of one axis: rows, costs, and a dual active-set method.
+
+Once it is fixed which cuboids are visited at which step and which faces of obstacles are kept
+away from, P2 of 004 falls apart into one problem for each axis: choose T forces u such that
+positions, velocities, forces and the way to brake afterwards, all linear in u, stay in their
+bounds. The matrices are the same at every step of a mission; only bounds and the free motion
+change, so that the method works on the rows' Gram matrix alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_planner.buildings.dynamics import Dynamics
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# The objective is scaled so that its rows are of the size of one.
+SCALE = 1e4
+# A row is met when it is this close to its bounds [m, m/s, N].
+TOLERANCE = 1e-7
+# A row is a combination of active ones when this share of its length is left.
+DEPENDENT = 1e-10
+
+
+@dataclass(frozen=True)
+class AxisRows:
+    """What is linear in the forces u_0 to u_{T-1} of an axis.
+
+    Rows: positions P_2 to P_T, velocities v_1 to v_T, forces, and P_T plus the ways that are left
+    after each step of braking, as if air resistance were all. P_1 is given by the state.
+
+    Attributes
+    ----------
+    matrix : (m, T) array
+        Rows.
+    gram : (m, m) array
+        matrix H^-1 matrix', H the Hessian of the objective.
+    gain : (T, m) array
+        H^-1 matrix'.
+    inverse : (T, T) array
+        H^-1.
+    pull : (T + 1,) array
+        Weight of the squared distance from the target at P_0 to P_T, scaled [1/m^2].
+    smoothness : float
+        Weight of the squared change of force, scaled [1/N^2].
+    """
+
+    matrix: FloatArray
+    gram: FloatArray
+    gain: FloatArray
+    inverse: FloatArray
+    pull: FloatArray
+    smoothness: float
+
+
+def axis_rows(
+    dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: float, braking_steps: int
+) -> AxisRows:
+    """Return the rows of an axis; `pull` (T + 1,) and `smoothness` not scaled yet."""
+    forces = np.eye(horizon)
+    gamma = dynamics.step / dynamics.mass
+    velocities = np.zeros((horizon + 1, horizon))
+    positions = np.zeros((horizon + 1, horizon))
+    for k in range(horizon):
+        velocities[k + 1] = dynamics.retained * velocities[k] + gamma * forces[k]
+        positions[k + 1] = positions[k] + dynamics.step * velocities[k]
+    ways = dynamics.step * np.cumsum(dynamics.retained ** np.arange(braking_steps))
+    terminal = positions[horizon] + ways[:, None] * velocities[horizon]
+    matrix = np.vstack([positions[2:], velocities[1:], forces, terminal])
+    differences = np.diff(forces, axis=0)
+    hessian = (
+        2.0 * SCALE * (smoothness * differences.T @ differences + (positions.T * pull) @ positions)
+    )
+    inverse = np.linalg.inv(hessian)
+    inverse = 0.5 * (inverse + inverse.T)
+    gain = inverse @ matrix.T
+    return AxisRows(
+        np.ascontiguousarray(matrix),
+        np.ascontiguousarray(matrix @ gain),
+        np.ascontiguousarray(gain),
+        inverse,
+        SCALE * pull,
+        SCALE * smoothness,
+    )
+
+
+@njit(cache=True, error_model='numpy')
+def solve_axis(
+    gram: FloatArray,
+    free: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    most: int,
+    cutoff: float,
+    y: FloatArray,
+    active: IntArray,
+    multipliers: FloatArray,
+    factor: FloatArray,
+    work: FloatArray,
+) -> float:
+    """Minimise over the rows' values y within their bounds: dual active-set method.
+
+    The method of Goldfarb and Idnani, written in the values y = free + gram lambda. Returns the
+    objective above that of the free minimum; inf where there is no solution, or where the
+    objective is certain to exceed `cutoff`.
+
+    Parameters
+    ----------
+    gram : (m, m) array
+        As in `AxisRows`.
+    free : (m,) array
+        Values at the free minimum.
+    lower, upper : (m,) arrays
+        Bounds.
+    most : int
+        Most rows that can be active: the number of forces.
+    cutoff : float
+        Objective at which to give up.
+    y : (m,) array
+        Takes the values.
+    active, multipliers, factor, work : arrays (n + 1,), (n + 1,), (n + 1, n + 1), (2, n + 1)
+        Room to work in, n the number of forces.
+    """
+    m = free.shape[0]
+    for i in range(m):
+        y[i] = free[i]
+    count = 0
+    objective = 0.0
+    row, step = work[0], work[1]
+    for _ in range(400):
+        # The most violated row, each measured by its own length.
+        worst, p, sign = 0.0, -1, 1.0
+        for i in range(m):
+            low = lower[i] - y[i]
+            high = y[i] - upper[i]
+            gap = low if low > high else high
+            if gap > TOLERANCE:
+                score = gap * gap / (gram[i, i] + 1e-300)
+                if score > worst:
+                    taken = False
+                    for a in range(count):
+                        if active[a] == i:
+                            taken = True
+                            break
+                    if not taken or gap > 1e-5:
+                        worst = score
+                        p = i
+                        sign = 1.0 if low > high else -1.0
+        if p < 0:
+            return objective
+        multiplier = 0.0
+        while True:
+            # factor is the lower Cholesky factor of the active rows' part of gram.
+            left = gram[p, p]
+            for a in range(count):
+                value = gram[active[a], p]
+                for b in range(a):
+                    value -= factor[a, b] * row[b]
+                row[a] = value / factor[a, a]
+                left -= row[a] * row[a]
+            for a in range(count - 1, -1, -1):
+                value = row[a]
+                for b in range(a + 1, count):
+                    value -= factor[b, a] * step[b]
+                step[a] = value / factor[a, a]
+            dependent = left <= DEPENDENT * gram[p, p] or count >= most
+            shortest, leaving = math.inf, -1
+            for a in range(count):
+                side = 1.0 if multipliers[a] > 0.0 else -1.0
+                fall = sign * step[a] * side
+                if fall > 1e-13:
+                    length = multipliers[a] * side / fall
+                    if length < shortest:
+                        shortest = length
+                        leaving = a
+            full = math.inf
+            if not dependent:
+                gap = lower[p] - y[p] if sign > 0.0 else y[p] - upper[p]
+                full = gap / left
+            length = shortest if shortest < full else full
+            if length == math.inf:
+                return math.inf
+            if not dependent:
+                for i in range(m):
+                    value = gram[i, p]
+                    for a in range(count):
+                        value -= gram[i, active[a]] * step[a]
+                    y[i] += sign * length * value
+                objective += length * left * (0.5 * length + multiplier)
+                if objective > cutoff:
+                    return math.inf
+            for a in range(count):
+                multipliers[a] -= sign * length * step[a]
+            multiplier += length
+            if length == full:
+                if count >= most:
+                    return math.inf
+                for a in range(count):
+                    factor[count, a] = row[a]
+                factor[count, count] = math.sqrt(left)
+                active[count] = p
+                multipliers[count] = sign * multiplier
+                count += 1
+                break
+            # The row that blocks leaves; the factor is made anew from there on.
+            count -= 1
+            for a in range(leaving, count):
+                active[a] = active[a + 1]
+                multipliers[a] = multipliers[a + 1]
+            for a in range(leaving, count):
+                for b in range(a + 1):
+                    value = gram[active[a], active[b]]
+                    for c in range(b):
+                        value -= factor[a, c] * factor[b, c]
+                    if b == a:
+                        factor[a, a] = math.sqrt(value if value > 1e-14 else 1e-14)
+                    else:
+                        factor[a, b] = value / factor[b, b]
+    return math.inf

@@ -1,0 +1,566 @@
+"""Exact branch and bound over visits and obstacle faces: 004, P2 for one robot.
+
+A node fixes visits in the order of their steps, and which faces of obstacles some segments of the
+trajectory stay beyond. Its relaxation is one quadratic problem for each axis. An *open* node
+stands for every plan that makes these visits and perhaps later ones, a *closed* one for those
+that make no other. Faces are branched on only where a trajectory gets in an obstacle's way.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_planner.buildings.axis_problem import solve_axis
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+# A plan must be better than the best by this much, scaled objective.
+GAP = 1e-3
+# A position beyond a face by no less than minus this is beyond it [m].
+FACE_TOLERANCE = 1e-6
+# The same for the first two positions, which are given [m].
+GIVEN_TOLERANCE = 1e-3
+
+FOUND, EXHAUSTED, UNFINISHED, FULL = 0, 1, 2, 3
+
+
+class Instance(NamedTuple):
+    """One problem, as the compiled search wants it; objectives scaled.
+
+    Attributes
+    ----------
+    gram : (3, m, m) array
+        Of the axes.
+    free, lower, upper : (3, m) arrays
+        Values of the rows at the free minimum, and their bounds.
+    rise, sink : (3, J) arrays
+        What the ways to brake are longer by than their rows, going up and down [m].
+    given : (2, 3) array
+        P_0 and P_1 [m].
+    area : (3, 2) array
+        [m].
+    horizon : int
+        T.
+    visit_step, visit_cuboid : (Q,) arrays
+        Visits to choose from, in order of their steps.
+    visit_reward : (Q,) array
+        Their rewards.
+    visit_lower, visit_upper : (Q, 3) arrays
+        Their cuboids [m].
+    ahead : (Q,) array
+        Most reward that can follow a visit.
+    follows : (Q, Q) array of bool
+        Whether a visit (column) may follow another (row).
+    obstacles : (O, 3, 2) array
+        Corners, clearance included [m].
+    between : bool
+        Whether segments, and not only positions, keep away from obstacles.
+    brakes : bool
+        Whether the way to brake after the horizon keeps away from them as well.
+    """
+
+    gram: FloatArray
+    free: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    rise: FloatArray
+    sink: FloatArray
+    given: FloatArray
+    area: FloatArray
+    horizon: int
+    visit_step: IntArray
+    visit_cuboid: IntArray
+    visit_reward: FloatArray
+    visit_lower: FloatArray
+    visit_upper: FloatArray
+    ahead: FloatArray
+    follows: BoolArray
+    obstacles: FloatArray
+    between: bool
+    brakes: bool
+
+
+class Tree(NamedTuple):
+    """Nodes of the search, best bound first; room for so many, used again and again.
+
+    Attributes
+    ----------
+    bound, reward : (n,) arrays
+        Lower bound of the objective, and the reward of the visits made.
+    cost : (n, 3) array
+        Of each axis.
+    dirty : (n,) array
+        Bit mask of the axes that have to be solved anew.
+    closed : (n,) array of bool
+        Whether no further visits are made.
+    visits, number : (n, V) and (n,) arrays
+        The visits made.
+    low, high : (n, 3, T + 2) arrays
+        Bounds of the positions P_0 to P_T and, last, of the way to brake [m].
+    values : (n, 3, m) array
+        Of the rows.
+    heap, spare : (n,) arrays
+        Nodes by bound, and nodes that are free.
+    counts : (6,) array
+        Sizes of `heap` and `spare`, nodes solved, the best node (-1: none), ways out, axes solved.
+    best : (1,) array
+        Objective of the best node.
+    scratch : (3, m) array
+        Bounds of an axis while it is solved.
+    active, multipliers, factor, work : arrays
+        Room for `solve_axis`.
+    """
+
+    bound: FloatArray
+    reward: FloatArray
+    cost: FloatArray
+    dirty: IntArray
+    closed: BoolArray
+    visits: IntArray
+    number: IntArray
+    low: FloatArray
+    high: FloatArray
+    values: FloatArray
+    heap: IntArray
+    spare: IntArray
+    counts: IntArray
+    best: FloatArray
+    scratch: FloatArray
+    active: IntArray
+    multipliers: FloatArray
+    factor: FloatArray
+    work: FloatArray
+
+
+def make_tree(size: int, horizon: int, rows: int) -> Tree:
+    """Return room for `size` nodes."""
+    room = horizon + 1
+    return Tree(
+        bound=np.empty(size),
+        reward=np.empty(size),
+        cost=np.empty((size, 3)),
+        dirty=np.empty(size, dtype=np.int64),
+        closed=np.empty(size, dtype=np.bool_),
+        visits=np.empty((size, 2 * horizon), dtype=np.int64),
+        number=np.empty(size, dtype=np.int64),
+        low=np.empty((size, 3, horizon + 2)),
+        high=np.empty((size, 3, horizon + 2)),
+        values=np.empty((size, 3, rows)),
+        heap=np.empty(size, dtype=np.int64),
+        spare=np.empty(size, dtype=np.int64),
+        counts=np.zeros(6, dtype=np.int64),
+        best=np.full(1, np.inf),
+        scratch=np.empty((3, rows)),
+        active=np.empty(room, dtype=np.int64),
+        multipliers=np.empty(room),
+        factor=np.empty((room, room)),
+        work=np.empty((2, room)),
+    )
+
+
+@njit(cache=True)
+def _push(tree: Tree, node: int) -> None:
+    place = tree.counts[0]
+    tree.counts[0] += 1
+    while place > 0:
+        parent = (place - 1) // 2
+        if tree.bound[tree.heap[parent]] <= tree.bound[node]:
+            break
+        tree.heap[place] = tree.heap[parent]
+        place = parent
+    tree.heap[place] = node
+
+
+@njit(cache=True)
+def _pop(tree: Tree) -> int:
+    top = tree.heap[0]
+    tree.counts[0] -= 1
+    size = tree.counts[0]
+    if size:
+        node = tree.heap[size]
+        place = 0
+        while True:
+            child = 2 * place + 1
+            if child >= size:
+                break
+            if child + 1 < size and tree.bound[tree.heap[child + 1]] < tree.bound[tree.heap[child]]:
+                child += 1
+            if tree.bound[tree.heap[child]] >= tree.bound[node]:
+                break
+            tree.heap[place] = tree.heap[child]
+            place = child
+        tree.heap[place] = node
+    return top
+
+
+@njit(cache=True)
+def _free(tree: Tree, node: int) -> None:
+    tree.spare[tree.counts[1]] = node
+    tree.counts[1] += 1
+
+
+@njit(cache=True)
+def _copy(tree: Tree, source: int, size: int) -> int:
+    """Return a copy of a node whose bounds can be tightened; -1: there is no room."""
+    if tree.counts[1] == 0:
+        tree.counts[4] = 1
+        return -1
+    tree.counts[1] -= 1
+    node = tree.spare[tree.counts[1]]
+    tree.reward[node] = tree.reward[source]
+    tree.closed[node] = tree.closed[source]
+    tree.number[node] = tree.number[source]
+    tree.dirty[node] = tree.dirty[source]
+    for i in range(tree.number[source]):
+        tree.visits[node, i] = tree.visits[source, i]
+    for a in range(3):
+        tree.cost[node, a] = tree.cost[source, a]
+        for k in range(size):
+            tree.low[node, a, k] = tree.low[source, a, k]
+            tree.high[node, a, k] = tree.high[source, a, k]
+        for i in range(tree.values.shape[2]):
+            tree.values[node, a, i] = tree.values[source, a, i]
+    return node
+
+
+@njit(cache=True)
+def _ahead(instance: Instance, tree: Tree, node: int, first: float) -> float:
+    """Return the most reward that can be added to a node."""
+    if tree.closed[node]:
+        return 0.0
+    if tree.number[node] == 0:
+        return first
+    return instance.ahead[tree.visits[node, tree.number[node] - 1]]
+
+
+@njit(cache=True)
+def _solve(instance: Instance, tree: Tree, node: int, cutoff: float) -> bool:
+    """Solve the axes of a node that have changed; return whether it is of use."""
+    horizon = instance.horizon
+    last = horizon + 1
+    steps = instance.rise.shape[1]
+    first = 3 * horizon - 1
+    # What an axis cost before it changed is the least that it costs now.
+    total = tree.cost[node, 0] + tree.cost[node, 1] + tree.cost[node, 2]
+    lower, upper = tree.scratch[0], tree.scratch[1]
+    for a in range(3):
+        if not tree.dirty[node] >> a & 1:
+            continue
+        for i in range(instance.lower.shape[1]):
+            lower[i] = instance.lower[a, i]
+            upper[i] = instance.upper[a, i]
+        for k in range(2, horizon + 1):
+            lower[k - 2] = max(lower[k - 2], tree.low[node, a, k])
+            upper[k - 2] = min(upper[k - 2], tree.high[node, a, k])
+        for j in range(steps):
+            lower[first + j] = max(lower[first + j], tree.low[node, a, last] - instance.sink[a, j])
+            upper[first + j] = min(upper[first + j], tree.high[node, a, last] + instance.rise[a, j])
+        for i in range(instance.lower.shape[1]):
+            if lower[i] > upper[i] + 1e-9:
+                return False
+        tree.counts[5] += 1
+        total -= tree.cost[node, a]
+        cost = solve_axis(
+            instance.gram[a],
+            instance.free[a],
+            lower,
+            upper,
+            horizon,
+            cutoff - total,
+            tree.values[node, a],
+            tree.active,
+            tree.multipliers,
+            tree.factor,
+            tree.work,
+        )
+        if cost == math.inf:
+            return False
+        tree.cost[node, a] = cost
+        total += cost
+    tree.dirty[node] = 0
+    return total <= cutoff
+
+
+@njit(cache=True)
+def _position(instance: Instance, tree: Tree, node: int, a: int, k: int) -> float:
+    return instance.given[k, a] if k < 2 else tree.values[node, a, k - 2]
+
+
+@njit(cache=True)
+def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int) -> tuple[int, int]:
+    """Return the first segment from `begin` to `end`, and the obstacle in its way; (-1, -1): none.
+
+    Segment k joins P_{k-1} and P_k; segment T + 1 is the way to brake.
+    """
+    horizon = instance.horizon
+    steps = instance.rise.shape[1]
+    first = 3 * horizon - 1
+    for k in range(begin, end + 1):
+        if k > horizon and not instance.brakes:
+            break
+        for o in range(instance.obstacles.shape[0]):
+            clear = False
+            for a in range(3):
+                near = _position(instance, tree, node, a, min(k, horizon))
+                low = near
+                high = near
+                if k > horizon:
+                    for j in range(steps):
+                        value = tree.values[node, a, first + j]
+                        high = max(high, value - instance.rise[a, j])
+                        low = min(low, value + instance.sink[a, j])
+                elif instance.between and k > 2:
+                    far = _position(instance, tree, node, a, k - 1)
+                    low = min(low, far)
+                    high = max(high, far)
+                slack = FACE_TOLERANCE
+                below = high <= instance.obstacles[o, a, 0] + slack
+                above = low >= instance.obstacles[o, a, 1] - slack
+                if instance.between and k == 2:
+                    given = instance.given[1, a]
+                    below = below and given <= instance.obstacles[o, a, 0] + GIVEN_TOLERANCE
+                    above = above and given >= instance.obstacles[o, a, 1] - GIVEN_TOLERANCE
+                if below or above:
+                    clear = True
+                    break
+            if not clear:
+                return k, o
+    return -1, -1
+
+
+@njit(cache=True)
+def _branch_on_faces(
+    instance: Instance, tree: Tree, node: int, k: int, o: int, closed: bool, first: float
+) -> None:
+    horizon = instance.horizon
+    total = tree.cost[node, 0] + tree.cost[node, 1] + tree.cost[node, 2]
+    for a in range(3):
+        for side in range(2):
+            face = instance.obstacles[o, a, side]
+            if side == 0 and face <= instance.area[a, 0]:
+                continue
+            if side == 1 and face >= instance.area[a, 1]:
+                continue
+            if instance.between and k == 2:
+                given = instance.given[1, a]
+                if side == 0 and given > face + GIVEN_TOLERANCE:
+                    continue
+                if side == 1 and given < face - GIVEN_TOLERANCE:
+                    continue
+            child = _copy(tree, node, horizon + 2)
+            if child < 0:
+                return
+            tree.closed[child] = closed
+            begin = k - 1 if instance.between and k > 2 else k
+            for i in range(begin, k + 1):
+                if side == 0:
+                    tree.high[child, a, i] = min(tree.high[child, a, i], face)
+                else:
+                    tree.low[child, a, i] = max(tree.low[child, a, i], face)
+            tree.dirty[child] = 1 << a
+            tree.bound[child] = total - tree.reward[child] - _ahead(instance, tree, child, first)
+            _push(tree, child)
+
+
+@njit(cache=True)
+def begin(instance: Instance, tree: Tree, first: float, hint: IntArray) -> None:
+    """Start a search: the root, and the visits of an earlier plan as a closed node."""
+    size = tree.heap.shape[0]
+    horizon = instance.horizon
+    tree.counts[:] = 0
+    tree.counts[1] = size - 1
+    tree.counts[3] = -1
+    for i in range(size - 1):
+        tree.spare[i] = size - 1 - i
+    tree.best[0] = math.inf
+    tree.reward[0] = 0.0
+    tree.closed[0] = False
+    tree.number[0] = 0
+    tree.dirty[0] = 7
+    tree.bound[0] = -math.inf
+    tree.low[0] = -math.inf
+    tree.high[0] = math.inf
+    tree.cost[0] = 0.0
+    if hint.shape[0]:
+        child = _copy(tree, 0, horizon + 2)
+        tree.closed[child] = True
+        for i in range(hint.shape[0]):
+            _visit(instance, tree, child, hint[i])
+        # Before all others: its objective prunes.
+        tree.bound[child] = -math.inf
+        _push(tree, child)
+    _push(tree, 0)
+
+
+@njit(cache=True)
+def _visit(instance: Instance, tree: Tree, node: int, q: int) -> None:
+    k = instance.visit_step[q]
+    for a in range(3):
+        low, high = instance.visit_lower[q, a], instance.visit_upper[q, a]
+        tree.low[node, a, k] = max(tree.low[node, a, k], low)
+        tree.high[node, a, k] = min(tree.high[node, a, k], high)
+        place = tree.values[node, a, k - 2]
+        if place < low or place > high:
+            # Where it lies inside already, nothing changes.
+            tree.dirty[node] |= 1 << a
+    tree.visits[node, tree.number[node]] = q
+    tree.number[node] += 1
+    tree.reward[node] += instance.visit_reward[q]
+
+
+@njit(cache=True)
+def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
+    """Add the nodes with one more visit."""
+    number = tree.number[node]
+    last = tree.visits[node, number - 1] if number else -1
+    for q in range(instance.visit_step.shape[0]):
+        if last >= 0 and not instance.follows[last, q]:
+            continue
+        bound = total - tree.reward[node] - instance.visit_reward[q] - instance.ahead[q]
+        if bound >= tree.best[0] - GAP:
+            continue
+        seen = False
+        for i in range(number):
+            if instance.visit_cuboid[tree.visits[node, i]] == instance.visit_cuboid[q]:
+                seen = True
+                break
+        if seen or number >= tree.visits.shape[1]:
+            continue
+        k = instance.visit_step[q]
+        meets = True
+        for a in range(3):
+            if (
+                tree.low[node, a, k] > instance.visit_upper[q, a]
+                or tree.high[node, a, k] < instance.visit_lower[q, a]
+            ):
+                meets = False
+                break
+        if not meets:
+            continue
+        child = _copy(tree, node, instance.horizon + 2)
+        if child < 0:
+            return
+        _visit(instance, tree, child, q)
+        tree.bound[child] = bound
+        _push(tree, child)
+
+
+@njit(cache=True)
+def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
+    """Go on with a search for at most `most` nodes.
+
+    Returns
+    -------
+    int
+        FOUND: the best node is the optimum; EXHAUSTED: there is no plan; UNFINISHED: nodes are
+        left; FULL: there was no room for more, the best node may not be the optimum.
+    """
+    horizon = instance.horizon
+    end = horizon + 1
+    solved = 0
+    while tree.counts[0] > 0:
+        if tree.counts[4]:
+            return FULL
+        if solved >= most:
+            return UNFINISHED
+        node = _pop(tree)
+        if tree.bound[node] >= tree.best[0] - GAP:
+            # All others are no better.
+            _free(tree, node)
+            while tree.counts[0] > 0:
+                _free(tree, tree.heap[tree.counts[0] - 1])
+                tree.counts[0] -= 1
+            break
+        if tree.dirty[node]:
+            solved += 1
+            tree.counts[2] += 1
+            gain = tree.reward[node] + _ahead(instance, tree, node, first)
+            if not _solve(instance, tree, node, tree.best[0] + gain - GAP):
+                _free(tree, node)
+                continue
+            bound = tree.cost[node, 0] + tree.cost[node, 1] + tree.cost[node, 2] - gain
+            early = tree.bound[node] == -math.inf
+            tree.bound[node] = bound
+            if not early and tree.counts[0] > 0 and bound > tree.bound[tree.heap[0]]:
+                _push(tree, node)
+                continue
+        total = tree.cost[node, 0] + tree.cost[node, 1] + tree.cost[node, 2]
+        number = tree.number[node]
+        last = 2
+        if number:
+            last = max(last, instance.visit_step[tree.visits[node, number - 1]])
+        until = end if tree.closed[node] else last
+        k, o = _obstructed(instance, tree, node, 2, until)
+        if k >= 0:
+            _branch_on_faces(instance, tree, node, k, o, tree.closed[node], first)
+            _free(tree, node)
+            continue
+        own = total - tree.reward[node]
+        better = own < tree.best[0] - GAP
+        if not tree.closed[node]:
+            if better:
+                k, o = _obstructed(instance, tree, node, last + 1, end)
+                if k >= 0:
+                    better = False
+                    _branch_on_faces(instance, tree, node, k, o, True, first)
+            _extend(instance, tree, node, total)
+        if better:
+            if tree.counts[3] >= 0:
+                _free(tree, tree.counts[3])
+            tree.counts[3] = node
+            tree.best[0] = own
+        else:
+            _free(tree, node)
+    if tree.counts[4]:
+        return FULL
+    return FOUND if tree.counts[3] >= 0 else EXHAUSTED
+
+
+@njit(cache=True)
+def longest_chains(
+    visit_step: IntArray,
+    visit_cuboid: IntArray,
+    reward: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    fall: FloatArray,
+    climb: FloatArray,
+) -> tuple[BoolArray, FloatArray]:
+    """Return which visits may follow which, and the most reward that can follow each.
+
+    Parameters
+    ----------
+    visit_step, visit_cuboid, reward : (Q,) arrays
+        Visits in order of their steps.
+    lower, upper : (Q, 3) arrays
+        Their cuboids, cut to what can be reached then [m].
+    fall, climb : (3, T + 1) arrays
+        Sums of the lowest and highest velocities up to each step, times the step [m].
+    """
+    number = visit_step.shape[0]
+    follows = np.zeros((number, number), dtype=np.bool_)
+    ahead = np.zeros(number)
+    for p in range(number - 1, -1, -1):
+        for q in range(p + 1, number):
+            if visit_cuboid[p] == visit_cuboid[q]:
+                continue
+            i, j = visit_step[p], visit_step[q]
+            near = True
+            for a in range(3):
+                if (
+                    lower[q, a] - upper[p, a] > climb[a, j] - climb[a, i] + 1e-9
+                    or upper[q, a] - lower[p, a] < fall[a, j] - fall[a, i] - 1e-9
+                ):
+                    near = False
+                    break
+            if near:
+                follows[p, q] = True
+                ahead[p] = max(ahead[p], reward[q] + ahead[q])
+    return follows, ahead

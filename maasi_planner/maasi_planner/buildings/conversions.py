@@ -1,0 +1,203 @@
+"""Between messages and the records of the search of buildings."""
+
+from __future__ import annotations
+
+import numpy as np
+from geometry_msgs.msg import Vector3
+from numpy.typing import NDArray
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from maasi_filter.ros.conversions import (
+    FARTHEST,
+    FASTEST,
+    bounded,
+    colour,
+    point_from_ros,
+    point_to_ros,
+)
+from maasi_msgs.msg import CuboidDecision, SearchLink
+from maasi_msgs.msg import Snapshot as SnapshotMessage
+from maasi_planner.buildings.agent import Broadcast, Choice, SearchAgent, Snapshot
+from maasi_planner.buildings.battery import Hazard
+from maasi_planner.buildings.preplanning import Mission
+
+FloatArray = NDArray[np.float64]
+
+# Of a battery's parameters.
+_LARGEST_HAZARD = 1e9
+
+
+def vector_to_ros(values: FloatArray) -> Vector3:
+    """Return a vector (3,)."""
+    x, y, z = (float(value) for value in values)
+    return Vector3(x=x, y=y, z=z)
+
+
+def vector_from_ros(message: Vector3) -> FloatArray:
+    """Return a vector, (3,)."""
+    return np.array([message.x, message.y, message.z])
+
+
+def broadcast_to_ros(broadcast: Broadcast, header: Header) -> SearchLink:
+    """Return what a robot tells the others."""
+    return SearchLink(
+        header=header,
+        step=broadcast.step,
+        robot=broadcast.robot,
+        silent=False,
+        searching=broadcast.searching,
+        position=point_to_ros(broadcast.position),
+        velocity=vector_to_ros(broadcast.velocity),
+        visited=broadcast.visited.tolist(),
+        flight_steps=broadcast.flight_steps,
+        planned=list(broadcast.plan),
+        planned_in=list(broadcast.plan.values()),
+        alpha=broadcast.hazard.alpha,
+        beta=broadcast.hazard.beta,
+        failures=broadcast.hazard.failures,
+        predicted=point_to_ros(broadcast.predicted),
+    )
+
+
+def broadcast_from_ros(message: SearchLink, cuboids: int) -> Broadcast:
+    """Return what another robot tells.
+
+    Parameters
+    ----------
+    message : SearchLink
+        As heard.
+    cuboids : int
+        Number of them in this robot's mission.
+
+    Raises
+    ------
+    ValueError
+        If the message does not fit the mission; it names the field.
+    """
+    if len(message.visited) != cuboids:
+        raise ValueError(
+            f'visited: read {len(message.visited)} cuboids, allowed are {cuboids}: the missions '
+            'must be the same'
+        )
+    if len(message.planned) != len(message.planned_in):
+        raise ValueError(
+            f'planned_in: read {len(message.planned_in)} numbers, allowed are as many as planned, '
+            f'{len(message.planned)}'
+        )
+    if any(n >= cuboids for n in message.planned):
+        raise ValueError(f'planned: read {max(message.planned)}, allowed is below {cuboids}')
+    position, velocity = point_from_ros(message.position), vector_from_ros(message.velocity)
+    predicted = point_from_ros(message.predicted)
+    bounded('position, predicted', [*position, *predicted], FARTHEST)
+    bounded('velocity', velocity, FASTEST)
+    bounded('alpha, beta', (message.alpha, message.beta), _LARGEST_HAZARD)
+    if message.alpha <= 0.0 or message.beta <= 0.0:
+        raise ValueError(
+            f'alpha, beta: read {message.alpha}, {message.beta}, allowed are numbers above 0'
+        )
+    return Broadcast(
+        robot=message.robot,
+        step=int(message.step),
+        position=position,
+        velocity=velocity,
+        searching=bool(message.searching),
+        visited=np.array(message.visited, dtype=bool),
+        flight_steps=int(message.flight_steps),
+        plan={int(n): int(k) for n, k in zip(message.planned, message.planned_in)},
+        hazard=Hazard(message.alpha, message.beta, bool(message.failures)),
+        predicted=predicted,
+    )
+
+
+def snapshot_to_ros(shot: Snapshot) -> SnapshotMessage:
+    """Return a snapshot."""
+    return SnapshotMessage(
+        cuboid=shot.cuboid,
+        position=point_to_ros(shot.position),
+        direction=vector_to_ros(shot.direction),
+        distance=shot.distance,
+        detection_probability=shot.detection_probability,
+    )
+
+
+def choice_to_ros(
+    agent: SearchAgent,
+    choice: Choice,
+    shots: list[Snapshot],
+    heard: list[str],
+    solve_time: float,
+    header: Header,
+) -> CuboidDecision:
+    """Return a decision with the snapshots of its step."""
+    return CuboidDecision(
+        header=header,
+        step=agent.step,
+        robot=agent.name,
+        activity=choice.activity.value,
+        how=choice.how,
+        target=point_to_ros(choice.target),
+        heard=heard,
+        visited=int(agent.visited.sum()),
+        done=agent.done,
+        objective=choice.plan.objective,
+        nodes=choice.plan.nodes,
+        solve_time=solve_time,
+        control=vector_to_ros(choice.control),
+        planned=[n for _, n in choice.plan.visits],
+        planned_in=[k for k, _ in choice.plan.visits],
+        snapshots=[snapshot_to_ros(shot) for shot in shots],
+    )
+
+
+def mission_markers(mission: Mission, header: Header) -> MarkerArray:
+    """Return objects and obstacles as boxes."""
+    markers = []
+    for namespace, boxes, tint in (
+        ('objects', mission.objects, colour(0.6, 0.6, 0.7, 0.6)),
+        ('obstacles', mission.obstacles, colour(0.4, 0.38, 0.33, 0.9)),
+    ):
+        for number, box in enumerate(boxes):
+            markers.append(_box(header, namespace, number, box, tint))
+    return MarkerArray(markers=markers)
+
+
+def agent_markers(agent: SearchAgent, choice: Choice, header: Header) -> MarkerArray:
+    """Return a robot, its plan, its search map, and where its camera looks."""
+    name = agent.name
+    markers = []
+    for number, box in enumerate(agent.mission.boxes):
+        visited = bool(agent.visited[number])
+        tint = colour(0.3, 0.7, 0.9, 0.1) if visited else colour(0.85, 0.4, 0.0, 0.35)
+        markers.append(_box(header, f'{name}/cuboids', number, box, tint))
+    robot = Marker(header=header, ns=f'{name}/robot', type=Marker.SPHERE)
+    robot.pose.position = point_to_ros(agent.position)
+    robot.pose.orientation.w = 1.0
+    robot.scale.x = robot.scale.y = robot.scale.z = 4.0
+    robot.color = colour(0.1, 0.3, 0.9)
+    line = Marker(header=header, ns=f'{name}/plan', type=Marker.LINE_STRIP)
+    line.pose.orientation.w = 1.0
+    line.scale.x = 0.8
+    line.color = colour(0.1, 0.7, 0.2)
+    line.points = [point_to_ros(point) for point in choice.plan.positions]
+    arrow = Marker(header=header, ns=f'{name}/camera', type=Marker.ARROW)
+    arrow.pose.orientation.w = 1.0
+    arrow.scale.x, arrow.scale.y = 0.8, 2.0
+    arrow.color = colour(0.9, 0.1, 0.1)
+    if agent.snapshots:
+        shot = agent.snapshots[-1]
+        tip = shot.position + shot.distance * shot.direction
+        arrow.points = [point_to_ros(shot.position), point_to_ros(tip)]
+    else:
+        arrow.action = Marker.DELETE
+    return MarkerArray(markers=[*markers, robot, line, arrow])
+
+
+def _box(header: Header, namespace: str, number: int, box: FloatArray, tint: object) -> Marker:
+    marker = Marker(header=header, ns=namespace, id=number, type=Marker.CUBE)
+    marker.pose.position = point_to_ros(box.mean(axis=1))
+    marker.pose.orientation.w = 1.0
+    size = box[:, 1] - box[:, 0]
+    marker.scale.x, marker.scale.y, marker.scale.z = (float(length) for length in size)
+    marker.color = tint
+    return marker

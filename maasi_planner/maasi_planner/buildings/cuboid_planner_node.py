@@ -1,0 +1,414 @@
+"""The planner node of one robot that searches buildings beside others (004)."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.subscription import Subscription
+from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
+
+from maasi_filter.models.pose import Pose, compose
+from maasi_filter.ros.conversions import (
+    FASTEST,
+    point_to_ros,
+    pose_from_ros,
+    stamp_from_ros,
+    stamp_of_step,
+    stamp_to_ros,
+)
+from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError, run
+from maasi_filter.ros.marker_board import MarkerBoard
+from maasi_filter.ros.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
+from maasi_filter.ros.stamps import JUMP, StampGate
+from maasi_msgs.msg import AgentState, CuboidDecision, LockstepStep, SearchLink, SearchLinkArray
+from maasi_planner.buildings.agent import Activity, Broadcast, SearchAgent, decision_stream
+from maasi_planner.buildings.conversions import (
+    agent_markers,
+    broadcast_from_ros,
+    broadcast_to_ros,
+    choice_to_ros,
+    mission_markers,
+    vector_from_ros,
+    vector_to_ros,
+)
+from maasi_planner.buildings.dynamics import Dynamics
+from maasi_planner.buildings.node_settings import CuboidPlannerSettings
+from maasi_planner.buildings.preplanning import plan_mission
+from maasi_planner.conversions import path_to_ros
+from maasi_planner.search_control.search_modes import Mode, SearchModes
+from maasi_planner.search_control.search_services import offer_services
+
+# How far an odometry's stamp may be from a step [ns].
+_STAMP_TOLERANCE = 1_000_000
+_REASONS = {
+    Activity.SEARCHING: '',
+    Activity.RETURNING: 'battery failed: flies to its station',
+    Activity.RECHARGING: 'recharges',
+}
+
+
+class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
+    """Plans for the robot whose namespace it is in, with what those in range tell.
+
+    At each step it takes in its state, tells the others, hears them, decides, and commands the
+    velocity that its plan leads to. A message of a robot that is not heard changes nothing: nobody
+    waits for it.
+
+    Subscribes
+    ----------
+    `odom` (nav_msgs/Odometry); `link/rx` (maasi_msgs/SearchLinkArray): what it hears at a step
+
+    Publishes
+    ---------
+    `link/tx` (maasi_msgs/SearchLink): what it tells; `cmd_vel` (geometry_msgs/TwistStamped): the
+    velocity at the next step; `state` (maasi_msgs/AgentState); `decision`
+    (maasi_msgs/CuboidDecision); `plan` (nav_msgs/Path); of the team: `markers`,
+    `search_area` (visualization_msgs/MarkerArray)
+
+    Services
+    --------
+    `search/start`, `pause`, `resume`, `stop` (std_srvs/Trigger); `search/home` is refused
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('cuboid_planner', CuboidPlannerSettings, in_robot=True, **options)
+
+    def prepare(self) -> None:
+        """Plan the mission."""
+        self.name = self.get_namespace().rpartition('/')[2]
+        if not self.name:
+            raise SettingsError("namespace: read '', allowed is the name of the robot")
+        settings = self.settings
+        try:
+            self._search = settings.search()
+            self._mission = plan_mission(self._search, settings.environment.array())
+            self._dynamics = Dynamics.from_settings(settings.dynamics, settings.step)
+            self.agent = self._make_agent()
+        except ValueError as error:
+            raise SettingsError(f'parameter {error}') from error
+        self.modes = SearchModes([self.name])
+        # Between two odometry messages there may be several steps [ns].
+        self._gate = StampGate(max(JUMP, round(3e9 * settings.step)))
+        self._begin_anew()
+
+    def _make_agent(self) -> SearchAgent:
+        settings = self.settings
+        return SearchAgent(
+            self.name,
+            self._search,
+            self._mission,
+            self._dynamics,
+            settings.hazard,
+            settings.start,
+        )
+
+    def _begin_anew(self) -> None:
+        self._state: tuple[int, Pose, np.ndarray] | None = None
+        self._wanted_step = -1
+        self._board = MarkerBoard()
+        self._told_step = -1
+        # Whether the agent observed the state of that step, and is to decide.
+        self._observed = False
+        self._decided_step = -1
+        self._link: SearchLink | None = None
+        self._heard: SearchLinkArray | None = None
+        self._command: TwistStamped | None = None
+        self._told_at = 0.0
+        self._solve_time = 0.0
+
+    # ---- life cycle --------------------------------------------------------------------------
+
+    def set_up(self) -> None:
+        """Compile and connect."""
+        self._warm_up()
+        lockstep = self.settings.lockstep
+        self._command_publisher = self.create_publisher(
+            TwistStamped, 'cmd_vel', RELIABLE if lockstep else 10
+        )
+        self._link_publisher = self.create_publisher(SearchLink, 'link/tx', RELIABLE)
+        self.expect_subscribers(self._command_publisher)
+        self.expect_subscribers(self._link_publisher)
+        self._state_publisher = self.create_publisher(AgentState, 'state', LIVELY)
+        self.create_wall_timer(LIVELINESS_PERIOD, self._state_publisher.assert_liveliness)
+        self._decision_publisher = self.create_publisher(CuboidDecision, 'decision', RELIABLE)
+        self._path_publisher = self.create_publisher(Path, 'plan', 10)
+        self._markers_publisher = self.create_publisher(MarkerArray, self.team_topic('markers'), 10)
+        self._area_publisher = self.create_publisher(
+            MarkerArray, self.team_topic('search_area'), LATCHED
+        )
+        self._area_publisher.publish(
+            mission_markers(self._mission, Header(frame_id=self.settings.frame))
+        )
+        self._odometry: Subscription = self.create_subscription(
+            Odometry, 'odom', self._on_odometry, sensor_reader(lockstep)
+        )
+        self.create_subscription(SearchLinkArray, 'link/rx', self._on_heard, RELIABLE)
+        self.expect_publisher(self._odometry.topic_name)
+        offer_services(self, [self.name], self.team_topic, self._take_command)
+        if not lockstep:
+            self.create_wall_timer(0.02, self._look_at_the_time)
+        for cell, reason in self._mission.lost:
+            self.get_logger().warning(
+                f'the {cell.face} face of object {cell.target} is not searched whole: {reason}'
+            )
+
+    def _warm_up(self) -> None:
+        agent = self._make_agent()
+        agent.observe(0, self.settings.start, np.zeros(3))
+        agent.decide([], decision_stream(self.settings.seed, self.name, 0))
+
+    def start(self) -> None:
+        """Start the search, unless it waits for the service."""
+        if self.settings.search_on_start:
+            self.modes.command('start')
+
+    def halt(self) -> None:
+        """End the search: the robot stops."""
+        self.modes.command('stop')
+        self._stop_robot()
+
+    def _stop_robot(self) -> None:
+        self._observed = False
+        if self.active and self._decided_step >= 0:
+            self._command_publisher.publish(TwistStamped(header=self._header(self._decided_step)))
+
+    @property
+    def _searching(self) -> bool:
+        return self.modes.of[self.name] is Mode.SEARCHING
+
+    def _take_command(self, word: str, _: list[str] | None) -> tuple[bool, str]:
+        """Follow a command; return whether, and an answer in words."""
+        if not self.active:
+            return False, 'the planner is not active'
+        if word == 'home':
+            return False, f'{self.name}: no home in a search of buildings, allowed is pause, stop'
+        if not self.modes.command(word):
+            return False, f'{self.name}: {self.modes.describe()}; {word} changes nothing'
+        if not self._searching and not self.settings.lockstep:
+            self._stop_robot()
+        answer = f'{word}: {self.name}'
+        self.get_logger().info(answer)
+        return True, answer
+
+    def reset(self) -> None:
+        """Begin a new search."""
+        if not self.settings.lockstep:
+            self._stop_robot()
+        self.agent = self._make_agent()
+        self._begin_anew()
+
+    def status(self) -> dict[str, Any]:
+        """Return the state of the search."""
+        return {
+            'search': self.modes.describe(),
+            'activity': self.agent.activity.name.lower(),
+            'visited': f'{int(self.agent.visited.sum())} of {len(self.agent.visited)}',
+            'solves without a plan': self.agent.failed,
+            'last decision [ms]': f'{1e3 * self._solve_time:.2f}',
+        }
+
+    # ---- what comes in -----------------------------------------------------------------------
+
+    def on_step(self, message: LockstepStep) -> None:
+        """Plan when state and messages of this step are there."""
+        if self.name in message.robots:
+            self._wanted_step = int(message.step)
+            self._try_step()
+
+    def _on_odometry(self, message: Odometry) -> None:
+        if not self.active:
+            return
+        stamp = stamp_from_ros(message.header.stamp)
+        step = round(stamp * 1e-9 / self.settings.step)
+        if abs(stamp_of_step(step, self.settings.step) - stamp) > _STAMP_TOLERANCE:
+            self.drop(
+                'bad odometry',
+                f'odom.header.stamp: read {stamp * 1e-9:.6f} s, allowed are multiples of step, '
+                f'{self.settings.step} s',
+            )
+            return
+        try:
+            reading = pose_from_ros(message.pose.pose)
+        except ValueError as error:
+            self.drop('bad odometry', f'odom.pose.{error}')
+            return
+        velocity = vector_from_ros(message.twist.twist.linear)
+        if not (np.abs(velocity) <= FASTEST).all():
+            self.drop(
+                'bad odometry',
+                f'odom.twist: read {velocity}, allowed are finite numbers up to {FASTEST:g} [m/s]',
+            )
+            return
+        if not (self.settings.lockstep or self._gate.accepts(stamp)):
+            self.drop(
+                'bad odometry',
+                f'odom.header.stamp: read {stamp * 1e-9:.6f} s, which is far from the one before; '
+                'allowed if the next one follows it',
+            )
+            return
+        # Odometry starts at zero.
+        pose = compose(Pose.from_yaw(self.settings.start, self.settings.yaw), reading)
+        self._state = (step, pose, pose.rotation() @ velocity)
+        if not self.settings.lockstep:
+            if step < self._decided_step:
+                self.get_logger().warning(
+                    f'odom.header.stamp went back to step {step}: starting anew'
+                )
+                self.reset()
+                self._state = (step, pose, pose.rotation() @ velocity)
+            self._wanted_step = step
+        self._try_step()
+
+    def _on_heard(self, message: SearchLinkArray) -> None:
+        if not self.active:
+            return
+        if int(message.step) != self._wanted_step:
+            self.drop(
+                'stale link',
+                f'link/rx.step: read {message.step}, allowed is {self._wanted_step}',
+            )
+            return
+        self._heard = message
+        self._try_step()
+
+    def _look_at_the_time(self) -> None:
+        """Decide with nobody heard, if the link stays silent for long."""
+        if not self.active or self._told_step != self._wanted_step:
+            return
+        patience = self.settings.link_patience * self.settings.step
+        if self._decided_step < self._told_step and time.monotonic() - self._told_at > patience:
+            self.warn_throttled('link', f'step {self._told_step}: nothing on link/rx')
+            self._decide([])
+
+    # ---- the step ----------------------------------------------------------------------------
+
+    def _header(self, step: int) -> Header:
+        stamp = stamp_to_ros(stamp_of_step(step, self.settings.step))
+        return Header(frame_id=self.settings.frame, stamp=stamp)
+
+    def _try_step(self) -> None:
+        step = self._wanted_step
+        if self._state is None or self._state[0] != step or step < 0:
+            return
+        if self._told_step != step:
+            self._tell(step)
+        elif self._decided_step == step and self.settings.lockstep:
+            # Another node was started again, and the step came anew.
+            if self._link is not None and self._command is not None:
+                self._link_publisher.publish(self._link)
+                self._command_publisher.publish(self._command)
+                self.done(step)
+            return
+        if self._decided_step != step and self._heard is not None and self._heard.step == step:
+            self._decide(self._understood(self._heard))
+
+    def _tell(self, step: int) -> None:
+        assert self._state is not None
+        _, pose, velocity = self._state
+        self._shots = len(self.agent.snapshots)
+        self._observed = self._searching
+        broadcast = self.agent.observe(step, pose.position, velocity) if self._observed else None
+        if broadcast is None:
+            self._link = SearchLink(
+                header=self._header(step),
+                step=step,
+                robot=self.name,
+                silent=True,
+                position=point_to_ros(pose.position),
+                velocity=vector_to_ros(velocity),
+            )
+        else:
+            self._link = broadcast_to_ros(broadcast, self._header(step))
+        self._told_step = step
+        self._told_at = time.monotonic()
+        self._link_publisher.publish(self._link)
+
+    def _understood(self, message: SearchLinkArray) -> list[Broadcast]:
+        heard = []
+        for item in message.messages:
+            if item.robot == self.name or int(item.step) != self._told_step:
+                self.drop('stale link', f'link/rx: from {item.robot} of step {item.step}')
+                continue
+            try:
+                heard.append(broadcast_from_ros(item, len(self._mission.cells)))
+            except ValueError as error:
+                self.drop('bad link', f'link/rx: {item.robot}: {error}')
+        return heard
+
+    def _decide(self, heard: list[Broadcast]) -> None:
+        step = self._told_step
+        if not self._observed:
+            self._stand(step)
+            return
+        agent = self.agent
+        begun = time.perf_counter()
+        choice = agent.decide(heard, decision_stream(self.settings.seed, self.name, step))
+        self._solve_time = time.perf_counter() - begun
+        self._decided_step = step
+        header = self._header(step)
+        if choice.how in ('shifted', 'brake'):
+            self.warn_throttled(
+                'how', f'step {step}: no plan was found, it does this: {choice.how}'
+            )
+        assert self._state is not None
+        pose = self._state[1]
+        turned = pose.rotation().T @ choice.velocity
+        self._command = TwistStamped(header=header)
+        self._command.header.frame_id = f'{self.name}/base_link'
+        self._command.twist.linear = vector_to_ros(turned)
+        names = [message.robot for message in heard]
+        shots = agent.snapshots[self._shots :]
+        self._decision_publisher.publish(
+            choice_to_ros(agent, choice, shots, names, self._solve_time, header)
+        )
+        self._publish_state(step, header)
+        self._path_publisher.publish(path_to_ros(choice.plan.positions, header))
+        self._markers_publisher.publish(self._board.replace(agent_markers(agent, choice, header)))
+        self._command_publisher.publish(self._command)
+        self.done(step)
+
+    def _stand(self, step: int) -> None:
+        """Do a step without searching: the robot stands."""
+        self._decided_step = step
+        header = self._header(step)
+        self._command = TwistStamped(header=header)
+        self._command.header.frame_id = f'{self.name}/base_link'
+        self._publish_state(step, header)
+        self._command_publisher.publish(self._command)
+        self.done(step)
+
+    def _publish_state(self, step: int, header: Header) -> None:
+        assert self._state is not None
+        _, pose, velocity = self._state
+        agent = self.agent
+        away = agent.activity is not Activity.SEARCHING
+        message = AgentState(
+            header=header,
+            step=step,
+            robot=self.name,
+            battery=-1.0,
+            goal_status=AgentState.UNAVAILABLE if away else AgentState.MOVING,
+            reason=_REASONS[agent.activity],
+        )
+        if not self._observed:
+            message.goal_status, message.reason = AgentState.IDLE, self.modes.describe()
+        message.pose.pose.position = point_to_ros(pose.position)
+        w, x, y, z = (float(value) for value in pose.orientation)
+        turn = message.pose.pose.orientation
+        turn.w, turn.x, turn.y, turn.z = w, x, y, z
+        message.twist.linear = vector_to_ros(velocity)
+        self._state_publisher.publish(message)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the planner node of one robot."""
+    return run(CuboidPlannerNode, arguments)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

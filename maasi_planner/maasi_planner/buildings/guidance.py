@@ -1,0 +1,122 @@
+"""Where a robot is drawn to: the local assignment (10), and ways around obstacles."""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from maasi_planner.buildings.preplanning import segment_cuts
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+# Distance of the corners that robots aim at from the obstacle [m].
+_BERTH = 3.0
+
+
+def nearest(place: FloatArray, centres: FloatArray, unvisited: IntArray) -> int | None:
+    """Return the unvisited cuboid nearest to a place (3,), None: there is none left."""
+    if not len(unvisited):
+        return None
+    offset = centres[unvisited] - place
+    return int(unvisited[np.argmin((offset * offset).sum(axis=1))])
+
+
+def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntArray) -> int | None:
+    """Return the cuboid that falls to robot `own` when all places (m, 3) share them: (10).
+
+    None where more robots than cuboids are left and none falls to this one.
+    """
+    if not len(unvisited):
+        return None
+    cost = np.sqrt(((places[:, None, :] - centres[unvisited][None, :, :]) ** 2).sum(axis=2))
+    rows, columns = linear_sum_assignment(cost)
+    chosen = np.flatnonzero(rows == own)
+    return int(unvisited[columns[chosen[0]]]) if len(chosen) else None
+
+
+class WayFinder:
+    """Ways around boxes: a visibility graph over their corners, by time of travel.
+
+    Parameters
+    ----------
+    solids : (n, 3, 2) array
+        Boxes [m].
+    area : (3, 2) array
+        Where robots may be [m].
+    speed, climb : float
+        Largest speed on each axis, and of a steady climb [m/s].
+    """
+
+    def __init__(self, solids: FloatArray, area: FloatArray, speed: float, climb: float) -> None:
+        self.solids = solids
+        self.area = area
+        self._speeds = np.array([speed, speed, max(climb, 1e-3)])
+        self._down = speed
+
+    def first_corner(self, place: FloatArray, target: FloatArray) -> FloatArray:
+        """Return where to aim at from a place (3,) on the way to a target (3,).
+
+        The target itself where it is in sight, or where no way is found.
+        """
+        if not segment_cuts(place, target, self.solids).any():
+            return target
+        corners = self._corners(place, target)
+        points = np.vstack([place, target, corners])
+        number = len(points)
+        times = self._times(points)
+        for i in range(number):
+            blocked = segment_cuts(
+                np.broadcast_to(points[i], points.shape), points, self.solids
+            ).any(axis=1)
+            times[i, blocked] = np.inf
+        best = np.full(number, np.inf)
+        before = np.full(number, -1)
+        best[0] = 0.0
+        queue = [(0.0, 0)]
+        while queue:
+            spent, i = heapq.heappop(queue)
+            if i == 1:
+                break
+            if spent > best[i]:
+                continue
+            for j in np.flatnonzero(spent + times[i] < best - 1e-12):
+                best[j] = spent + times[i, j]
+                before[j] = i
+                heapq.heappush(queue, (float(best[j]), int(j)))
+        if not np.isfinite(best[1]):
+            return target
+        node = 1
+        while before[node] != 0:
+            node = int(before[node])
+        return np.asarray(points[node])
+
+    def reaches(self, place: FloatArray, target: FloatArray) -> bool:
+        """Return whether a way leads from a place to a target."""
+        if not segment_cuts(place, target, self.solids).any():
+            return True
+        return bool((self.first_corner(place, target) != target).any())
+
+    def _corners(self, place: FloatArray, target: FloatArray) -> FloatArray:
+        corners = []
+        for box in self.solids:
+            for height in (place[2], target[2], box[2, 1] + _BERTH):
+                for x in (box[0, 0] - _BERTH, box[0, 1] + _BERTH):
+                    for y in (box[1, 0] - _BERTH, box[1, 1] + _BERTH):
+                        corners.append((x, y, height))
+        points = np.array(corners)
+        free = ((points >= self.area[:, 0]) & (points <= self.area[:, 1])).all(axis=1)
+        low = points[:, None, :] > self.solids[None, :, :, 0]
+        high = points[:, None, :] < self.solids[None, :, :, 1]
+        within: NDArray[np.bool_] = np.all(low & high, axis=2)
+        free &= ~within.any(axis=1)
+        return np.asarray(points[free])
+
+    def _times(self, points: FloatArray) -> FloatArray:
+        way = points[None, :, :] - points[:, None, :]
+        times = np.abs(way) / self._speeds
+        times[:, :, 2] = np.where(way[:, :, 2] > 0.0, times[:, :, 2], -way[:, :, 2] / self._down)
+        length = np.sqrt((way * way).sum(axis=2))
+        return np.asarray(times.max(axis=2) + 1e-3 * length)

@@ -1,0 +1,301 @@
+"""From objects to cuboids: 004, IV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_planner.buildings.settings import (
+    FACES,
+    BoxSettings,
+    CuboidSettings,
+    ObjectSettings,
+    SearchCameraSettings,
+)
+
+FloatArray = NDArray[np.float64]
+# Thinnest cuboid that a robot is sent to [m].
+_THINNEST = 1.0
+
+
+def detection_probability(distance: float, camera: SearchCameraSettings) -> float:
+    """Return p_d at a distance from the face [m]: (4), with 0 only below d_min."""
+    if distance < camera.least_distance:
+        return 0.0
+    span = camera.largest_distance - camera.least_distance
+    return max(0.0, 1.0 - (distance - camera.least_distance) / span)
+
+
+def distance_for(probability: float, camera: SearchCameraSettings) -> float:
+    """Return the largest distance [m] at which p_d is `probability`.
+
+    Raises
+    ------
+    ValueError
+        If it is not above 0 and at most 1.
+    """
+    if not 0.0 < probability <= 1.0:
+        raise ValueError(f'detection_probability: got {probability}, allowed is above 0, at most 1')
+    span = camera.largest_distance - camera.least_distance
+    return camera.least_distance + (1.0 - probability) * span
+
+
+def footprint(distance: float, camera: SearchCameraSettings) -> float:
+    """Return r, the side of the square that the camera sees at a distance [m] (III-C)."""
+    return 2.0 * distance * math.tan(0.5 * camera.angle)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A part of a face and the cuboid that it is searched from.
+
+    Attributes
+    ----------
+    target : int
+        Index of the object.
+    face : str
+        west, east, south, north, bottom or top.
+    centre, normal : (3,) arrays
+        Of the cell [m], and outward.
+    size : (2,) array
+        Sides of the cell [m].
+    box : (3, 2) array
+        Lower and upper corner of the cuboid [m].
+    """
+
+    target: int
+    face: str
+    centre: FloatArray
+    normal: FloatArray
+    size: FloatArray
+    box: FloatArray
+
+    def distance(self, position: ArrayLike) -> float:
+        """Return how far a position (3,) is from the face [m]."""
+        return float((np.asarray(position, dtype=float) - self.centre) @ self.normal)
+
+
+@dataclass(frozen=True)
+class Mission:
+    """What is searched, decided before take-off.
+
+    Attributes
+    ----------
+    cells : list of Cell
+        That can be searched.
+    lost : list of (Cell, str)
+        Those that cannot, and why.
+    area : (3, 2) array
+        Where robots may be [m].
+    objects, obstacles : (n, 3, 2) arrays
+        As they are [m].
+    distance, footprint : float
+        d and r [m].
+    coverage : float
+        Share of the searchable faces that the snapshots show, 0 to 1.
+    """
+
+    cells: list[Cell]
+    lost: list[tuple[Cell, str]]
+    area: FloatArray
+    objects: FloatArray
+    obstacles: FloatArray
+    distance: float
+    footprint: float
+    coverage: float
+    boxes: FloatArray = field(init=False)
+    centres: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        boxes = np.array([cell.box for cell in self.cells]).reshape(-1, 3, 2)
+        object.__setattr__(self, 'boxes', boxes)
+        object.__setattr__(self, 'centres', boxes.mean(axis=2))
+
+    @property
+    def solids(self) -> FloatArray:
+        """Objects and obstacles, (n, 3, 2) [m]."""
+        return np.concatenate([self.objects, self.obstacles])
+
+    def inside(self, position: ArrayLike) -> NDArray[np.bool_]:
+        """Return which cuboids a position (3,) is in, (N,)."""
+        place = np.asarray(position, dtype=float)
+        return np.asarray(
+            ((self.boxes[:, :, 0] <= place) & (place <= self.boxes[:, :, 1])).all(axis=1)
+        )
+
+    def hits(self, position: ArrayLike) -> bool:
+        """Return whether a position (3,) is inside an object or obstacle."""
+        place = np.asarray(position, dtype=float)
+        solids = self.solids
+        return bool(((solids[:, :, 0] < place) & (place < solids[:, :, 1])).all(axis=1).any())
+
+    def way_hits(self, begin: ArrayLike, end: ArrayLike) -> bool:
+        """Return whether the segment between two positions (3,) cuts an object or obstacle."""
+        return bool(
+            segment_cuts(
+                np.asarray(begin, dtype=float), np.asarray(end, dtype=float), self.solids
+            ).any()
+        )
+
+
+def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> NDArray[np.bool_]:
+    """Return which boxes (n, 3, 2) the inside of is cut by segments (..., 3), (..., n)."""
+    way = end - begin
+    with np.errstate(divide='ignore', invalid='ignore'):
+        first = (boxes[:, :, 0] - begin[..., None, :]) / way[..., None, :]
+        second = (boxes[:, :, 1] - begin[..., None, :]) / way[..., None, :]
+    still = np.broadcast_to(way[..., None, :] == 0.0, first.shape)
+    within = (boxes[:, :, 0] < begin[..., None, :]) & (begin[..., None, :] < boxes[:, :, 1])
+    enter = np.where(still, np.where(within, -np.inf, np.inf), np.minimum(first, second))
+    leave = np.where(still, np.where(within, np.inf, -np.inf), np.maximum(first, second))
+    start = np.maximum(enter.max(axis=-1), 0.0)
+    stop = np.minimum(leave.min(axis=-1), 1.0)
+    return np.asarray(start < stop - 1e-12)
+
+
+def plan_mission(settings: CuboidSettings, area: ArrayLike) -> Mission:
+    """Return the cuboids of a mission.
+
+    Parameters
+    ----------
+    settings : CuboidSettings
+        Objects, obstacles, camera and probability.
+    area : array_like, shape (3, 2)
+        Bounds of the environment [m].
+
+    Raises
+    ------
+    ValueError
+        If there is no object, one lies outside the area, or no cuboid can be reached.
+    """
+    bounds = np.asarray(area, dtype=float)
+    if bounds.shape != (3, 2) or not np.isfinite(bounds).all():
+        raise ValueError('area: allowed are three pairs of finite numbers, low and high [m]')
+    if not settings.objects:
+        raise ValueError('objects: got none, allowed is at least one object to search')
+    objects = _boxes('objects', settings.objects, bounds)
+    obstacles = _boxes('obstacles', settings.obstacles, bounds)
+    distance = distance_for(settings.detection_probability, settings.camera)
+    side = footprint(distance, settings.camera)
+    cells: list[Cell] = []
+    lost: list[tuple[Cell, str]] = []
+    seen = total = 0.0
+    for index, item in enumerate(settings.objects):
+        for face in item.faces:
+            made, share = _face_cells(index, face, objects[index], distance, side, settings)
+            for cell in made:
+                area_of_cell = float(np.prod(cell.size))
+                total += area_of_cell
+                box, reason = _usable(cell, bounds, np.concatenate([objects, obstacles]), settings)
+                if reason:
+                    lost.append((cell, reason))
+                    continue
+                seen += share * area_of_cell
+                cells.append(Cell(cell.target, cell.face, cell.centre, cell.normal, cell.size, box))
+    if not cells:
+        reasons = '; '.join(sorted({reason for _, reason in lost}))
+        raise ValueError(
+            f'objects: no cuboid can be reached ({reasons}); allowed is an area that leaves room '
+            f'at {distance:.1f} m from a face'
+        )
+    return Mission(cells, lost, bounds, objects, obstacles, distance, side, seen / total)
+
+
+def _boxes(key: str, items: Sequence[BoxSettings], area: FloatArray) -> FloatArray:
+    boxes = np.zeros((len(items), 3, 2))
+    for index, item in enumerate(items):
+        box = item.array(float(area[2, 0]))
+        outside = (box[:, 0] < area[:, 0] - 1e-9) | (box[:, 1] > area[:, 1] + 1e-9)
+        # An obstacle may go on outside.
+        wrong = (
+            outside.any()
+            if isinstance(item, ObjectSettings)
+            else ((box[:, 1] <= area[:, 0]) | (box[:, 0] >= area[:, 1])).any()
+        )
+        if wrong:
+            raise ValueError(
+                f'{key}[{index}]: read centre {item.centre}, size {item.size}, allowed is what '
+                f'lies inside the area, {area.tolist()} [m]'
+            )
+        boxes[index] = box
+    return boxes
+
+
+def _face_cells(
+    index: int,
+    face: str,
+    box: FloatArray,
+    distance: float,
+    side: float,
+    settings: CuboidSettings,
+) -> tuple[list[Cell], float]:
+    """Return the cells of a face, and the share of each that a snapshot shows."""
+    number = FACES.index(face)  # type: ignore[arg-type]
+    axis, upper = divmod(number, 2)
+    others = [a for a in range(3) if a != axis]
+    normal = np.zeros(3)
+    normal[axis] = 1.0 if upper else -1.0
+    lengths = (box[:, 1] - box[:, 0])[others]
+    if settings.coverage == 'strict':
+        counts = np.ceil(lengths / side - 1e-9).astype(int)
+    else:
+        counts = np.maximum(np.floor(lengths / side + 0.5).astype(int), 1)
+    size = lengths / counts
+    share = float(np.prod(np.minimum(side / size, 1.0)))
+    cells = []
+    half = 0.5 * settings.cuboid_size
+    for j in range(counts[1]):
+        for i in range(counts[0]):
+            centre = np.empty(3)
+            centre[axis] = box[axis, upper]
+            centre[others] = box[others, 0] + (np.array([i, j]) + 0.5) * size
+            middle = centre + distance * normal
+            corners = np.stack([middle - half, middle + half], axis=1)
+            cells.append(Cell(index, face, centre, normal, size, corners))
+    return cells, share
+
+
+def _usable(
+    cell: Cell, area: FloatArray, solids: FloatArray, settings: CuboidSettings
+) -> tuple[FloatArray, str]:
+    """Return the part of a cuboid that robots can be in, or why there is none."""
+    box = np.stack(
+        [np.maximum(cell.box[:, 0], area[:, 0]), np.minimum(cell.box[:, 1], area[:, 1])], axis=1
+    )
+    if (box[:, 1] - box[:, 0] < _THINNEST).any():
+        for axis, words in ((2, ('below the floor', 'above the ceiling')),):
+            if cell.box[axis, 1] < area[axis, 0] + _THINNEST:
+                return box, f'a cuboid is {words[0]}'
+            if cell.box[axis, 0] > area[axis, 1] - _THINNEST:
+                return box, f'a cuboid is {words[1]}'
+        return box, 'a cuboid is outside the area'
+    for solid in solids:
+        wall = np.stack(
+            [solid[:, 0] - settings.clearance, solid[:, 1] + settings.clearance], axis=1
+        )
+        if ((box[:, 0] >= wall[:, 1]) | (box[:, 1] <= wall[:, 0])).any():
+            continue
+        # The largest part beside the solid.
+        parts = []
+        for axis in range(3):
+            below, above = box.copy(), box.copy()
+            below[axis, 1] = min(box[axis, 1], wall[axis, 0])
+            above[axis, 0] = max(box[axis, 0], wall[axis, 1])
+            parts += [below, above]
+        thickness = [float((part[:, 1] - part[:, 0]).min()) for part in parts]
+        volumes = [
+            float(np.prod(part[:, 1] - part[:, 0])) if thin >= _THINNEST else 0.0
+            for part, thin in zip(parts, thickness)
+        ]
+        if max(volumes) <= 0.0:
+            return box, 'a cuboid is inside another object'
+        box = parts[int(np.argmax(volumes))]
+    middle = box.mean(axis=1)
+    near = cell.centre + 1e-6 * cell.normal
+    if segment_cuts(middle, near, solids).any():
+        return box, 'another object stands in the view of a cuboid'
+    return box, ''

@@ -1,0 +1,156 @@
+"""Refinement T and exploration E as 000 prints them, (18), (19), (31), (32)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_filter.models.detection import (
+    detection_probability_at,
+)
+from maasi_planner.objective.candidate_table import CandidateTable
+from maasi_planner.objective.unexplored_nodes import (
+    ROOM_ROWS,
+    apply_misses,
+    fill_detection,
+    is_vectorised,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@njit(cache=True)
+def centre_sum(
+    places: FloatArray,
+    turns: FloatArray,
+    first: int,
+    own: IntArray,
+    centres: FloatArray,
+    dimension: int,
+    kind: int,
+    parameters: FloatArray,
+    out: FloatArray,
+) -> None:
+    together = is_vectorised(kind)
+    room = np.empty((ROOM_ROWS, places.shape[1] * centres.shape[0]))
+    for w in range(places.shape[0]):
+        total = 0.0
+        number = 0
+        for i in range(first, own[w]):
+            for c in range(centres.shape[0]):
+                dx = centres[c, 0] - places[w, i, 0]
+                dy = centres[c, 1] - places[w, i, 1]
+                dz = centres[c, 2] - places[w, i, 2] if dimension == 3 else 0.0
+                if together:
+                    room[0, number] = dx
+                    room[1, number] = dy
+                    room[2, number] = dz
+                    number += 1
+                else:
+                    total += detection_probability_at(
+                        kind, parameters, dx, dy, dz, turns[w, i, 0], turns[w, i, 1]
+                    )
+        if together:
+            chances = fill_detection(kind, parameters, number, room)
+            for i in range(number):
+                total += chances[i]
+        out[w] = total
+
+
+@njit(cache=True)
+def _fill_miss_factors(
+    nodes: FloatArray,
+    until: IntArray,
+    times: IntArray,
+    places: FloatArray,
+    turns: FloatArray,
+    dimension: int,
+    kind: int,
+    parameters: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write what a row of measurements leaves at each entry, up to the entry's own time."""
+    out[:] = 1.0
+    apply_misses(nodes, until, 0, times, places, turns, dimension, kind, parameters, out)
+
+
+@njit(cache=True)
+def apply_settled_misses(
+    entry_count: IntArray,
+    entry_value: FloatArray,
+    entry_node: FloatArray,
+    entry_time: IntArray,
+    times: IntArray,
+    places: FloatArray,
+    turns: FloatArray,
+    dimension: int,
+    kind: int,
+    parameters: FloatArray,
+) -> None:
+    """Multiply the entries by what a robot whose trajectory is settled will have seen."""
+    begin = 0
+    for w in range(entry_count.shape[0]):
+        end = begin + entry_count[w]
+        apply_misses(
+            entry_node[begin:end],
+            entry_time[begin:end],
+            0,
+            times,
+            places,
+            turns,
+            dimension,
+            kind,
+            parameters,
+            entry_value[begin:end],
+        )
+        begin = end
+
+
+@njit(cache=True)
+def miss_factors(table: CandidateTable, g: int, other: int) -> FloatArray:
+    """Return what the measurements of candidate `other` leave at the entries of g."""
+    begin = table.entry_start[g]
+    end = table.entry_start[g + 1]
+    slot = table.slot[g, other]
+    if slot >= 0:
+        return table.cache[slot, : end - begin]
+    if table.used[0] < table.cache.shape[0]:
+        slot = table.used[0]
+        table.used[0] += 1
+        table.slot[g, other] = slot
+        out = table.cache[slot, : end - begin]
+    else:
+        out = np.empty(end - begin)
+    first = table.event_start[other]
+    last = table.event_start[other + 1]
+    robot = table.robot[other]
+    _fill_miss_factors(
+        table.entry_node[begin:end],
+        table.entry_time[begin:end],
+        table.event_time[first:last],
+        table.event_place[first:last],
+        table.event_turn[first:last],
+        table.dimension,
+        table.kind[robot],
+        table.parameters[robot],
+        out,
+    )
+    return out
+
+
+@njit(cache=True)
+def explored(table: CandidateTable, g: int, chosen: IntArray) -> float:
+    """Return E of `paper` for candidate g, given the others (31), (32)."""
+    robot = table.robot[g]
+    values = table.entry_value[table.entry_start[g] : table.entry_start[g + 1]].copy()
+    for r in range(chosen.shape[0]):
+        if r != robot and chosen[r] >= 0:
+            left = miss_factors(table, g, chosen[r])
+            for i in range(values.shape[0]):
+                values[i] *= left[i]
+    total = 0.0
+    for i in range(values.shape[0]):
+        total += values[i]
+    return total

@@ -1,0 +1,226 @@
+"""Predicted measurements along trajectories: when, where, and in which direction."""
+
+from __future__ import annotations
+
+import math
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_filter.models.detection import (
+    BOX,
+)
+from maasi_planner.team import RobotView
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class Events(NamedTuple):
+    """Predicted measurements along trajectories, in order of time.
+
+    times (W, H) [steps from now], places (W, H, 3), turns (W, H, 2) cosine and sine of the
+    heading; of each row the first `own` (W,) are planned, and up to `total` (W,) others expect.
+    """
+
+    times: IntArray
+    places: FloatArray
+    turns: FloatArray
+    own: IntArray
+    total: IntArray
+
+
+@njit(cache=True)
+def _fill_events(
+    positions: FloatArray,
+    yaws: FloatArray,
+    lengths: IntArray,
+    phase: int,
+    period: int,
+    horizon: int,
+    arrival: bool,
+    extend: bool,
+    times: IntArray,
+    places: FloatArray,
+    turns: FloatArray,
+    own: IntArray,
+    total: IntArray,
+) -> None:
+    for w in range(positions.shape[0]):
+        length = lengths[w]
+        number = 0
+        t = phase
+        while t < length:
+            times[w, number] = t
+            number += 1
+            t += period
+        if arrival:
+            times[w, number] = length
+            number += 1
+            if t == length:
+                t += period
+        own[w] = number
+        if extend:
+            while t <= horizon:
+                times[w, number] = t
+                number += 1
+                t += period
+        total[w] = number
+        last_yaw = 0.0
+        cosine = 1.0
+        sine = 0.0
+        for i in range(number):
+            k = min(times[w, i], length)
+            for axis in range(3):
+                places[w, i, axis] = positions[w, k, axis]
+            if yaws[w, k] != last_yaw:
+                last_yaw = yaws[w, k]
+                cosine = math.cos(last_yaw)
+                sine = math.sin(last_yaw)
+            turns[w, i, 0] = cosine
+            turns[w, i, 1] = sine
+
+
+def events(
+    positions: FloatArray,
+    yaws: FloatArray,
+    lengths: IntArray,
+    phase: int,
+    period: int,
+    horizon: int,
+    arrival: bool,
+    extend: bool,
+) -> Events:
+    """Return the predicted measurements along trajectories.
+
+    Parameters
+    ----------
+    positions, yaws : (W, K + 1, 3), (W, K + 1) arrays
+        Trajectories, metres and radians.
+    lengths : (W,) array
+        Their lengths in steps.
+    phase, period : int
+        Steps to the first measurement and between measurements.
+    horizon : int
+        Last step of interest.
+    arrival : bool
+        Whether the measurement on arrival belongs to the trajectory, too.
+    extend : bool
+        Whether a robot goes on measuring where its trajectory ends (000, section 6: appended
+        constant states), which others see in e but which it does not count for itself.
+    """
+    number = len(positions)
+    longest = max(horizon, int(lengths.max(initial=0)))
+    slots = max(0, longest - phase) // period + 3
+    out = Events(
+        np.zeros((number, slots), np.int64),
+        np.zeros((number, slots, 3)),
+        np.zeros((number, slots, 2)),
+        np.zeros(number, np.int64),
+        np.zeros(number, np.int64),
+    )
+    _fill_events(
+        positions,
+        yaws,
+        lengths,
+        phase,
+        period,
+        horizon,
+        arrival,
+        extend,
+        out.times,
+        out.places,
+        out.turns,
+        out.own,
+        out.total,
+    )
+    return out
+
+
+def first_row(item: Events) -> Events:
+    """Return the events of the first trajectory."""
+    return Events(item.times[:1], item.places[:1], item.turns[:1], item.own[:1], item.total[:1])
+
+
+def kernel_of(view: RobotView) -> tuple[int, FloatArray] | None:
+    """Return kind and parameters of a robot's detection model, if it has a kernel."""
+    return view.sensor.detection.kernel()
+
+
+def reach_of(kind: int, parameters: FloatArray) -> float:
+    """Return the horizontal distance beyond which pi is 0, metres; inf if there is none."""
+    if kind != BOX:
+        return math.inf
+    offsets = np.abs(parameters[[1, 2, 4, 5]])
+    extra = np.abs(parameters[[3, 6]])
+    extra = extra[np.isfinite(extra)]
+    reach = math.hypot(float(offsets[[0, 2]].max()), float(offsets[[1, 3]].max()))
+    return max([reach, *extra.tolist()]) + 2.0 * float(parameters[7])
+
+
+def tail_events(view: RobotView, horizon: int, extend: bool) -> Events:
+    """Return the predicted measurements of a robot that is not planning."""
+    if view.tail is None or len(view.tail) == 0:
+        positions = np.array(view.state.pose.position)[None, None, :]
+    else:
+        positions = np.ascontiguousarray(view.tail, dtype=float)[None, :, :]
+    if view.tail is not None and view.tail_yaws is not None and len(view.tail):
+        yaws = np.ascontiguousarray(view.tail_yaws, dtype=float)[None, :]
+    else:
+        yaws = np.full(positions.shape[:2], view.state.pose.yaw)
+    lengths = np.array([positions.shape[1] - 1], np.int64)
+    # Where the tail ends the robot measures in any case: it plans there.
+    return events(
+        positions,
+        yaws,
+        lengths,
+        max(0, view.phase),
+        view.period_steps,
+        horizon,
+        view.tail is not None and len(view.tail) > 1,
+        extend,
+    )
+
+
+def required_kernel(name: str, view: RobotView) -> tuple[int, FloatArray]:
+    kernel = kernel_of(view)
+    if kernel is None:
+        raise ValueError(
+            f'{name}: got a detection model without a kernel, allowed here are exponential, '
+            'gaussian and box'
+        )
+    return kernel
+
+
+def rows_of(planned: list[Events]) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Return the events of all candidates one after the other."""
+    totals = joined([item.total for item in planned], np.int64)
+    start = starts_of(totals)
+    keep = [np.arange(item.times.shape[1])[None, :] < item.total[:, None] for item in planned]
+    return (
+        start,
+        joined([item.times[mask] for item, mask in zip(planned, keep)], np.int64),
+        stacked([item.places[mask] for item, mask in zip(planned, keep)], 3),
+        stacked([item.turns[mask] for item, mask in zip(planned, keep)], 2),
+    )
+
+
+def starts_of(counts: IntArray) -> IntArray:
+    """Return where each of several parts begins, one after the other, and where the last ends."""
+    # For the few that there are quicker than NumPy's sums.
+    return np.array([0, *accumulate(counts.tolist())], np.int64)
+
+
+def joined(parts: list, dtype: type) -> NDArray:
+    if len(parts) == 1:
+        return np.ascontiguousarray(parts[0], dtype)
+    return np.concatenate(parts).astype(dtype, copy=False) if parts else np.zeros(0, dtype)
+
+
+def stacked(parts: list, width: int) -> FloatArray:
+    if len(parts) == 1:
+        return np.ascontiguousarray(parts[0])
+    return np.concatenate(parts) if parts else np.zeros((0, width))

@@ -1,0 +1,1 @@
+"""Starting, pausing, resuming and ending a search: its action, services and modes."""

@@ -1,0 +1,184 @@
+"""The goals of a team's robots, and whether a robot follows a goal of another client."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import partial
+from typing import Any
+
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
+from rclpy.node import Node
+
+from maasi_filter.ros.silence import Silence
+from maasi_msgs.action import GoToWaypoint
+from maasi_msgs.msg import AgentState
+from maasi_planner.motion import RobotState
+
+ENDED = (AgentState.IDLE, AgentState.REACHED, AgentState.CANCELED, AgentState.ABORTED)
+# The reason of a driver for the end of a goal that was preempted.
+REPLACED = 'replaced'
+# A robot whose states show another goal for so long after it accepted one has lost it [s].
+_PATIENCE = 1.0
+
+
+@dataclass
+class HeardState:
+    """The last state heard of a robot."""
+
+    step: int
+    state: RobotState
+    goal: int
+    status: int
+    reason: str
+    silence: Silence
+    heard_at: float = field(default_factory=time.monotonic)
+
+
+class Course(Enum):
+    """The course of a robot's goal."""
+
+    UNDER_WAY = 0
+    ENDED = 1
+    #: The robot knows nothing of it, or has not taken it.
+    LOST = 2
+    #: It was preempted by a goal of another client.
+    REPLACED = 3
+
+
+@dataclass
+class _Sent:
+    number: int
+    handle: Any = None
+    accepted_at: float | None = None
+    # Of the result, once it has come.
+    status: int | None = None
+    reason: str = ''
+    ended_at: float = math.inf
+
+
+class TeamGoals:
+    """
+    Clients of the action `go_to` of all robots.
+
+    In lockstep only states count: they belong to a step, results come at any time.
+
+    Parameters
+    ----------
+    node : Node
+        Whose clients they are.
+    topics : dict
+        Name of the action of each robot.
+    lockstep : bool
+        Whether results are ignored.
+    on_answer : callable
+        Called with robot and number of a goal that was answered, and whether it was accepted.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topics: dict[str, str],
+        lockstep: bool,
+        on_answer: Callable[[str, int, bool], None],
+    ) -> None:
+        self._logger = node.get_logger()
+        self._lockstep = lockstep
+        self._on_answer = on_answer
+        self.clients = {
+            name: ActionClient(node, GoToWaypoint, topic) for name, topic in topics.items()
+        }
+        self._sent: dict[str, _Sent] = {}
+        # Goals that were cancelled, and when.
+        self._cancelled: dict[str, tuple[int, float]] = {}
+        #: Goals that have not been answered: robot and number.
+        self.waiting: set[tuple[str, int]] = set()
+
+    def send(self, name: str, goal: GoToWaypoint.Goal) -> None:
+        """Send a goal to a robot."""
+        sent = _Sent(int(goal.goal_id))
+        self._sent[name] = sent
+        self.waiting.add((name, sent.number))
+        future = self.clients[name].send_goal_async(goal)
+        future.add_done_callback(partial(self._answered, name, sent))
+
+    def cancel(self, name: str) -> None:
+        """Cancel a robot's goal, also where it has not been answered yet: the robot stops."""
+        sent = self._sent.pop(name, None)
+        if sent is None:
+            return
+        self._cancelled[name] = (sent.number, time.monotonic())
+        if sent.handle is not None and sent.status is None:
+            sent.handle.cancel_goal_async()
+
+    def forget(self, name: str) -> None:
+        """Drop a robot's goal without cancelling it."""
+        self._sent.pop(name, None)
+
+    def course(self, name: str, number: int, heard: HeardState) -> Course:
+        """Return the course of goal `number` of a robot, by the last state heard of it."""
+        sent = self._sent.get(name)
+        if sent is None or sent.number != number:
+            return Course.LOST
+        same = heard.goal == number
+        if self._lockstep:
+            if same:
+                return Course.ENDED if heard.status in ENDED else Course.UNDER_WAY
+            return Course.REPLACED if heard.status == AgentState.MOVING else Course.LOST
+        if sent.accepted_at is None:
+            return Course.UNDER_WAY
+        if sent.status == GoalStatus.STATUS_ABORTED and sent.reason == REPLACED:
+            # The last state before the result shows the preempted goal.
+            return Course.REPLACED if heard.heard_at > sent.ended_at else Course.UNDER_WAY
+        after = heard.heard_at > sent.accepted_at
+        if same and after and heard.status in ENDED:
+            return Course.ENDED
+        if sent.status == GoalStatus.STATUS_ABORTED and not same:
+            # Refused, as far as can be seen: it never was the robot's goal.
+            return Course.REPLACED if heard.status == AgentState.MOVING and after else Course.LOST
+        if sent.status is not None:
+            if heard.status == AgentState.MOVING:
+                # A state from before the end, or of another client's goal.
+                return Course.UNDER_WAY if same or not after else Course.REPLACED
+            return Course.ENDED
+        if same or time.monotonic() - sent.accepted_at < _PATIENCE:
+            return Course.UNDER_WAY
+        return Course.REPLACED if heard.status == AgentState.MOVING else Course.LOST
+
+    @staticmethod
+    def driven(heard: HeardState) -> bool:
+        """Return whether a robot that has no goal of the planner follows another client's."""
+        return heard.status == AgentState.MOVING or heard.reason == REPLACED
+
+    def ends(self, name: str, heard: HeardState) -> bool:
+        """Return whether a robot is still on its way to a goal that has just been cancelled."""
+        number, at = self._cancelled.get(name, (-1, -math.inf))
+        return heard.goal == number and time.monotonic() - at < _PATIENCE
+
+    def _answered(self, name: str, sent: _Sent, future: Any) -> None:
+        self.waiting.discard((name, sent.number))
+        handle = future.result()
+        accepted = handle is not None and bool(handle.accepted)
+        if accepted:
+            sent.accepted_at = time.monotonic()
+            if self._sent.get(name) is sent:
+                sent.handle = handle
+                handle.get_result_async().add_done_callback(partial(self._ended, name, sent))
+            else:
+                # It was cancelled before it was answered.
+                handle.cancel_goal_async()
+        self._on_answer(name, sent.number, accepted)
+
+    def _ended(self, name: str, sent: _Sent, future: Any) -> None:
+        answer = future.result()
+        if answer is None:
+            return
+        sent.status, sent.reason = int(answer.status), str(answer.result.reason)
+        sent.ended_at = time.monotonic()
+        if sent.status == GoalStatus.STATUS_ABORTED and self._sent.get(name) is sent:
+            self._logger.warning(f'{name}: goal {sent.number} was aborted: {sent.reason}')

@@ -1,0 +1,1 @@
+"""Searches of buildings (004): scenario, simulation, observer and report."""

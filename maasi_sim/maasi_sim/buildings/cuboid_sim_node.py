@@ -1,0 +1,132 @@
+"""The simulation node of searches of buildings: robots, time, and the link between the robots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from rclpy.publisher import Publisher
+from std_msgs.msg import Header
+
+from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
+from maasi_filter.ros.lifecycle_node import run
+from maasi_filter.ros.qos import RELIABLE
+from maasi_msgs.msg import SearchLink, SearchLinkArray
+from maasi_sim.buildings.scenario import CuboidScenario, load_any_scenario
+from maasi_sim.buildings.simulation import CuboidSimulation
+from maasi_sim.scenario.layering import Key
+from maasi_sim.scenario.schema import ScenarioError
+from maasi_sim.sim_node import SimNode
+
+# Share of a step after which the link passes on what it has, though some said nothing.
+_PATIENCE = 0.1
+
+
+class CuboidSimNode(SimNode):
+    """Plays the robots of a search of buildings, the time, and a radio of limited range.
+
+    What a robot sends at a step is passed on to those within the communication range, with all that
+    they hear at once: when all robots that are there have sent, or, free running, soon after the
+    step began.
+
+    Publishes
+    ---------
+    as `SimNode`, and `<robot>/link/rx` (maasi_msgs/SearchLinkArray)
+
+    Subscribes
+    ----------
+    as `SimNode`, and `<robot>/link/tx` (maasi_msgs/SearchLink)
+    """
+
+    robot_node = 'cuboid_planner'
+    scenario: Any
+    simulation: Any
+
+    def load(self, path: str, overrides: Mapping[str, tuple[Key, Any]]) -> Any:
+        """See `SimNode.load`."""
+        scenario = load_any_scenario(path, overrides)
+        if not isinstance(scenario, CuboidScenario):
+            raise ScenarioError(
+                f"{path}: planner.name: read {scenario.planner.name!r}, allowed is 'cuboid_mpc'"
+            )
+        return scenario
+
+    def simulate(self) -> Any:
+        """See `SimNode.simulate`."""
+        return CuboidSimulation(self.scenario, self.settings.seed)
+
+    def connect(self) -> list[Any]:
+        """See `SimNode.connect`."""
+        self._sent: dict[str, SearchLink] = {}
+        self._served: set[str] = set()
+        self._link_publishers: dict[str, Publisher] = {}
+        entities: list[Any] = []
+        for name in self.simulation.robots:
+            publisher = self.create_publisher(SearchLinkArray, f'{name}/link/rx', RELIABLE)
+            self._link_publishers[name] = publisher
+            self._expected[self._driver_of[name]].append(publisher.topic_name)
+            entities.append(publisher)
+            entities.append(
+                self.create_subscription(
+                    SearchLink,
+                    f'{name}/link/tx',
+                    partial(self._on_sent, name),
+                    RELIABLE,
+                )
+            )
+        self._link_timer = self.create_wall_timer(1.0, self._pass_on)
+        self._link_timer.cancel()
+        return entities
+
+    def on_new_step(self) -> None:
+        """See `SimNode.on_new_step`."""
+        self._sent.clear()
+        self._served.clear()
+        if not self.settings.lockstep:
+            self._link_timer.timer_period_ns = max(round(_PATIENCE * self._period * 1e9), 1)
+            self._link_timer.reset()
+
+    def _on_sent(self, name: str, message: SearchLink) -> None:
+        if name in self.simulation.away:
+            return
+        if message.robot != name or int(message.step) != self.step:
+            self.drop(
+                'stale link',
+                f'{name}/link/tx: read {message.robot!r}, step {message.step}, allowed is '
+                f'{name!r}, step {self.step}',
+            )
+            return
+        self._sent[name] = message
+        # One that was started again hears what the others said at this step.
+        self._served.discard(name)
+        if all(robot in self._sent for robot in self.simulation.present):
+            self._pass_on()
+
+    def _pass_on(self) -> None:
+        """Give each robot that has sent what it hears."""
+        self._link_timer.cancel()
+        senders = sorted(name for name, message in self._sent.items() if not message.silent)
+        heard = self.simulation.heard_by(senders)
+        stamp = stamp_to_ros(stamp_of_step(self.step, self.scenario.step))
+        header = Header(frame_id=self.settings.frame, stamp=stamp)
+        for name in self.simulation.present:
+            if name in self._served or name not in self._sent:
+                continue
+            self._served.add(name)
+            self._link_publishers[name].publish(
+                SearchLinkArray(
+                    header=header,
+                    step=self.step,
+                    messages=[self._sent[other] for other in heard.get(name, [])],
+                )
+            )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the simulation node of a search of buildings."""
+    return run(CuboidSimNode, arguments)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,292 @@
+"""What a search of buildings has come to, from its messages: live, or from a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys.store import Typestore
+
+from maasi_planner.buildings import Mission
+from maasi_sim.buildings.scenario import CuboidScenario
+from maasi_sim.run.observer import STEP, seconds
+
+FloatArray = NDArray[np.float64]
+
+SEARCHING = 0
+_ACTIVITIES = ('searching', 'returning', 'recharging')
+
+
+@dataclass(frozen=True)
+class SnapshotRecord:
+    """A snapshot as it was reported; position (3,) [m] and optical axis (3,)."""
+
+    cuboid: int
+    agent: str
+    step: int
+    time: float
+    position: FloatArray
+    direction: FloatArray
+    distance: float
+    detection_probability: float
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where a run stood when the last cuboid was visited."""
+
+    time: float
+    step: int
+
+
+@dataclass
+class CuboidRecord:
+    """All that a report needs of a run.
+
+    Attributes
+    ----------
+    name : str
+        Of the scenario.
+    scenario : CuboidScenario
+        With all layers.
+    seed : int
+        Of the run.
+    mission : Mission
+        What was searched.
+    snapshots : list of SnapshotRecord
+        In the order of steps and robots; of a cuboid there can be several.
+    trajectories : dict
+        By robot: time [s], x, y, z [m], (n, 4).
+    choices : dict
+        Decisions by how they were made.
+    active : (n, 2) array
+        Time [s] and robots that search.
+    solve_times : array
+        Of decisions [s].
+    most_heard : int
+        Robots heard at once, at most.
+    events : list of dict
+        Robots lost and back, batteries that failed, nodes restarted or dead.
+    end_reason : str
+        Why it ended.
+    end_time, wall_time : float
+        Simulated time at the end, wall time from the first step [s].
+    completed : Moment or None
+        When the last cuboid was visited.
+    """
+
+    name: str
+    scenario: CuboidScenario
+    seed: int
+    mission: Mission
+    snapshots: list[SnapshotRecord] = field(default_factory=list)
+    trajectories: dict[str, FloatArray] = field(default_factory=dict)
+    choices: dict[str, int] = field(default_factory=dict)
+    active: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    solve_times: FloatArray = field(default_factory=lambda: np.zeros(0))
+    most_heard: int = 0
+    events: list[dict[str, Any]] = field(default_factory=list)
+    end_reason: str = ''
+    end_time: float = 0.0
+    wall_time: float = 0.0
+    completed: Moment | None = None
+
+
+class CuboidObserver:
+    """Gather what a report needs from serialised messages, in the order in which they come.
+
+    Parameters
+    ----------
+    name : str
+        Of the scenario.
+    scenario : CuboidScenario
+        What is run.
+    seed : int
+        Of the run.
+    types : Typestore
+        Message types.
+    """
+
+    #: As `RunObserver` has them; there are no filters here.
+    update_topics: tuple[str, ...] = ()
+    result_topics: tuple[str, ...] = ()
+
+    def __init__(self, name: str, scenario: CuboidScenario, seed: int, types: Typestore) -> None:
+        self.name = name
+        self.scenario = scenario
+        self.seed = seed
+        self.mission = scenario.mission()
+        self._types = types
+        self._decision_topics = {f'/{name}/decision': name for name in scenario.names()}
+        self._state_topics = {f'/{name}/state': name for name in scenario.names()}
+        self._decisions: dict[str, list[Any]] = {name: [] for name in scenario.names()}
+        self._states: dict[str, list[bytes]] = {name: [] for name in scenario.names()}
+        self._visited_at: dict[int, Moment] = {}
+        self._done: dict[str, int] = {}
+        self._team: list[str] | None = None
+        # As in `RunObserver`.
+        self._begin: float | None = None
+        self._shots = 0
+        self.events: list[dict[str, Any]] = []
+        self.news = False
+
+    @property
+    def topics(self) -> list[str]:
+        """Topics that it wants."""
+        return [STEP, *self._decision_topics, *self._state_topics]
+
+    @property
+    def truth(self) -> FloatArray:
+        """Centres of the cuboids, (N, 3) [m]: what there is to visit."""
+        return self.mission.centres
+
+    @property
+    def found(self) -> int:
+        """Cuboids visited so far."""
+        return len(self._visited_at)
+
+    @property
+    def total_measurements(self) -> int:
+        """Snapshots so far."""
+        return self._shots
+
+    @property
+    def explored(self) -> float:
+        """Share of the cuboids visited."""
+        return self.found / len(self.mission.cells)
+
+    @property
+    def completed(self) -> Moment | None:
+        """When the last cuboid was visited, if `stop` asks for that."""
+        if self.scenario.stop != 'all_found' or self.found < len(self.mission.cells):
+            return None
+        return max(self._visited_at.values(), key=lambda moment: moment.step)
+
+    @property
+    def settled(self) -> str | None:
+        """Why nothing is left to gain, once every planner says so."""
+        if len(self._done) < len(self._decision_topics):
+            return None
+        return 'every planner knows that all cuboids are visited'
+
+    @property
+    def end_step(self) -> int | None:
+        """Step at which the run came to its end by itself, if it has."""
+        if self.completed is not None:
+            return self.completed.step
+        return max(self._done.values()) if self.settled is not None else None
+
+    def add(self, topic: str, data: bytes) -> None:
+        """Take a serialised message; what is not in `topics` is left alone."""
+        if topic in self._decision_topics:
+            self._take(self._decision_topics[topic], self._decode(data, 'CuboidDecision'))
+        elif topic in self._state_topics:
+            self._states[self._state_topics[topic]].append(data)
+        elif topic == STEP and self.completed is None:
+            self._note_team(self._decode(data, 'LockstepStep'))
+
+    def settle(self) -> None:
+        """Do nothing: each message was taken as it came."""
+
+    def _take(self, name: str, decision: Any) -> None:
+        self._decisions[name].append(decision)
+        moment = Moment(self._time(decision.header.stamp), int(decision.step))
+        for shot in decision.snapshots:
+            self._shots += 1
+            known = self._visited_at.get(int(shot.cuboid))
+            self.news = self.news or known is None
+            if known is None or moment.step < known.step:
+                self._visited_at[int(shot.cuboid)] = moment
+        if decision.done:
+            self._done.setdefault(name, moment.step)
+
+    def _time(self, stamp: Any) -> float:
+        return seconds(stamp) - (self._begin or 0.0)
+
+    def _note_team(self, step: Any) -> None:
+        if self._begin is None:
+            self._begin = seconds(step.stamp)
+        team = list(step.robots)
+        if self._team is not None:
+            for word, names in (
+                ('lost', set(self._team) - set(team)),
+                ('joined', set(team) - set(self._team)),
+            ):
+                for name in sorted(names):
+                    time = self._time(step.stamp)
+                    self.events.append({'time': time, 'agent': name, 'event': word})
+        self._team = team
+
+    def _decode(self, data: bytes, name: str) -> Any:
+        return self._types.deserialize_cdr(data, f'maasi_msgs/msg/{name}')
+
+    def record(
+        self,
+        end_reason: str,
+        end_time: float,
+        wall_time: float,
+        events: list[dict[str, Any]] | None = None,
+    ) -> CuboidRecord:
+        """Return the record of the run; one that is complete ends where it became so."""
+        completed = self.completed
+        if completed is not None:
+            end_time = completed.time
+        record = CuboidRecord(
+            self.name,
+            self.scenario,
+            self.seed,
+            self.mission,
+            end_reason=end_reason,
+            end_time=end_time,
+            wall_time=wall_time,
+        )
+        if self.found == len(self.mission.cells):
+            record.completed = max(self._visited_at.values(), key=lambda moment: moment.step)
+        active: dict[float, int] = {}
+        times = []
+        for name, decisions in self._decisions.items():
+            activity = SEARCHING
+            for item in decisions:
+                moment = self._time(item.header.stamp)
+                if moment > end_time:
+                    continue
+                record.choices[item.how] = record.choices.get(item.how, 0) + 1
+                record.most_heard = max(record.most_heard, len(item.heard))
+                times.append(float(item.solve_time))
+                active[moment] = active.get(moment, 0) + (item.activity == SEARCHING)
+                if item.activity != activity:
+                    activity = int(item.activity)
+                    record.events.append(
+                        {'time': moment, 'agent': name, 'event': _ACTIVITIES[activity]}
+                    )
+                record.snapshots += [
+                    SnapshotRecord(
+                        int(shot.cuboid),
+                        name,
+                        int(item.step),
+                        moment,
+                        np.array([shot.position.x, shot.position.y, shot.position.z]),
+                        np.array([shot.direction.x, shot.direction.y, shot.direction.z]),
+                        float(shot.distance),
+                        float(shot.detection_probability),
+                    )
+                    for shot in item.snapshots
+                ]
+        record.snapshots.sort(key=lambda shot: (shot.step, shot.agent, shot.cuboid))
+        record.active = np.array(sorted(active.items()), dtype=float).reshape(-1, 2)
+        record.solve_times = np.array(times)
+        for name, states in self._states.items():
+            rows = []
+            for data in states:
+                state = self._decode(data, 'AgentState')
+                place = state.pose.pose.position
+                moment = self._time(state.header.stamp)
+                if moment <= end_time:
+                    rows.append((moment, place.x, place.y, place.z))
+            record.trajectories[name] = np.array(rows, dtype=float).reshape(-1, 4)
+        record.events = sorted(
+            record.events + self.events + (events or []), key=lambda event: float(event['time'])
+        )
+        return record

@@ -1,0 +1,110 @@
+"""Pictures of a search of buildings (004): objects, cuboids and trajectories in 3D."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_planner.buildings import Mission
+
+FloatArray = NDArray[np.float64]
+
+# Told apart also by those who do not see all colours (Okabe and Ito).
+COLOURS = ('#CC79A7', '#D62728', '#009E73', '#0072B2', '#E69F00', '#56B4E9', '#8C564B')
+_OBJECT, _OBSTACLE, _OPEN, _VISITED = '#B9B9C9', '#8A8478', '#D55E00', '#56B4E9'
+_SIDES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+
+
+def colours_of(names: Collection[str]) -> dict[str, str]:
+    """Return a colour for each robot; one that is called by a colour has that."""
+    named = {'purple': '#7B3294', 'red': '#D62728', 'green': '#2CA02C', 'blue': '#0072B2'}
+    return {
+        name: named.get(name, COLOURS[index % len(COLOURS)])
+        for index, name in enumerate(sorted(names))
+    }
+
+
+def draw_mission(
+    axes: Any,
+    mission: Mission,
+    paths: Mapping[str, ArrayLike],
+    visited: Collection[int],
+    plans: Mapping[str, ArrayLike] | None = None,
+) -> None:
+    """Draw a mission on 3D axes.
+
+    Parameters
+    ----------
+    axes : Axes3D
+        Where.
+    mission : Mission
+        Objects, obstacles and cuboids.
+    paths : mapping
+        Positions of each robot, (n, 3) [m].
+    visited : collection of int
+        Cuboids that were visited.
+    plans : mapping, optional
+        Predicted positions of each robot, (T + 1, 3) [m].
+    """
+    for box in mission.objects:
+        _draw_box(axes, box, _OBJECT, 0.35, 'object')
+    for box in mission.obstacles:
+        _draw_box(axes, box, _OBSTACLE, 0.6, 'obstacle')
+    seen = set(visited)
+    for number, box in enumerate(mission.boxes):
+        done = number in seen
+        _draw_box(
+            axes,
+            box,
+            _VISITED if done else _OPEN,
+            0.12 if done else 0.35,
+            'cuboid, visited' if done else 'cuboid, not visited',
+        )
+    for name, colour in colours_of(paths).items():
+        path = np.asarray(paths[name], dtype=float).reshape(-1, 3)
+        axes.plot(*path.T, '-', color=colour, lw=1.4, label=name)
+        axes.plot(*path.T, 'D', color=colour, ms=2.2)
+        if len(path):
+            axes.plot(*path[:1].T, 's', color=colour, ms=8, mec='white')
+            axes.plot(*path[-1:].T, 'o', color=colour, ms=7, mec='white')
+        if plans and name in plans:
+            plan = np.asarray(plans[name], dtype=float)
+            axes.plot(*plan.T, 'o--', color=colour, ms=3, lw=0.8, mfc='none')
+    axes.set_xlim(*mission.area[0])
+    axes.set_ylim(*mission.area[1])
+    axes.set_zlim(*mission.area[2])
+    axes.set_box_aspect(mission.area[:, 1] - mission.area[:, 0], zoom=1.05)
+    axes.set_xlabel('x [m]')
+    axes.set_ylabel('y [m]')
+    axes.set_zlabel('z [m]')
+    axes.view_init(elev=34, azim=-62)
+
+
+def legend(axes: Any, columns: int = 4) -> None:
+    """Add a legend with each label once."""
+    handles, labels = axes.get_legend_handles_labels()
+    unique = dict(zip(labels, handles))
+    axes.legend(
+        unique.values(),
+        unique.keys(),
+        loc='upper center',
+        bbox_to_anchor=(0.5, -0.02),
+        ncols=columns,
+        fontsize=8,
+        frameon=False,
+    )
+
+
+def _draw_box(axes: Any, box: FloatArray, colour: str, alpha: float, label: str) -> None:
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    corners = np.array([[x, y, z] for x in box[0] for y in box[1] for z in box[2]])
+    sides = [corners[list(side)] for side in _SIDES]
+    axes.add_collection3d(
+        Poly3DCollection(sides, facecolor=colour, edgecolor=colour, alpha=alpha, linewidth=0.4)
+    )
+    # A collection has no handle for a legend in 3D.
+    axes.plot([], [], [], 's', color=colour, alpha=max(alpha, 0.35), label=label)

@@ -1,0 +1,1 @@
+"""Emulated vehicles that are reached by their own protocols."""

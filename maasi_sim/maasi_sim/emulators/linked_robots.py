@@ -1,0 +1,69 @@
+"""Robots that the simulation does not move: it plays their link in real time, or others do."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from maasi_filter.models.pose import Pose
+from maasi_sim.scenario.schema import RobotSettings, Scenario
+from maasi_sim.world.external_robot import ExternalRobot
+from maasi_sim.world.noise_streams import noise_stream
+from maasi_sim.world.robots import Leader
+
+_LOOPBACK = '127.'
+
+
+class LinkedRobot(Leader, Protocol):
+    """A robot at the other end of a link."""
+
+    @property
+    def obeys(self) -> bool:
+        """Whether it moves as its driver says."""
+
+    def cut(self, cut: bool = True) -> None:
+        """Cut the link, or mend it."""
+
+    def close(self) -> None:
+        """End it."""
+
+
+def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
+    """
+    Return the other end of a robot's link; time passes for it at once.
+
+    Raises
+    ------
+    OSError, RuntimeError
+        If it cannot be opened.
+
+    """
+    if robot.external:
+        return ExternalRobot(Pose.from_yaw(robot.start, robot.yaw))
+    if robot.link == 'mambo_wifi':
+        from maasi_sim.emulators.mambo.linked_mambo import LinkedMambo
+
+        return LinkedMambo(name, robot, seed)
+    from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import vehicle_of
+
+    return vehicle_of(robot, noise_stream(seed, name, purpose='autopilot'))
+
+
+def with_addresses(scenario: Scenario) -> Scenario:
+    """
+    Return a scenario in which each Mambo has an address of this host.
+
+    Raises
+    ------
+    OSError
+        If there are none.
+
+    """
+    robots = dict(scenario.robots)
+    for name, robot in scenario.robots.items():
+        mambo = robot.mambo
+        if robot.link == 'mambo_wifi' and mambo and not mambo.address.startswith(_LOOPBACK):
+            from maasi_sim.emulators.mambo.fake_mambo import free_address, free_port
+
+            mambo = mambo.model_copy(update={'address': free_address(), 'port': free_port()})
+            robots[name] = robot.model_copy(update={'mambo': mambo})
+    return scenario.model_copy(update={'robots': robots})

@@ -1,0 +1,1 @@
+"""A Parrot Mambo: its firmware, its body, and its WiFi protocol."""

@@ -1,0 +1,460 @@
+"""A fake Parrot Mambo: the drone's end of its WiFi protocol, over a firmware that flies a model.
+
+Speaks what pyparrot 1.5.20 speaks: a handshake in JSON over TCP, then frames over UDP.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import secrets
+import signal
+import socket
+import struct
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from maasi_filter.models.pose import Pose, quaternion_product
+from maasi_sim.emulators.mambo.commands import ALL_STATES, obey
+from maasi_sim.emulators.mambo.firmware import (
+    CLIMB_RANGE,
+    TILT_RANGE,
+    TURN_RANGE,
+    Estimate,
+    FirmwareSettings,
+    MamboFirmware,
+)
+from maasi_sim.emulators.mambo.frames import ACK, DATA, DATA_WITH_ACK, Frame, FrameError, frames
+from maasi_sim.emulators.mambo.tilt_body import TiltBodySettings
+
+#: Where pyparrot looks for the handshake; it cannot be changed there.
+HANDSHAKE_PORT = 44444
+#: Where the drone hears commands, as it says in the handshake.
+COMMAND_PORT = 6000
+
+PING, PONG, COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 0, 1, 10, 11, 12
+EVENTS, ACKED_EVENTS = 126, 127
+_ID = struct.Struct('<BBH')
+
+_SENSOR_PERIOD, _PING_PERIOD = 0.5, 1.0
+# A frame that is not acknowledged is sent again after this, so many times.
+_RETRY_PERIOD, _RETRIES = 0.15, 5
+_POLL = 0.1
+_STEP = 0.02
+# Longest time caught up at once when the host stood still [s].
+_CATCH_UP = 0.5
+_TRIES = 100
+
+
+def free_address() -> str:
+    """
+    Return a loopback address where a fake can be reached for its handshake.
+
+    Raises
+    ------
+    OSError
+        If there is none.
+
+    """
+    for _ in range(_TRIES):
+        numbers = [secrets.randbelow(200) + 20 for _ in range(3)]
+        address = '.'.join(map(str, [127, *numbers]))
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as test:
+            try:
+                test.bind((address, HANDSHAKE_PORT))
+            except OSError:
+                continue
+        return address
+    raise OSError(f'no address 127.x.y.z of this host with TCP port {HANDSHAKE_PORT} free')
+
+
+def free_port() -> int:
+    """Return a UDP port that nobody has, on which a driver can hear its drone."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as test:
+        test.bind(('0.0.0.0', 0))
+        return int(test.getsockname()[1])
+
+
+class FakeMambo:
+    """
+    A Mambo on this host, which a client such as pyparrot connects to.
+
+    Whoever owns it moves its time by `advance`, or has it run by itself in real time with `run`.
+
+    Parameters
+    ----------
+    firmware : MamboFirmware
+        Its flight.
+    address : str
+        Of this host; several fakes have different ones (127.0.0.1, 127.0.0.2, ...).
+    command_port : int
+        UDP; 0: any that is free.
+
+    Attributes
+    ----------
+    position_sent : str
+        'true', or for tests 'none' (no position events), 'stuck' (always the same), 'nan'.
+    cut_up, cut_down : bool
+        Whether the network loses what comes, and what is sent.
+    refused : int
+        Datagrams that were no frames, or commands with contents that make no sense.
+
+    """
+
+    def __init__(
+        self, firmware: MamboFirmware, address: str = '127.0.0.1', command_port: int = 0
+    ) -> None:
+        self.firmware = firmware
+        self.address = address
+        self.position_sent = 'true'
+        self.cut_up = self.cut_down = False
+        self.refused = 0
+        #: What was heard from the controller: (project, class, id) to how often.
+        self.heard: dict[tuple[int, int, int], int] = {}
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+        self._controller: tuple[str, int] | None = None
+        self._sequences: dict[int, int] = {}
+        # Frames that wait to be acknowledged: frame, tries left, time of the next try.
+        self._unacked: dict[int, tuple[Frame, int, float]] = {}
+        self._done: dict[int, int] = {}
+        self._sensors_at = self._ping_at = 0.0
+        self._stuck: Estimate | None = None
+        self._said: tuple[int, int] | None = None
+        firmware.on_change = self._tell_state
+        self._door = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._air = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._door.bind((address, HANDSHAKE_PORT))
+            self._door.listen()
+            self._air.bind((address, command_port))
+        except OSError as error:
+            self._door.close()
+            self._air.close()
+            raise OSError(
+                f'fake Mambo at {address}: {error.strerror}; allowed is an address of this host '
+                f'with TCP port {HANDSHAKE_PORT} and UDP port {command_port} free'
+            ) from error
+        self._door.settimeout(_POLL)
+        self._air.settimeout(_POLL)
+        self.command_port = int(self._air.getsockname()[1])
+        self._threads = [
+            threading.Thread(target=work, name=f'fake Mambo {what}', daemon=True)
+            for what, work in (('handshake', self._answer_door), ('commands', self._listen))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def __enter__(self) -> FakeMambo:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave the network."""
+        self.close()
+
+    def close(self) -> None:
+        """Leave the network."""
+        self._closing.set()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join()
+        self._door.close()
+        self._air.close()
+
+    def run(self) -> None:
+        """Let its time pass as it does here, in a thread, until it is closed."""
+        thread = threading.Thread(target=self._live, name='fake Mambo time', daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _live(self) -> None:
+        last = time.monotonic()
+        while not self._closing.wait(_STEP):
+            now = time.monotonic()
+            self.advance(min(now - last, _CATCH_UP))
+            last = now
+
+    # ---- time --------------------------------------------------------------------------------
+
+    def advance(self, dt: float) -> None:
+        """Go on for `dt` seconds, and send what is due."""
+        with self._lock:
+            firmware = self.firmware
+            firmware.advance(dt)
+            now = firmware.time
+            if now - self._sensors_at >= _SENSOR_PERIOD - 1e-9:
+                self._send_sensors(now - self._sensors_at)
+                self._sensors_at = now
+            if now - self._ping_at >= _PING_PERIOD - 1e-9:
+                self._ping_at = now
+                self._send(DATA, PING, struct.pack('<Q', round(1e9 * now)))
+            for sequence, (frame, tries, due) in list(self._unacked.items()):
+                if now >= due:
+                    self._unacked[sequence] = (frame, tries - 1, now + _RETRY_PERIOD)
+                    if tries <= 1:
+                        del self._unacked[sequence]
+                    self._transmit(frame)
+
+    def snapshot(self) -> tuple[Any, Any, float]:
+        """Return true state in the map, flying state and charge, all of one instant."""
+        with self._lock:
+            firmware = self.firmware
+            return firmware.state, firmware.flying_state, firmware.charge.charge
+
+    # ---- what it says ------------------------------------------------------------------------
+
+    def _transmit(self, frame: Frame) -> None:
+        if self._controller is None or self.cut_down:
+            return
+        # A controller that is gone is nothing to the drone.
+        with contextlib.suppress(OSError):
+            self._air.sendto(frame.encode(), self._controller)
+
+    def _send(self, kind: int, buffer: int, payload: bytes) -> Frame:
+        sequence = (self._sequences.get(buffer, -1) + 1) % 256
+        self._sequences[buffer] = sequence
+        frame = Frame(kind, buffer, sequence, payload)
+        self._transmit(frame)
+        return frame
+
+    def _event(self, number: tuple[int, int, int], payload: bytes, acked: bool = False) -> None:
+        content = _ID.pack(*number) + payload
+        if not acked:
+            self._send(DATA, EVENTS, content)
+            return
+        frame = self._send(DATA_WITH_ACK, ACKED_EVENTS, content)
+        self._unacked[frame.sequence] = (frame, _RETRIES, self.firmware.time + _RETRY_PERIOD)
+
+    def _tell_state(self) -> None:
+        state = (int(self.firmware.flying_state), self.firmware.percent)
+        before = self._said or (-1, -1)
+        self._said = state
+        if state[0] != before[0]:
+            self._event((2, 3, 1), struct.pack('<I', state[0]), acked=True)
+        if state[1] != before[1]:
+            self._event((0, 5, 1), struct.pack('<B', state[1]), acked=True)
+
+    def _tell_all(self) -> None:
+        self._said = None
+        self._tell_state()
+        limits = self.firmware.limits
+        self._event((2, 9, 1), struct.pack('<fff', math.degrees(limits.tilt), *TILT_RANGE))
+        self._event((2, 5, 0), struct.pack('<fff', limits.climb, *CLIMB_RANGE))
+        self._event((2, 5, 1), struct.pack('<fff', math.degrees(limits.turn), *TURN_RANGE))
+        self._event((0, 5, 0), b'')
+
+    def _send_sensors(self, elapsed: float) -> None:
+        estimate = self.firmware.estimate()
+        stamp = round(1000.0 * self.firmware.time) % 65536
+        forward, left, up = estimate.velocity.tolist()
+        # Down and right are positive here.
+        self._event((2, 18, 1), struct.pack('<fffH', forward, -left, -up, stamp))
+        self._event((2, 18, 2), struct.pack('<fH', self.firmware.height, stamp))
+        self._event((2, 18, 4), struct.pack('<ffffH', *_quaternion(estimate), stamp))
+        if self.position_sent == 'none':
+            return
+        if self.position_sent == 'stuck':
+            self._stuck = estimate = self._stuck or estimate
+        else:
+            self._stuck = None
+        x, y, z = (100.0 * estimate.position).tolist()
+        if self.position_sent == 'nan':
+            x = math.nan
+        psi = round(math.degrees(-estimate.yaw))
+        # Its stamp is the time since the one before, unlike that of the others.
+        self._event((2, 18, 0), struct.pack('<ffhhh', x, y, round(z), psi, round(1000.0 * elapsed)))
+
+    # ---- what it hears -----------------------------------------------------------------------
+
+    def _answer_door(self) -> None:
+        while not self._closing.is_set():
+            try:
+                visitor, (host, _) = self._door.accept()
+            except OSError:
+                continue
+            with visitor:
+                visitor.settimeout(2.0)
+                try:
+                    answer = self._shake_hands(host, visitor.recv(4096))
+                    visitor.sendall(json.dumps(answer).encode() + b'\0')
+                except OSError:
+                    continue
+
+    def _shake_hands(self, host: str, request: bytes) -> dict[str, int]:
+        try:
+            port = int(json.loads(request.rstrip(b'\0'))['d2c_port'])
+            if not 0 < port < 65536:
+                raise ValueError
+        except (ValueError, KeyError, TypeError):
+            self.refused += 1
+            return {'status': -1, 'c2d_port': 0}
+        with self._lock:
+            self._controller = (host, port)
+            self._unacked.clear()
+            self._done.clear()
+            self._sequences.clear()
+            self._said = None
+            self.firmware.hear()
+        return {
+            'status': 0,
+            'c2d_port': self.command_port,
+            'c2d_update_port': 51,
+            'c2d_user_port': 21,
+        }
+
+    def _listen(self) -> None:
+        while not self._closing.is_set():
+            try:
+                data, sender = self._air.recvfrom(65536)
+            except OSError:
+                continue
+            with self._lock:
+                controller = self._controller
+                if self.cut_up or controller is None or sender[0] != controller[0]:
+                    continue
+                try:
+                    for frame in frames(data):
+                        self._take(frame)
+                except FrameError:
+                    self.refused += 1
+
+    def _take(self, frame: Frame) -> None:
+        self.firmware.hear()
+        if frame.kind == ACK:
+            if frame.payload and frame.buffer == ACKED_EVENTS + 128:
+                self._unacked.pop(frame.payload[0], None)
+            return
+        if frame.kind == DATA_WITH_ACK:
+            self._send(ACK, frame.buffer + 128, bytes([frame.sequence]))
+            if self._done.get(frame.buffer) == frame.sequence:
+                # Sent again because the acknowledgement was lost.
+                return
+            self._done[frame.buffer] = frame.sequence
+        if frame.buffer not in (COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS):
+            return
+        if len(frame.payload) < _ID.size:
+            self.refused += 1
+            return
+        number = _ID.unpack_from(frame.payload)
+        self.heard[number] = self.heard.get(number, 0) + 1
+        if number == ALL_STATES:
+            self._tell_all()
+            return
+        try:
+            obey(self.firmware, number, frame.payload[_ID.size :])
+        except ValueError:
+            self.refused += 1
+
+
+def _quaternion(estimate: Estimate) -> list[float]:
+    """Return w, x, y, z of the turn from north-east-down at the start to forward-right-down."""
+    turned = np.array([1.0, 0.0, 0.0, 0.0])
+    for axis, angle in ((3, -estimate.yaw), (2, -estimate.pitch), (1, estimate.roll)):
+        turn = np.zeros(4)
+        turn[0], turn[axis] = math.cos(0.5 * angle), math.sin(0.5 * angle)
+        turned = quaternion_product(turned, turn)
+    return [float(value) for value in turned]
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='fake_mambo',
+        description='A simulated Parrot Mambo on the network of this host, for a driver with '
+        'link: mambo_wifi, or for any program that uses pyparrot over WiFi.',
+    )
+    parser.add_argument(
+        '--address', default='127.0.0.1', help='of this host (default: %(default)s)'
+    )
+    parser.add_argument(
+        '--type', default='mambo', metavar='NAME', help='robot type (default: %(default)s)'
+    )
+    parser.add_argument('--seed', type=int, default=1, metavar='N', help='of the noise')
+    parser.add_argument(
+        '--charge', type=float, default=1.0, metavar='X', help='of the battery at the start, 0 to 1'
+    )
+    body, firmware = TiltBodySettings(), FirmwareSettings()
+    parser.add_argument(
+        '--drag', type=float, default=body.drag, metavar='D', help='of its body [1/s] (%(default)s)'
+    )
+    parser.add_argument(
+        '--delay',
+        type=float,
+        default=firmware.delay,
+        metavar='S',
+        help='from a command to its tilt set-point [s] (%(default)s)',
+    )
+    parser.add_argument(
+        '--lost-link',
+        choices=('hover', 'land'),
+        default=firmware.lost_link,
+        help='what it does when its controller falls silent (%(default)s)',
+    )
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a fake Mambo until it is interrupted."""
+    from maasi_sim.scenario.loading import robot_type
+    from maasi_sim.scenario.schema import ScenarioError
+
+    options = build_parser().parse_args(arguments)
+    try:
+        if not 0.0 <= options.charge <= 1.0:
+            raise ScenarioError(f'--charge: read {options.charge}, allowed is 0 to 1')
+        robot = robot_type(options.type)
+        firmware = MamboFirmware(
+            Pose.from_yaw([0.0, 0.0, 0.0], 0.0),
+            FirmwareSettings(
+                delay=options.delay,
+                lost_link=options.lost_link,
+                body=TiltBodySettings(drag=options.drag),
+            ),
+            battery=robot.battery.model_copy(update={'charge': options.charge}),
+            odometry=robot.odometry,
+            seed=options.seed,
+        )
+        fake = FakeMambo(firmware, options.address, COMMAND_PORT)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        print(
+            f'error: --{wrong["loc"][-1]}: read {wrong["input"]}: {wrong["msg"]}', file=sys.stderr
+        )
+        return 2
+    except (ScenarioError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    print(f'fake Mambo at {options.address}, TCP {HANDSHAKE_PORT}, UDP {fake.command_port}')
+    with fake:
+        fake.run()
+        said = None
+        while not ended.wait(_POLL):
+            state, flying, charge = fake.snapshot()
+            now = (flying, round(10 * charge))
+            if now != said:
+                said = now
+                place = ', '.join(f'{value:.2f}' for value in state.pose.position)
+                print(f'{flying.name.lower()} at {place} m, battery {charge:.0%}', flush=True)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

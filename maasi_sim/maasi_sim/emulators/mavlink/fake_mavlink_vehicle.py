@@ -1,0 +1,238 @@
+"""A fake vehicle on a real wire, in real time: what a driver talks to where there is none."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from maasi_drivers.links.mavlink.link import LinkError, open_connection
+from maasi_drivers.links.mavlink.protocol import mavlink
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_filter.models.pose import Pose
+from maasi_planner.motion import RobotState
+from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.emulators.mavlink.fake_autopilot import FIRMWARES, FakeAutopilot
+from maasi_sim.scenario.schema import RobotSettings
+
+_PERIOD = 0.02
+# Of a turn that came late, in steps of the period [s].
+_LONGEST = 0.5
+
+
+class _Gate:
+    """Lets bytes through to a wire, or not."""
+
+    def __init__(self, wire: Any) -> None:
+        self._wire = wire
+        self.shut = False
+
+    def write(self, data: bytes) -> None:
+        """Write."""
+        if not self.shut:
+            self._wire.write(data)
+
+
+class FakeVehicle:
+    """
+    A fake autopilot with a wire and a thread that moves it in real time.
+
+    Parameters
+    ----------
+    settings : AutopilotSettings
+        What it is like.
+    url : str
+        As pymavlink has it: where the driver listens.
+    start : Pose
+        In the map, of the origin of its local frame, and its heading; that frame is ENU.
+    generator : Generator
+        Of its noise.
+
+    Raises
+    ------
+    LinkError
+        If the connection cannot be opened.
+
+    """
+
+    def __init__(
+        self, settings: AutopilotSettings, url: str, start: Pose, generator: np.random.Generator
+    ) -> None:
+        self._connection = open_connection(url, settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1)
+        self._origin = np.array(start.position)
+        self._gate = self._connection.mav.file = _Gate(self._connection)
+        self.autopilot = FakeAutopilot(settings, self._connection.mav, start.yaw, generator)
+        self._lock = threading.Lock()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='fake vehicle', daemon=True)
+        self._thread.start()
+
+    @property
+    def state(self) -> RobotState:
+        """Where it truly is, in the map."""
+        with self._lock:
+            body = self.autopilot.body
+            return RobotState(
+                Pose.from_yaw(self._origin + body.position, body.yaw),
+                body.velocity,
+                np.array([0.0, 0.0, body.yaw_rate]),
+            )
+
+    @property
+    def obeys(self) -> bool:
+        """Whether it is armed, and goes where the driver says."""
+        with self._lock:
+            autopilot = self.autopilot
+            return autopilot.armed and autopilot.mode == autopilot.firmware.external
+
+    def cut(self, cut: bool = True) -> None:
+        """Cut the link, so that nothing goes out or comes in, or mend it."""
+        self._gate.shut = cut
+
+    @property
+    def running(self) -> bool:
+        """Whether the autopilot has not crashed."""
+        return not self.autopilot.crashed
+
+    def close(self) -> None:
+        """Stop the thread, and close the wire."""
+        self._end.set()
+        self._thread.join(timeout=2.0)
+        self._connection.close()
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while not self._end.wait(_PERIOD):
+            now = time.monotonic()
+            late = min(now - before, _LONGEST)
+            before = now
+            with self._lock:
+                while (message := self._connection.recv_msg()) is not None:
+                    if not self._gate.shut:
+                        self.autopilot.handle(message)
+                steps = max(1, math.ceil(late / _PERIOD - 0.5))
+                for _ in range(steps):
+                    self.autopilot.advance(late / steps)
+
+
+def vehicle_of(robot: RobotSettings, generator: np.random.Generator) -> FakeVehicle:
+    """
+    Return the vehicle of a robot of a scenario, at its start.
+
+    Raises
+    ------
+    LinkError
+        If the connection cannot be opened.
+
+    """
+    link = robot.mavlink or MavlinkSettings()
+    host, port = link.url.removeprefix('udpin:').split(':')
+    return FakeVehicle(
+        robot.autopilot.model_copy(update={'system': link.system}),
+        f'udpout:{"127.0.0.1" if host == "0.0.0.0" else host}:{port}',
+        Pose.from_yaw([*robot.start[:2], link.ground], robot.yaw),
+        generator,
+    )
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='fake_mavlink_vehicle',
+        description='A fake vehicle that speaks MAVLink 2, to try the driver without a real one.',
+    )
+    parser.add_argument(
+        '--url',
+        default='udpout:127.0.0.1:14550',
+        help='where the driver listens, as pymavlink has it (default: %(default)s)',
+    )
+    parser.add_argument(
+        '--firmware',
+        choices=sorted(FIRMWARES),
+        default='arducopter',
+        help='whose manners it has (default: %(default)s)',
+    )
+    parser.add_argument('--system', type=int, default=1, help='system id (default: 1)')
+    parser.add_argument(
+        '--estimator-time',
+        type=float,
+        default=2.0,
+        metavar='S',
+        help='until its position estimate is ready (default: 2)',
+    )
+    parser.add_argument(
+        '--charge', type=float, default=1.0, help='of its battery, 0 to 1 (default: 1)'
+    )
+    parser.add_argument(
+        '--parameter',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='of the autopilot, as FS_GCS_ENABLE=0; may be given more than once',
+    )
+    return parser
+
+
+def read_parameters(items: list[str]) -> dict[str, float]:
+    """Return parameters given as NAME=VALUE.
+
+    Raises
+    ------
+    ValueError
+        Where one is not.
+    """
+    parameters = {}
+    for item in items:
+        name, _, value = item.partition('=')
+        try:
+            parameters[name] = float(value)
+        except ValueError:
+            raise ValueError(f'--parameter: read {item!r}, allowed is NAME=NUMBER') from None
+    return parameters
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Play a vehicle until it is told to end; a crash of the autopilot is exit code 3."""
+    options = build_parser().parse_args(arguments)
+    try:
+        settings = AutopilotSettings(
+            firmware=options.firmware,
+            system=options.system,
+            estimator_time=options.estimator_time,
+            charge=options.charge,
+            parameters=read_parameters(options.parameter),
+        )
+        vehicle = FakeVehicle(
+            settings, options.url, Pose.from_yaw(np.zeros(3), 0.0), np.random.default_rng(1)
+        )
+    except (ValueError, LinkError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    shown = ''
+    try:
+        while vehicle.running and not ended.wait(0.2):
+            autopilot = vehicle.autopilot
+            text = f'{autopilot.mode_name}, {"armed" if autopilot.armed else "not armed"}'
+            if text != shown:
+                shown = text
+                position = ', '.join(f'{value:.2f}' for value in vehicle.state.pose.position)
+                print(f'{text}, at {position} m', flush=True)
+    finally:
+        vehicle.close()
+    if not vehicle.running:
+        print(f'the autopilot crashed: {vehicle.autopilot.crashed}', file=sys.stderr)
+        return 3
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""Runs of scenarios: processes, recording, observation, report and replay."""

@@ -1,0 +1,364 @@
+"""Write and read rosbag2 recordings (MCAP) from serialised messages, without ROS."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from maasi_drivers.calibration.bag_reader import BagError, BagMessage, BagReader
+from maasi_sim.run.mcap_writer import FLUSH_PERIOD, BagFile
+
+__all__ = [
+    'Bag',
+    'BagError',
+    'BagMessage',
+    'BagWriteError',
+    'BagWriter',
+    'TopicQos',
+    'interface_folder',
+    'load_types',
+]
+
+IMAGE_TYPE = 'sensor_msgs/msg/Image'
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
+SCENARIO_TOPIC = '/scenario'
+
+ImageFormat = Literal['jpeg', 'png', 'raw']
+
+# Encodings that are compressed, with their number of channels.
+_CHANNELS = {'bgr8': 3, 'rgb8': 3, 'mono8': 1, '8UC1': 1, '8UC3': 3}
+# Shortest wait for a message, so that a chunk that is due does not spin [s].
+_LEAST_WAIT = 0.01
+# Time of what is no message, but a topic that was announced.
+_ANNOUNCED = -(2**63)
+_FOREVER = QosTime(9223372036, 854775807)
+
+
+class BagWriteError(BagError):
+    """A recording cannot be written: the disk is full, or fails."""
+
+
+@dataclass(frozen=True)
+class TopicQos:
+    """What a player of the recording needs to know of a topic's quality of service."""
+
+    reliable: bool = True
+    latched: bool = False
+    depth: int = 10
+
+    def profile(self) -> Qos:
+        """Return the profile as `rosbags` writes it."""
+        return Qos(
+            QosHistory.KEEP_LAST,
+            max(self.depth, 1),
+            QosReliability.RELIABLE if self.reliable else QosReliability.BEST_EFFORT,
+            QosDurability.TRANSIENT_LOCAL if self.latched else QosDurability.VOLATILE,
+            _FOREVER,
+            _FOREVER,
+            QosLiveliness.AUTOMATIC,
+            _FOREVER,
+            False,
+        )
+
+
+def interface_folder(package: str) -> Path:
+    """Return the folder of a package's `.msg` files, installed or in this repository.
+
+    Raises
+    ------
+    BagError
+        If the package is in neither.
+    """
+    places = [Path(__file__).resolve().parents[3] / package / 'msg']
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        places.insert(0, Path(get_package_share_directory(package)) / 'msg')
+    except (ImportError, LookupError, OSError):
+        pass
+    for place in places:
+        if place.is_dir():
+            return place
+    raise BagError(f'package {package}: no message definitions in {", ".join(map(str, places))}')
+
+
+def load_types(packages: Collection[str] = ('maasi_msgs',)) -> Typestore:
+    """Return the message types of Jazzy and of `packages`."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for package in packages:
+        types = {}
+        for path in sorted(interface_folder(package).glob('*.msg')):
+            types.update(
+                get_types_from_msg(path.read_text(encoding='utf-8'), f'{package}/msg/{path.stem}')
+            )
+        store.register(types)
+    return store
+
+
+class BagWriter:
+    """Write a recording in a thread of its own; always closable, and readable once closed.
+
+    What was handed in is in the file after `FLUSH_PERIOD`: a killed process loses no more.
+
+    Images are stored as `sensor_msgs/msg/CompressedImage` on `<topic>/compressed`, in the encoding
+    that image_transport would use. Messages keep the order in which they were handed in: times
+    that do not rise are moved up by a nanosecond.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the recording; must not exist.
+    types : Typestore
+        Message types, from `load_types`.
+    images : {'jpeg', 'png', 'raw'}
+        How images are stored. JPEG has quality 95 without chroma subsampling; PNG is lossless and
+        costs ten times the time.
+    backlog : int
+        Bytes that may wait to be written before `write` waits.
+
+    Raises
+    ------
+    BagError
+        If the folder exists. `write`, `wait` and `close` raise it when the thread failed.
+    BagWriteError
+        If the folder cannot be made, or the thread could not write (disk full).
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        types: Typestore,
+        images: ImageFormat = 'jpeg',
+        backlog: int = 256 * 2**20,
+    ) -> None:
+        self.path = Path(path)
+        self._types = types
+        self._images = images
+        self._limit = backlog
+        if self.path.exists():
+            raise BagError(f'{path}: exists already')
+        self._writer = BagFile(self.path)
+        try:
+            self._writer.open()
+        except OSError as error:
+            raise BagWriteError(f'{path}: cannot be written: {error.strerror}') from error
+        self._topics: dict[str, tuple[str, TopicQos]] = {}
+        self._connections: dict[str, Connection] = {}
+        self._time = -1
+        self._queue: queue.SimpleQueue[tuple[str, int, bytes] | None] = queue.SimpleQueue()
+        self._pending = 0
+        self._changed = threading.Condition()
+        self._error: BaseException | None = None
+        self._closed = False
+        self.counts: dict[str, int] = {}
+        self._thread = threading.Thread(target=self._work, name='bag writer', daemon=True)
+        self._thread.start()
+
+    def add_topic(self, topic: str, type_name: str, qos: TopicQos | None = None) -> None:
+        """Announce a topic; it appears in the recording even if nothing comes.
+
+        Raises
+        ------
+        BagError
+            If the type is unknown: neither Jazzy's nor one of the packages loaded.
+        """
+        if type_name not in self._types.fielddefs:
+            raise BagError(f'topic {topic}: unknown message type {type_name}')
+        self._topics[topic] = (type_name, qos or TopicQos())
+        # To describe a topic takes a while: not when its first messages wait. Of images it is not
+        # known yet how they are stored.
+        if type_name != IMAGE_TYPE:
+            self._queue.put((topic, _ANNOUNCED, b''))
+
+    def write(self, topic: str, time: int, data: bytes) -> None:
+        """Take a serialised message (CDR) received at `time` [ns]."""
+        self._check()
+        if topic not in self._topics:
+            raise BagError(f'topic {topic}: not announced')
+        with self._changed:
+            self._pending += len(data)
+            if self._pending > self._limit:
+                self._changed.wait_for(lambda: self._pending <= self._limit or self._error)
+        self._queue.put((topic, time, data))
+
+    def write_message(self, topic: str, time: int, message: Any) -> None:
+        """Serialise and take a message of `rosbags`' own classes."""
+        type_name = self._topics[topic][0]
+        self.write(topic, time, bytes(self._types.serialize_cdr(message, type_name)))
+
+    def write_scenario(self, text: str, facts: Mapping[str, str]) -> None:
+        """Store what was run: latched on topic `/scenario`, and as custom data of the recording."""
+        string = self._types.types['std_msgs/msg/String']
+        self.add_topic(SCENARIO_TOPIC, 'std_msgs/msg/String', TopicQos(latched=True, depth=1))
+        for key, value in facts.items():
+            self._writer.set_custom_data(key, value)
+        self.write_message(SCENARIO_TOPIC, 0, string(data=text))
+
+    @property
+    def failed(self) -> bool:
+        """Whether something could not be written: nothing more is."""
+        return self._error is not None
+
+    def wait(self, backlog: int = 0) -> None:
+        """Wait until at most `backlog` bytes are still to be written."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._pending <= backlog or self._error)
+        self._check()
+
+    def close(self) -> None:
+        """Write all that is held, and the index; closing again does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.put(None)
+        self._thread.join()
+        if self._error is None:
+            try:
+                for topic in self._topics:
+                    self._connect(topic, self._topics[topic][0] == IMAGE_TYPE)
+                self._writer.close()
+            except Exception as error:
+                self._error = error
+        if self._error is not None:
+            self._writer.give_up()
+        self._check()
+
+    def __enter__(self) -> BagWriter:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close, whatever happened."""
+        self.close()
+
+    def _check(self) -> None:
+        if self._error is not None:
+            text = getattr(self._error, 'strerror', None) or self._error
+            kind = BagWriteError if isinstance(self._error, OSError) else BagError
+            raise kind(f'{self.path}: writing failed: {text}') from self._error
+
+    def _work(self) -> None:
+        due = FLUSH_PERIOD
+        while True:
+            try:
+                item = self._queue.get(timeout=due)
+            except queue.Empty:
+                item = '', 0, b''
+            if item is None:
+                return
+            topic, time, data = item
+            if self._error is None:
+                try:
+                    if topic and time == _ANNOUNCED:
+                        self._connect(topic, False)
+                    elif topic:
+                        self._store(topic, time, data)
+                    due = max(self._writer.flush(), _LEAST_WAIT)
+                except Exception as error:
+                    self._error = error
+                    due = FLUSH_PERIOD
+            with self._changed:
+                self._pending -= len(data)
+                self._changed.notify_all()
+
+    def _store(self, topic: str, time: int, data: bytes) -> None:
+        compressed = None
+        if self._topics[topic][0] == IMAGE_TYPE and self._images != 'raw':
+            compressed = self._compress(data)
+        connection = self._connect(topic, compressed is not None)
+        self._time = max(time, self._time + 1)
+        self._writer.write(connection, self._time, data if compressed is None else compressed)
+        self.counts[connection.topic] = self.counts.get(connection.topic, 0) + 1
+
+    def _connect(self, topic: str, compressed: bool) -> Connection:
+        type_name, qos = self._topics[topic]
+        name = topic
+        if compressed and self._images != 'raw':
+            name, type_name = f'{topic}/compressed', COMPRESSED_TYPE
+        if name not in self._connections:
+            self._connections[name] = self._writer.add_connection(
+                name,
+                type_name,
+                typestore=self._types,
+                offered_qos_profiles=[qos.profile()],
+            )
+        return self._connections[name]
+
+    def _compress(self, data: bytes) -> bytes | None:
+        """Return an image compressed, or None if OpenCV cannot hold its encoding."""
+        import cv2
+
+        image: Any = self._types.deserialize_cdr(data, IMAGE_TYPE)
+        channels = _CHANNELS.get(image.encoding)
+        if channels is None or image.height * image.width == 0:
+            return None
+        if image.step < image.width * channels or image.data.size < image.height * image.step:
+            return None
+        rows = image.data[: image.height * image.step].reshape(image.height, image.step)
+        pixels = rows[:, : image.width * channels].reshape(image.height, image.width, channels)
+        pixels = np.ascontiguousarray(pixels)
+        if image.encoding == 'rgb8':
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        options = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        if self._images == 'jpeg':
+            options = [cv2.IMWRITE_JPEG_QUALITY, 95]
+            options += [
+                cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+                cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+            ]
+        done, encoded = cv2.imencode(f'.{self._images}', pixels, options)
+        if not done:
+            return None
+        stored = 'bgr8' if channels == 3 else ''
+        message = self._types.types[COMPRESSED_TYPE](
+            header=image.header,
+            format=f'{image.encoding}; {self._images} compressed {stored}',
+            data=encoded.reshape(-1),
+        )
+        return bytes(self._types.serialize_cdr(message, COMPRESSED_TYPE))
+
+
+class Bag(BagReader):
+    """Read the recording of a run; also one whose end is missing."""
+
+    def scenario(self) -> dict[str, Any]:
+        """Return what was run: scenario, seed and the parameters of each node.
+
+        Raises
+        ------
+        BagError
+            If the recording does not hold it.
+        """
+        for item in self.messages([SCENARIO_TOPIC]):
+            content = yaml.safe_load(item.message.data)
+            if isinstance(content, dict):
+                return content
+        raise BagError(f'{self.path}: holds no scenario: run_scenario did not record it')
+
+    def __enter__(self) -> Bag:
+        """Return itself."""
+        return self

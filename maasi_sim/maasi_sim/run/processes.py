@@ -1,0 +1,430 @@
+"""Processes of a run: a ROS domain of its own, nodes that never outlive it, bounded endings."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, NoReturn
+
+from setproctitle import setproctitle
+
+from maasi_sim.run.shared_memory import LONGEST_CREATION, remove_dead_ports
+
+# Domains whose ports lie below those that Linux gives to others (from 32768).
+DOMAINS = range(0, 102)
+_FIRST_PORT, _PORTS_PER_DOMAIN = 7400, 250
+_PR_SET_PDEATHSIG = 1
+# Where Fast DDS is told of profiles.
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+# Loaded here: between fork and exec there is no safe place for it.
+_libc = ctypes.CDLL(None)
+
+
+class ProcessError(RuntimeError):
+    """A process cannot be started, or no domain is free."""
+
+
+class Domain:
+    """A ROS domain that no other run on this host uses, until `release`.
+
+    Parameters
+    ----------
+    number : int, optional
+        The domain to use; the first free one from 1 if not given (0 is where everybody else is).
+    folder : Path, optional
+        Where the lock files are: one for each domain, and one for each namespace in it.
+    team : str
+        Namespace of the run.
+    shared : bool
+        Whether other runs, in other namespaces, may be in it already.
+
+    Raises
+    ------
+    ProcessError
+        If the one asked for is used by another run, is not from 0 to 101, or none is free.
+    """
+
+    def __init__(
+        self,
+        number: int | None = None,
+        folder: Path | None = None,
+        *,
+        team: str = '',
+        shared: bool = False,
+    ) -> None:
+        # A run that was killed a moment ago, at its start, leaves some that are young.
+        remove_dead_ports(patience=LONGEST_CREATION + 1.0)
+        self._folder = folder or Path('/tmp/maasi_domains')
+        self._folder.mkdir(mode=0o777, parents=True, exist_ok=True)
+        if self._folder.stat().st_uid == os.getuid():
+            self._folder.chmod(0o777)
+        if number is not None and number not in DOMAINS:
+            raise ProcessError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
+        for candidate in DOMAINS[1:] if number is None else [number]:
+            # One that was asked for may have other nodes in it: that may be why.
+            if number is None and _port_used(_FIRST_PORT + _PORTS_PER_DOMAIN * candidate):
+                continue
+            problem = self._take(candidate, team, shared)
+            if not problem:
+                self.number = candidate
+                return
+            if number is not None:
+                raise ProcessError(f'domain id: {problem} is used by another run')
+        raise ProcessError(f'no ROS domain from 1 to {DOMAINS[-1]} is free')
+
+    def _take(self, number: int, team: str, shared: bool) -> str:
+        """Lock a domain and a namespace in it; return what is locked already, empty if nothing."""
+        wanted = {} if shared else {f'{number}': f'{number}'}
+        wanted[f'{number}_{team.replace("/", ".")}'] = f'namespace /{team} in {number}'
+        self._files: list[int] = []
+        for name, words in wanted.items():
+            file = self._lock(name)
+            if file is None:
+                self.release()
+                return words
+            self._files.append(file)
+        return ''
+
+    def _lock(self, name: str) -> int | None:
+        path = self._folder / f'{name}.lock'
+        try:
+            try:
+                file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+            except FileNotFoundError:
+                file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+                os.fchmod(file, 0o666)
+        except OSError:
+            return None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(file)
+            return None
+        return file
+
+    def environment(self) -> dict[str, str]:
+        """Return the variables that keep nodes in this domain, and on this host.
+
+        Where the user has no profile for Fast DDS, one with which they find each other sooner.
+        """
+        variables = {
+            'ROS_DOMAIN_ID': str(self.number),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        }
+        if _PROFILES not in os.environ:
+            variables[_PROFILES] = str(Path(__file__).with_name('discovery.xml'))
+        return variables
+
+    def release(self) -> None:
+        """Let others have the domain."""
+        while self._files:
+            os.close(self._files.pop())
+
+    def __enter__(self) -> Domain:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Release it."""
+        self.release()
+
+
+def _port_used(port: int) -> bool:
+    """Return whether some process on this host listens on a UDP port."""
+    for table in ('/proc/net/udp', '/proc/net/udp6'):
+        try:
+            lines = Path(table).read_text().splitlines()[1:]
+        except OSError:
+            continue
+        if any(int(line.split()[1].rpartition(':')[2], 16) == port for line in lines):
+            return True
+    return False
+
+
+def find_executable(package: str, executable: str) -> Path:
+    """Return the file that `ros2 run package executable` would run.
+
+    Raises
+    ------
+    ProcessError
+        If the package is not installed or has no such executable.
+    """
+    from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+
+    try:
+        folder = Path(get_package_prefix(package)) / 'lib' / package
+    except PackageNotFoundError:
+        raise ProcessError(f'package {package} is not installed: source the workspace') from None
+    path = folder / executable
+    if not os.access(path, os.X_OK):
+        raise ProcessError(f'package {package}: has no executable {executable} in {folder}')
+    return path
+
+
+def _die_with_parent(parent: int) -> None:
+    """Ask Linux to kill this process when its parent ends, however it ends."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+class ForkedProcess:
+    """A copy of this process that runs a function; with the interface of `subprocess.Popen`.
+
+    What was imported and compiled here is there already: a node is up in a tenth of the time.
+
+    Parameters
+    ----------
+    function : callable
+        What to run; its result is the exit code.
+    command : list of str
+        What it finds in `sys.argv`, and what `ps` shows.
+    log : int
+        File that takes what it prints.
+    environment : dict
+        Variables on top of this process's own.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[], Any],
+        command: list[str],
+        log: int,
+        environment: Mapping[str, str],
+    ) -> None:
+        parent = os.getpid()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.pid = os.fork()
+        self.returncode: int | None = None
+        if self.pid == 0:
+            _run_and_exit(function, command, log, environment, parent)
+
+    def poll(self) -> int | None:
+        """Return the exit code, negative for a signal, or None while it runs."""
+        if self.returncode is None:
+            try:
+                pid, status = os.waitpid(self.pid, os.WNOHANG)
+            except ChildProcessError:
+                # Somebody else has asked for it.
+                self.returncode = 0
+            else:
+                if pid:
+                    self.returncode = os.waitstatus_to_exitcode(status)
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, if it still runs."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+
+def _run_and_exit(
+    function: Callable[[], Any],
+    command: list[str],
+    log: int,
+    environment: Mapping[str, str],
+    parent: int,
+) -> NoReturn:
+    """Be a process of its own from here on, whatever was above it when it was forked."""
+    code: Any = 1
+    try:
+        os.setsid()
+        _die_with_parent(parent)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        for source, target in ((nothing, 0), (log, 1), (log, 2)):
+            os.dup2(source, target)
+        sys.stdout = open(1, 'w', buffering=1, encoding='utf-8', closefd=False)  # noqa: SIM115
+        sys.stderr = open(2, 'w', buffering=1, encoding='utf-8', closefd=False)  # noqa: SIM115
+        os.environ.update(environment)
+        sys.argv = list(command)
+        setproctitle(' '.join(command))
+        code = function()
+    except SystemExit as leaving:
+        code = leaving.code
+        if isinstance(code, str):
+            with contextlib.suppress(OSError):
+                print(code, file=sys.stderr)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            traceback.print_exc()
+    finally:
+        # Where the disk is full, the copy must not go on as if it were the run.
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
+        os._exit(code if isinstance(code, int) else 0 if code is None else 1)
+
+
+def _single_threaded() -> bool:
+    """Return whether this process can be forked: locks of other threads would stay locked."""
+    return len(os.listdir('/proc/self/task')) == 1
+
+
+@dataclass
+class NodeProcess:
+    """A node that runs as a process of its own and cannot outlive this one.
+
+    Attributes
+    ----------
+    name : str
+        Of the node, with namespace.
+    command : list of str
+        What is run.
+    log : Path
+        Takes what it prints; goes on growing over restarts.
+    environment : dict
+        Variables on top of this process's own.
+    main : callable, optional
+        What `command` runs, where it is loaded already: the node is then forked from this process,
+        unless that has several threads.
+    restarts : int
+        How often it was started again.
+    """
+
+    name: str
+    command: list[str]
+    log: Path
+    environment: Mapping[str, str] = field(default_factory=dict)
+    main: Callable[[], Any] | None = None
+    restarts: int = 0
+    _process: subprocess.Popen[bytes] | ForkedProcess | None = None
+
+    def start(self) -> None:
+        """Start it.
+
+        Raises
+        ------
+        ProcessError
+            If it cannot be.
+        """
+        parent = os.getpid()
+        with self._output() as output:
+            try:
+                if self.main is not None and _single_threaded():
+                    self._process = ForkedProcess(
+                        self.main, self.command, output.fileno(), self.environment
+                    )
+                    return
+                self._process = subprocess.Popen(
+                    self.command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    env={**os.environ, **self.environment},
+                    # Not in the terminal's group: Ctrl-C reaches the run, which ends its nodes.
+                    start_new_session=True,
+                    preexec_fn=lambda: _die_with_parent(parent),
+                )
+            except OSError as error:
+                raise ProcessError(f'{self.name}: cannot be started: {error}') from error
+
+    def _output(self) -> BinaryIO:
+        """Open the log; where it cannot be (disk full), the node runs without one."""
+        try:
+            return self.log.open('ab')
+        except OSError:
+            return open(os.devnull, 'ab')
+
+    def restart(self) -> None:
+        """Start it again after it died."""
+        self.restarts += 1
+        remove_dead_ports()
+        with contextlib.suppress(OSError), self.log.open('ab') as output:
+            output.write(f'--- start number {self.restarts + 1} ---\n'.encode())
+        self.start()
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process."""
+        return None if self._process is None else self._process.pid
+
+    @property
+    def code(self) -> int | None:
+        """Exit code; negative: the signal that killed it; None while it runs."""
+        return None if self._process is None else self._process.poll()
+
+    @property
+    def running(self) -> bool:
+        """Whether it was started and has not ended."""
+        return self._process is not None and self._process.poll() is None
+
+    def signal(self, number: int) -> None:
+        """Send a signal, if it still runs."""
+        if self._process is not None and self.running:
+            self._process.send_signal(number)
+
+    def how_it_ended(self) -> str:
+        """Return in words how it ended."""
+        code = self.code
+        if code is None:
+            return 'is running'
+        if code >= 0:
+            return f'exited with {code}'
+        try:
+            return f'was killed by {signal.Signals(-code).name}'
+        except ValueError:
+            return f'was killed by signal {-code}'
+
+    def last_words(self, lines: int = 12) -> str:
+        """Return the end of its log."""
+        try:
+            text = self.log.read_text(encoding='utf-8', errors='replace')
+        except OSError:
+            return ''
+        return '\n'.join(text.splitlines()[-lines:])
+
+
+# Signals of an ending and how long each may take [s].
+ENDING = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5.0))
+
+
+def stop(
+    processes: Sequence[NodeProcess],
+    ending: Sequence[tuple[signal.Signals, float]] = ENDING,
+) -> list[str]:
+    """End processes: ask, insist, kill; returns when all are gone.
+
+    Parameters
+    ----------
+    processes : sequence of NodeProcess
+        All get each signal at the same time.
+    ending : sequence of (signal, seconds)
+        Signals, and how long to wait after each.
+
+    Returns
+    -------
+    list of str
+        Names of those that had to be killed.
+    """
+    stubborn: list[str] = []
+    for number, patience in ending:
+        rest = [process for process in processes if process.running]
+        if not rest:
+            break
+        if number == signal.SIGKILL:
+            stubborn = [process.name for process in rest]
+        for process in rest:
+            process.signal(number)
+        deadline = time.monotonic() + patience
+        while any(process.running for process in rest) and time.monotonic() < deadline:
+            time.sleep(0.005)
+    return stubborn

@@ -1,0 +1,495 @@
+"""The recorder: sees all topics of a run, writes them down, and takes part in lockstep."""
+
+from __future__ import annotations
+
+import importlib
+import struct
+import time
+from collections import deque
+from collections.abc import Collection
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Twist, TwistStamped
+from rcl_interfaces.msg import Log
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+
+from maasi_filter.ros.conversions import stamp_of_step
+from maasi_msgs.msg import (
+    AgentState,
+    CuboidDecision,
+    DetectionArray,
+    FilterUpdate,
+    LockstepDone,
+    LockstepStep,
+    MeasurementBatch,
+    PlanDecision,
+    SearchLink,
+    SearchLinkArray,
+)
+from maasi_sim.buildings.observer import CuboidObserver
+from maasi_sim.run.bag import BagError, BagWriter, TopicQos
+from maasi_sim.run.observer import STEP, RunObserver, within
+
+NAME = 'recorder'
+CLOCK, READY, DONE = '/clock', '/lockstep/ready', '/lockstep/done'
+DIAGNOSTICS, ROSOUT = '/diagnostics', '/rosout'
+# What all teams of a domain share.
+_SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)
+# What is left out: of no use to who reads the recording.
+_SKIPPED = ('/parameter_events', READY)
+# A copy of the found targets for a restarted filter.
+_KEPT = '/found_targets/kept'
+# What is recorded while the nodes are ended.
+_AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
+_WITH_STEP = (
+    AgentState,
+    CuboidDecision,
+    DetectionArray,
+    FilterUpdate,
+    LockstepDone,
+    LockstepStep,
+    MeasurementBatch,
+    PlanDecision,
+    SearchLink,
+    SearchLinkArray,
+)
+# A message may arrive before the time that it is stamped with: it is recorded when that time has
+# come, so that no stamp is ahead of its log time. Longest wait [s of wall time], and the lead above
+# which a stamp is taken for one of another clock [ns].
+_LONGEST_HOLD, _LARGEST_LEAD = 1.0, 60 * 10**9
+# Longest wait for robots to hear that they are to stop [s].
+_STOP_PATIENCE = 1.0
+_READY_QOS = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+_RELIABLE = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
+)
+
+
+class Recorder:
+    """
+    A node that takes serialised messages from all topics that it discovers.
+
+    It is not spun: `wait` and `drain` take the messages without callbacks, which costs a fifth.
+
+    Subscribes
+    ----------
+    every topic with a publisher, with the quality of service of that publisher; where the team has
+    a namespace, only those below it, `/clock`, and what its nodes say on `/diagnostics` and
+    `/rosout`;
+    `lockstep/ready` (maasi_msgs/LockstepDone)
+
+    Publishes
+    ---------
+    `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone);
+    `<robot>/cmd_vel` (geometry_msgs/TwistStamped or Twist): zeros, when `stop_robots` is called
+
+    Parameters
+    ----------
+    domain : int
+        ROS domain.
+    observer : RunObserver
+        Is fed with what the report needs.
+    bag : BagWriter, optional
+        Recording; None: nothing is recorded, and only what the observer needs is taken.
+    team : str
+        Namespace of the team, without slashes at its ends. The observer is not told of it: its
+        topics are relative to it.
+    """
+
+    def __init__(
+        self,
+        domain: int,
+        observer: RunObserver | CuboidObserver,
+        bag: BagWriter | None,
+        team: str = '',
+    ) -> None:
+        self.context = Context()
+        rclpy.init(
+            context=self.context,
+            domain_id=domain,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self.node = Node(
+            NAME,
+            namespace=f'/{team}',
+            context=self.context,
+            start_parameter_services=False,
+            enable_rosout=False,
+            use_global_arguments=False,
+        )
+        self.observer = observer
+        self.bag = bag
+        self._team = team
+        self.name = within(team, f'/{NAME}')
+        self.time = 0
+        # Of the first step [ns].
+        self._begun: int | None = None
+        self.step: int | None = None
+        self.last_seen: dict[str, float] = {}
+        #: When each node was last heard of in the diagnostics [s of wall time].
+        self.heartbeats: dict[str, float] = {}
+        self._held: list[tuple[str, bytes]] = []
+        self._hold_began = 0.0
+        self._last_done: deque[bytes] = deque(maxlen=100)
+        self.ready: set[str] = set()
+        self._finished = False
+        self._last_step = -1
+        self.complaints: list[str] = []
+        self._wanted = {*observer.topics, CLOCK, DONE, DIAGNOSTICS}
+        self._subscriptions: dict[str, Subscription] = {}
+        self._refused: set[str] = set()
+        self._ready_subscription = self._subscribe(
+            READY,
+            LockstepDone,
+            QoSProfile(
+                depth=100,
+                reliability=ReliabilityPolicy.RELIABLE,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL,
+            ),
+        )
+        self._ready_publisher = self.node.create_publisher(
+            LockstepDone, within(team, READY), _READY_QOS
+        )
+        self._done_publisher = self.node.create_publisher(
+            LockstepDone, within(team, DONE), _RELIABLE
+        )
+        self._wait_set = rclpy_implementation.WaitSet(2, 0, 0, 0, 0, 0, self.context.handle)
+
+    def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> Subscription:
+        return self.node.create_subscription(kind, self._full(topic), _never, qos, raw=True)
+
+    def _full(self, topic: str) -> str:
+        """Return the full name of a topic of the team."""
+        return topic if topic in _SHARED else within(self._team, topic)
+
+    def _relative(self, topic: str) -> str | None:
+        """Return the name of a topic within the team; None for one of somebody else."""
+        if not self._team or topic in _SHARED:
+            return topic
+        inner = topic.removeprefix(f'/{self._team}')
+        return None if inner == topic or inner[0] != '/' or inner in _SHARED else inner
+
+    def discover(self) -> None:
+        """Subscribe to the topics that have come up since the last time."""
+        for full, types in self.node.get_topic_names_and_types():
+            topic = self._relative(full)
+            if topic is None or topic in self._subscriptions or topic in self._refused:
+                continue
+            if not self._wants(topic):
+                continue
+            infos = self.node.get_publishers_info_by_topic(full)
+            if not infos:
+                continue
+            profiles = [info.qos_profile for info in infos]
+            reliable = all(
+                profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles
+            )
+            latched = all(
+                profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles
+            )
+            try:
+                kind = _message_class(types[0])
+                if self.bag is not None:
+                    self.bag.add_topic(full, types[0], TopicQos(reliable, latched))
+            except (ImportError, AttributeError, BagError) as error:
+                self._refused.add(topic)
+                self.complaints.append(f'topic {full} is not recorded: {error}')
+                continue
+            qos = QoSProfile(
+                history=HistoryPolicy.KEEP_ALL if reliable else HistoryPolicy.KEEP_LAST,
+                depth=1000,
+                reliability=(
+                    ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+                ),
+                durability=(
+                    DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+                ),
+            )
+            self._subscriptions[topic] = self._subscribe(topic, kind, qos)
+
+    def missing(self, topics: Collection[str]) -> list[str]:
+        """Return those topics, of use to the recorder, whose publisher is not connected yet."""
+        return [full for full in topics if self._is_missing(self._relative(full))]
+
+    def _is_missing(self, topic: str | None) -> bool:
+        if topic is None or not self._wants(topic):
+            return False
+        subscription = self._subscriptions.get(topic)
+        return subscription is None or subscription.handle.get_publisher_count() == 0
+
+    def _wants(self, topic: str) -> bool:
+        # A name with an underscore in front is hidden: the inner topics of actions.
+        if topic in _SKIPPED or '/_' in topic or topic.endswith(_KEPT):
+            return False
+        return self.bag is not None or topic in self._wanted
+
+    def take_ready(self) -> set[str]:
+        """Return the names of the nodes that have said that they are ready."""
+        for data in _take(self._ready_subscription):
+            self.ready.add(deserialize_message(data, LockstepDone).node)
+        return self.ready
+
+    def publish_ready(self) -> None:
+        """Say that the recorder is ready."""
+        self._ready_publisher.publish(LockstepDone(node=self.name, step=0))
+
+    def publish_done(self, step: int) -> None:
+        """Say that the recorder is done with a step."""
+        self._done_publisher.publish(LockstepDone(node=self.name, step=step))
+
+    def wait(self, timeout: float) -> None:
+        """Return when there is a new step (free running: after the time) [s]."""
+        waiting = [self._ready_subscription]
+        if STEP in self._subscriptions:
+            waiting.append(self._subscriptions[STEP])
+        self._wait_set.clear_entities()
+        for subscription in waiting:
+            self._wait_set.add_subscription(subscription.handle)
+        self._wait_set.wait(round(timeout * 1e9))
+
+    def drain(self, limit: int | None = None) -> None:
+        """
+        Take all messages that have come: to the observer, and into the recording.
+
+        What ends a run ends it at a step: of what nodes have sent since, nothing is kept that
+        would make one recording differ from another.
+
+        Parameters
+        ----------
+        limit : int, optional
+            Simulated time after its start at which the run ends [ns].
+        """
+        # Left where they are they would end each wait at once.
+        self.take_ready()
+        # What belongs to an update was published before it: take updates first, read them last.
+        updates = [
+            (topic, data)
+            for topic in self.observer.update_topics
+            for data in self._take_from(topic)
+        ]
+        steps = self._take_from(STEP)
+        for data in steps:
+            self.step = struct.unpack_from('<Q', data, 4)[0]
+            self._set_time(data, 12)
+            if self._begun is None:
+                self._begun = _time_at(data, 12)
+        taken = [(CLOCK, data) for data in self._take_from(CLOCK)]
+        for _, data in taken:
+            self._set_time(data, 4)
+        for topic, subscription in self._subscriptions.items():
+            if topic not in (*self.observer.update_topics, STEP, CLOCK):
+                taken += [
+                    (topic, data) for data in _take(subscription) if self._is_own(topic, data)
+                ]
+        taken += updates
+        taken += [(STEP, data) for data in steps]
+        if self._finished:
+            taken = self._until(taken, self._last_step)
+        elif limit is not None and self.step is not None and self._elapsed >= limit:
+            self._last_step = self.step - 1
+            taken = self._until(taken, self._last_step)
+        now = time.monotonic()
+        for topic, data in taken:
+            self.last_seen[topic] = now
+            if topic == DONE:
+                self._last_done.append(data)
+            elif topic == DIAGNOSTICS:
+                for status in deserialize_message(data, DiagnosticArray).status:
+                    self.heartbeats[status.name] = now
+            if not self._finished or topic in self.observer.result_topics:
+                self.observer.add(topic, data)
+        self.observer.settle()
+        if self.observer.end_step is not None and not self._finished:
+            self._last_step = self.observer.end_step
+            taken = self._until(taken, self._last_step)
+        self._record(taken)
+
+    @property
+    def elapsed(self) -> float:
+        """Simulated time since the first step [s]."""
+        return self._elapsed / 1e9
+
+    @property
+    def _elapsed(self) -> int:
+        return 0 if self._begun is None else self.time - self._begun
+
+    def _is_own(self, topic: str, data: bytes) -> bool:
+        """Return whether a message on a topic that all teams share is the team's own."""
+        if not self._team:
+            return True
+        if topic == DIAGNOSTICS:
+            names = [item.name for item in deserialize_message(data, DiagnosticArray).status]
+            return any(name.startswith(f'/{self._team}/') for name in names)
+        if topic == ROSOUT:
+            logger = f'{self._team.replace("/", ".")}.'
+            return bool(deserialize_message(data, Log).name.startswith(logger))
+        return True
+
+    def _record(self, taken: list[tuple[str, bytes]]) -> None:
+        # One that has failed ends the run: `bag.failed`.
+        if self.bag is None or self.bag.failed:
+            return
+        try:
+            for topic, data in self._due(taken):
+                self.bag.write(self._full(topic), self.time, data)
+        except BagError:
+            if not self.bag.failed:
+                raise
+
+    def _due(self, taken: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+        """Return what to record now; hold what is stamped with a time that has not come yet."""
+        now = time.monotonic()
+        items = self._held + taken
+        if not self._held:
+            self._hold_began = now
+        if self._last_step >= 0:
+            items = self._until(items, self._last_step)
+        self._held = []
+        if self._finished or now - self._hold_began > _LONGEST_HOLD:
+            return items
+        due = []
+        early: set[str] = set()
+        for topic, data in items:
+            lead = _stamp(topic, self._subscriptions[topic].msg_type, data) - self.time
+            # A topic keeps its order.
+            if topic in early or 0 < lead <= _LARGEST_LEAD:
+                early.add(topic)
+                self._held.append((topic, data))
+            else:
+                due.append((topic, data))
+        return due
+
+    def finish(self) -> None:
+        """Keep from now on only what belongs to the steps so far, and how all is stopped."""
+        self._finished = True
+        if self._last_step < 0 and self.step is not None:
+            self._last_step = self.step
+
+    def _until(self, taken: list[tuple[str, bytes]], step: int) -> list[tuple[str, bytes]]:
+        """Return the messages up to a step, as far as they say to which they belong."""
+        end = stamp_of_step(step, self.observer.scenario.step)
+        kept = []
+        for topic, data in taken:
+            kind = self._subscriptions[topic].msg_type
+            if self._finished and topic.rpartition('/')[2] in _AT_THE_END:
+                kept.append((topic, data))
+                continue
+            if _stamp(topic, kind, data) > end:
+                continue
+            if kind in _WITH_STEP and deserialize_message(data, kind).step > step:
+                continue
+            kept.append((topic, data))
+        return kept
+
+    def _take_from(self, topic: str) -> list[bytes]:
+        subscription = self._subscriptions.get(topic)
+        return [] if subscription is None else _take(subscription)
+
+    def _set_time(self, data: bytes, offset: int) -> None:
+        self.time = max(self.time, _time_at(data, offset))
+
+    def done_steps(self) -> dict[str, int]:
+        """Return the last step that each node has said it is done with, of late."""
+        steps: dict[str, int] = {}
+        for data in self._last_done:
+            message = deserialize_message(data, LockstepDone)
+            steps[message.node] = max(message.step, steps.get(message.node, 0))
+        return steps
+
+    def stop_robots(self, names: Collection[str]) -> None:
+        """Publish zeros on `cmd_vel` of robots that listen to it, and wait until they arrive."""
+        types = dict(self.node.get_topic_names_and_types())
+        publishers = []
+        for name in names:
+            topic = self._full(f'/{name}/cmd_vel')
+            if self.node.count_subscribers(topic):
+                plain = types[topic] == ['geometry_msgs/msg/Twist']
+                chosen = Twist if plain else TwistStamped
+                publishers.append(self.node.create_publisher(chosen, topic, _RELIABLE))
+        deadline = time.monotonic() + _STOP_PATIENCE
+        while time.monotonic() < deadline and any(
+            publisher.get_subscription_count() < self.node.count_subscribers(publisher.topic)
+            for publisher in publishers
+        ):
+            time.sleep(0.005)
+        for publisher in publishers:
+            kind: Any = publisher.msg_type
+            message = kind()
+            if isinstance(message, TwistStamped):
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.time, 10**9)
+            publisher.publish(message)
+        for publisher in publishers:
+            left = max(deadline - time.monotonic(), 0.0)
+            publisher.wait_for_all_acked(Duration(nanoseconds=round(left * 1e9)))
+            self.node.destroy_publisher(publisher)
+
+    def followers(self) -> list[str]:
+        """Return the namespaces of the runs whose time is the clock of this one."""
+        return sorted(
+            info.node_namespace
+            for info in self.node.get_subscriptions_info_by_topic(CLOCK)
+            if info.node_name == 'sim_node' and info.node_namespace.strip('/') != self._team
+        )
+
+    def close(self) -> None:
+        """Leave the graph."""
+        if self.context.ok():
+            self.node.destroy_node()
+            rclpy.shutdown(context=self.context)
+
+
+def _take(subscription: Subscription) -> list[bytes]:
+    """Return all serialised messages that wait in a subscription."""
+    taken: list[bytes] = []
+    handle = subscription.handle
+    while True:
+        item = handle.take_message(subscription.msg_type, True)
+        if item is None:
+            return taken
+        taken.append(item[0])
+
+
+def _stamp_offset(topic: str, kind: Any, data: bytes) -> int | None:
+    """Return where the first stamp of a serialised message is; None where it has none."""
+    first = next(iter(kind.get_fields_and_field_types()))
+    if first in ('header', 'clock'):
+        return 4
+    # Transforms are a sequence: its length comes first.
+    if topic.rpartition('/')[2] == 'tf' and first == 'transforms' and len(data) >= 16:
+        return 8
+    return None
+
+
+def _stamp(topic: str, kind: Any, data: bytes) -> int:
+    """Return the first stamp of a serialised message, 0 if it has none [ns]."""
+    offset = _stamp_offset(topic, kind, data)
+    if offset is None:
+        return 0
+    return _time_at(data, offset)
+
+
+def _time_at(data: bytes, offset: int) -> int:
+    """Return the time at a place of a serialised message [ns]."""
+    seconds, nanoseconds = struct.unpack_from('<iI', data, offset)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def _message_class(name: str) -> type:
+    """Return the class of `package/msg/Type`."""
+    package, _, kind = name.split('/')
+    return getattr(importlib.import_module(f'{package}.msg'), kind)
+
+
+def _never(_: bytes) -> None:
+    """Stand in for a callback: messages are taken by hand."""

@@ -1,0 +1,70 @@
+"""RViz's view of a run: the files of maasi_config, with the cameras of the scenario's robots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from maasi_sim.buildings.scenario import AnyScenario
+from maasi_sim.scenario.loading import config_folder
+from maasi_sim.scenario.schema import Scenario
+
+
+def view_text(scenario: AnyScenario, namespace: str = '') -> str:
+    """Return RViz's configuration for a run of a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Whose robots are shown.
+    namespace : str
+        Of the team, without slashes; empty for none.
+    """
+    name = 'search_3d' if scenario.dimension == 3 else 'search'
+    path = config_folder() / 'rviz' / f'{name}.rviz'
+    content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    displays: list[dict[str, Any]] = content['Visualization Manager']['Displays']
+    team = f'/{namespace}' if namespace else ''
+    for display in displays:
+        if 'Topic' in display:
+            display['Topic']['Value'] = team + display['Topic']['Value']
+    if isinstance(scenario, Scenario):
+        for robot in scenario.names():
+            if scenario.robots[robot].camera is not None:
+                topic = f'{team}/{robot}/camera/image_raw'
+                displays.append(_camera(f'Camera of {robot}', topic, shown=True))
+                # What a bag holds.
+                displays.append(
+                    _camera(f'Camera of {robot}, bag', f'{topic}/compressed', shown=False)
+                )
+    return yaml.safe_dump(content, sort_keys=False)
+
+
+def shown_topics(path: Path) -> list[str]:
+    """Return the topics that a configuration of RViz shows, and those of the frames."""
+    content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    displays = content['Visualization Manager']['Displays']
+    topics = [display['Topic']['Value'] for display in displays if 'Topic' in display]
+    return [*topics, '/tf', '/tf_static']
+
+
+def _camera(name: str, topic: str, *, shown: bool) -> dict[str, Any]:
+    return {
+        'Class': 'rviz_default_plugins/Image',
+        'Enabled': shown,
+        'Max Value': 1,
+        'Median window': 5,
+        'Min Value': 0,
+        'Name': name,
+        'Normalize Range': False,
+        'Topic': {
+            'Depth': 5,
+            'Durability Policy': 'Volatile',
+            'History Policy': 'Keep Last',
+            'Reliability Policy': 'Best Effort',
+            'Value': topic,
+        },
+        'Value': shown,
+    }

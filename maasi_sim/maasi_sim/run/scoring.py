@@ -1,0 +1,93 @@
+"""Scores of found targets against the truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.metrics import Gospa, Match, gospa, match_targets
+from maasi_sim.scenario.schema import Scenario
+
+FloatArray = NDArray[np.float64]
+
+
+def matching_radius(removal_distance: float, truth: ArrayLike) -> float:
+    """Return the distance within which a found target is true [m].
+
+    Three times T_z, at most half the smallest distance between two targets, so that none can
+    be matched with its neighbour.
+
+    Parameters
+    ----------
+    removal_distance : float
+        T_z [m].
+    truth : (n, d) array
+        True positions [m].
+
+    Raises
+    ------
+    ValueError
+        If T_z is not a finite number above 0, or two targets are at the same place.
+    """
+    if not (math.isfinite(removal_distance) and removal_distance > 0.0):
+        raise ValueError(
+            f'removal_distance: got {removal_distance}, allowed are finite numbers above 0'
+        )
+    # Imported late: it takes longer than all else that a run imports.
+    from scipy.spatial.distance import pdist
+
+    positions = np.asarray(truth, dtype=float)
+    radius = 3.0 * removal_distance
+    if len(positions) > 1:
+        nearest = float(pdist(positions).min())
+        if nearest == 0.0:
+            raise ValueError('truth: got two targets at the same place, allowed are different ones')
+        radius = min(radius, 0.5 * nearest)
+    return radius
+
+
+def scoring_radius(scenario: Scenario, truth: FloatArray) -> float:
+    """Return the scenario's matching radius, or the one that follows from T_z and the targets."""
+    if scenario.scoring.radius is not None:
+        return scenario.scoring.radius
+    return matching_radius(scenario.removal_distance(), truth)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Found targets against the truth.
+
+    Attributes
+    ----------
+    radius : float
+        Within which a found target is true, and c of GOSPA [m].
+    order : float
+        p of GOSPA.
+    match : Match
+        One-to-one pairs and their RMSE.
+    gospa : Gospa
+        The metric and its parts.
+    """
+
+    radius: float
+    order: float
+    match: Match
+    gospa: Gospa
+
+    @property
+    def complete(self) -> bool:
+        """Whether every true target is found."""
+        return self.match.missed == 0
+
+
+def score(found: ArrayLike, truth: ArrayLike, radius: float, order: float = 2.0) -> Scores:
+    """Return the scores of found targets (n, d) against true ones (m, d) [m]."""
+    return Scores(
+        radius,
+        order,
+        match_targets(found, truth, radius),
+        gospa(found, truth, cutoff=radius, power=order),
+    )

@@ -1,0 +1,305 @@
+"""What must hold between the settings of a scenario."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from maasi_sim.scenario.layering import (
+    Key,
+    unknown,
+)
+from maasi_sim.scenario.schema import (
+    EventSettings,
+    LimitSettings,
+    RobotSettings,
+    Scenario,
+)
+from maasi_sim.scenario.visibility import robot_candidates
+
+_ROBOT_NAME = re.compile(r'^[a-z][a-z0-9_]*$')
+
+_RESERVED = ('exploration', 'ground_truth', 'lockstep', 'scenario')
+
+# How far a time may be from a whole number of steps.
+_STEP_TOLERANCE = 1e-6
+
+# Drivers of robots that have no camera.
+_RANGING = ('ranging_driver', 'mavlink_driver')
+
+# Drivers that have link mavlink.
+_MAVLINK = ('mavlink_driver', 'mavlink_camera_driver')
+
+# Where the driver of a vehicle listens that the sim plays.
+_MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
+
+
+def problems_of(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    """Yield what is wrong between the keys: key and text."""
+    yield from _world_problems(scenario)
+    for name, robot in scenario.robots.items():
+        for inner, text in _robot_problems(name, robot, scenario):
+            yield ('robots', name, *inner), text
+    yield from _mambo_problems(scenario)
+    yield from _mavlink_problems(scenario)
+    yield from event_problems(scenario.events, scenario.names(), scenario.limits)
+    for index, event in enumerate(scenario.events):
+        if event.robot in scenario.robots and scenario.robots[event.robot].external:
+            yield (
+                ('events', index, 'robot'),
+                f"read '{event.robot}', which is external; allowed are simulated robots",
+            )
+    if scenario.stop == 'all_found' and scenario.targets.count == 0:
+        yield ('stop',), "read 'all_found' but there are no targets, allowed is 'planner_done'"
+
+
+def _world_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    found = False
+    for index, obstacle in enumerate(scenario.environment.obstacles):
+        if len(obstacle.centre) > scenario.dimension:
+            found = True
+            yield (
+                ('environment', 'obstacles', index, 'centre'),
+                f'read {obstacle.centre}, allowed are {scenario.dimension} coordinates, '
+                'as in environment.bounds',
+            )
+    most = _room_for_targets(scenario)
+    if scenario.targets.count is not None and scenario.targets.count > most:
+        found = True
+        yield (
+            ('targets', 'separation'),
+            f'read {scenario.targets.separation}, with which about {most} targets can be drawn '
+            f'at most, not {scenario.targets.count}',
+        )
+    if found:
+        return
+    try:
+        scenario.world(scenario.seed)
+    except ValueError as error:
+        head, _, text = str(error).partition(': ')
+        key: Key = tuple(int(part) if part.isdigit() else part for part in re.findall(r'\w+', head))
+        yield (key, text) if key[:1] == ('targets',) else (('targets',), str(error))
+
+
+def _room_for_targets(scenario: Scenario) -> int:
+    """Return how many targets can be drawn one after the other at their separation, at most.
+
+    Balls that are placed at random, none moved again, fill 0.547 of a plane and 0.382 of space.
+    """
+    targets = scenario.targets
+    bounds = scenario.environment.array()
+    sides = bounds[:, 1] - bounds[:, 0] - 2.0 * targets.margin
+    if targets.separation == 0.0 or sides.min() < 0.0:
+        return targets.count or 0
+    filled, ball = (0.547, math.pi / 4.0) if scenario.dimension == 2 else (0.382, math.pi / 6.0)
+    space = float(np.prod(sides + targets.separation))
+    return max(1, round(1.1 * filled * space / (ball * targets.separation**scenario.dimension)))
+
+
+def _robot_problems(
+    name: str, robot: RobotSettings, scenario: Scenario
+) -> Iterator[tuple[Key, str]]:
+    for text in check_names(name):
+        yield (), text
+    bounds = scenario.environment.array()
+    start = np.array(robot.start)
+    if not _inside(start, bounds):
+        yield (
+            ('start',),
+            f'read {robot.start}, allowed is what lies inside environment.bounds, '
+            f'{bounds.tolist()}',
+        )
+    for index, obstacle in enumerate(scenario.environment.obstacles):
+        size = min(len(obstacle.centre), 3)
+        distance = float(np.linalg.norm(start[:size] - np.array(obstacle.centre)[:size]))
+        if distance < obstacle.radius + robot.radius:
+            yield (
+                ('start',),
+                f'read {robot.start}, {distance:.3g} m from the centre of '
+                f'environment.obstacles[{index}], allowed is at least its radius and the '
+                f"robot's, {obstacle.radius + robot.radius:g} m",
+            )
+    try:
+        candidates = robot_candidates(robot, scenario.environment)
+    except ValueError as error:
+        head, _, text = str(error).partition(': ')
+        yield (('candidates', head), text) if head != 'candidates' else (('candidates',), text)
+    else:
+        if not len(candidates.at(robot.start)):
+            yield ('candidates',), 'leave no waypoint inside environment.bounds'
+    if robot.body == 'external' and robot.link != 'topics':
+        yield ('body',), f"read 'external', allowed with link {robot.link} is simulated"
+    yield from _sensor_problems(robot, scenario)
+
+
+def check_names(name: str) -> Iterator[str]:
+    """Yield what is wrong with the name of a robot."""
+    if not _ROBOT_NAME.match(name) or name.endswith('_') or '__' in name:
+        yield f"read '{name}' as a name, allowed are lower case letters, digits and single _"
+    if name in _RESERVED:
+        yield f"read '{name}' as a name, which is that of a topic; allowed is any other"
+
+
+def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    detection = robot.sensor.detection
+    used = ('lower', 'upper') if detection.kind == 'box' else ('size',)
+    for name in used:
+        length = len(getattr(detection, name))
+        if length < scenario.dimension:
+            yield (
+                ('sensor', 'detection', name),
+                f'read {length} numbers, allowed are {scenario.dimension}, '
+                'as in environment.bounds',
+            )
+    times: list[tuple[Key, float]] = [(('sensor', 'period'), robot.sensor.period)]
+    if robot.camera is not None:
+        times.append((('camera', 'rate'), 1.0 / robot.camera.rate))
+    if robot.laser is not None:
+        times.append((('laser', 'rate'), 1.0 / robot.laser.rate))
+    for key, time in times:
+        steps = time / scenario.step
+        if abs(steps - round(steps)) > _STEP_TOLERANCE * max(steps, 1.0) or (
+            time > 0.0 and round(steps) == 0
+        ):
+            yield key, f'is every {time:g} s, allowed are whole multiples of step, {scenario.step}'
+    if robot.driver in _RANGING and robot.camera is not None:
+        yield ('camera',), f"read one, but driver '{robot.driver}' has none; allowed is null"
+    if robot.driver not in _RANGING and robot.camera is None:
+        yield ('camera',), f"is missing, driver '{robot.driver}' needs it"
+
+
+def _mambo_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    for name in scenario.names():
+        robot = scenario.robots[name]
+        if robot.link != 'mambo_wifi':
+            continue
+        key: Key = ('robots', name)
+        if robot.driver != 'mambo_driver':
+            yield (
+                (*key, 'link'),
+                f"read 'mambo_wifi', but driver '{robot.driver}' does not have it; allowed is "
+                "'topics', or driver 'mambo_driver'",
+            )
+        if robot.motion.model != 'mambo':
+            yield (
+                (*key, 'motion', 'model'),
+                f"read '{robot.motion.model}', allowed with link mambo_wifi is 'mambo'",
+            )
+        if robot.guard:
+            yield (
+                (*key, 'guard'),
+                'read true, allowed with link mambo_wifi is false: the drone has one link only',
+            )
+        link = robot.mambo
+        if link is None:
+            yield (
+                (*key, 'mambo'),
+                'is missing, link mambo_wifi needs it: at least {arm: true, full_speed: ...}',
+            )
+            continue
+        key = (*key, 'mambo')
+        if not link.arm:
+            yield (*key, 'arm'), 'read false, allowed is true: it would never take off'
+        if link.full_speed is None:
+            yield (
+                (*key, 'full_speed'),
+                'is missing: it would never take off; measure_mambo says it, of fake_mambo too',
+            )
+        if link.pose != 'events':
+            yield (*key, 'pose'), f"read '{link.pose}', allowed in simulation is 'events'"
+        if robot.start[2] <= link.ground:
+            yield (
+                ('robots', name, 'start'),
+                f'read height {robot.start[2]}, allowed is what lies above mambo.ground, '
+                f'{link.ground}',
+            )
+
+
+def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    ports: dict[str, str] = {}
+    for name in scenario.names():
+        robot = scenario.robots[name]
+        if robot.link != 'mavlink':
+            continue
+        key: Key = ('robots', name)
+        if robot.driver not in _MAVLINK:
+            yield (
+                (*key, 'link'),
+                f"read 'mavlink', but driver '{robot.driver}' does not have it; allowed is "
+                "'topics', or one of the drivers " + ', '.join(_MAVLINK),
+            )
+        if robot.guard:
+            yield (
+                (*key, 'guard'),
+                'read true, allowed with link mavlink is false: its autopilot stops it',
+            )
+        link = robot.mavlink
+        if link is None:
+            yield (*key, 'mavlink'), 'is missing, link mavlink needs it: at least {arm: true}'
+            continue
+        key = (*key, 'mavlink')
+        if not link.arm:
+            yield (*key, 'arm'), 'read false, allowed is true: nothing would ever fly'
+        match = _MAVLINK_URL.match(link.url)
+        if match is None:
+            if not robot.external:
+                yield (
+                    (*key, 'url'),
+                    f"read '{link.url}', allowed is udpin:HOST:PORT, as the sim plays the vehicle, "
+                    'or autopilot: external',
+                )
+        elif match[1] in ports:
+            yield (
+                (*key, 'url'),
+                f'read port {match[1]}, which {ports[match[1]]} has as well; allowed is any other',
+            )
+        else:
+            ports[match[1]] = name
+        if link.map_yaw != 0.0 and not robot.external:
+            yield (*key, 'map_yaw'), f'read {link.map_yaw}, allowed in simulation is 0'
+        firmware = robot.autopilot.firmware
+        submarine = link.vehicle == 'submarine'
+        if submarine != (firmware == 'ardusub') and not robot.external:
+            yield (
+                (*key, 'vehicle'),
+                f"read '{link.vehicle}', but its autopilot.firmware is '{firmware}'",
+            )
+        rise = robot.start[2] - link.ground
+        if rise >= 0.0 if submarine else rise <= 0.0:
+            side = 'below' if submarine else 'above'
+            yield (
+                ('robots', name, 'start'),
+                f'read height {robot.start[2]}, allowed is what lies {side} mavlink.ground, '
+                f'{link.ground}',
+            )
+
+
+def event_problems(
+    events: Sequence[EventSettings], names: Sequence[str], limits: LimitSettings
+) -> Iterator[tuple[Key, str]]:
+    """Yield what is wrong with what happens to robots: key and text."""
+    away: set[str] = set()
+    order = sorted(range(len(events)), key=lambda index: events[index].at)
+    for index in order:
+        event = events[index]
+        key: Key = ('events', index)
+        if event.robot not in names:
+            yield (*key, 'robot'), unknown(event.robot, list(names), 'robot')
+            continue
+        if event.at > limits.time:
+            yield (
+                (*key, 'at'),
+                f'read {event.at}, allowed is at most limits.time, {limits.time}',
+            )
+        if (event.do == 'back') != (event.robot in away):
+            state = 'is there' if event.do == 'back' else 'has left'
+            yield (*key, 'do'), f"read '{event.do}', but {event.robot} {state} at that time"
+        (away.add if event.do == 'leave' else away.discard)(event.robot)
+
+
+def _inside(position: Sequence[float] | np.ndarray, bounds: np.ndarray) -> bool:
+    point = np.asarray(position, dtype=float)[: len(bounds)]
+    return bool(((point >= bounds[:, 0]) & (point <= bounds[:, 1])).all())

@@ -1,0 +1,190 @@
+"""Scenario files: found by name, laid over robot types, and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+from maasi_sim.scenario.checks import problems_of
+from maasi_sim.scenario.layering import (
+    Key,
+    Layer,
+    ScenarioError,
+    dotted,
+    merge,
+    override,
+    place,
+    read_layer,
+    unknown,
+    validate,
+)
+from maasi_sim.scenario.schema import RobotSettings, Scenario
+
+
+def config_folder() -> Path:
+    """Return the folder of `robots/` and `scenarios/`: installed, or in this repository.
+
+    Raises
+    ------
+    ScenarioError
+        If it is in neither.
+    """
+    places = [Path(__file__).resolve().parents[3] / 'config']
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        places.insert(0, Path(get_package_share_directory('maasi_config')))
+    except (ImportError, LookupError, OSError):
+        pass
+    for folder in places:
+        if (folder / 'robots').is_dir():
+            return folder
+    raise ScenarioError(f'robots: no such folder in {", ".join(map(str, places))}')
+
+
+def find_scenario(name: str | Path) -> Path:
+    """Return the file of a scenario: a path, or the name of one in `config/scenarios`.
+
+    Raises
+    ------
+    ScenarioError
+        If there is none; the known ones are named.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    folder = config_folder() / 'scenarios'
+    known = sorted(item.stem for item in folder.glob('*.yaml'))
+    if path.name not in known:
+        raise ScenarioError(unknown(path.name, known, 'scenario'))
+    return folder / f'{path.name}.yaml'
+
+
+def load_scenario(
+    path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> Scenario:
+    """Read a scenario file with its layers: all robots, then the type, then the robot itself.
+
+    Types are looked for in `robots/` beside the scenario file and beside its folder, then in
+    `config/robots`.
+
+    Parameters
+    ----------
+    path : str or Path
+        Scenario file, or the name of one in `config/scenarios`.
+    overrides : mapping, optional
+        Values that win over the file's: where each comes from (for messages), key and value.
+
+    Raises
+    ------
+    ScenarioError
+        With file, line, key, what was read and what is allowed.
+    """
+    return check_scenario(read_scenario(path, overrides))
+
+
+def read_scenario(
+    path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> Layer:
+    """Return the values of a scenario file with its layers, not checked yet.
+
+    Raises
+    ------
+    ScenarioError
+        If a file cannot be read, or a robot's type is not known.
+    """
+    path = find_scenario(path)
+    layer = read_layer(path)
+    _lay_types_under(layer, path)
+    for origin, (key, value) in (overrides or {}).items():
+        override(layer, key, value, origin)
+    return layer
+
+
+def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
+    """Return the scenario of values as a scenario file has them: types come from config/robots.
+
+    Raises
+    ------
+    ScenarioError
+        As `load_scenario`.
+    """
+    layer = Layer(deepcopy(values), {(): origin})
+    _lay_types_under(layer, config_folder() / 'scenarios' / origin)
+    return check_scenario(layer)
+
+
+def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
+    """Return the scenario of values with all layers merged, as from `Scenario.content`.
+
+    Raises
+    ------
+    ScenarioError
+        As `load_scenario`.
+    """
+    return check_scenario(Layer(content, {(): origin}))
+
+
+def check_scenario(layer: Layer) -> Scenario:
+    """Return the scenario of a tree of values with all layers merged."""
+    scenario = validate(Scenario, layer)
+    problems = list(problems_of(scenario))
+    if problems:
+        raise ScenarioError(
+            '\n'.join(
+                f'{layer.origin(problem)}: {dotted(problem)}: {text}' for problem, text in problems
+            )
+        )
+    return scenario
+
+
+def _lay_types_under(layer: Layer, path: Path) -> None:
+    """Put the layers of each robot's type under what the scenario says of it."""
+    robots = layer.data.get('robots')
+    if isinstance(robots, dict):
+        for name in robots:
+            if isinstance(robots[name], dict):
+                key: Key = ('robots', name)
+                place(layer, key, _robot_layer(path, layer.part(key), key))
+
+
+def _robot_layer(path: Path, own: Layer, key: Key) -> Layer:
+    folders = [path.parent / 'robots', path.parent.parent / 'robots', config_folder() / 'robots']
+    files: dict[str, Path] = {}
+    for folder in folders:
+        for file in sorted(folder.glob('*.yaml')):
+            files.setdefault(file.stem, file)
+    layers = [read_layer(files['all'])] if 'all' in files else []
+    kind = own.data.get('type')
+    known = sorted(set(files) - {'all'})
+    if kind is None:
+        raise ScenarioError(
+            f'{own.origin(())}: {dotted((*key, "type"))}: is missing, known are {", ".join(known)}'
+        )
+    if isinstance(kind, str):
+        if kind not in known:
+            raise ScenarioError(
+                f'{own.origin(("type",))}: {dotted((*key, "type"))}: '
+                f'{unknown(kind, known, "robot type")}'
+            )
+        layers.append(read_layer(files[kind]))
+    return merge(*layers, own)
+
+
+def robot_type(name: str) -> RobotSettings:
+    """Return a robot of a type in `config/robots`, on its own.
+
+    Raises
+    ------
+    ScenarioError
+        If there is no such type, or its file is wrong.
+    """
+    content = {
+        'type': name,
+        'start': [0.0, 0.0, 0.0],
+        'candidates': {'ring': 4, 'distance': 1.0},
+    }
+    own = Layer(content, {(): f'robot type {name}'})
+    return validate(RobotSettings, _robot_layer(config_folder() / 'scenarios' / name, own, ()))

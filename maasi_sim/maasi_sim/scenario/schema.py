@@ -1,0 +1,297 @@
+"""What a scenario file may hold: its settings, checked one by one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.settings import (
+    EnvironmentSettings,
+    FilterSettings,
+    Finite,
+    SensorSettings,
+    Settings,
+)
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
+from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.scenario.layering import (
+    ScenarioError,
+    to_yaml,
+)
+from maasi_sim.world.camera import RenderSettings
+from maasi_sim.world.laser_scan import LaserSettings
+from maasi_sim.world.odometry import OdometrySettings
+from maasi_sim.world.robots import BatterySettings
+from maasi_sim.world.world import TargetSettings, World
+
+
+class RobotSettings(Settings):
+    """One robot: its type's settings with the scenario's own on top."""
+
+    type: str = Field(description='Name of the type: a file in config/robots')
+    description: str = Field(default='', description='What it is, in words')
+    driver: Literal[
+        'mambo_driver',
+        'turtlebot_driver',
+        'ranging_driver',
+        'mavlink_driver',
+        'mavlink_camera_driver',
+    ] = Field(description='Executable of maasi_drivers that drives it')
+    guard: bool | None = Field(
+        default=None,
+        description='Whether a guard stops it when its driver dies or hangs; none: where it is '
+        'reached by topics, as another link has a time limit of its own',
+    )
+    body: Literal['simulated', 'external'] = Field(
+        default='simulated',
+        description='With link topics: whether the sim moves it, or another program, as Gazebo, '
+        'that publishes its odometry and the time (/clock)',
+    )
+    link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
+        default='topics', description='How its driver reaches it; the sim plays the other end'
+    )
+    mambo: MamboSettings | None = Field(
+        default=None,
+        description='With link mambo_wifi: how, and what it may be made to do; an address that '
+        'is not of this host is replaced, as the sim plays the drone',
+    )
+    mavlink: MavlinkSettings | None = Field(
+        default=None, description='With link mavlink: how, and what it may be made to do'
+    )
+    autopilot: AutopilotSettings = Field(
+        default_factory=AutopilotSettings,
+        description='With link mavlink: its autopilot, simulated; or external: another program',
+    )
+    start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
+        description='Position at the start, x y z [m, map]'
+    )
+    yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
+    radius: float = Field(default=0.1, gt=0.0, description='Of a circle around the robot [m]')
+    candidates: CandidateSettings = Field(description='Waypoints to choose from')
+    motion: MotionSettings = Field(description='How it moves')
+    sensor: SensorSettings = Field(description='What it sees, as the filter believes')
+    camera: CameraSettings | None = Field(
+        default=None, description='Its camera; none: a ranging sensor'
+    )
+    laser: LaserSettings | None = Field(default=None, description='Its laser scanner, if any')
+    odometry: OdometrySettings = Field(
+        default_factory=OdometrySettings, description='How good its odometry is, simulated'
+    )
+    battery: BatterySettings = Field(
+        default_factory=BatterySettings, description='Its battery, simulated'
+    )
+
+    @property
+    def external(self) -> bool:
+        """Whether another program than the sim moves it."""
+        if self.link == 'mavlink':
+            return self.autopilot.external
+        return self.body == 'external'
+
+    @property
+    def takes_off(self) -> bool:
+        """Whether it is simulated, and takes off when its driver's service `arm` is called."""
+        return self.link != 'topics' and not self.external
+
+
+class EventSettings(Settings):
+    """Something that happens to a robot."""
+
+    at: float = Field(ge=0.0, description='When [s]')
+    robot: str = Field(description='To whom')
+    do: Literal['leave', 'back'] = Field(description='It goes silent, or it is there again')
+
+
+class LimitSettings(Settings):
+    """When a run is given up."""
+
+    time: float = Field(default=600.0, gt=0.0, description='Simulated time [s]')
+    start: float = Field(
+        default=180.0,
+        gt=0.0,
+        description='Wall time until all nodes are ready; they may have to compile [s]',
+    )
+    silence: float = Field(
+        default=30.0,
+        gt=0.0,
+        description='Wall time without a step until a node counts as hung [s]',
+    )
+    heartbeat: float = Field(
+        default=4.5,
+        ge=2.0,
+        description='Wall time without a sign of life of a node, while it does not wait for a '
+        'processor, until it counts as hung; free running [s]',
+    )
+    restarts: int = Field(
+        default=3, ge=0, description='Restarts of one node with on_exit: respawn [1]'
+    )
+
+
+class ScoringSettings(Settings):
+    """How found targets are compared with the truth."""
+
+    radius: float | None = Field(
+        default=None,
+        gt=0.0,
+        description='Distance within which a found target is true; none: 3 T_z, at most half the '
+        'smallest distance of two targets [m]',
+    )
+    order: float = Field(default=2.0, ge=1.0, description='p of GOSPA [1]')
+
+
+class RecordSettings(Settings):
+    """What the recording holds."""
+
+    images: Literal['jpeg', 'png', 'raw'] = Field(
+        default='jpeg', description='How images are stored; png is lossless and slower'
+    )
+
+
+class Scenario(Settings):
+    """A whole scenario file, all layers merged."""
+
+    version: Literal[1] = Field(description='Of this format')
+    description: str = Field(default='', description='What it shows, in words')
+    environment: EnvironmentSettings = Field(description='Where the targets are')
+    step: float = Field(default=0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')
+    seed: int = Field(default=1, ge=0, description='Of all random numbers, unless given otherwise')
+    targets: TargetSettings = Field(description='The truth, for the simulation and the report')
+    robots: dict[str, RobotSettings] = Field(min_length=1, description='Robots by name')
+    filter: FilterSettings = Field(default_factory=FilterSettings, description='Search filter')
+    planner: PlannerSettings = Field(default_factory=PlannerSettings, description='Planner')
+    floor: RenderSettings = Field(
+        default_factory=lambda: RenderSettings.model_validate({}),
+        description='What simulated cameras see',
+    )
+    events: list[EventSettings] = Field(default_factory=list, description='What happens to robots')
+    stop: Literal['all_found', 'planner_done'] = Field(
+        default='all_found',
+        description='When the run ends well: all true targets are found, or the planner says that '
+        'nothing is left to gain',
+    )
+    on_exit: Literal['end', 'respawn'] = Field(
+        default='end', description='A node that dies ends the run, or is started again'
+    )
+    limits: LimitSettings = Field(default_factory=LimitSettings, description='When to give up')
+    scoring: ScoringSettings = Field(default_factory=ScoringSettings, description='Scores')
+    record: RecordSettings = Field(default_factory=RecordSettings, description='Recording')
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.environment.dimension
+
+    def names(self) -> list[str]:
+        """Return the robots' names in order."""
+        return sorted(self.robots)
+
+    def namespaces(self) -> dict[str, list[str]]:
+        """Return the robots that share filter and planner, by the namespace of those nodes.
+
+        The empty one stands for the root: all robots together.
+        """
+        if self.planner.coordination == 'independent':
+            return {name: [name] for name in self.names()}
+        return {'': self.names()}
+
+    def check_pace(self, lockstep: bool, rate: float | None) -> None:
+        """Check that it can be run in lockstep, or at a rate (simulated over wall time).
+
+        Raises
+        ------
+        ScenarioError
+            If it cannot: links other than topics run in real time.
+        """
+        for name in self.names():
+            link = self.robots[name].link
+            if link != 'topics' and (lockstep or rate not in (None, 1.0)):
+                asked = 'lockstep' if lockstep else f'rate {rate:g}'
+                raise ScenarioError(
+                    f'robots.{name}.link: read {link!r}, which runs in real time, and {asked}; '
+                    'allowed is topics, or rate 1 without lockstep'
+                )
+            if self.robots[name].body == 'external' and (lockstep or rate not in (None, 1.0)):
+                asked = 'lockstep' if lockstep else f'rate {rate:g}'
+                raise ScenarioError(
+                    f"robots.{name}.body: read 'external', and {asked}; allowed is simulated, or "
+                    'neither --lockstep nor --rate: the time is that of /clock'
+                )
+
+    @property
+    def external_clock(self) -> bool:
+        """Whether the time is that of the program that moves a robot."""
+        return any(robot.body == 'external' for robot in self.robots.values())
+
+    def removal_distance(self) -> float:
+        """Return T_z [m]: the filter's, or four deviations of the coarsest range without."""
+        distance = self.filter.resolved().removal_distance
+        if distance is not None:
+            return distance
+        return 4.0 * max(
+            float(robot.sensor.noise.deviations(self.dimension)[0])
+            for robot in self.robots.values()
+        )
+
+    def world(self, seed: int) -> World:
+        """Return the true world of a run."""
+        return World.from_settings(self.environment, self.targets, seed)
+
+    def content(self) -> dict[str, Any]:
+        """Return all settings as plain values; `load_scenario` reads them back the same."""
+        return self.model_dump(mode='python', by_alias=True)
+
+    def text(self) -> str:
+        """Return all settings as a scenario file that needs no other layer."""
+        return to_yaml(self.content())
+
+
+def planner_settings(
+    scenario: Scenario, names: Sequence[str], common: Mapping[str, Any]
+) -> PlannerNodeSettings:
+    """Return the settings of the planner of some robots; the others plan for themselves.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With all layers.
+    names : sequence of str
+        Its robots.
+    common : mapping
+        Settings that all nodes share.
+    """
+    return PlannerNodeSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment,
+            'planner': scenario.planner,
+            # As the filter has it.
+            'exploration_spacing': scenario.filter.exploration_spacing,
+            'robots': {
+                name: {
+                    'candidates': scenario.robots[name].candidates,
+                    'motion': scenario.robots[name].motion,
+                    'sensor': scenario.robots[name].sensor,
+                    'radius': scenario.robots[name].radius,
+                    'start': scenario.robots[name].start,
+                }
+                for name in names
+            },
+            'others': {
+                name: {'radius': robot.radius, 'start': robot.start}
+                for name, robot in scenario.robots.items()
+                if name not in names
+            },
+        }
+    )
+
+
+def steps_of(time: float, step: float) -> int:
+    """Return how many steps a time takes, at least one."""
+    return max(1, math.floor(time / step + 0.5))

@@ -1,0 +1,1 @@
+"""The simulated world: targets, robots and their sensors, on one clock."""

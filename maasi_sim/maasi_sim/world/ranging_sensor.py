@@ -1,0 +1,93 @@
+"""Plays a sensor of range, bearing and elevation that misses targets and measures them badly."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.models.measurement import wrap_angle
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_sim.world.noise_streams import noise_stream
+
+Array = NDArray[np.float64]
+
+
+class RangingSensor:
+    """
+    A robot's ranging sensor (000, eq. (3) to (9)).
+
+    Parameters
+    ----------
+    sensor : Sensor
+        pi, g, R and clutter; the true ones.
+    targets : ndarray, shape (n, 3) or (n, 2)
+        True positions [m, map].
+    seed : int
+        Of the run.
+    robot : str
+        Whose sensor it is: with the seed and the step it keys every draw.
+    reach : float
+        Farthest range at which clutter appears [m].
+
+    """
+
+    def __init__(
+        self, sensor: Sensor, targets: Array, seed: int, robot: str, reach: float = 0.0
+    ) -> None:
+        self.sensor = sensor
+        self.targets = np.asarray(targets, dtype=float)
+        self.seed = seed
+        self.robot = robot
+        self.reach = min(reach, sensor.maximum_range)
+        self._spread = np.linalg.cholesky(sensor.covariance)
+
+    def measure(self, pose: Pose, step: int) -> Array:
+        """
+        Return one sweep.
+
+        Parameters
+        ----------
+        pose : Pose
+            True pose of the robot.
+        step : int
+            Discrete step.
+
+        Returns
+        -------
+        ndarray, shape (m, d)
+            Range [m], bearing from the map's x axis and, in 3D, elevation [rad], in random order.
+
+        """
+        dimension = self.sensor.dimension
+        generator = noise_stream(self.seed, self.robot, step, 'ranging')
+        count = len(self.targets)
+        # As many draws whatever is detected: what happens to one target leaves the others alone.
+        chance = generator.random(count)
+        noise = generator.standard_normal((count, dimension))
+        positions = self.targets[:, :dimension]
+        values = self.sensor.measurement.measure(positions, pose)
+        seen = chance < self.sensor.detection.probability(positions, pose)
+        seen &= values[:, 0] <= self.sensor.maximum_range
+        # Summed in a fixed order, whatever linear algebra library is there.
+        errors = np.zeros((count, dimension))
+        for column in range(dimension):
+            errors += noise[:, column, None] * self._spread[:, column]
+        returns = (values + errors)[seen]
+        if self.sensor.clutter > 0.0 and self.reach > 0.0:
+            returns = np.concatenate([returns, self._clutter(generator, dimension)])
+        returns = returns[generator.permutation(len(returns))]
+        returns[:, 0] = np.maximum(returns[:, 0], 1e-6)
+        returns[:, 1] = wrap_angle(returns[:, 1])
+        if dimension == 3:
+            returns[:, 2] = np.clip(returns[:, 2], -0.5 * math.pi, 0.5 * math.pi)
+        return returns
+
+    def _clutter(self, generator: np.random.Generator, dimension: int) -> Array:
+        """Draw false returns, uniform in range and angles."""
+        low = np.array([0.0, -math.pi, -0.5 * math.pi][:dimension])
+        high = np.array([self.reach, math.pi, 0.5 * math.pi][:dimension])
+        count = generator.poisson(self.sensor.clutter * float(np.prod(high - low)))
+        return generator.uniform(low, high, size=(count, dimension))

@@ -1,0 +1,275 @@
+"""Simulated robots: a body under velocity commands, with battery, odometry and sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.settings import Settings
+from maasi_planner.motion import Body, RobotState, make_motion
+from maasi_planner.motion.base import check_command
+from maasi_planner.settings import MotionSettings
+from maasi_sim.world.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.world.laser_scan import LaserScanner, LaserSettings
+from maasi_sim.world.odometry import OdometryModel, OdometryReading, OdometrySettings
+from maasi_sim.world.ranging_sensor import RangingSensor
+from maasi_sim.world.world import World
+
+Array = NDArray[np.float64]
+
+# Speed at which a flying robot with an empty battery comes down [m/s].
+_SINKING = 0.3
+
+
+class BatterySettings(Settings):
+    """A robot's battery."""
+
+    capacity: float = Field(default=7200.0, gt=0.0, description='Energy of a full battery [J]')
+    charge: float = Field(default=1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
+    idle_power: float = Field(default=2.0, ge=0.0, description='Drain at rest or hovering [W]')
+    motion_power: float = Field(
+        default=4.0, ge=0.0, description='Drain for each metre per second on top of it [W/(m/s)]'
+    )
+
+
+class Battery:
+    """A battery that idling and moving drain."""
+
+    def __init__(self, settings: BatterySettings) -> None:
+        self.settings = settings
+        self.charge = settings.charge
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is left."""
+        return self.charge <= 0.0
+
+    def drain(self, speed: float, dt: float) -> None:
+        """Take what `dt` seconds at a speed [m/s] need."""
+        power = self.settings.idle_power + self.settings.motion_power * speed
+        self.charge = max(self.charge - power * dt / self.settings.capacity, 0.0)
+
+
+@dataclass(frozen=True)
+class Equipment:
+    """
+    What a simulated robot is made of.
+
+    Attributes
+    ----------
+    motion : MotionSettings
+        Its body.
+    radius : float
+        Of a circle around it that hits obstacles [m].
+    camera : CameraSettings or None
+        True camera.
+    sensor : Sensor or None
+        Ranging sensor.
+    laser : LaserSettings or None
+        Laser scanner.
+    odometry : OdometrySettings
+        Noise and drift.
+    battery : BatterySettings
+        Capacity and drain.
+
+    """
+
+    motion: MotionSettings
+    radius: float
+    camera: CameraSettings | None
+    sensor: Sensor | None
+    laser: LaserSettings | None
+    odometry: OdometrySettings
+    battery: BatterySettings
+
+
+class Leader(Protocol):
+    """What moves a robot in place of its simulation."""
+
+    @property
+    def state(self) -> RobotState:
+        """Where it truly is, in the map."""
+
+
+class SimulatedRobot:
+    """
+    A robot as the simulation plays it.
+
+    The last command holds until the next one, as on a robot without a watchdog. A robot that would
+    run into an obstacle stops short of it; one with an empty battery stops, or sinks to the floor.
+
+    Parameters
+    ----------
+    name : str
+        Keys its noise.
+    equipment : Equipment
+        Body and sensors.
+    start : Pose
+        In the map; the odometry starts at zero there.
+    world : World
+        Targets and obstacles.
+    floor : RenderSettings
+        How cameras see.
+    seed : int
+        Of the run.
+
+    Raises
+    ------
+    ValueError
+        If it starts inside an obstacle.
+
+    """
+
+    def __init__(
+        self,
+        name: str,
+        equipment: Equipment,
+        start: Pose,
+        world: World,
+        floor: RenderSettings,
+        seed: int,
+    ) -> None:
+        self.name = name
+        self.equipment = equipment
+        self.world = world
+        self.collisions = 0
+        self._motion = make_motion(equipment.motion)
+        self._body: Body = self._motion.body(RobotState(start))
+        self.state = self._body.robot_state()
+        if self._hits(self.state.pose.position):
+            raise ValueError(
+                f'{name}: got start {start.position.tolist()}, allowed is a place at least its '
+                f'radius ({equipment.radius} m) from every obstacle'
+            )
+        self._command = np.zeros(4)
+        self._flies = equipment.motion.model != 'unicycle' and start.position[2] > 0.0
+        self._resting = False
+        self.battery = Battery(equipment.battery)
+        self._odometry = OdometryModel(equipment.odometry, start, seed, name)
+        self.odometry: OdometryReading = self._odometry.step(self.state, 0)
+        self._leader: Leader | None = None
+        self.camera: CameraRenderer | None = None
+        if equipment.camera is not None:
+            self.camera = CameraRenderer(
+                Camera.from_settings(equipment.camera),
+                floor,
+                scene_of(world, floor, seed),
+                seed,
+                name,
+            )
+        self.laser: LaserScanner | None = None
+        if equipment.laser is not None:
+            obstacles = world.obstacles
+            self.laser = LaserScanner(
+                equipment.laser, world.bounds, obstacles.centres, obstacles.radii, seed, name
+            )
+        self.ranging: RangingSensor | None = None
+        if equipment.sensor is not None:
+            size = world.bounds[:, 1] - world.bounds[:, 0]
+            reach = float(np.sqrt((size * size).sum()))
+            self.ranging = RangingSensor(equipment.sensor, world.targets_3d, seed, name, reach)
+
+    def command(self, velocity: ArrayLike) -> None:
+        """
+        Take a velocity command, which holds until the next.
+
+        Parameters
+        ----------
+        velocity : array_like, shape (4,)
+            vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+
+        """
+        self._command = check_command(velocity)
+
+    def follow(self, leader: Leader) -> None:
+        """Be from now on where `leader` is: what moves it is not this simulation."""
+        self._leader = leader
+        self.state = leader.state
+
+    def step(self, step: int, dt: float) -> None:
+        """Go on by `dt` seconds to the discrete step `step`, from 1."""
+        if self._leader is not None:
+            was_clear = not self._hits(self.state.pose.position)
+            self.state = self._leader.state
+            self.collisions += was_clear and self._hits(self.state.pose.position)
+            self.odometry = self._odometry.step(self.state, step)
+            return
+        command = self._command
+        if self.battery.empty:
+            command = np.array([0.0, 0.0, -_SINKING if self._flies else 0.0, 0.0])
+        before = self.state
+        if not self._resting:
+            self._body.step(command, dt)
+            self.state = self._body.robot_state()
+            position = self.state.pose.position
+            if self._hits(position):
+                self.collisions += 1
+                self._halt(before.pose)
+            elif self._flies and self.battery.empty and position[2] <= 0.0:
+                self._halt(Pose(np.array([position[0], position[1], 0.0]), before.pose.orientation))
+                self._resting = True
+        velocity = self.state.velocity
+        self.battery.drain(float(np.sqrt((velocity * velocity).sum())), dt)
+        self.odometry = self._odometry.step(self.state, step)
+
+    def stand(self, step: int) -> None:
+        """Stay where it is until the discrete step `step`, at rest; the last command is void."""
+        if self._leader is not None:
+            self.step(step, 0.0)
+            return
+        self._command = np.zeros(4)
+        if self.state.velocity.any() or self.state.angular_velocity.any():
+            self._halt(self.state.pose)
+        self.odometry = self._odometry.step(self.state, step)
+
+    def image(self, step: int, time: float) -> NDArray[np.uint8]:
+        """Return what the camera sees now, (h, w, 3) uint8 in R, G, B."""
+        if self.camera is None:
+            raise ValueError(f'{self.name}: has no camera')
+        state = self.state
+        return self.camera.render(state.pose, step, time, state.velocity, state.angular_velocity)
+
+    def scan(
+        self, step: int, centres: ArrayLike = (), radii: ArrayLike = ()
+    ) -> NDArray[np.float32]:
+        """Return a laser scan (beams,) [m]; `centres` (n, 2) and `radii` (n,) of other robots."""
+        if self.laser is None:
+            raise ValueError(f'{self.name}: has no laser scanner')
+        return self.laser.scan(self.state.pose, step, centres, radii)
+
+    def ranges(self, step: int) -> Array:
+        """Return a sweep of the ranging sensor, (m, d) [m, rad]."""
+        if self.ranging is None:
+            raise ValueError(f'{self.name}: has no ranging sensor')
+        return self.ranging.measure(self.state.pose, step)
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, what this robot uses; nothing changes."""
+        self._motion.body(self.state).step(np.zeros(4), 0.05)
+        if self.camera is not None:
+            self.image(0, 0.0)
+        if self.laser is not None:
+            self.scan(0)
+        if self.ranging is not None:
+            self.ranges(0)
+
+    def _halt(self, pose: Pose) -> None:
+        self._body = self._motion.body(RobotState(Pose.from_yaw(pose.position, pose.yaw)))
+        self.state = self._body.robot_state()
+
+    def _hits(self, position: Array) -> bool:
+        distances = self.world.obstacles.distances(position)
+        return bool(len(distances) and distances.min() < self.equipment.radius)

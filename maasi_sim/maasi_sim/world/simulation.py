@@ -1,0 +1,160 @@
+"""All simulated robots of a scenario on one clock, with what happens to them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.models.pose import Pose
+from maasi_sim.scenario.schema import (
+    RobotSettings,
+    Scenario,
+    steps_of,
+)
+from maasi_sim.world.robots import Equipment, SimulatedRobot
+from maasi_sim.world.world import World
+
+# A time this close to a step, in steps, is the step's.
+_TOLERANCE = 1e-6
+
+
+class Simulation:
+    """
+    The robots of a scenario, from step 0 on.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With all layers.
+    seed : int
+        Of the run.
+
+    Attributes
+    ----------
+    step : int
+        Discrete step k.
+    robots : dict
+        SimulatedRobot by name, in name order.
+    away : set of str
+        Robots that have left: they stand still and are silent.
+    world : World
+        The truth.
+
+    Raises
+    ------
+    ValueError
+        If a robot starts inside an obstacle.
+
+    """
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self.scenario = scenario
+        self.step = 0
+        self.world = scenario.world(seed)
+        self.robots = {
+            name: simulated_robot(name, scenario, self.world, seed) for name in scenario.names()
+        }
+        self.away: set[str] = set()
+        self._image_steps = {
+            name: _steps_between_images(scenario.robots[name], scenario.step)
+            for name in self.robots
+        }
+        self._events: dict[int, list[tuple[str, str]]] = {}
+        for event in sorted(scenario.events, key=lambda event: event.at):
+            step = step_of_event(event.at, scenario.step)
+            self._events.setdefault(step, []).append((event.robot, event.do))
+        self._apply_events()
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.step * self.scenario.step
+
+    @property
+    def present(self) -> list[str]:
+        """Robots that take part, in name order."""
+        return [name for name in self.robots if name not in self.away]
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, what the robots use; nothing changes."""
+        for robot in self.robots.values():
+            robot.warm_up()
+
+    def advance(self) -> None:
+        """Go on to the next step, each robot under its last command."""
+        self.step += 1
+        for name, robot in self.robots.items():
+            if name in self.away:
+                robot.stand(self.step)
+            else:
+                robot.step(self.step, self.scenario.step)
+        self._apply_events()
+
+    def images_due(self, name: str) -> bool:
+        """Return whether the camera, or the ranging sensor, of a robot has data at this step."""
+        return name not in self.away and self.step % self._image_steps[name] == 0
+
+    def scan_due(self, name: str) -> bool:
+        """Return whether the laser scanner of a robot has data at this step."""
+        laser = self.scenario.robots[name].laser
+        return (
+            laser is not None
+            and name not in self.away
+            and self.step % steps_of(1.0 / laser.rate, self.scenario.step) == 0
+        )
+
+    def scan(self, name: str) -> NDArray[np.float32]:
+        """Return a laser scan (beams,) [m] that shows the other robots at its height as well."""
+        robot = self.robots[name]
+        height, radius = robot.state.pose.position[2], robot.equipment.radius
+        others = [
+            other
+            for key, other in self.robots.items()
+            if key != name
+            and abs(other.state.pose.position[2] - height) <= radius + other.equipment.radius
+        ]
+        return robot.scan(
+            self.step,
+            [other.state.pose.position[:2] for other in others],
+            [other.equipment.radius for other in others],
+        )
+
+    def _apply_events(self) -> None:
+        for name, change in self._events.get(self.step, []):
+            if change == 'leave':
+                self.away.add(name)
+            else:
+                self.away.discard(name)
+
+
+def step_of_event(time: float, step: float) -> int:
+    """Return the first step at or after a time [s]."""
+    return math.ceil(time / step - _TOLERANCE)
+
+
+def simulated_robot(name: str, scenario: Scenario, world: World, seed: int) -> SimulatedRobot:
+    """Return a robot of a scenario at its start."""
+    robot = scenario.robots[name]
+    return SimulatedRobot(
+        name,
+        Equipment(
+            motion=robot.motion,
+            radius=robot.radius,
+            camera=robot.camera,
+            sensor=robot.sensor.build(name, scenario.dimension) if robot.camera is None else None,
+            laser=robot.laser,
+            odometry=robot.odometry,
+            battery=robot.battery,
+        ),
+        Pose.from_yaw(robot.start, robot.yaw),
+        world,
+        scenario.floor,
+        seed,
+    )
+
+
+def _steps_between_images(robot: RobotSettings, step: float) -> int:
+    period = robot.sensor.period if robot.camera is None else 1.0 / robot.camera.rate
+    return steps_of(period, step)

@@ -1,0 +1,212 @@
+"""What the robots search: bounds, targets, obstacles, and things on the floor that mislead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from maasi_filter.settings import EnvironmentSettings, Finite, Settings
+from maasi_planner.obstacles import Obstacles
+from maasi_sim.world.noise_streams import noise_stream
+
+Array = NDArray[np.float64]
+
+# Draws for one target before the space is said to be too full.
+_ATTEMPTS = 1000
+# Whole sets of targets drawn anew where the last ones found no room.
+_RESTARTS = 10
+
+
+class TargetSettings(Settings):
+    """Where the targets are: drawn at random, or given."""
+
+    count: int | None = Field(default=None, ge=0, le=100_000, description='How many are drawn [1]')
+    distribution: Literal['uniform', 'clustered'] = Field(
+        default='uniform', description='Drawn anywhere, or around random centres'
+    )
+    positions: list[list[Finite]] | None = Field(
+        default=None, description='Given positions, instead of drawn ones [m, map]'
+    )
+    separation: float = Field(
+        default=0.0, ge=0.0, description='Least distance between two targets [m]'
+    )
+    margin: float = Field(default=0.0, ge=0.0, description='Least distance from the bounds [m]')
+    clusters: int = Field(default=3, ge=1, description='Clustered: how many centres [1]')
+    spread: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="Clustered: deviation around the centres; none: 1/15 of the space's size [m]",
+    )
+
+    @model_validator(mode='after')
+    def _one_way(self) -> TargetSettings:
+        if (self.count is None) == (self.positions is None):
+            raise ValueError('targets: give either count or positions')
+        return self
+
+
+@dataclass(frozen=True)
+class World:
+    """
+    The true world.
+
+    Attributes
+    ----------
+    bounds : ndarray, shape (d, 2)
+        Lower and upper bound on each axis of the map [m].
+    targets : ndarray, shape (n, d)
+        True positions [m].
+    obstacles : Obstacles
+        In their own size.
+
+    """
+
+    bounds: Array
+    targets: Array
+    obstacles: Obstacles = field(default_factory=Obstacles.none)
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return len(self.bounds)
+
+    @property
+    def targets_3d(self) -> Array:
+        """Targets with three coordinates, shape (n, 3); those of a floor have z = 0 [m]."""
+        return np.pad(self.targets, ((0, 0), (0, 3 - self.dimension)))
+
+    @classmethod
+    def from_settings(
+        cls, environment: EnvironmentSettings, targets: TargetSettings, seed: int
+    ) -> World:
+        """
+        Build the world of a run: the same for the same seed.
+
+        Raises
+        ------
+        ValueError
+            If targets lie outside the bounds, or do not fit.
+
+        """
+        bounds = environment.array()
+        obstacles = Obstacles.from_settings(environment.obstacles)
+        if targets.positions is not None:
+            positions = check_positions(targets.positions, bounds)
+        else:
+            positions = draw_targets(
+                targets, bounds, noise_stream(seed, purpose='targets'), obstacles
+            )
+        return cls(bounds, positions, obstacles)
+
+
+def check_positions(positions: ArrayLike, bounds: Array) -> Array:
+    """
+    Return given target positions as an (n, d) array.
+
+    Raises
+    ------
+    ValueError
+        If one has not as many coordinates as the bounds, or lies outside them.
+
+    """
+    rows = [np.asarray(row, dtype=float) for row in np.asarray(positions, dtype=object)]
+    for index, row in enumerate(rows):
+        if row.shape != (len(bounds),):
+            raise ValueError(
+                f'targets.positions[{index}]: got {row.size} coordinates, allowed {len(bounds)}'
+            )
+        if not np.all((row >= bounds[:, 0]) & (row <= bounds[:, 1])):
+            raise ValueError(
+                f'targets.positions[{index}]: got {row.tolist()}, '
+                f'allowed within the bounds {bounds.tolist()}'
+            )
+    return np.array(rows, dtype=float).reshape(len(rows), len(bounds))
+
+
+def draw_targets(
+    settings: TargetSettings,
+    bounds: Array,
+    generator: np.random.Generator,
+    obstacles: Obstacles | None = None,
+) -> Array:
+    """
+    Draw target positions.
+
+    Parameters
+    ----------
+    settings : TargetSettings
+        Count, distribution, separation and margin.
+    bounds : ndarray, shape (d, 2)
+        [m].
+    generator : numpy.random.Generator
+        Where the randomness comes from.
+    obstacles : Obstacles, optional
+        No target lies inside one, nor within ``margin`` of one.
+
+    Returns
+    -------
+    ndarray, shape (count, d)
+        [m].
+
+    Raises
+    ------
+    ValueError
+        If they do not fit: the margin leaves no room, or the separation is too large.
+
+    """
+    count = settings.count or 0
+    low, high = bounds[:, 0] + settings.margin, bounds[:, 1] - settings.margin
+    if np.any(low > high):
+        raise ValueError(
+            f'targets.margin: got {settings.margin}, allowed at most half the smallest side, '
+            f'{0.5 * float((bounds[:, 1] - bounds[:, 0]).min()):g}'
+        )
+    for _ in range(_RESTARTS):
+        drawn = _draw(settings, count, low, high, generator, obstacles or Obstacles.none())
+        if drawn is not None:
+            return drawn
+    raise ValueError(
+        f'targets: got count {count} with separation {settings.separation} and margin '
+        f'{settings.margin}, which do not fit into the bounds {bounds.tolist()}'
+    )
+
+
+def _draw(
+    settings: TargetSettings,
+    count: int,
+    low: Array,
+    high: Array,
+    generator: np.random.Generator,
+    obstacles: Obstacles,
+) -> Array | None:
+    centres = np.empty((0, len(low)))
+    spread = settings.spread or float((high - low).mean()) / 15.0
+    if settings.distribution == 'clustered':
+        centres = generator.uniform(low, high, size=(settings.clusters, len(low)))
+    drawn = np.empty((count, len(low)))
+    for index in range(count):
+        for _ in range(_ATTEMPTS):
+            if settings.distribution == 'clustered':
+                # Centres in turn: none stays without targets, whatever the draw.
+                position = generator.normal(centres[index % len(centres)], spread)
+                if np.any((position < low) | (position > high)):
+                    continue
+            else:
+                position = generator.uniform(low, high)
+            if index and np.linalg.norm(drawn[:index] - position, axis=1).min() < (
+                settings.separation
+            ):
+                continue
+            if len(obstacles):
+                place = np.pad(position, (0, 3 - len(position)))
+                if obstacles.distances(place).min() < settings.margin:
+                    continue
+            drawn[index] = position
+            break
+        else:
+            return None
+    return drawn
