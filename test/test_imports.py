@@ -1,0 +1,177 @@
+"""Which module may import which: packages one way, ROS in few places, no cycles."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+# Each imports only those before it. maasi_entry starts nodes of all packages, by name.
+PACKAGES = (
+    'maasi_msgs',
+    'maasi_entry',
+    'maasi_filter',
+    'maasi_planner',
+    'maasi_drivers',
+    'maasi_sim',
+)
+FOLDERS = (
+    'maasi_filter/maasi_entry',
+    'maasi_filter/maasi_filter',
+    'maasi_planner/maasi_planner',
+    'maasi_drivers/maasi_drivers',
+    'maasi_sim/maasi_sim',
+)
+# Folders and files that may import ROS.
+ROS_FOLDERS = ('ros',)
+ROS_FILES = (
+    '*_node.py',
+    '*_driver.py',
+    # Of the filter.
+    'bad_requests.py',
+    'clock_watch.py',
+    'conversions.py',
+    'executor.py',
+    'marker_board.py',
+    'node_entities.py',
+    'node_parameters.py',
+    'qos.py',
+    'silence.py',
+    # Of the planner.
+    'found_keeper.py',
+    'search_action.py',
+    'search_command.py',
+    'search_services.py',
+    'team_goals.py',
+    # Of the drivers.
+    'arm_permission.py',
+    'command_publisher.py',
+    'pose_topic.py',
+    'robot_command.py',
+    'robot_frames.py',
+    'robot_stop.py',
+    # Of the simulation.
+    'arming.py',
+    'external_robot.py',
+)
+# Not ament_index_python, which looks up where files are installed.
+ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*')
+# Sets of modules that import each other. None is to be added.
+KNOWN_CYCLES = (
+    frozenset({'maasi_sim.cuboid_report', 'maasi_sim.report', 'maasi_sim.results'}),
+    frozenset({'maasi_sim.experiments.registry', 'maasi_sim.experiments.results'}),
+    frozenset({'maasi_sim.replay', 'maasi_sim.replay_node'}),
+)
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Return the file of each of our modules by its name."""
+    found = {}
+    for folder in FOLDERS:
+        base = (ROOT / folder).parent
+        for path in sorted((ROOT / folder).rglob('*.py')):
+            parts = path.relative_to(base).with_suffix('').parts
+            found['.'.join(parts[:-1] if parts[-1] == '__init__' else parts)] = path
+    return found
+
+
+@cache
+def imports(name: str) -> list[tuple[str, int]]:
+    """Return what a module imports, also in functions and for types only: name and line."""
+    path = modules()[name]
+    package = name if path.name == '__init__.py' else name.rpartition('.')[0]
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found += [(item.name, node.lineno) for item in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split('.')[: len(package.split('.')) - node.level + 1]
+            base = '.'.join([*(above if node.level else []), *filter(None, [node.module])])
+            for item in node.names:
+                whole = f'{base}.{item.name}'
+                found.append((whole if whole in modules() else base, node.lineno))
+    return found
+
+
+def components(graph: dict[str, set[str]]) -> Iterator[frozenset[str]]:
+    """Yield the sets of nodes that reach each other (Tarjan's strongly connected components)."""
+    numbers: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    stack: list[str] = []
+
+    def visit(node: str) -> Iterator[frozenset[str]]:
+        numbers[node] = lowest[node] = len(numbers)
+        stack.append(node)
+        for other in sorted(graph[node]):
+            if other not in numbers:
+                yield from visit(other)
+                lowest[node] = min(lowest[node], lowest[other])
+            elif other in stack:
+                lowest[node] = min(lowest[node], numbers[other])
+        if lowest[node] == numbers[node]:
+            position = stack.index(node)
+            yield frozenset(stack[position:])
+            del stack[position:]
+
+    for node in graph:
+        if node not in numbers:
+            yield from visit(node)
+
+
+def cycles(graph: dict[str, set[str]]) -> set[frozenset[str]]:
+    """Return the sets of modules that import each other, or one that imports itself."""
+    return {
+        found
+        for found in components(graph)
+        if len(found) > 1 or any(node in graph[node] for node in found)
+    }
+
+
+def test_packages_import_one_way():
+    wrong = []
+    for name in modules():
+        rank = PACKAGES.index(name.partition('.')[0])
+        for other, line in imports(name):
+            package = other.partition('.')[0]
+            if package in PACKAGES[rank + 1 :]:
+                wrong.append(f'{modules()[name].relative_to(ROOT)}:{line}: imports {package}')
+    assert not wrong, '\n'.join(wrong)
+
+
+def test_only_few_places_import_ros():
+    wrong = []
+    needed = set()
+    for name, path in modules().items():
+        ros = [
+            f'{path.relative_to(ROOT)}:{line}: imports {other}'
+            for other, line in imports(name)
+            if any(fnmatch(other.partition('.')[0], pattern) for pattern in ROS_PACKAGES)
+        ]
+        if not ros or set(path.relative_to(ROOT).parts) & set(ROS_FOLDERS):
+            continue
+        allowed = {pattern for pattern in ROS_FILES if fnmatch(path.name, pattern)}
+        needed |= allowed
+        wrong += [] if allowed else ros
+    assert not wrong, '\n'.join(wrong)
+    gone = set(ROS_FILES) - needed
+    assert not gone, f'import no ROS, or are in a folder that may: take out of ROS_FILES: {gone}'
+
+
+def test_modules_do_not_import_each_other_in_circles():
+    graph = {
+        name: {other for other, _ in imports(name) if other in modules()} for name in modules()
+    }
+    found = cycles(graph)
+    new = found - set(KNOWN_CYCLES)
+    assert not new, '\n'.join(', '.join(sorted(cycle)) for cycle in new)
+    gone = set(KNOWN_CYCLES) - found
+    assert not gone, f'no longer there, take out of KNOWN_CYCLES: {gone}'
+
+
+def test_cycles_are_found():
+    graph = {'a': {'b'}, 'b': {'c', 'd'}, 'c': {'a'}, 'd': set(), 'e': {'e'}, 'f': {'d'}}
+    assert cycles(graph) == {frozenset('abc'), frozenset('e')}
