@@ -30,16 +30,7 @@ ROS_FOLDERS = ('ros',)
 ROS_FILES = (
     '*_node.py',
     '*_driver.py',
-    # Of the filter.
-    'bad_requests.py',
-    'clock_watch.py',
     'conversions.py',
-    'executor.py',
-    'marker_board.py',
-    'node_entities.py',
-    'node_parameters.py',
-    'qos.py',
-    'silence.py',
     # Of the planner.
     'found_keeper.py',
     'search_action.py',
@@ -61,9 +52,9 @@ ROS_FILES = (
 ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*')
 # Sets of modules that import each other. None is to be added.
 KNOWN_CYCLES = (
-    frozenset({'maasi_sim.cuboid_report', 'maasi_sim.report', 'maasi_sim.results'}),
     frozenset({'maasi_sim.experiments.registry', 'maasi_sim.experiments.results'}),
-    frozenset({'maasi_sim.replay', 'maasi_sim.replay_node'}),
+    frozenset({'maasi_sim.run.replay', 'maasi_sim.run.replay_node'}),
+    frozenset({'maasi_sim.buildings.report', 'maasi_sim.run.report', 'maasi_sim.run.run_folder'}),
 )
 
 

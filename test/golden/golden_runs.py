@@ -13,11 +13,11 @@ import numpy as np
 
 from maasi_filter import SearchFilter
 from maasi_planner.coordinator import Coordinator
-from maasi_sim.cuboid_mission import CuboidMission
-from maasi_sim.cuboid_scenario import CuboidScenario, load_any_scenario, mission_of
+from maasi_sim.buildings.mission import CuboidMission
+from maasi_sim.buildings.scenario import CuboidScenario, load_any_scenario, mission_of
 from maasi_sim.experiments.registry import Experiment, experiments
+from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.search import search
-from maasi_sim.yaml_files import ScenarioError
 
 SCENARIOS = Path(__file__).resolve().parents[2] / 'config' / 'scenarios'
 SEEDS = (1, 2, 3)
