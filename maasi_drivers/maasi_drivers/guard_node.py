@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message
 
 from maasi_drivers.agent.driver_settings import LOCKSTEP_LEASE, GuardSettings
 from maasi_drivers.links.command_publisher import CommandPublisher
-from maasi_filter.ros.lifecycle_node import SearchNode, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, run
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1
@@ -21,7 +21,7 @@ _STOP_PERIOD = 0.1
 _LOOK_PERIOD = 0.5
 
 
-class GuardNode(SearchNode[GuardSettings]):
+class GuardNode(LockstepLifecycleNode[GuardSettings]):
     """
     Publishes zeros while no driver is alive, and nothing while one is.
 

@@ -31,7 +31,7 @@ from maasi_filter.ros.conversions import (
     stamp_from_ros,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError, run
 from maasi_filter.ros.marker_board import MarkerBoard
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
@@ -81,7 +81,7 @@ class PendingBatch:
         return all(name in self.failed for name in self.missing)
 
 
-class FilterNode(SearchNode[FilterNodeSettings]):
+class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     """The particle PHD filter of the team (000, sections 3.1 to 3.3).
 
     In the namespace of its only robot it is that robot's own: beside others of the kind that tell

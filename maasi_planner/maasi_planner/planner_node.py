@@ -29,7 +29,7 @@ from maasi_filter.ros.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import SearchNode, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, run
 from maasi_filter.ros.marker_board import MarkerBoard
 from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
 from maasi_filter.ros.silence import Silence
@@ -75,7 +75,7 @@ _ANSWER_PATIENCE = 1.0
 _POSES_KEPT = 1000
 
 
-class PlannerNode(SearchNode[PlannerNodeSettings]):
+class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     """Plans for the whole team (000, algorithms 1 and 2), or for one robot of several by itself.
 
     In the namespace of its only robot it is that robot's own (002, section 4, independent

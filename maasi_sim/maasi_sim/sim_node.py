@@ -32,7 +32,7 @@ from maasi_filter.ros.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError, run
 from maasi_filter.ros.marker_board import MarkerBoard
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray, RangeMeasurement
@@ -220,7 +220,7 @@ def scan_message(settings: LaserSettings, frame: str) -> LaserScan:
     )
 
 
-class SimNode(SearchNode[SimNodeSettings]):
+class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     """
     Plays the robots of a scenario, and the time.
 

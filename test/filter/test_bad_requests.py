@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from maasi_filter.ros.executor import executor_of
-from maasi_filter.ros.lifecycle_node import SearchNode
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_sim.run.processes import Domain
 
@@ -32,7 +32,7 @@ def context():
 @pytest.fixture
 def node(context):
     """Return a node whose executor runs in a thread; it keeps what it raised."""
-    made = SearchNode('searcher', NodeSettings, context=context)
+    made = LockstepLifecycleNode('searcher', NodeSettings, context=context)
     executor = executor_of(made, context)
     ended = threading.Event()
     made.raised = []

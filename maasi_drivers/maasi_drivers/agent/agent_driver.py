@@ -39,7 +39,7 @@ from maasi_filter.ros.conversions import (
     stamp_from_ros,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
 from maasi_filter.ros.silence import Silence
 from maasi_filter.ros.stamps import JUMP, StampGate, batch_id_limit
@@ -98,7 +98,7 @@ class Sighting:
     dropped: dict[str, int]
 
 
-class AgentDriver(SearchNode[DriverSettings], Generic[DataT], ABC):
+class AgentDriver(LockstepLifecycleNode[DriverSettings], Generic[DataT], ABC):
     """
     The driver of a robot, in the robot's namespace.
 

@@ -9,7 +9,7 @@ from geometry_msgs.msg import PoseStamped
 from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros
-from maasi_filter.ros.lifecycle_node import SearchNode
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import sensor_reader
 
 
@@ -23,7 +23,7 @@ class PoseTopic:
 
     Parameters
     ----------
-    node : SearchNode
+    node : LockstepLifecycleNode
         The robot's driver.
     on_pose : callable
         Takes stamp [ns] and pose in the map.
@@ -31,7 +31,7 @@ class PoseTopic:
     """
 
     def __init__(
-        self, node: SearchNode[DriverSettings], on_pose: Callable[[int, Pose], None]
+        self, node: LockstepLifecycleNode[DriverSettings], on_pose: Callable[[int, Pose], None]
     ) -> None:
         self._node = node
         self._on_pose = on_pose

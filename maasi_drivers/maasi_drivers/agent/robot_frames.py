@@ -24,7 +24,7 @@ from maasi_filter.ros.conversions import (
     stamp_from_ros,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
 from maasi_filter.ros.stamps import stamp_problem
 
@@ -50,7 +50,7 @@ class RobotFrames:
 
     Parameters
     ----------
-    node : SearchNode
+    node : LockstepLifecycleNode
         The robot's driver.
     robot : str
         Its name.
@@ -66,7 +66,7 @@ class RobotFrames:
 
     def __init__(
         self,
-        node: SearchNode[DriverSettings],
+        node: LockstepLifecycleNode[DriverSettings],
         robot: str,
         on_pose: Callable[[int, Pose], None],
     ) -> None:

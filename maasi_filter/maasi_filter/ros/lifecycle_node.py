@@ -33,7 +33,7 @@ from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_filter.ros.stamps import stamp_problem
 from maasi_msgs.msg import LockstepDone, LockstepStep
 
-__all__ = ['SearchNode', 'SettingsError', 'run']
+__all__ = ['LockstepLifecycleNode', 'SettingsError', 'run']
 
 # Between two looks at whether the peers are there [s].
 _PEERS_PERIOD = 0.02
@@ -49,7 +49,7 @@ _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _CONNECTION_PATIENCE = 5.0
 
 
-class SearchNode(LifecycleNode, Generic[SettingsT]):
+class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     """A lifecycle node of the suite.
 
     Publishes
@@ -452,7 +452,7 @@ def _takes_part(name: str) -> bool:
     return name not in ('recorder', 'guard', 'rosbag2_recorder') and not name.startswith('_')
 
 
-def _configure(node: SearchNode[Any]) -> bool:
+def _configure(node: LockstepLifecycleNode[Any]) -> bool:
     """Configure a node; return whether it is configured."""
     done = node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     if not done:
@@ -460,11 +460,13 @@ def _configure(node: SearchNode[Any]) -> bool:
     return done
 
 
-def _activate(node: SearchNode[Any]) -> bool:
+def _activate(node: LockstepLifecycleNode[Any]) -> bool:
     return node.trigger_activate() == TransitionCallbackReturn.SUCCESS
 
 
-def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = None) -> int:
+def run(
+    make_node: Callable[[], LockstepLifecycleNode[Any]], arguments: list[str] | None = None
+) -> int:
     """Run a node until it is told to end; return the exit code.
 
     SIGINT and SIGTERM stop what moves before the node leaves the graph.
@@ -479,7 +481,7 @@ def run(make_node: Callable[[], SearchNode[Any]], arguments: list[str] | None = 
             raise KeyboardInterrupt
         asked = True
 
-    node: SearchNode[Any] | None = None
+    node: LockstepLifecycleNode[Any] | None = None
     try:
         signal.signal(signal.SIGINT, interrupt)
         signal.signal(signal.SIGTERM, interrupt)

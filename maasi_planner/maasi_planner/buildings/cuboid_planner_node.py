@@ -21,7 +21,7 @@ from maasi_filter.ros.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import SearchNode, SettingsError, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError, run
 from maasi_filter.ros.marker_board import MarkerBoard
 from maasi_filter.ros.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
 from maasi_filter.ros.stamps import JUMP, StampGate
@@ -52,7 +52,7 @@ _REASONS = {
 }
 
 
-class CuboidPlannerNode(SearchNode[CuboidPlannerSettings]):
+class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
     """Plans for the robot whose namespace it is in, with what those in range tell.
 
     At each step it takes in its state, tells the others, hears them, decides, and commands the
