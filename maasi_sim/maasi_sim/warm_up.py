@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import gc
-import importlib
 from collections.abc import Callable
+from importlib.metadata import distribution
 from typing import Any
 
 import maasi_filter
@@ -45,10 +45,12 @@ def warm_up_all() -> None:
 def main_of(package: str, executable: str) -> Callable[[], Any] | None:
     """Return what runs an executable of this suite, or None for one of another package.
 
-    The node itself is imported only then: rclpy begins threads of its own, and a process that has
-    some is not to be copied.
+    The node itself is imported when it is called: rclpy starts threads, and a process with several
+    threads must not be forked.
     """
     if package not in _PACKAGES:
         return None
-    module = f'{package}.{executable}'
-    return lambda: importlib.import_module(module).main()
+    scripts = distribution(package).entry_points
+    (script,) = scripts.select(group='console_scripts', name=executable)
+    main: Callable[[], Any] = script.load()
+    return main

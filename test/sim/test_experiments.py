@@ -465,7 +465,7 @@ def test_names_are_unique_and_listed(capsys):
 def test_command_ends_cleanly_when_interrupted(tmp_path):
     code = (
         'import os, signal, sys\n'
-        'from maasi_sim import reproduce\n'
+        'from maasi_sim.experiments import reproduce\n'
         'from maasi_sim.experiments import campaign\n'
         'campaign.execute = lambda task: os.kill(os.getpid(), signal.SIGTERM)\n'
         "arguments = ['000-fig4', '--small', '--workers', '1', '--out', sys.argv[1]]\n"
