@@ -19,7 +19,9 @@ from visualization_msgs.msg import MarkerArray
 
 from maasi_filter import warm_up
 from maasi_filter.filter_memory import FilterMemory, Progress
-from maasi_filter.ic_phd.search_filter import AgentMeasurement, SearchFilter
+from maasi_filter.filter_protocol import TargetFilter
+from maasi_filter.ic_phd.search_filter import AgentMeasurement
+from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.kept_found_targets import KeptFoundTargets, checked_found
 from maasi_filter.ros.conversions import (
     cluster_to_ros,
@@ -82,7 +84,7 @@ class PendingBatch:
 
 
 class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
-    """The particle PHD filter of the team (000, sections 3.1 to 3.3).
+    """The filter of the team: particle PHD (000, sections 3.1 to 3.3) or Poisson multi-Bernoulli.
 
     In the namespace of its only robot it is that robot's own: beside others of the kind that tell
     each other what they have found (002, section 4, independent planner). What another one found
@@ -130,7 +132,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def _begin_anew(self) -> None:
         settings = self.settings
-        self.filter = SearchFilter(
+        self.filter = make_filter(
             settings.filter, settings.environment.array(), np.random.default_rng(settings.seed)
         )
         self._pending: dict[int, PendingBatch] = {}
@@ -182,7 +184,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         """
         settings = self.settings
         try:
-            saved = SearchFilter.load(settings.save_file)
+            saved = load_filter(settings.save_file)
         except StateFileError as error:
             raise SettingsError(f'parameter save_file: {error}') from None
         self._check_bounds(saved)
@@ -195,7 +197,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             f'state loaded from {settings.save_file}: {len(saved.found_targets)} found targets'
         )
 
-    def _check_bounds(self, saved: SearchFilter) -> None:
+    def _check_bounds(self, saved: TargetFilter) -> None:
         bounds = self.settings.environment.array()
         if not np.array_equal(saved.bounds, bounds):
             raise SettingsError(

@@ -17,6 +17,7 @@ from maasi_filter.models.detection import (
 )
 from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.pmb.settings import PmbSettings
 
 FloatArray = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -274,6 +275,9 @@ class FilterSettings(Settings):
     and a floor of 2.7 m. `docs/filter_presets.md` has the presets side by side.
     """
 
+    method: Literal['ic_phd', 'pmb'] = Field(
+        default='ic_phd', description='Particle PHD filter, or Poisson multi-Bernoulli filter'
+    )
     preset: Preset = Field(default='recommended', description='Where values left None come from')
     particles: int = Field(
         default=10000,
@@ -368,6 +372,9 @@ class FilterSettings(Settings):
     )
     kmeans_iterations: int | None = Field(
         default=None, ge=1, le=1000, description='Largest number of K-means iterations [1]'
+    )
+    pmb: PmbSettings = Field(
+        default_factory=PmbSettings, description='Of the Poisson multi-Bernoulli filter'
     )
     threads: int | None = Field(
         default=None,

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from maasi_filter.ic_phd.phd import prepare_measurements
-from maasi_filter.ic_phd.search_filter import LEAST_CLUSTER_MASS, AgentMeasurement, SearchFilter
+from maasi_filter.ic_phd.search_filter import LEAST_CLUSTER_MASS, AgentMeasurement
 from maasi_filter.ic_phd.unconfirmed_targets import LostTargets
 from maasi_filter.models.detection import PARAMETERS, detection_probability
+from maasi_filter.make_filter import make_filter
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import (
     DetectionSettings,
@@ -32,11 +33,14 @@ def warm_up() -> None:
             noise = NoiseSettings(range=0.5, bearing=0.1, elevation=0.1)
             sensor = SensorSettings(detection=detection, noise=noise).build('warm_up', dimension)
             presets: tuple[Preset, ...] = ('recommended', 'paper_000', 'paper_003')
-            for preset in presets:
-                settings = FilterSettings(
+            variants = [
+                FilterSettings(
                     preset=preset, particles=500, birth_particles=50, particles_minimum=50
                 )
-                search = SearchFilter(settings, bounds, np.random.default_rng(0))
+                for preset in presets
+            ]
+            for settings in (*variants, FilterSettings(method='pmb')):
+                search = make_filter(settings, bounds, np.random.default_rng(0))
                 for step in range(6):
                     position = np.array([3.0 + 0.2 * step, 3.0, 3.0])
                     pose = Pose.from_yaw(position, 0.1)

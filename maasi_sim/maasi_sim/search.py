@@ -14,7 +14,8 @@ from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.ic_phd.found_targets import FoundTarget
-from maasi_filter.ic_phd.search_filter import AgentMeasurement, SearchFilter
+from maasi_filter.ic_phd.search_filter import AgentMeasurement
+from maasi_filter.make_filter import make_filter
 from maasi_filter.models.pose import Pose
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState, make_motion
@@ -200,7 +201,7 @@ class _Group:
         self.names = names
         common = {'step': scenario.step, 'seed': seed, 'lockstep': True}
         self.coordinator = Coordinator(planner_settings(scenario, names, common))
-        self.filter = SearchFilter(
+        self.filter = make_filter(
             scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
         )
         self.last_batch: int | None = None

@@ -1,0 +1,84 @@
+"""What a search filter is to those that use it: nodes, planners and searches in one process."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.exploration import Exploration
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.ic_phd.found_targets import FoundTarget
+from maasi_filter.ic_phd.search_filter import AgentMeasurement, FilterResult
+from maasi_filter.settings import FilterSettings
+
+FloatArray = NDArray[np.float64]
+
+
+class TargetFilter(Protocol):
+    """A filter that finds targets from the detections of several robots.
+
+    Attributes
+    ----------
+    settings : FilterSettings
+        As given.
+    bounds : (d, 2) array
+        Of the environment, metres.
+    dimension : int
+        2 or 3.
+    exploration : Exploration
+        e, updated with every measurement.
+    clusters : list of Cluster
+        Potential targets that are not found, heaviest first.
+    """
+
+    settings: FilterSettings
+    bounds: FloatArray
+    dimension: int
+    exploration: Exploration
+    clusters: list[Cluster]
+
+    @property
+    def found_targets(self) -> list[FoundTarget]:
+        """Targets found so far, in the order of being found."""
+
+    @property
+    def particles(self) -> FloatArray:
+        """(n, d), metres."""
+
+    @property
+    def weights(self) -> FloatArray:
+        """(n,); they sum to the expected number of targets that are not found yet."""
+
+    @property
+    def expected_number(self) -> float:
+        """Expected number of targets that are not found yet, of those that were detected."""
+
+    def step(
+        self, measurements: Sequence[AgentMeasurement], steps: int, time: float
+    ) -> FilterResult:
+        """Predict over `steps` control steps, correct with every robot of M_k, and mark.
+
+        Raises
+        ------
+        ValueError
+            If a measurement is not usable. Nothing has changed then.
+        """
+
+    def own_found_targets(self) -> list[FoundTarget]:
+        """Return the found targets that this filter found itself."""
+
+    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
+        """Take over what the filter of another robot has found; return whether anything changed."""
+
+    def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
+        """Add targets found before this filter was made; return those that are new."""
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the whole state, random generator included, to one file."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return the whole state, random generator included, as arrays for a file."""

@@ -1,0 +1,1 @@
+"""Poisson multi-Bernoulli filter."""

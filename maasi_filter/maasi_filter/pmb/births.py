@@ -1,0 +1,109 @@
+"""Births: where new targets may be that detections point at."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_filter.exploration import Exploration
+from maasi_filter.pmb.factors import LEAST_UNEXPLORED, MOST_PROBABLE, Scan
+
+FloatArray = NDArray[np.float64]
+
+
+@njit(cache=True, error_model='numpy')
+def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    values, cartesian, centres, roots, volume, sensor_position, particles, jacobian
+):
+    """Turn standard normal numbers (m, n, d) into positions, and fill |dx/dz| at each (m, n)."""
+    d = values.shape[1]
+    z = np.zeros(3)
+    for m in range(particles.shape[0]):
+        origin = centres[m] if cartesian[m] else values[m]
+        for i in range(particles.shape[1]):
+            for a in range(d):
+                z[a] = origin[a]
+                for b in range(a + 1):
+                    z[a] += roots[m, a, b] * particles[m, i, b]
+            if cartesian[m]:
+                for a in range(d):
+                    particles[m, i, a] = z[a]
+                jacobian[m, i] = volume[m]
+                continue
+            level = z[0] * math.cos(z[2]) if d == 3 else z[0]
+            particles[m, i, 0] = sensor_position[0] + level * math.cos(z[1])
+            particles[m, i, 1] = sensor_position[1] + level * math.sin(z[1])
+            jacobian[m, i] = z[0]
+            if d == 3:
+                particles[m, i, 2] = sensor_position[2] + z[0] * math.sin(z[2])
+                jacobian[m, i] = z[0] * level
+            # No detection points behind the sensor, nor beyond straight up.
+            if not (z[0] > 0.0 and level > 0.0):
+                jacobian[m, i] = 0.0
+
+
+@dataclass(frozen=True)
+class Births:
+    """Draws of the places that each of m detections points at.
+
+    Parameters
+    ----------
+    particles : (m, n, d) array
+        x = g^-1(z + noise), metres.
+    volume : (m, n) array
+        pi(x) |dx/dz|, 0 outside the bounds: with it a mean over the draws is an integral of
+        pi(x) g(z | x).
+    weights : (m, n) array
+        The same times e(x).
+    intensity : (m,) array
+        lambda_j = (N0 / V) int e pi g(z_j | x) dx, of detections of targets not seen before.
+    """
+
+    particles: FloatArray
+    volume: FloatArray
+    weights: FloatArray
+    intensity: FloatArray
+
+
+def draw_births(
+    scan: Scan,
+    exploration: Exploration,
+    expected_targets: float,
+    number: int,
+    generator: np.random.Generator,
+) -> Births:
+    """Return births of a scan, before e is updated with it (Williams 2015, eq. (27), (34)).
+
+    Parameters
+    ----------
+    expected_targets : float
+        N0.
+    number : int
+        Draws for each detection.
+    """
+    measurements = scan.measurements
+    count, d = measurements.values.shape
+    particles = generator.standard_normal((count, number, d))
+    volume = np.empty((count, number))
+    _draw(
+        measurements.values,
+        measurements.cartesian,
+        measurements.centres,
+        measurements.roots,
+        measurements.volume,
+        scan.pose.position,
+        particles,
+        volume,
+    )
+    flat = particles.reshape(-1, d)
+    inside = ((flat >= exploration.bounds[:, 0]) & (flat <= exploration.bounds[:, 1])).all(axis=1)
+    probability = np.minimum(scan.detection.probability(flat, scan.pose), MOST_PROBABLE)
+    volume *= (probability * inside).reshape(count, number)
+    unseen = np.maximum(exploration.at(flat), LEAST_UNEXPLORED).reshape(count, number)
+    weights = unseen * volume
+    intensity = expected_targets / exploration.volume * weights.mean(axis=1)
+    return Births(particles, volume, weights, intensity)

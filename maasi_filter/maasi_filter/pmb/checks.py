@@ -1,0 +1,143 @@
+"""Checks of measurements before a step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.ic_phd.search_filter import POSE_ERROR_OF_BOX, AgentMeasurement
+from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor, is_covariance
+from maasi_filter.settings import FilterSettings
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class Checked:
+    """A checked measurement: every detection has a covariance, and their order is fixed.
+
+    Parameters
+    ----------
+    own : bool
+        Whether the covariances are the detections' own.
+    pose_error : float
+        Deviation of the error of the robot's position, per axis, as far as it is not in them [m].
+    """
+
+    robot: str
+    pose: Pose
+    sensor: Sensor
+    values: FloatArray
+    covariances: FloatArray
+    own: bool
+    index: int
+    pose_error: float
+
+    def only(self, keep: NDArray[np.bool_]) -> Checked:
+        """Return a copy with some of the detections."""
+        return replace(self, values=self.values[keep], covariances=self.covariances[keep])
+
+
+def check_step(
+    measurements: Sequence[AgentMeasurement],
+    steps: int,
+    time: float,
+    settings: FilterSettings,
+    dimension: int,
+) -> list[Checked]:
+    """Return the measurements of a step in the order of the robots' names.
+
+    Raises
+    ------
+    ValueError
+        If anything is not finite, a covariance is not positive definite, shapes or dimensions do
+        not fit, or a robot is there twice.
+    """
+    if isinstance(steps, bool) or int(steps) != steps or steps < 0:
+        raise ValueError(f'steps: got {steps!r}, allowed are whole numbers from 0')
+    if not math.isfinite(time):
+        raise ValueError(f'time: got {time}, allowed are finite numbers')
+    ordered = sorted(measurements, key=lambda item: item.robot)
+    members = [_checked(item, settings, dimension) for item in ordered]
+    names = [member.robot for member in members]
+    if len(set(names)) != len(names):
+        raise ValueError(f'measurements: got robots {names}, allowed is each robot once')
+    return members
+
+
+def pose_error_of(sensor: Sensor, settings: FilterSettings, dimension: int) -> float:
+    """Return the error of a robot's position, where it does not say more of it [m]."""
+    if settings.pose_error is not None:
+        return settings.pose_error
+    if isinstance(sensor.detection, BoxDetection):
+        extent = sensor.detection.upper - sensor.detection.lower
+        return POSE_ERROR_OF_BOX * 0.5 * float(extent[:dimension].min())
+    return 0.0
+
+
+def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) -> Checked:
+    name, sensor = measurement.robot, measurement.sensor
+    if sensor.dimension != d:
+        raise ValueError(f'{name}: sensor: got {sensor.dimension} dimensions, allowed is {d}')
+    values = np.array(measurement.values, dtype=float)
+    if values.size == 0:
+        values = values.reshape(0, d)
+    if values.ndim != 2 or values.shape[1] != d:
+        raise ValueError(f'{name}: values: got shape {values.shape}, allowed is (m, {d})')
+    if not np.isfinite(values).all():
+        raise ValueError(f'{name}: values: got {values.tolist()}, allowed are finite numbers')
+    own = bool(settings.use_detection_covariances) and measurement.covariances is not None
+    covariances = np.empty((len(values), d, d))
+    covariances[:] = sensor.covariance
+    if own:
+        covariances = _own_covariances(name, measurement.covariances, len(values), d)
+    pose_error = pose_error_of(sensor, settings, d)
+    if measurement.position_covariance is not None:
+        reported = _reported_error(name, measurement.position_covariance, d)
+        if settings.pose_error is None and not own:
+            pose_error = max(pose_error, reported)
+    # The order in which a sensor lists its detections means nothing, so it decides nothing.
+    order = np.lexsort(values.T[::-1])
+    return Checked(
+        name,
+        measurement.pose,
+        sensor,
+        values[order],
+        covariances[order],
+        own,
+        measurement.index,
+        pose_error,
+    )
+
+
+def _own_covariances(name: str, given: FloatArray | None, count: int, d: int) -> FloatArray:
+    covariances = np.array(given, dtype=float)
+    if covariances.size == 0:
+        covariances = covariances.reshape(0, d, d)
+    if covariances.shape != (count, d, d):
+        raise ValueError(
+            f'{name}: covariances: got shape {covariances.shape}, allowed is ({count}, {d}, {d})'
+        )
+    for covariance in covariances:
+        if not is_covariance(covariance):
+            raise ValueError(
+                f'{name}: covariances: got {covariance.tolist()}, allowed is a symmetric positive '
+                'definite matrix of finite numbers'
+            )
+    return covariances
+
+
+def _reported_error(name: str, reported: FloatArray, d: int) -> float:
+    variances = np.diagonal(np.asarray(reported, dtype=float))
+    if variances.shape != (3,) or not (np.isfinite(variances).all() and min(variances) >= 0):
+        raise ValueError(
+            f'{name}: position_covariance: got {np.asarray(reported).tolist()}, allowed is a '
+            '(3, 3) matrix with finite variances from 0'
+        )
+    return math.sqrt(float(variances[:d].max()))

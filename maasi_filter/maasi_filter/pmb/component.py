@@ -1,0 +1,257 @@
+"""Bernoulli components: a potential target, with the probability that it exists."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.ic_phd.found_targets import FoundTarget
+from maasi_filter.pmb.births import Births
+from maasi_filter.pmb.density import Density
+from maasi_filter.pmb.factors import (
+    GIVEN,
+    KIND,
+    MISS,
+    MODEL,
+    MOST_PROBABLE,
+    SCALE,
+    Scan,
+    likelihoods,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# A detection may be a component's within so many deviations and root mean square radii.
+GATE = 6.0
+# Fewer effective particles than this do not tell a likelihood; draws from the detection may.
+LEAST_SUPPORT = 10.0
+# Squared normalised distance up to which such draws are tried.
+SUPPORT_DISTANCE = 36.0
+# Associations and changes of the log density that are not worth a term or a factor.
+LEAST_SHARE = 1e-4
+LEAST_CHANGE = 1e-3
+# Factors after which a density is condensed to a normal one: found, or not.
+MOST_FACTORS_FOUND = 60
+MOST_FACTORS = 150
+
+
+@dataclass
+class View:
+    """A component as one scan sees it.
+
+    Parameters
+    ----------
+    probability : (n,) array
+        pi at its particles.
+    detected : float
+        p_D = sum w pi.
+    gated : (g,) int array
+        Detections that may be its own.
+    seen : (g, n) array
+        pi g_j at its particles.
+    likelihood : (g,) array
+        L_j = int f pi g_j dx.
+    drawn : dict
+        Weights of the detection's draws, by the place in `gated`, where particles do not reach.
+    """
+
+    probability: FloatArray
+    detected: float
+    gated: IntArray
+    seen: FloatArray
+    likelihood: FloatArray
+    drawn: dict[int, FloatArray] = field(default_factory=dict)
+
+
+@dataclass
+class Component:
+    """A potential target.
+
+    Parameters
+    ----------
+    existence : float
+        r.
+    density : Density
+        f.
+    hits : float
+        Expected number of its detections, if it exists.
+    scan : int
+        Number of the scan it was born in.
+    pose_error : float
+        Of the robot that detected it last, metres.
+    found_radius : float
+        T_r of that robot's sensor, metres.
+    target : FoundTarget, optional
+        What is reported, where it is found.
+    """
+
+    existence: float
+    density: Density
+    hits: float
+    scan: int
+    pose_error: float
+    found_radius: float
+    target: FoundTarget | None = None
+
+    @property
+    def foreign(self) -> bool:
+        """Whether the filter of another robot found it, and follows it."""
+        return self.target is not None and self.target.origin != 0
+
+    def view(self, scan: Scan, births: Births) -> View:
+        """Return how a scan sees this component."""
+        density = self.density
+        gated = self._gated(scan)
+        probability = np.empty(len(density.weights))
+        if scan.head[KIND] == GIVEN:
+            given = scan.detection.probability(density.particles, scan.pose)
+            probability = np.minimum(given, MOST_PROBABLE)
+        seen = np.empty((len(gated), len(probability)))
+        detected = likelihoods(
+            scan.head,
+            scan.terms[gated],
+            density.particles,
+            density.weights,
+            probability,
+            seen,
+        )
+        view = View(probability, detected, gated, seen, seen @ density.weights)
+        for k, j in enumerate(gated.tolist()):
+            self._support(view, k, births.particles[j], births.volume[j])
+        return view
+
+    def odds(self, view: View) -> FloatArray:
+        """Return r L_j / (1 - r p_D) of the gated detections."""
+        return self.existence * view.likelihood / (1.0 - self.existence * view.detected)
+
+    def update(
+        self,
+        view: View,
+        missed: float,
+        caused: FloatArray,
+        scan: Scan,
+        births: Births,
+        generator: np.random.Generator,
+    ) -> bool:
+        """Take a scan in, given marginal association probabilities; return whether f changed.
+
+        a_0 = p_miss r (1 - p_D) / (1 - r p_D), a_j = p_j, r = sum a (Williams 2015, eq. (31)).
+        """
+        r, detected = self.existence, view.detected
+        nothing = missed * r * (1.0 - detected) / (1.0 - r * detected)
+        own = caused[view.gated]
+        self.existence = min(nothing + float(own.sum()), 1.0)
+        if self.foreign or not self.existence > 0.0:
+            return False
+        self.hits += float(own.sum()) / self.existence
+        share = own / self.existence
+        taken = np.flatnonzero(share > LEAST_SHARE)
+        head = scan.head.copy()
+        head[MISS] = nothing / ((1.0 - detected) * self.existence)
+        if head[KIND] == GIVEN:
+            head[MODEL] = detected
+        scale = share[taken] / view.likelihood[taken]
+        terms = scan.terms[view.gated[taken]]
+        terms[:, SCALE] += np.log(scale)
+        factor = head[MISS] * (1.0 - view.probability) + scale @ view.seen[taken]
+        logs = np.log(np.maximum(factor, 1e-300))
+        drawn = [k for k in taken.tolist() if k in view.drawn and share[k] > 0.05]
+        if drawn:
+            self._restart(head, terms, factor, view, drawn, share, births, generator)
+        elif len(taken) or np.ptp(logs) > LEAST_CHANGE:
+            self.density.absorb(head, terms, logs, generator)
+        else:
+            return False
+        most = MOST_FACTORS if self.target is None else MOST_FACTORS_FOUND
+        if len(self.density.heads) > most:
+            self.density.condense()
+        return True
+
+    def _gated(self, scan: Scan) -> IntArray:
+        measurements = scan.measurements
+        mean = self.density.mean
+        offset = mean - scan.pose.position[: len(mean)]
+        reach = GATE * (np.sqrt(measurements.covariances[:, 0, 0]) + self.density.radius)
+        near = np.abs(measurements.values[:, 0] - math.sqrt(float(offset @ offset))) < reach
+        return np.flatnonzero(near)
+
+    def _support(self, view: View, k: int, particles: FloatArray, volume: FloatArray) -> None:
+        """Take a likelihood from the detection's draws where particles are too sparse for it."""
+        shares = view.seen[k] * self.density.weights
+        total = view.likelihood[k]
+        if total > 0.0 and total * total >= LEAST_SUPPORT * float(shares @ shares):
+            return
+        mean = volume @ particles / max(float(volume.sum()), 1e-300)
+        offset = mean - self.density.mean
+        spread = particles - mean
+        covariance = self.density.covariance + spread.T @ spread / len(particles)
+        if float(offset @ np.linalg.solve(covariance, offset)) > SUPPORT_DISTANCE:
+            return
+        drawn = np.exp(np.minimum(self.density.log_at(particles), 600.0)) * volume
+        square = float(drawn @ drawn)
+        if square > 0.0 and float(drawn.sum()) ** 2 > LEAST_SUPPORT * square:
+            view.likelihood[k] = float(drawn.mean())
+            view.drawn[k] = drawn
+
+    def _restart(
+        self,
+        head: FloatArray,
+        terms: FloatArray,
+        factor: FloatArray,
+        view: View,
+        drawn: list[int],
+        share: FloatArray,
+        births: Births,
+        generator: np.random.Generator,
+    ) -> None:
+        """Draw the posterior from particles and, for some detections, from their own draws."""
+        density = self.density
+        for k in drawn:
+            factor = factor - share[k] / view.likelihood[k] * view.seen[k]
+        particles = [density.particles]
+        weights = [density.weights * np.maximum(factor, 0.0)]
+        for k in drawn:
+            particles.append(births.particles[view.gated[k]])
+            weights.append(share[k] * view.drawn[k] / view.drawn[k].sum())
+        density.restart(head, terms, np.concatenate(particles), np.concatenate(weights), generator)
+
+
+def same_place(one: Component, other: Component, distance: float) -> bool:
+    """Return whether two components may be one target, within a squared normalised distance.
+
+    Not those of one scan, as a target causes one detection of it at most, nor those which together
+    are more than one target.
+    """
+    if one.scan == other.scan or one.existence + other.existence > 1.0:
+        return False
+    offset = one.density.mean - other.density.mean
+    total = one.density.covariance + other.density.covariance
+    return float(offset @ np.linalg.solve(total, offset)) < distance
+
+
+def merge(components: list[Component], distance: float) -> list[Component]:
+    """Merge components of one place: the heavier one's density, both existences.
+
+    One of the two is a target at most: the events exclude each other, and their probabilities add.
+    """
+    if len(components) < 2:
+        return components
+    means = np.array([item.density.mean for item in components])
+    radii = np.array([item.density.radius for item in components])
+    gaps = np.square(means[:, None] - means[None]).sum(axis=2)
+    near = gaps < distance * (radii[:, None] ** 2 + radii[None] ** 2)
+    order = np.argsort([-item.existence for item in components], kind='stable').tolist()
+    kept: list[int] = []
+    for i in order:
+        item = components[i]
+        for k in kept:
+            if near[i, k] and same_place(components[k], item, distance):
+                components[k].existence += item.existence
+                break
+        else:
+            kept.append(i)
+    return [components[i] for i in sorted(kept)]

@@ -1,0 +1,304 @@
+"""Where a component's target is: weighted particles of a density known up to a constant.
+
+Iterated batch importance sampling (Chopin 2002): a new factor changes weights; when few particles
+carry them, they are resampled and moved by Metropolis steps that leave the product of all factors
+invariant, so that no number of measurements lets the particles collapse.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_filter.pmb.factors import (
+    FIRST,
+    TERMS,
+    gaussian_factor,
+    log_product_at,
+    log_products,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# Below this share of effective particles they are resampled and moved.
+LEAST_EFFECTIVE = 0.4
+# Smallest part of a factor that is taken in at a time.
+LEAST_STEP = 1.0 / 64.0
+# Moves end when as many are accepted as there are particles, or after so many sweeps.
+MOST_SWEEPS = 8
+
+
+@njit(cache=True, error_model='numpy')
+def _effective(weights, logs, exponent):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return the effective number of particles with weights w exp(exponent log f)."""
+    largest = -np.inf
+    for i in range(len(weights)):
+        if weights[i] > 0.0:
+            largest = max(largest, logs[i])
+    total = 0.0
+    squares = 0.0
+    for i in range(len(weights)):
+        if weights[i] > 0.0:
+            weight = weights[i] * math.exp(exponent * (logs[i] - largest))
+            total += weight
+            squares += weight * weight
+    return total * total / squares
+
+
+@njit(cache=True, error_model='numpy')
+def _exponent(weights, logs, most, least_effective):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the largest exponent up to `most` that leaves enough effective particles."""
+    if _effective(weights, logs, most) >= least_effective:
+        return most
+    low = 0.0
+    high = most
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        if _effective(weights, logs, middle) >= least_effective:
+            low = middle
+        else:
+            high = middle
+    return min(max(low, LEAST_STEP), most)
+
+
+@njit(cache=True, error_model='numpy')
+def _reweigh(weights, logs, exponent):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Multiply weights by f to an exponent, in place; they sum to 1."""
+    largest = -np.inf
+    for i in range(len(weights)):
+        if weights[i] > 0.0:
+            largest = max(largest, logs[i])
+    total = 0.0
+    for i in range(len(weights)):
+        weights[i] *= math.exp(exponent * (logs[i] - largest))
+        total += weights[i]
+    for i in range(len(weights)):
+        weights[i] /= total
+
+
+@njit(cache=True, error_model='numpy')
+def _systematic(weights, number, start):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return indices of a systematic resampling; `start` is uniform in [0, 1)."""
+    index = np.empty(number, np.int64)
+    cumulative = weights[0]
+    i = 0
+    for k in range(number):
+        while cumulative < (k + start) / number and i < len(weights) - 1:
+            i += 1
+            cumulative += weights[i]
+        index[k] = i
+    return index
+
+
+@njit(cache=True, error_model='numpy')
+def _sweep(heads, terms, grid, frame, exponent, particles, products, last, draws):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Propose a move for each particle, in place; return how many were accepted.
+
+    Differential moves: a share of the difference of two particles of the other half, which does
+    not move meanwhile, so that the target density is left invariant.
+    """
+    number, d = particles.shape
+    half = number // 2
+    accepted = 0
+    place = np.zeros(3)
+    for i in range(number):
+        first, size = (half, number - half) if i < half else (0, half)
+        a = first + min(int(draws[i, 0] * size), size - 1)
+        b = first + min(int(draws[i, 1] * size), size - 1)
+        scale = 2.38 / math.sqrt(2.0 * d) * (0.1 + 0.9 * draws[i, 2])
+        for k in range(d):
+            place[k] = particles[i, k] + scale * (particles[a, k] - particles[b, k])
+        product, newest = log_product_at(heads, terms, grid, frame, d, place[0], place[1], place[2])
+        gain = product - products[i] + exponent * (newest - last[i])
+        if gain >= math.log(max(draws[i, 3], 1e-300)):
+            for k in range(d):
+                particles[i, k] = place[k]
+            products[i] = product
+            last[i] = newest
+            accepted += 1
+    return accepted
+
+
+@njit(cache=True, error_model='numpy')
+def _moments(particles, weights, mean, covariance):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Fill mean and covariance."""
+    number, d = particles.shape
+    for a in range(d):
+        mean[a] = 0.0
+        for i in range(number):
+            mean[a] += weights[i] * particles[i, a]
+    for a in range(d):
+        for b in range(a + 1):
+            total = 0.0
+            for i in range(number):
+                total += weights[i] * (particles[i, a] - mean[a]) * (particles[i, b] - mean[b])
+            covariance[a, b] = total
+            covariance[b, a] = total
+
+
+class Density:
+    """Density of one target's position.
+
+    Parameters
+    ----------
+    particles : (n, d) array
+        Metres.
+    weights : (n,) array
+        They sum to 1.
+    heads, terms : arrays
+        Factors, at least one; see `factors`.
+    grid : (nx, ny, nz) array
+        e at birth, a factor too; empty where there is none. It is not written to.
+    frame : (3, 3) array
+        Lower and upper bounds of the environment, and the step of the grid.
+
+    Attributes
+    ----------
+    mean, covariance : (d,) and (d, d) arrays
+        Of the particles.
+    """
+
+    def __init__(
+        self,
+        particles: FloatArray,
+        weights: FloatArray,
+        heads: FloatArray,
+        terms: FloatArray,
+        grid: FloatArray,
+        frame: FloatArray,
+    ) -> None:
+        self.particles = particles
+        self.weights = weights
+        self.heads = heads
+        self.terms = terms
+        self.grid = grid
+        self.frame = frame
+        d = particles.shape[1]
+        self.mean: FloatArray = np.empty(d)
+        self.covariance: FloatArray = np.empty((d, d))
+        self._measure()
+
+    @classmethod
+    def normal(
+        cls,
+        mean: FloatArray,
+        covariance: FloatArray,
+        number: int,
+        frame: FloatArray,
+        generator: np.random.Generator,
+    ) -> Density:
+        """Return a normal density within the bounds."""
+        d = len(mean)
+        values, vectors = np.linalg.eigh(covariance)
+        root = vectors * np.sqrt(np.maximum(values, 1e-12 * max(values.max(), 1e-12)))
+        particles = mean + generator.standard_normal((number, d)) @ root.T
+        particles = np.clip(particles, frame[0, :d], frame[1, :d])
+        head, terms = gaussian_factor(mean, root @ root.T)
+        weights = np.full(number, 1.0 / number)
+        return cls(particles, weights, head[None], terms, np.empty((0, 0, 0)), frame)
+
+    @property
+    def radius(self) -> float:
+        """Root mean square distance from the mean [m]."""
+        return math.sqrt(float(np.trace(self.covariance)))
+
+    def log_at(self, positions: FloatArray) -> FloatArray:
+        """Return the log density at positions (n, d); its constant is that of the factors."""
+        products, last = self._logs(positions)
+        return products + last
+
+    def absorb(
+        self, head: FloatArray, terms: FloatArray, logs: FloatArray, generator: np.random.Generator
+    ) -> None:
+        """Multiply by a factor, whose log at the particles is `logs`."""
+        self._append(head, terms)
+        if _effective(self.weights, logs, 1.0) >= LEAST_EFFECTIVE * len(self.weights):
+            _reweigh(self.weights, logs, 1.0)
+        else:
+            self._temper(generator)
+        self._measure()
+
+    def restart(
+        self,
+        head: FloatArray,
+        terms: FloatArray,
+        particles: FloatArray,
+        weights: FloatArray,
+        generator: np.random.Generator,
+    ) -> None:
+        """Multiply by a factor; `particles` with weights are draws from the product already."""
+        self._append(head, terms)
+        index = _systematic(weights / weights.sum(), len(self.weights), generator.random())
+        self.particles = particles[index]
+        self.weights = np.full(len(index), 1.0 / len(index))
+        products, last = self._logs(self.particles)
+        self._move(1.0, products, last, generator)
+        self._measure()
+
+    def replace_particles(self, particles: FloatArray) -> None:
+        """Put others in place of the particles, with the same weights."""
+        self.particles = particles
+        self._measure()
+
+    def condense(self) -> None:
+        """Replace all factors by a normal density with the particles' moments."""
+        head, self.terms = gaussian_factor(self.mean, self.covariance)
+        self.heads = head[None]
+        self.grid = np.empty((0, 0, 0))
+
+    def _append(self, head: FloatArray, terms: FloatArray) -> None:
+        row = head.copy()
+        row[FIRST], row[TERMS] = len(self.terms), len(terms)
+        self.heads = np.concatenate([self.heads, row[None]])
+        self.terms = np.concatenate([self.terms, terms])
+
+    def _logs(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        products, last = np.empty(len(positions)), np.empty(len(positions))
+        log_products(self.heads, self.terms, self.grid, self.frame, positions, products, last)
+        return products, last
+
+    def _temper(self, generator: np.random.Generator) -> None:
+        """Take the last factor in by parts, with moves after each (Chopin 2002, section 4)."""
+        products, last = self._logs(self.particles)
+        number = len(self.weights)
+        taken = 0.0
+        while taken < 1.0:
+            step = _exponent(self.weights, last, 1.0 - taken, LEAST_EFFECTIVE * number)
+            taken = 1.0 if taken + step > 1.0 - 1e-9 else taken + step
+            _reweigh(self.weights, last, step)
+            index = _systematic(self.weights, number, generator.random())
+            self.particles = self.particles[index]
+            self.weights = np.full(number, 1.0 / number)
+            products, last = products[index], last[index]
+            self._move(taken, products, last, generator)
+
+    def _move(
+        self,
+        exponent: float,
+        products: FloatArray,
+        last: FloatArray,
+        generator: np.random.Generator,
+    ) -> None:
+        number = len(self.weights)
+        accepted = 0
+        for _ in range(MOST_SWEEPS):
+            accepted += _sweep(
+                self.heads,
+                self.terms,
+                self.grid,
+                self.frame,
+                exponent,
+                self.particles,
+                products,
+                last,
+                generator.random((number, 4)),
+            )
+            if accepted >= number:
+                break
+
+    def _measure(self) -> None:
+        _moments(self.particles, self.weights, self.mean, self.covariance)

@@ -1,0 +1,541 @@
+"""Poisson multi-Bernoulli filter of targets that stand still, or walk a little.
+
+Targets not detected yet are a Poisson process of intensity (N0 / V) e(x); every detection that
+may be of one of them makes a Bernoulli component (Williams 2015, TOMB/P). `docs/filter_pmb.md`
+has the equations.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.exploration import Exploration, check_bounds
+from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.ic_phd.found_targets import FoundTarget
+from maasi_filter.ic_phd.phd import prepare_measurements
+from maasi_filter.ic_phd.search_filter import (
+    EXPLORATION_CELLS,
+    FOUND_RADIUS_DEVIATIONS,
+    LEAST_CLUSTER_MASS,
+    AgentMeasurement,
+    FilterResult,
+)
+from maasi_filter.ic_phd.state_check import check_exploration
+from maasi_filter.models.detection import BoxDetection
+from maasi_filter.pmb import state as pmb_state
+from maasi_filter.pmb.association import associate
+from maasi_filter.pmb.births import Births, draw_births
+from maasi_filter.pmb.checks import Checked, check_step, pose_error_of
+from maasi_filter.pmb.clutter import ClutterEstimate, measurement_space
+from maasi_filter.pmb.component import Component, merge
+from maasi_filter.pmb.density import Density
+from maasi_filter.pmb.factors import FIRST, MISS, SCALE, TERMS, Scan, make_scan
+from maasi_filter.pmb.found import check_taken, nearest, same_estimate
+from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
+from maasi_filter.settings import FilterSettings
+from maasi_filter.state_file import (
+    StateFileError,
+    generator_state,
+    restored_generator,
+    text,
+    untext,
+    write_state,
+)
+
+FloatArray = NDArray[np.float64]
+
+LEAST_EXISTENCE = 1e-4
+# Squared normalised distance up to which components may be one target.
+SAME_PLACE = 6.0
+# Expected detections of a found target: one narrow detection alone is not enough.
+LEAST_HITS = 1.5
+# Existence of what the filter of another robot has found.
+CERTAIN = 0.999
+
+
+class PmbFilter:
+    """Poisson multi-Bernoulli filter for a set M_k of measuring robots.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        What is left None is derived from the sensor that measures.
+    bounds : (d, 2) array
+        Of the environment E, metres; d = 2 or 3.
+    generator : numpy.random.Generator
+        Every random draw comes from it.
+
+    Attributes
+    ----------
+    components : list of Component
+        Potential targets, those found among them.
+    found_targets : list of FoundTarget
+        In the order of being found.
+    clusters : list of Cluster
+        Potential targets that are not found, most probable first; their mass is r.
+    exploration : Exploration
+        e, updated with every measurement.
+    """
+
+    def __init__(
+        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+    ) -> None:
+        self.settings = settings
+        self._numbers = settings.resolved()
+        assert self._numbers.expected_targets is not None
+        self._expected_targets = self._numbers.expected_targets
+        self.bounds = check_bounds(bounds)
+        self.dimension = len(self.bounds)
+        self.generator = generator
+        size = self.bounds[:, 1] - self.bounds[:, 0]
+        spacing = self._numbers.exploration_spacing
+        if spacing is None:
+            spacing = float(np.prod(size)) ** (1.0 / self.dimension)
+            spacing /= EXPLORATION_CELLS[self.dimension]
+        self.exploration = Exploration(self.bounds, spacing)
+        self.components: list[Component] = []
+        self.clusters: list[Cluster] = []
+        self._clutter = ClutterEstimate()
+        self._scans = 0
+        self._last_id = 0
+        self._last_time: float | None = None
+        self._frame = np.zeros((3, 3))
+        self._frame[0, : self.dimension] = self.bounds[:, 0]
+        self._frame[1, : self.dimension] = self.bounds[:, 1]
+        self._frame[2] = self.exploration.kernel()[2]
+
+    @property
+    def found_targets(self) -> list[FoundTarget]:
+        """Targets found so far, in the order of being found."""
+        found = [item.target for item in self.components if item.target is not None]
+        return sorted(found, key=lambda target: target.id)
+
+    @property
+    def expected_number(self) -> float:
+        """Expected number of targets detected but not found: the sum of their r."""
+        return math.fsum(item.existence for item in self.components if item.target is None)
+
+    @property
+    def particles(self) -> FloatArray:
+        """Particles of the components that are not found, (n, d), metres."""
+        parts = [item.density.particles for item in self.components if item.target is None]
+        return np.concatenate([np.empty((0, self.dimension)), *parts])
+
+    @property
+    def weights(self) -> FloatArray:
+        """Their weights, (n,); they sum to the expected number."""
+        parts = [
+            item.existence * item.density.weights for item in self.components if item.target is None
+        ]
+        return np.concatenate([np.empty(0), *parts])
+
+    # One step.
+
+    def step(
+        self, measurements: Sequence[AgentMeasurement], steps: int, time: float
+    ) -> FilterResult:
+        """Predict, correct with every robot of M_k, merge and mark.
+
+        Parameters
+        ----------
+        measurements : sequence of AgentMeasurement
+            M_k, in any order; they are processed in the order of the robots' names. May be empty.
+        steps : int
+            Control steps since the last batch, from 0; targets that stand still do not care.
+        time : float
+            Seconds, kept with what is found.
+
+        Raises
+        ------
+        ValueError
+            If anything is not finite, a covariance is not positive definite, shapes or dimensions
+            do not fit, or a robot is there twice. Nothing has changed then.
+        """
+        members = check_step(measurements, steps, time, self._numbers, self.dimension)
+        dropped: dict[str, int] = {}
+        newly_found: list[FoundTarget] = []
+        changed = self._predict(time)
+        for member in members:
+            changed |= self._correct(member, newly_found, dropped, time)
+        self._reduce()
+        self._cluster()
+        return FilterResult(
+            clusters=list(self.clusters),
+            newly_found=newly_found,
+            found_changed=changed or bool(newly_found),
+            expected_number=self.expected_number,
+            dropped=dropped,
+        )
+
+    def _correct(
+        self,
+        member: Checked,
+        newly_found: list[FoundTarget],
+        dropped: dict[str, int],
+        time: float,
+    ) -> bool:
+        """Correct with one robot's scan; return whether what is found changed."""
+        scan = self._scan(member, dropped)
+        self._scans += 1
+        space = measurement_space(member.sensor, self.bounds)
+        # kappa: clutter per unit of measurement space.
+        kappa = self._clutter.per_scan(member.robot, member.sensor.clutter * space) / space
+        # lambda_j = (N0 / V) int e pi g_j dx, by draws from the detections.
+        births = draw_births(
+            scan,
+            self.exploration,
+            self._expected_targets,
+            self._numbers.pmb.particles,
+            self.generator,
+        )
+        # p_D = int f pi dx, L_j = int f pi g_j dx.
+        views = [item.view(scan, births) for item in self.components]
+        odds = np.zeros((len(views), len(scan.terms)))
+        for i, (item, view) in enumerate(zip(self.components, views)):
+            odds[i, view.gated] = item.odds(view)
+        # Who caused what: r L_j / (1 - r p_D) against kappa + lambda_j.
+        marginals = associate(odds, kappa + births.intensity)
+        self._count_unexplained(scan, births, odds, dropped)
+        changed = False
+        for i, (item, view) in enumerate(zip(self.components, views)):
+            # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
+            moved = item.update(
+                view, marginals.missed[i], marginals.caused[i], scan, births, self.generator
+            )
+            if marginals.caused[i].sum() > 0.5 and not item.foreign:
+                item.pose_error = member.pose_error
+                item.found_radius = self._found_radius(member)
+            changed |= self._mark(item, moved, member, newly_found, time)
+        # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
+        real = births.intensity / (kappa + births.intensity)
+        self._bear(member, scan, births, marginals.new * real)
+        self._clutter.count(member.robot, float((marginals.new * (1.0 - real)).sum()))
+        # e <- e (1 - pi).
+        self.exploration.update(scan.detection, member.pose)
+        return changed
+
+    def _scan(self, member: Checked, dropped: dict[str, int]) -> Scan:
+        """Return a member's scan without what is out of its sensor's range."""
+        if math.isfinite(member.sensor.maximum_range):
+            reach = member.values[:, 0] <= member.sensor.maximum_range
+            _count(dropped, 'range', int((~reach).sum()))
+            member = member.only(reach)
+        detection = member.sensor.detection
+        if isinstance(detection, BoxDetection):
+            # A box's edge is as uncertain as the robot's position.
+            detection = detection.softened(2.0 * member.pose_error)
+        prepared = prepare_measurements(
+            member.values,
+            member.covariances,
+            member.pose,
+            member.pose_error,
+            cartesian_near=member.own,
+        )
+        return make_scan(prepared, member.pose, detection)
+
+    def _bear(self, member: Checked, scan: Scan, births: Births, existence: FloatArray) -> None:
+        """Add a component for each detection that may be of a target not seen before."""
+        grid: FloatArray | None = None
+        for j in np.flatnonzero(existence >= LEAST_EXISTENCE).tolist():
+            if grid is None:
+                grid = self.exploration.kernel()[0].copy()
+            head = scan.head.copy()
+            head[MISS], head[FIRST], head[TERMS] = 0.0, 0.0, 1.0
+            terms = scan.terms[j : j + 1].copy()
+            terms[0, SCALE] -= math.log(births.weights[j].mean())
+            density = Density(
+                births.particles[j].copy(),
+                births.weights[j] / births.weights[j].sum(),
+                head[None],
+                terms,
+                grid,
+                self._frame,
+            )
+            self.components.append(
+                Component(
+                    float(existence[j]),
+                    density,
+                    1.0,
+                    self._scans,
+                    member.pose_error,
+                    self._found_radius(member),
+                )
+            )
+
+    def _mark(
+        self,
+        item: Component,
+        moved: bool,
+        member: Checked,
+        newly_found: list[FoundTarget],
+        time: float,
+    ) -> bool:
+        """Mark a component as found, report where it is now, or withdraw it."""
+        target, numbers = item.target, self._numbers.pmb
+        if item.foreign:
+            item.existence = CERTAIN
+            return False
+        if target is not None and item.existence < numbers.withdrawn_probability:
+            item.target = None
+            return True
+        if target is not None:
+            if moved:
+                item.target = self._estimate(target, item)
+            return moved
+        if not (
+            moved
+            and item.existence > numbers.found_probability
+            and item.hits >= LEAST_HITS
+            and item.density.radius <= item.found_radius
+        ):
+            return False
+        d = self.dimension
+        nowhere = np.zeros(d), np.zeros((d, d))
+        target = FoundTarget(self._next_id(), *nowhere, member.robot, member.index, time)
+        item.target = self._estimate(target, item)
+        newly_found.append(item.target)
+        return True
+
+    def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
+        """Return a target where its particles are, with the robot's position error."""
+        error = item.pose_error**2 * np.eye(self.dimension)
+        return replace(
+            target,
+            position=item.density.mean.copy(),
+            covariance=item.density.covariance + error,
+        )
+
+    def _predict(self, time: float) -> bool:
+        """Let targets walk since the last step; return whether they did."""
+        walk = self._numbers.pmb.walk
+        last = time if self._last_time is None else self._last_time
+        self._last_time = max(time, last)
+        variance = walk**2 * max(time - last, 0.0)
+        if variance == 0.0:
+            return False
+        diffuse_unexplored(self.exploration, variance)
+        for item in self.components:
+            if item.foreign:
+                continue
+            diffuse(item.density, variance, self.generator)
+            if item.target is not None:
+                item.target = self._estimate(item.target, item)
+        return any(item.target is not None for item in self.components)
+
+    def _reduce(self) -> None:
+        """Delete components that hardly exist, and merge those of one place."""
+        found = [item for item in self.components if item.target is not None]
+        others = [
+            item
+            for item in self.components
+            if item.target is None and item.existence >= LEAST_EXISTENCE
+        ]
+        self.components = found + merge(others, SAME_PLACE)
+
+    def _cluster(self) -> None:
+        self.clusters = sorted(
+            (
+                Cluster(
+                    item.density.mean.copy(),
+                    item.density.covariance.copy(),
+                    item.density.radius,
+                    item.existence,
+                )
+                for item in self.components
+                if item.target is None and item.existence >= LEAST_CLUSTER_MASS
+            ),
+            key=lambda cluster: -cluster.mass,
+        )
+
+    def _found_radius(self, member: Checked) -> float:
+        """Return T_r [m]."""
+        if self._numbers.found_radius is not None:
+            return self._numbers.found_radius
+        error = pose_error_of(member.sensor, self._numbers, self.dimension)
+        return FOUND_RADIUS_DEVIATIONS * math.sqrt(member.sensor.covariance[0, 0] + error**2)
+
+    def _count_unexplained(
+        self, scan: Scan, births: Births, odds: FloatArray, dropped: dict[str, int]
+    ) -> None:
+        """Count detections that nothing but clutter explains."""
+        alone = (births.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
+        centres = scan.measurements.centres[alone]
+        inside = ((centres >= self.bounds[:, 0]) & (centres <= self.bounds[:, 1])).all(axis=1)
+        _count(dropped, 'outside', int((~inside).sum()))
+        _count(dropped, 'unseen', int(inside.sum()))
+
+    # What others have found.
+
+    def own_found_targets(self) -> list[FoundTarget]:
+        """Return the found targets that this filter found itself."""
+        return [target for target in self.found_targets if not target.origin]
+
+    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
+        """Take over what the filter of another robot has found; return whether anything changed.
+
+        A target that two robots found belongs to the one that was first, at the same time to the
+        first by name, and follows that one's estimate.
+
+        Parameters
+        ----------
+        robot : str
+            Whose filter.
+        targets : sequence of FoundTarget
+            All that its filter found itself, as they stand there; taken before `step`.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite, or dimensions do not fit. Nothing has changed then.
+        """
+        check_taken(robot, targets, self.dimension)
+        changed = False
+        for target in targets:
+            same = [
+                item
+                for item in self.components
+                if item.target is not None
+                and (item.target.robot, item.target.origin) == (robot, target.id)
+            ]
+            item = same[0] if same else nearest(target, self.components)
+            known = None if item is None else item.target
+            earlier = known is not None and (known.time, known.robot) <= (target.time, robot)
+            if earlier and not same:
+                continue
+            taken = replace(
+                target,
+                id=self._next_id() if known is None else known.id,
+                position=target.position.copy(),
+                covariance=target.covariance.copy(),
+                robot=robot,
+                origin=target.id,
+            )
+            if known is not None and same_estimate(taken, known):
+                continue
+            self._place(taken, item)
+            changed = True
+        return changed
+
+    def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
+        """Add targets that were found before this filter was made; return those that are new.
+
+        They keep their ids. Where another target has such an id already, the next free one is
+        used.
+
+        Parameters
+        ----------
+        targets : sequence of FoundTarget
+            With finite positions and covariances of this dimension.
+        """
+        found = [item for item in self.components if item.target is not None]
+        own = {item.target.id: item for item in found if item.target is not None}
+        kept = {target.id for target in targets}
+        since = [item for number, item in own.items() if number not in kept]
+        new: list[FoundTarget] = []
+        for target in targets:
+            same_id = [own[target.id]] if target.id in own else []
+            if nearest(target, same_id or since) is not None:
+                continue
+            added = replace(target, id=self._next_id() if same_id else target.id)
+            self._last_id = max(self._last_id, added.id)
+            others = [item for item in self.components if item.target is None]
+            self._place(added, nearest(added, others))
+            new.append(added)
+        return new
+
+    def _place(self, target: FoundTarget, item: Component | None) -> None:
+        """Let a component, or a new one, be a found target."""
+        density = Density.normal(
+            target.position,
+            target.covariance,
+            self._numbers.pmb.particles,
+            self._frame,
+            self.generator,
+        )
+        if item is None:
+            item = Component(CERTAIN, density, LEAST_HITS, -1, 0.0, math.inf)
+            self.components.append(item)
+        item.existence, item.density, item.target = CERTAIN, density, target
+        item.pose_error = 0.0
+
+    def _next_id(self) -> int:
+        self._last_id += 1
+        return self._last_id
+
+    # The state in a file.
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the whole state, random generator included, to one file.
+
+        The file is replaced in one piece: a crash leaves the old one or the new one.
+        """
+        write_state(path, self.state())
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return the whole state, random generator included, as arrays for a file."""
+        grid = self.exploration.kernel()[0].shape
+        number = self._numbers.pmb.particles
+        return {
+            'settings': text(self.settings.model_dump_json(exclude_unset=True)),
+            'generator': text(generator_state(self.generator)),
+            'bounds': self.bounds,
+            'spacing': np.array(self.exploration.spacing),
+            'exploration': self.exploration.values,
+            'counters': np.array([self._scans, self._last_id]),
+            'last_time': np.array(np.nan if self._last_time is None else self._last_time),
+            **pmb_state.to_arrays(
+                self.components, self.clusters, self._clutter, (number, self.dimension), grid
+            ),
+        }
+
+    @classmethod
+    def from_state(
+        cls, state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
+    ) -> PmbFilter:
+        """Return the filter of a state; it continues to the bit as the saved one would have.
+
+        Raises
+        ------
+        StateFileError
+            If an array is missing, or has a wrong shape or number; `path` is named.
+        """
+        try:
+            return cls._restored(state)
+        except KeyError as error:
+            raise StateFileError(f'{path}: does not hold a usable state: no {error}') from None
+        except (ValueError, TypeError) as error:
+            raise StateFileError(f'{path}: does not hold a usable state: {error}') from None
+
+    @classmethod
+    def _restored(cls, state: Mapping[str, NDArray[Any]]) -> PmbFilter:
+        pmb_state.check(state)
+        search = cls(
+            FilterSettings.model_validate_json(untext(state['settings'])),
+            state['bounds'],
+            restored_generator(untext(state['generator'])),
+        )
+        search.exploration = Exploration(search.bounds, float(state['spacing']))
+        check_exploration(state['exploration'], search.exploration.values.shape)
+        search.exploration.values[...] = state['exploration']
+        search._frame[2] = search.exploration.kernel()[2]
+        search._scans, search._last_id = (int(number) for number in state['counters'])
+        last = float(state['last_time'])
+        search._last_time = None if np.isnan(last) else last
+        grid = search.exploration.kernel()[0].shape
+        number = search._numbers.pmb.particles
+        search.components = pmb_state.components_of(state, number, grid, search._frame)
+        search.clusters = pmb_state.clusters_of(state)
+        search._clutter = pmb_state.clutter_of(state)
+        return search
+
+
+def _count(dropped: dict[str, int], reason: str, number: int) -> None:
+    if number:
+        dropped[reason] = dropped.get(reason, 0) + number
