@@ -7,8 +7,8 @@ import numpy as np
 from maasi_filter.ic_phd.phd import prepare_measurements
 from maasi_filter.ic_phd.search_filter import LEAST_CLUSTER_MASS, AgentMeasurement
 from maasi_filter.ic_phd.unconfirmed_targets import LostTargets
-from maasi_filter.models.detection import PARAMETERS, detection_probability
 from maasi_filter.make_filter import make_filter
+from maasi_filter.models.detection import PARAMETERS, detection_probability
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import (
     DetectionSettings,
