@@ -21,8 +21,8 @@ from maasi_filter import warm_up
 from maasi_filter.filter_memory import FilterMemory, Progress
 from maasi_filter.filter_protocol import TargetFilter
 from maasi_filter.ic_phd.search_filter import AgentMeasurement
-from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.kept_found_targets import KeptFoundTargets, checked_found
+from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.ros.conversions import (
     cluster_to_ros,
     filter_markers,
