@@ -52,7 +52,6 @@ ROS_FILES = (
 ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*')
 # Sets of modules that import each other. None is to be added.
 KNOWN_CYCLES = (
-    frozenset({'maasi_sim.experiments.registry', 'maasi_sim.experiments.results'}),
     frozenset({'maasi_sim.run.replay', 'maasi_sim.run.replay_node'}),
     frozenset({'maasi_sim.buildings.report', 'maasi_sim.run.report', 'maasi_sim.run.run_folder'}),
 )

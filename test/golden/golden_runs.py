@@ -15,7 +15,8 @@ from maasi_filter import SearchFilter
 from maasi_planner.coordinator import Coordinator
 from maasi_sim.buildings.mission import CuboidMission
 from maasi_sim.buildings.scenario import CuboidScenario, load_any_scenario, mission_of
-from maasi_sim.experiments.registry import Experiment, experiments
+from maasi_sim.experiments.experiment import Experiment
+from maasi_sim.experiments.registry import experiments
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.search import search
 

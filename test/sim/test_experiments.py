@@ -17,15 +17,9 @@ import yaml
 from scipy import stats
 
 from maasi_sim.experiments import campaign, registry, reproduce, results, statistics, tables
-from maasi_sim.experiments.campaign import Here, carry_out, plan
-from maasi_sim.experiments.registry import (
-    Case,
-    Comparison,
-    Experiment,
-    Outcome,
-    Published,
-    Quantity,
-)
+from maasi_sim.experiments.campaign import SerialExecutor, carry_out, plan
+from maasi_sim.experiments.cases import Case, Comparison, Outcome, Published, Quantity
+from maasi_sim.experiments.experiment import Experiment
 
 STEPS = Quantity('steps', 'steps', '', 'restricted')
 ERROR = Quantity('error', 'error', 'm')
@@ -179,7 +173,7 @@ def test_restricted_mean_refuses(times, ended, limit):
 
 def test_run_reads_back_the_same_to_the_bit(toy):
     case = toy.cases(False)[0]
-    run = results.run_of(toy, case, 3, 17, toy.run(case.settings, 17))
+    run = results.run_of(toy.name, case, 3, 17, toy.run(case.settings, 17))
     text = results.to_text(run)
     again = results.from_text(text)
     assert results.to_text(again) == text
@@ -215,7 +209,7 @@ def test_damaged_run_is_made_again_and_no_other(toy, tmp_path, damage, capsys):
 def test_columns_of_different_lengths_are_refused(toy):
     case = toy.cases(False)[0]
     with pytest.raises(ValueError, match='columns'):
-        results.run_of(toy, case, 0, 1, Outcome({}, {'a': [1.0], 'b': [1.0, 2.0]}))
+        results.run_of(toy.name, case, 0, 1, Outcome({}, {'a': [1.0], 'b': [1.0, 2.0]}))
 
 
 # Campaigns
@@ -256,7 +250,7 @@ def test_more_maps_later_keep_the_first(toy, tmp_path):
 
 
 def test_other_settings_are_run_anew(toy, tmp_path):
-    here = Here()
+    here = SerialExecutor()
     carry_out(plan(toy, tmp_path, 1), here)
     changed = Experiment(**{**toy.__dict__, 'cases': lambda small: [Case('first', {'bias': 2})]})
     assert [task.case for task in plan(changed, tmp_path, 1).tasks] == ['first']
@@ -334,7 +328,7 @@ def test_outputs_hold_what_was_run(toy, tmp_path):
 
 def test_table_compares_with_the_paper_and_in_pairs(toy, tmp_path):
     work = plan(toy, tmp_path, 4)
-    carry_out(work, Here())
+    carry_out(work, SerialExecutor())
     got = work.results()
     table = {(row.case, row.quantity.name): row for row in tables.rows(got)}
     row = table['first', 'steps']

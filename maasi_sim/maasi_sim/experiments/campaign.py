@@ -18,16 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from maasi_sim.experiments.registry import Case, Experiment, find
-from maasi_sim.experiments.results import (
-    DamagedRun,
-    Results,
-    Run,
-    RunFolder,
-    from_text,
-    run_of,
-    to_text,
-)
+from maasi_sim.experiments.cases import Case
+from maasi_sim.experiments.experiment import Experiment, Results
+from maasi_sim.experiments.registry import find
+from maasi_sim.experiments.results import DamagedRun, Run, RunFolder, from_text, run_of, to_text
 
 # One thread for each worker: there are as many workers as wanted.
 ONE_THREAD = {
@@ -67,7 +61,7 @@ def execute(task: Task) -> tuple[str, str]:
         begin = time.process_time()
         outcome = experiment.run(case.settings, seed)
         outcome.timing['processor_time'] = time.process_time() - begin
-        return to_text(run_of(experiment, case, task.number, seed, outcome)), ''
+        return to_text(run_of(experiment.name, case, task.number, seed, outcome)), ''
     except Exception as error:
         return '', f'{type(error).__name__}: {error}'
 
@@ -84,7 +78,7 @@ class Workers(Protocol):
         """Let them go; what is not done stays undone."""
 
 
-class Here:
+class SerialExecutor:
     """This process."""
 
     number = 1
@@ -261,7 +255,7 @@ def plan(experiment: Experiment, out: Path, runs: int, seed: int = 1, small: boo
     small : bool
         Whether the small cases are meant.
     """
-    folder = RunFolder(out / experiment.name, experiment)
+    folder = RunFolder(out / experiment.name, experiment.name)
     result = Plan(experiment, experiment.cases(small), {}, [], folder, [])
     for number in range(runs):
         for case in result.cases:

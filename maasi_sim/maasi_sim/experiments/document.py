@@ -8,9 +8,10 @@ import numpy as np
 
 from maasi_sim.experiments.campaign import plan
 from maasi_sim.experiments.earlier import EARLIER_ROW, Earlier, completed, earlier_sections
+from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.outputs import described, picture
-from maasi_sim.experiments.registry import Experiment, experiments
-from maasi_sim.experiments.results import Results, RunFolder, write_file
+from maasi_sim.experiments.registry import experiments
+from maasi_sim.experiments.results import RunFolder, write_file
 from maasi_sim.experiments.tables import markdown
 
 _PICTURE_DPI = 65
@@ -86,7 +87,7 @@ simulator, not a robot.
 
 def available(experiment: Experiment, out: Path, seed: int = 1, small: bool = False) -> Results:
     """Return the runs of an experiment that are in a folder."""
-    folder = RunFolder(out / experiment.name, experiment)
+    folder = RunFolder(out / experiment.name, experiment.name)
     return plan(experiment, out, folder.maps(), seed, small).results()
 
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_sim.experiments.registry import Quantity
-from maasi_sim.experiments.results import Results, Run
+from maasi_sim.experiments.cases import Quantity
+from maasi_sim.experiments.experiment import Results
+from maasi_sim.experiments.results import Run
 from maasi_sim.experiments.statistics import mean_interval
 from maasi_sim.experiments.tables import interval, shown
 

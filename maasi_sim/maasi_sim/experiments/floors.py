@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from maasi_sim.experiments.registry import Choice
+from maasi_sim.experiments.cases import Choice
 from maasi_sim.experiments.searches import NEVER_DONE, merged
 
 

@@ -6,8 +6,8 @@ import io
 
 import yaml
 
-from maasi_sim.experiments.registry import Experiment
-from maasi_sim.experiments.results import Results, RunFolder, runs_text, steps_text, write_file
+from maasi_sim.experiments.experiment import Experiment, Results
+from maasi_sim.experiments.results import RunFolder, runs_text, steps_text, write_file
 from maasi_sim.experiments.tables import markdown, table_text
 
 

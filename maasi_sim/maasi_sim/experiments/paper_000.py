@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from maasi_sim.experiments import figures, paper_000_floor
-from maasi_sim.experiments.registry import Case, Choice, Comparison, Experiment, Published
+from maasi_sim.experiments.cases import Case, Choice, Comparison, Published
+from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.searches import (
     FALSE,
     FILTER_TIME,
@@ -25,8 +26,6 @@ from maasi_sim.experiments.searches import (
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from maasi_sim.experiments.results import Results
 
 # Long enough for the lawnmower to cover the cube.
 _CAP = 900

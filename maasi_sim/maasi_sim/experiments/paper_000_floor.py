@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from maasi_sim.experiments import figures
+from maasi_sim.experiments.cases import Case, Choice, Comparison, Published
+from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.floors import (
     FLOOR_CHOICES,
     HARDWARE_NOTE,
@@ -14,7 +16,6 @@ from maasi_sim.experiments.floors import (
     floor,
     floor_filter,
 )
-from maasi_sim.experiments.registry import Case, Choice, Comparison, Experiment, Published
 from maasi_sim.experiments.searches import (
     FALSE,
     FOUND,
@@ -28,8 +29,6 @@ from maasi_sim.experiments.searches import (
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from maasi_sim.experiments.results import Results
 
 _FLOOR_FILTER = floor_filter('paper_000', particles=10000, found_radius=0.02, removal_distance=0.05)
 _RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 10000}

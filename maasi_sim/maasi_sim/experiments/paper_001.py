@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from maasi_sim.experiments import figures
+from maasi_sim.experiments.cases import Case, Choice, Comparison, Outcome, Published, Quantity
+from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.floors import (
     FLOOR_CHOICES,
     HARDWARE_NOTE,
@@ -14,15 +16,6 @@ from maasi_sim.experiments.floors import (
     MAMBO_SENSOR,
     floor,
     floor_filter,
-)
-from maasi_sim.experiments.registry import (
-    Case,
-    Choice,
-    Comparison,
-    Experiment,
-    Outcome,
-    Published,
-    Quantity,
 )
 from maasi_sim.experiments.searches import (
     FALSE,
@@ -41,8 +34,6 @@ from maasi_sim.experiments.searches import (
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from maasi_sim.experiments.results import Results
 
 EXPLORED = Quantity('explored', 'share explored in the end')
 CLEARANCE = Quantity('clearance', 'smallest distance to an obstacle', 'm')

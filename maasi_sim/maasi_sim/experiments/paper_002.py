@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from maasi_sim.experiments import figures
-from maasi_sim.experiments.registry import Case, Choice, Comparison, Experiment, Published
+from maasi_sim.experiments.cases import Case, Choice, Comparison, Published
+from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.searches import (
     FALSE,
     FOUND,
@@ -21,8 +22,6 @@ from maasi_sim.experiments.searches import (
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from maasi_sim.experiments.results import Results
 
 _LOW, _HIGH = -30.0, 300.0
 # 120 and 320 steps of both agents.

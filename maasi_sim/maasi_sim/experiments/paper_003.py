@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from maasi_sim.experiments import figures
-from maasi_sim.experiments.registry import Case, Choice, Comparison, Experiment, Outcome, Published
+from maasi_sim.experiments.cases import Case, Choice, Comparison, Outcome, Published
+from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.searches import (
     FALSE,
     FOUND,
@@ -25,8 +26,6 @@ from maasi_sim.world.noise_streams import noise_stream
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from maasi_sim.experiments.results import Results
 
 _PRINTED_FILTER = {'preset': 'paper_003', 'particles': 10000}
 _PAPER_FILTER = {

@@ -16,22 +16,13 @@ from maasi_planner.buildings import (
 )
 from maasi_sim.buildings.mission import CuboidMission, SearchRobot, summary
 from maasi_sim.buildings.picture import draw_mission, legend
-from maasi_sim.experiments.registry import (
-    Case,
-    Choice,
-    Comparison,
-    Experiment,
-    Outcome,
-    Published,
-    Quantity,
-    array,
-)
-from maasi_sim.experiments.statistics import mean_interval
+from maasi_sim.experiments.cases import Case, Choice, Comparison, Outcome, Published, Quantity
+from maasi_sim.experiments.experiment import Experiment, Results
+from maasi_sim.experiments.results import Run
+from maasi_sim.experiments.statistics import array, mean_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from maasi_sim.experiments.results import Results, Run
 
 _LIMIT = 1000
 _SIZE = [60.0, 60.0, 60.0]

@@ -9,14 +9,33 @@ import sys
 import time
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
-    from maasi_sim.experiments.campaign import Plan, Workers
-    from maasi_sim.experiments.registry import Experiment
-    from maasi_sim.experiments.results import Run
+from maasi_sim.experiments.campaign import (
+    Cluster,
+    Plan,
+    Processes,
+    SerialExecutor,
+    Workers,
+    WorkersLost,
+    carry_out,
+    plan,
+)
+from maasi_sim.experiments.document import write_document
+from maasi_sim.experiments.experiment import Experiment
+from maasi_sim.experiments.outputs import write_outputs
+from maasi_sim.experiments.registry import UnknownExperiment, experiments, find
+from maasi_sim.experiments.results import NoRoom, Run
 
 DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -92,10 +111,6 @@ def main(arguments: list[str] | None = None) -> int:
     if not (options.names or options.list or options.document):
         parser.error('give names of experiments, --list, or --document FILE')
     signal.signal(signal.SIGTERM, _interrupt)
-    from maasi_sim.experiments.campaign import WorkersLost
-    from maasi_sim.experiments.registry import UnknownExperiment, experiments, find
-    from maasi_sim.experiments.results import NoRoom
-
     if options.list:
         print('\n'.join(listing(list(experiments().values()))))
         return DONE
@@ -113,8 +128,6 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = run_all(wanted, options) if wanted else DONE
         if options.document is not None:
-            from maasi_sim.experiments.document import write_document
-
             shown = write_document(options.document, options.out, options.seed, options.small)
             print(f'wrote {options.document} with {len(shown)} experiments')
         return code
@@ -156,9 +169,6 @@ def listing(known: list[Experiment]) -> list[str]:
 
 def run_all(wanted: list[Experiment], options: argparse.Namespace) -> int:
     """Run experiments one after the other and return the exit code."""
-    from maasi_sim.experiments.campaign import carry_out, plan
-    from maasi_sim.experiments.outputs import write_outputs
-
     plans = []
     for experiment in wanted:
         runs = options.runs or experiment.runs
@@ -194,12 +204,10 @@ def run_all(wanted: list[Experiment], options: argparse.Namespace) -> int:
 
 def make_workers(options: argparse.Namespace, number: int) -> Workers:
     """Return who makes so many runs."""
-    from maasi_sim.experiments.campaign import Cluster, Here, Processes
-
     if options.cluster is not None:
         return Cluster(options.cluster)
     wanted = min(options.workers or os.cpu_count() or 1, number)
-    return Processes(wanted) if wanted > 1 else Here()
+    return Processes(wanted) if wanted > 1 else SerialExecutor()
 
 
 class _Display:
@@ -215,16 +223,6 @@ class _Display:
 
     def __enter__(self) -> _Display:
         if sys.stderr.isatty() and self._total:
-            from rich.console import Console
-            from rich.progress import (
-                BarColumn,
-                MofNCompleteColumn,
-                Progress,
-                TextColumn,
-                TimeElapsedColumn,
-                TimeRemainingColumn,
-            )
-
             self._bar = Progress(
                 TextColumn('{task.description}'),
                 BarColumn(),

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_sim.experiments.registry import Case, Experiment, Outcome, Value
+from maasi_sim.experiments.cases import Case, Outcome, Value
 
 FloatArray = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ class Run:
         return None if read is None or isinstance(read, str) else float(read)
 
 
-def run_of(experiment: Experiment, case: Case, number: int, seed: int, outcome: Outcome) -> Run:
+def run_of(experiment: str, case: Case, number: int, seed: int, outcome: Outcome) -> Run:
     """Return an outcome as a run.
 
     Raises
@@ -78,9 +78,9 @@ def run_of(experiment: Experiment, case: Case, number: int, seed: int, outcome: 
     columns = {name: np.asarray(values, float) for name, values in outcome.columns.items()}
     lengths = {len(values) for values in columns.values()}
     if len(lengths) > 1:
-        raise ValueError(f'{experiment.name}: columns of {sorted(lengths)} rows, allowed is one')
+        raise ValueError(f'{experiment}: columns of {sorted(lengths)} rows, allowed is one')
     return Run(
-        experiment.name,
+        experiment,
         case.name,
         number,
         seed,
@@ -191,42 +191,6 @@ def write_file(path: Path, content: str | bytes) -> None:
         raise NoRoom(error.errno, f'{path}: cannot be written: {reason}') from None
 
 
-@dataclass
-class Results:
-    """The runs of one experiment.
-
-    Attributes
-    ----------
-    experiment : Experiment
-        Which.
-    cases : list of Case
-        All of its cases.
-    runs : dict
-        Runs of each case by name, in the order of the maps.
-    """
-
-    experiment: Experiment
-    cases: list[Case]
-    runs: dict[str, list[Run]]
-
-    def names(self) -> list[str]:
-        """Return the cases that have runs."""
-        return [case.name for case in self.cases if self.runs.get(case.name)]
-
-    def case(self, name: str) -> Case:
-        """Return a case by its name."""
-        return next(case for case in self.cases if case.name == name)
-
-    def values(self, case: str, quantity: str) -> list[float | None]:
-        """Return a quantity in each run of a case."""
-        return [run.value(quantity) for run in self.runs[case]]
-
-    def pairs(self, first: str, second: str) -> list[tuple[Run, Run]]:
-        """Return the runs of two cases on the same maps."""
-        other = {run.number: run for run in self.runs.get(second, [])}
-        return [(run, other[run.number]) for run in self.runs.get(first, []) if run.number in other]
-
-
 class RunFolder:
     """The folder of an experiment's runs.
 
@@ -234,11 +198,11 @@ class RunFolder:
     ----------
     path : Path
         Made when the first run is written.
-    experiment : Experiment
-        Whose runs.
+    experiment : str
+        Name of that whose runs they are.
     """
 
-    def __init__(self, path: Path, experiment: Experiment) -> None:
+    def __init__(self, path: Path, experiment: str) -> None:
         self.path = path
         self.experiment = experiment
 
@@ -266,7 +230,7 @@ class RunFolder:
         if not path.exists():
             return None
         run = load_run(path)
-        wanted = (self.experiment.name, case.name, number, seed, case.digest())
+        wanted = (self.experiment, case.name, number, seed, case.digest())
         found = (run.experiment, run.case, run.number, run.seed, run.digest)
         return run if found == wanted else None
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from maasi_filter.exploration import Exploration
 from maasi_filter.models.pose import Pose
-from maasi_sim.experiments.registry import Case, Outcome, Quantity
+from maasi_sim.experiments.cases import Case, Outcome, Quantity
 from maasi_sim.scenario.loading import scenario_from_content, scenario_from_values
 from maasi_sim.search import SearchResult, search
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -150,3 +151,8 @@ def from_published(value: float, half_width: float | None, runs: int) -> Interva
     if half_width is None or runs < 2:
         return Interval(value, math.nan, runs, 0.0)
     return Interval(value, half_width, runs, runs - 1.0)
+
+
+def array(values: Sequence[float | None]) -> np.ndarray:
+    """Return values as an array, nan where there is none."""
+    return np.array([np.nan if value is None else float(value) for value in values])

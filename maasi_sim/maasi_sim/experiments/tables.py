@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from maasi_sim.experiments.registry import Quantity, array
-from maasi_sim.experiments.results import Results
+from maasi_sim.experiments.cases import Quantity
+from maasi_sim.experiments.experiment import Results
 from maasi_sim.experiments.statistics import (
     Interval,
+    array,
     from_published,
     independent_difference,
     mean_interval,
