@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
@@ -16,6 +17,7 @@ import pytest
 import yaml
 from scipy import stats
 
+from maasi_sim import machine
 from maasi_sim.experiments import campaign, registry, reproduce, results, statistics, tables
 from maasi_sim.experiments.campaign import SerialExecutor, carry_out, plan
 from maasi_sim.experiments.cases import Case, Comparison, Outcome, Published, Quantity
@@ -440,6 +442,22 @@ def test_cluster_that_does_not_answer_is_said(monkeypatch, capsys, tmp_path, toy
     assert 'no scheduler answers' in capsys.readouterr().err
 
 
+def test_workers_of_a_cluster_say_on_what_they_run(toy, tmp_path):
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, processes=False, dashboard_address=None) as local:
+        workers = campaign.Cluster(local.scheduler_address)
+        try:
+            machines = workers.machines()
+            assert len(machines) == 2
+            assert all(item == machine.this_machine() for item in machines.values())
+            work = plan(toy, tmp_path, 1)
+            assert carry_out(work, workers, machine=campaign.one_machine(workers, [work])) == []
+            assert len(work.done) == 3
+        finally:
+            workers.close()
+
+
 def test_names_are_unique_and_listed(capsys):
     assert reproduce.main(['--list']) == 0
     listed = capsys.readouterr().out
@@ -459,8 +477,7 @@ def test_names_are_unique_and_listed(capsys):
 def test_command_ends_cleanly_when_interrupted(tmp_path):
     code = (
         'import os, signal, sys\n'
-        'from maasi_sim.experiments import reproduce\n'
-        'from maasi_sim.experiments import campaign\n'
+        'from maasi_sim.experiments import campaign, reproduce\n'
         'campaign.execute = lambda task: os.kill(os.getpid(), signal.SIGTERM)\n'
         "arguments = ['000-fig4', '--small', '--workers', '1', '--out', sys.argv[1]]\n"
         'sys.exit(reproduce.main(arguments))\n'
@@ -470,3 +487,104 @@ def test_command_ends_cleanly_when_interrupted(tmp_path):
     )
     assert ended.returncode == 130
     assert 'Traceback' not in ended.stderr
+
+
+# Machines
+
+
+class Elsewhere(SerialExecutor):
+    """Workers on machines that differ in what is given."""
+
+    def __init__(self, *changes: dict[str, str], makes: dict[str, str] | None = None) -> None:
+        self.changes = changes
+        self.makes = makes or {}
+
+    def machines(self):
+        return {
+            f'tcp://{number}': {**machine.this_machine(), **change}
+            for number, change in enumerate(self.changes)
+        }
+
+    def make(self, tasks):
+        for task, text, problem in super().make(tasks):
+            run = results.from_text(text)
+            run.machine.update(self.makes)
+            yield task, results.to_text(run), problem
+
+
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """Let the workers of the command be those that are given."""
+
+    def use(workers):
+        monkeypatch.setattr(reproduce, 'make_workers', lambda options, number: workers)
+
+    return use
+
+
+def test_run_says_on_what_it_was_made(toy, tmp_path):
+    work = plan(toy, tmp_path, 1)
+    carry_out(work, SerialExecutor())
+    for case in work.cases:
+        made_on = results.load_run(work.folder.file(case, 0)).machine
+        assert made_on == machine.this_machine()
+    assert made_on['numpy'] == np.__version__
+    assert all(made_on[key] for key in ('processor', 'features', 'python', 'numba', 'llvmlite'))
+
+
+def test_file_without_a_machine_is_read(toy, tmp_path):
+    work = plan(toy, tmp_path, 1)
+    carry_out(work, SerialExecutor())
+    file = work.folder.file(work.cases[0], 0)
+    first, second, rest = file.read_text().split('\n', 2)
+    facts = json.loads(second[2:])
+    del facts['machine']
+    body = f'# {json.dumps(facts)}\n{rest}'
+    file.write_text(f'# maasi run, sha256 {hashlib.sha256(body.encode()).hexdigest()}\n{body}')
+    assert results.load_run(file).machine == {}
+    assert first != file.read_text().split('\n', 1)[0]
+    again = plan(toy, tmp_path, 2)
+    assert len(again.done) == 3 and len(again.tasks) == 2
+    assert campaign.one_machine(SerialExecutor(), [again]) == machine.this_machine()
+
+
+def test_workers_that_differ_are_refused_unless_asked(toy, tmp_path, elsewhere, capsys):
+    arguments = ['000-toy', '--out', str(tmp_path)]
+    elsewhere(Elsewhere({}, {}, {'processor': 'i486', 'numba': '0.1'}))
+    assert reproduce.main(arguments) == 2
+    said = capsys.readouterr().err
+    here = machine.this_machine()
+    assert 'tcp://2 differs from worker tcp://0' in said and '--mixed-workers' in said
+    assert f'processor i486 instead of {here["processor"]}' in said
+    assert f'Numba 0.1 instead of {here["numba"]}' in said
+    assert 'NumPy' not in said
+    assert not made and not run_files(tmp_path)
+    assert reproduce.main([*arguments, '--mixed-workers']) == 0
+    assert len(made) == len(run_files(tmp_path)) == 9
+
+
+def test_runs_of_another_machine_are_not_mixed_unless_asked(toy, tmp_path, elsewhere, capsys):
+    arguments = ['000-toy', '--out', str(tmp_path)]
+    other = {'features': '0123456789ab'}
+    elsewhere(Elsewhere(other, makes=other))
+    assert reproduce.main([*arguments, '--runs', '1']) == 0
+    kept = run_files(tmp_path)
+    elsewhere(SerialExecutor())
+    # With nothing to make, nothing is mixed.
+    assert reproduce.main([*arguments, '--runs', '1']) == 0
+    capsys.readouterr()
+    assert reproduce.main([*arguments, '--runs', '2']) == 2
+    said = capsys.readouterr().err
+    assert 'first-0000.csv was made on another machine' in said
+    assert 'processor features 0123456789ab' in said
+    assert run_files(tmp_path) == kept
+    assert reproduce.main([*arguments, '--runs', '2', '--mixed-workers']) == 0
+    assert kept.items() < run_files(tmp_path).items()
+
+
+def test_run_of_a_worker_that_came_later_and_differs_is_not_kept(toy, tmp_path, elsewhere, capsys):
+    elsewhere(Elsewhere({}, makes={'numpy': '1.0'}))
+    assert reproduce.main(['000-toy', '--out', str(tmp_path), '--runs', '1']) == 1
+    said = capsys.readouterr().err
+    assert 'first, map 0: not kept, made by a worker that differs: NumPy 1.0' in said
+    assert not run_files(tmp_path)

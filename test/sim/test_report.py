@@ -35,6 +35,7 @@ KEYS = [
     'end_reason',
     'wall_time',
     'real_time_factor',
+    'machine',
     'events',
     'scoring',
 ]

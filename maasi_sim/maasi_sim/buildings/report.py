@@ -11,6 +11,7 @@ import numpy as np
 
 from maasi_sim.buildings.observer import CuboidRecord
 from maasi_sim.buildings.picture import draw_mission, legend
+from maasi_sim.machine import this_machine
 from maasi_sim.run.report import END_REASONS, path_length
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
         'end_reason': record.end_reason,
         'wall_time': wall,
         'real_time_factor': record.end_time / wall if wall > 0.0 else None,
+        'machine': this_machine(),
         'events': record.events,
     }
 

@@ -1,7 +1,8 @@
 """Runs the cases of an experiment on its maps: here, in several processes, or on a Dask cluster.
 
-Which worker makes a run changes nothing: its seed is that of the map. Runs that are there already
-are not made again.
+The seed of a run is that of the map, whichever worker makes it. Runs that are there already are
+not made again. Another processor or other versions may change the last bits of numbers, so that
+runs of different machines are mixed only where this is asked for (docs/repeatability.md).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from maasi_sim.experiments.cases import Case
 from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.registry import find
 from maasi_sim.experiments.results import DamagedRun, Run, RunFolder, from_text, run_of, to_text
+from maasi_sim.machine import machine_difference, this_machine
 
 # One thread for each worker: there are as many workers as wanted.
 ONE_THREAD = {
@@ -50,6 +52,10 @@ class WorkersLost(RuntimeError):
     """The workers are gone; what they had finished is kept."""
 
 
+class MixedWorkers(ValueError):
+    """Processors or versions differ, and it was not asked to mix them."""
+
+
 def execute(task: Task) -> tuple[str, str]:
     """Make a run and return the text of its file, or '' and what went wrong."""
     try:
@@ -61,7 +67,9 @@ def execute(task: Task) -> tuple[str, str]:
         begin = time.process_time()
         outcome = experiment.run(case.settings, seed)
         outcome.timing['processor_time'] = time.process_time() - begin
-        return to_text(run_of(experiment.name, case, task.number, seed, outcome)), ''
+        run = run_of(experiment.name, case, task.number, seed, outcome)
+        run.machine = this_machine()
+        return to_text(run), ''
     except Exception as error:
         return '', f'{type(error).__name__}: {error}'
 
@@ -70,6 +78,9 @@ class Workers(Protocol):
     """Who makes the runs."""
 
     number: int
+
+    def machines(self) -> Mapping[str, dict[str, str]]:
+        """Return the machine of each of them by its name, as `this_machine` has it."""
 
     def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
         """Yield each task with what `execute` returned, as they are done."""
@@ -82,6 +93,10 @@ class SerialExecutor:
     """This process."""
 
     number = 1
+
+    def machines(self) -> Mapping[str, dict[str, str]]:
+        """See `Workers.machines`."""
+        return {'this process': this_machine()}
 
     def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
         """See `Workers.make`."""
@@ -123,6 +138,10 @@ class Processes:
                     os.environ.pop(name, None)
                 else:
                     os.environ[name] = value
+
+    def machines(self) -> Mapping[str, dict[str, str]]:
+        """See `Workers.machines`."""
+        return {'this machine': this_machine()}
 
     def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
         """See `Workers.make`."""
@@ -182,6 +201,14 @@ class Cluster:
             self._client.close()
             raise WorkersLost(f'--cluster: the scheduler at {address} has no workers') from None
         self.number = sum(self._client.nthreads().values())
+
+    def machines(self) -> Mapping[str, dict[str, str]]:
+        """See `Workers.machines`."""
+        try:
+            return dict(sorted(self._client.run(this_machine).items()))
+        except Exception as error:
+            self.close()
+            raise WorkersLost(f'--cluster: {type(error).__name__}: {error}') from None
 
     def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
         """See `Workers.make`."""
@@ -275,8 +302,37 @@ def plan(experiment: Experiment, out: Path, runs: int, seed: int = 1, small: boo
     return result
 
 
+def one_machine(workers: Workers, plans: Sequence[Plan]) -> dict[str, str]:
+    """Return the machine that all workers and the runs that are there have in common.
+
+    Runs of files that do not say on what machine they were made are taken to be of the same.
+
+    Raises
+    ------
+    MixedWorkers
+        If there is none; says who differs in what.
+    """
+    machines = workers.machines()
+    first, machine = next(iter(machines.items()))
+    for name, other in machines.items():
+        difference = machine_difference(machine, other)
+        if difference:
+            raise MixedWorkers(f'worker {name} differs from worker {first}: {difference}')
+    for work in plans:
+        cases = {case.name: case for case in work.cases}
+        for (case, number), run in work.done.items() if work.tasks else ():
+            difference = machine_difference(machine, run.machine) if run.machine else ''
+            if difference:
+                file = work.folder.file(cases[case], number)
+                raise MixedWorkers(f'{file} was made on another machine: {difference}')
+    return machine
+
+
 def carry_out(
-    work: Plan, workers: Workers, advance: Callable[[Run | None], None] = lambda run: None
+    work: Plan,
+    workers: Workers,
+    advance: Callable[[Run | None], None] = lambda run: None,
+    machine: Mapping[str, str] | None = None,
 ) -> list[str]:
     """Make the runs of a plan, keep each as soon as it is there, and return what went wrong.
 
@@ -288,6 +344,8 @@ def carry_out(
         Who makes them.
     advance : function
         Called after each run, with None if it failed.
+    machine : mapping, optional
+        On which all runs must have been made, such as by workers that came later; None: on any.
 
     Raises
     ------
@@ -299,12 +357,15 @@ def carry_out(
     cases = {case.name: case for case in work.cases}
     problems = []
     for task, text, problem in workers.make(work.tasks):
-        if problem:
+        run = None if problem else from_text(text)
+        if run is not None and machine is not None:
+            difference = machine_difference(machine, run.machine)
+            problem = difference and f'not kept, made by a worker that differs: {difference}'
+        if run is None or problem:
             problems.append(f'{task.experiment}, {task.case}, map {task.number}: {problem}')
             advance(None)
             continue
         work.folder.write(cases[task.case], task.number, text)
-        run = from_text(text)
         work.done[task.case, task.number] = run
         advance(run)
     return problems

@@ -55,8 +55,9 @@ Other machines take part through Dask. In an environment in which `maasi_sim` ca
     dask scheduler
     dask worker tcp://SCHEDULER:8786
 
-Then `./scripts/reproduce NAME --cluster tcp://SCHEDULER:8786`. Who makes a run changes none of
-its numbers.
+Then `./scripts/reproduce NAME --cluster tcp://SCHEDULER:8786`. Workers of different processors or
+versions are refused, and so are runs that are there from another machine, unless `--mixed-workers`
+is given: their numbers may differ ([repeatability](repeatability.md)).
 
 ## How to read the tables
 

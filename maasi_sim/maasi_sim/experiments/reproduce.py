@@ -23,12 +23,14 @@ from rich.progress import (
 
 from maasi_sim.experiments.campaign import (
     Cluster,
+    MixedWorkers,
     Plan,
     Processes,
     SerialExecutor,
     Workers,
     WorkersLost,
     carry_out,
+    one_machine,
     plan,
 )
 from maasi_sim.experiments.document import write_document
@@ -66,6 +68,11 @@ def build_parser() -> argparse.ArgumentParser:
         '--workers', type=_count, metavar='N', help='processes (default: one for each core)'
     )
     parser.add_argument('--cluster', metavar='ADDRESS', help='scheduler of a Dask cluster')
+    parser.add_argument(
+        '--mixed-workers',
+        action='store_true',
+        help='mix runs of different processors or versions, which may differ in the last bits',
+    )
     parser.add_argument(
         '--out',
         type=Path,
@@ -131,6 +138,8 @@ def main(arguments: list[str] | None = None) -> int:
             shown = write_document(options.document, options.out, options.seed, options.small)
             print(f'wrote {options.document} with {len(shown)} experiments')
         return code
+    except MixedWorkers as error:
+        return _refuse(f'{error}; --mixed-workers makes runs on both', WRONG_INPUT)
     except (NoRoom, WorkersLost) as error:
         return _refuse(f'{error}; the runs until now are kept', STOPPED)
     except KeyboardInterrupt:
@@ -185,10 +194,13 @@ def run_all(wanted: list[Experiment], options: argparse.Namespace) -> int:
     try:
         if number:
             workers = make_workers(options, number)
+        machine = None
+        if workers is not None and not options.mixed_workers:
+            machine = one_machine(workers, plans)
         with _Display(plans) as display:
             for work in plans:
                 if work.tasks and workers is not None:
-                    problems += carry_out(work, workers, display.advance(work))
+                    problems += carry_out(work, workers, display.advance(work), machine)
                 write_outputs(work.folder, work.results(), options.seed)
                 display.say(f'{work.experiment.name}: {work.folder.path}/table.md')
     finally:

@@ -49,6 +49,8 @@ class Run:
         Of the case's settings.
     summary, columns, details, timing
         See `Outcome`.
+    machine : dict
+        On what it was made, see `this_machine`; empty in files of earlier versions.
     """
 
     experiment: str
@@ -60,6 +62,7 @@ class Run:
     columns: dict[str, FloatArray] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
     timing: dict[str, float] = field(default_factory=dict)
+    machine: dict[str, str] = field(default_factory=dict)
 
     def value(self, quantity: str) -> float | None:
         """Return a measured quantity; None where the run has none."""
@@ -116,6 +119,7 @@ def to_text(run: Run) -> str:
         'summary': run.summary,
         'details': run.details,
         'timing': run.timing,
+        'machine': run.machine,
     }
     body = io.StringIO()
     body.write(f'# {json.dumps(facts, allow_nan=False)}\n')

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_sim.machine import this_machine
 from maasi_sim.run.observer import Progress, RunRecord
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ def build_report(record: RunRecord) -> dict[str, Any]:
         'end_reason': record.end_reason,
         'wall_time': wall_time,
         'real_time_factor': record.end_time / wall_time if wall_time > 0.0 else None,
+        'machine': this_machine(),
         'events': record.events,
         'scoring': {'radius': scores.radius, 'c': scores.radius, 'p': scores.order},
     }

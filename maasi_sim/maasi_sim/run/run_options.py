@@ -49,7 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--lockstep',
         action='store_true',
-        help='step by step, as fast as it goes: the same seed gives the same run, to the bit',
+        help='step by step, as fast as it goes: the same seed gives the same run',
     )
     parser.add_argument(
         '--rate', type=_positive, metavar='X', help='simulated over wall time (default: 1)'

@@ -1,0 +1,62 @@
+"""On what a run was made: processor and versions, as far as they change the last bits of numbers.
+
+See docs/repeatability.md.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+
+# By key: what a difference is called.
+_NAMES = {
+    'processor': 'processor',
+    'features': 'processor features',
+    'python': 'Python',
+    'numpy': 'NumPy',
+    'scipy': 'SciPy',
+    'numba': 'Numba',
+    'llvmlite': 'llvmlite',
+    'cv2': 'OpenCV',
+}
+_LIBRARIES = ('numpy', 'scipy', 'numba', 'llvmlite', 'cv2')
+
+
+@cache
+def _facts() -> tuple[tuple[str, str], ...]:
+    from numba.core.registry import cpu_target
+
+    # What kernels are compiled for, NUMBA_CPU_NAME and NUMBA_CPU_FEATURES included.
+    _, processor, features = cpu_target.target_context.codegen().magic_tuple()
+    facts = {
+        'processor': processor,
+        'features': hashlib.sha256(features.encode()).hexdigest()[:12],
+        'python': platform.python_version(),
+        **{name: import_module(name).__version__ for name in _LIBRARIES},
+    }
+    return tuple(facts.items())
+
+
+def this_machine() -> dict[str, str]:
+    """Return the processor that kernels are compiled for, a hash of its features, and versions."""
+    return dict(_facts())
+
+
+def machine_difference(first: Mapping[str, str], second: Mapping[str, str]) -> str:
+    """Return in words in what two machines differ, '' if in nothing.
+
+    Parameters
+    ----------
+    first, second : mapping
+        As `this_machine` returns it.
+    """
+    keys = dict.fromkeys([*first, *second])
+    return ', '.join(
+        f'{_NAMES.get(key, key)} {second.get(key, "unknown")} instead of '
+        f'{first.get(key, "unknown")}'
+        for key in keys
+        if first.get(key) != second.get(key)
+    )
