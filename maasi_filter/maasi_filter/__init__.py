@@ -1,9 +1,8 @@
-"""What the team believes: sensors, exploration, the particle PHD filter and found targets."""
+"""What the team believes: sensors, exploration, filters and found targets."""
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
-from maasi_filter.ic_phd.found_targets import FoundTarget
-from maasi_filter.ic_phd.search_filter import AgentMeasurement, FilterResult, SearchFilter
+from maasi_filter.ic_phd.filter import IcPhdFilter
+from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.metrics import (
     Gospa,
     Match,
@@ -17,7 +16,6 @@ from maasi_filter.models.detection import (
     BoxDetection,
     DetectionModel,
     ExponentialDetection,
-    FunctionDetection,
     GaussianDetection,
     detection_probability,
 )
@@ -29,6 +27,9 @@ from maasi_filter.models.measurement import (
 )
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.pmb.filter import PmbFilter
+from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
+from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import (
     DetectionSettings,
     EnvironmentSettings,
@@ -51,12 +52,13 @@ __all__ = [
     'FilterResult',
     'FilterSettings',
     'FoundTarget',
-    'FunctionDetection',
     'GaussianDetection',
     'Gospa',
+    'IcPhdFilter',
     'Match',
     'MeasurementModel',
     'NoiseSettings',
+    'PmbFilter',
     'Pose',
     'RangeBearing',
     'RangeBearingElevation',
@@ -69,6 +71,8 @@ __all__ = [
     'detection_probability',
     'gospa',
     'inverse',
+    'load_filter',
+    'make_filter',
     'match_targets',
     'ospa',
     'restricted_mean',

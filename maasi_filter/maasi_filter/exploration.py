@@ -20,6 +20,8 @@ from maasi_filter.models.detection import (
 from maasi_filter.models.pose import Pose
 
 FloatArray = NDArray[np.float64]
+# Cells along the mean side of the environment, in 2D and 3D.
+CELLS = {2: 54, 3: 13}
 MAXIMUM_NODES = 20_000_000
 
 
@@ -161,6 +163,12 @@ def check_bounds(bounds: ArrayLike) -> FloatArray:
     return array
 
 
+def default_spacing(bounds: FloatArray) -> float:
+    """Return the spacing of the grid where none is given, metres."""
+    size = bounds[:, 1] - bounds[:, 0]
+    return float(np.prod(size)) ** (1.0 / len(bounds)) / CELLS[len(bounds)]
+
+
 class Exploration:
     """Exploration function on a grid.
 
@@ -232,12 +240,7 @@ class Exploration:
 
     def update(self, detection: DetectionModel, pose: Pose) -> None:
         """Multiply e by 1 - pi for one measurement at `pose` (000, eq. (20))."""
-        kernel = detection.kernel()
-        if kernel is None:
-            probability = detection.probability(self.nodes(), pose)
-            self._values *= (1.0 - probability).reshape(self._values.shape)
-            return
-        kind, parameters = kernel
+        kind, parameters = detection.kernel()
         _decrease(
             self._values,
             self._lower,
@@ -317,25 +320,16 @@ class Exploration:
         sensors = np.ascontiguousarray(np.atleast_2d(np.asarray(positions, dtype=float)))
         headings = np.ascontiguousarray(np.atleast_1d(np.asarray(yaws, dtype=float)))
         volumes = self.cell_volumes()
-        kernel = detection.kernel()
-        if kernel is None:
-            nodes = self.nodes()
-            missed = np.ones(len(nodes))
-            for position, yaw in zip(sensors, headings):
-                missed *= 1.0 - detection.probability(nodes, Pose.from_yaw(position, yaw))
-            total = float((volumes.ravel() * self.values.ravel() * (1.0 - missed)).sum())
-        else:
-            total = _expected_unseen_seen(
-                self._values,
-                volumes.reshape(self._values.shape),
-                self._lower,
-                self._step,
-                kernel[0],
-                kernel[1],
-                sensors,
-                headings,
-                self.dimension,
-            )
+        total = _expected_unseen_seen(
+            self._values,
+            volumes.reshape(self._values.shape),
+            self._lower,
+            self._step,
+            *detection.kernel(),
+            sensors,
+            headings,
+            self.dimension,
+        )
         return float(expected_targets) * total / float(volumes.sum())
 
     def copy(self) -> Exploration:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.filter_protocol import TargetFilter
 from maasi_filter.make_filter import filter_from_state
+from maasi_filter.search_filter import SearchFilter
 from maasi_filter.state_file import StateFileError, read_state, text, untext, write_state
 
 # Of the arrays in the file: what the filter itself does not know.
@@ -61,7 +61,7 @@ class FilterMemory:
     def __init__(self, path: str) -> None:
         self.path = Path(path)
 
-    def save(self, search: TargetFilter, progress: Progress) -> None:
+    def save(self, search: SearchFilter, progress: Progress) -> None:
         """Save both.
 
         Raises
@@ -77,7 +77,7 @@ class FilterMemory:
         state[_UPDATE] = np.frombuffer(update, np.uint8)
         write_state(self.path, state, durable=False)
 
-    def load(self) -> tuple[TargetFilter, Progress] | None:
+    def load(self) -> tuple[SearchFilter, Progress] | None:
         """Return what was saved, or None where nothing was.
 
         Raises

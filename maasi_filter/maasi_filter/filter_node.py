@@ -19,10 +19,9 @@ from visualization_msgs.msg import MarkerArray
 
 from maasi_filter import warm_up
 from maasi_filter.filter_memory import FilterMemory, Progress
-from maasi_filter.filter_protocol import TargetFilter
-from maasi_filter.ic_phd.search_filter import AgentMeasurement
 from maasi_filter.kept_found_targets import KeptFoundTargets, checked_found
 from maasi_filter.make_filter import load_filter, make_filter
+from maasi_filter.records import AgentMeasurement
 from maasi_filter.ros.conversions import (
     cluster_to_ros,
     filter_markers,
@@ -39,6 +38,7 @@ from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
 from maasi_filter.ros.silence import Silence
 from maasi_filter.ros.stamps import batch_id_limit
+from maasi_filter.search_filter import SearchFilter
 from maasi_filter.state_file import StateFileError
 from maasi_msgs.msg import (
     BatchMember,
@@ -197,7 +197,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             f'state loaded from {settings.save_file}: {len(saved.found_targets)} found targets'
         )
 
-    def _check_bounds(self, saved: TargetFilter) -> None:
+    def _check_bounds(self, saved: SearchFilter) -> None:
         bounds = self.settings.environment.array()
         if not np.array_equal(saved.bounds, bounds):
             raise SettingsError(

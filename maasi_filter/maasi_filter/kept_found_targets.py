@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from maasi_filter.ic_phd.found_targets import FoundTarget
 from maasi_filter.models.sensor import is_covariance
+from maasi_filter.records import FoundTarget
 
 # Longest wait for a message that its publisher has latched [s].
 _PATIENCE = 5.0

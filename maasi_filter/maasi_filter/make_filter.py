@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.filter_protocol import TargetFilter
-from maasi_filter.ic_phd.search_filter import SearchFilter
+from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.pmb.filter import PmbFilter
+from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 from maasi_filter.state_file import read_state
 
 
 def make_filter(
     settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
-) -> TargetFilter:
+) -> SearchFilter:
     """Return a new filter of the method that the settings name.
 
     Parameters
@@ -35,10 +35,10 @@ def make_filter(
     """
     if settings.method == 'pmb':
         return PmbFilter(settings, bounds, generator)
-    return SearchFilter(settings, bounds, generator)
+    return IcPhdFilter(settings, bounds, generator)
 
 
-def load_filter(path: str | os.PathLike[str]) -> TargetFilter:
+def load_filter(path: str | os.PathLike[str]) -> SearchFilter:
     """Return the filter that was saved; it continues to the bit as the saved one would have.
 
     Raises
@@ -51,7 +51,7 @@ def load_filter(path: str | os.PathLike[str]) -> TargetFilter:
 
 def filter_from_state(
     state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
-) -> TargetFilter:
+) -> SearchFilter:
     """Return the filter of a state; `path` is named in errors.
 
     Raises
@@ -61,4 +61,4 @@ def filter_from_state(
     """
     if 'method' in state and state['method'].tobytes() == b'pmb':
         return PmbFilter.from_state(state, path)
-    return SearchFilter.from_state(state, path)
+    return IcPhdFilter.from_state(state, path)

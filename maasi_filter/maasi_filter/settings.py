@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -200,64 +201,33 @@ class EnvironmentSettings(Settings):
         return np.array(self.bounds, dtype=float)
 
 
-Preset = Literal['recommended', 'paper_000', 'paper_001', 'paper_002', 'paper_003']
+Preset = Literal['paper_000', 'paper_001', 'paper_002', 'paper_003']
 
-
-# What the papers leave open is the same for all four.
-_PAPER: dict[str, Any] = {
+_PAPER_000: dict[str, Any] = {
     'particles': 10000,
     'particles_minimum': 500,
     'particles_per_target': 1000,
     'survival_probability': 1.0,
     'births': 'measurement',
     'birth_particles': 500,
-    'birth_prior': 'constant',
-    'expected_targets': 12.0,
     'birth_targets': 1.0,
-    'corrector': 'running',
-    'resampling': 'multinomial',
-    'jitter_differential': 0.3,
     'jitter_deviation': 0.1,
-    'extraction': 'kmeans',
     'found_radius': 1.1,
-    'found_radius_kind': 'rms',
     'found_mass': 0.5,
     'removal': 'closest',
     'removal_distance': 5.0,
-    'refine_found': False,
-    'pose_error': 0.0,
-    'use_detection_covariances': False,
     'kmeans_iterations': 20,
+    'use_detection_covariances': False,
+    'pose_error': 0.0,
 }
 
 # What each preset fills in; `docs/filter_presets.md` says where the numbers are from.
 PRESETS: dict[str, dict[str, Any]] = {
-    'recommended': {
-        'particles': 10000,
-        'particles_minimum': 1000,
-        'particles_per_target': 2000,
-        'survival_probability': 1.0,
-        'births': 'measurement',
-        'birth_particles': 500,
-        'birth_prior': 'unexplored',
-        'expected_targets': 12.0,
-        'birth_targets': 0.0,
-        'corrector': 'running',
-        'resampling': 'systematic',
-        'jitter_differential': 0.3,
-        'extraction': 'measurement',
-        'found_radius_kind': 'rms',
-        'found_mass': 0.5,
-        'removal': 'soft',
-        'refine_found': True,
-        'use_detection_covariances': True,
-        'kmeans_iterations': 20,
-    },
-    'paper_000': _PAPER,
-    'paper_001': {**_PAPER, 'particles': 5000, 'particles_per_target': 500},
-    'paper_002': {**_PAPER, 'found_radius': 1.2},
+    'paper_000': _PAPER_000,
+    'paper_001': {**_PAPER_000, 'particles': 5000, 'particles_per_target': 500},
+    'paper_002': {**_PAPER_000, 'found_radius': 1.2},
     'paper_003': {
-        **_PAPER,
+        **_PAPER_000,
         'births': 'gaussian',
         'birth_particles': 2000,
         'removal': 'every',
@@ -265,116 +235,32 @@ PRESETS: dict[str, dict[str, Any]] = {
         'found_radius': 0.5,
     },
 }
+_PMB: dict[str, Any] = {'use_detection_covariances': True}
 
 
 class FilterSettings(Settings):
-    """Numbers of the search filter. What is left None takes the value of the preset.
+    """Numbers of the search filter.
 
-    Lengths that the `recommended` preset leaves None too are derived at each step from the noise
-    of the measuring sensor and from the environment, so that one preset serves a cube of 260 m
-    and a floor of 2.7 m. `docs/filter_presets.md` has the presets side by side.
+    What is left None takes, with `method: ic_phd`, the value of the preset; with `method: pmb` it
+    is derived at each step from the sensor and the environment, or not used.
     """
 
     method: Literal['ic_phd', 'pmb'] = Field(
-        default='ic_phd', description='Particle PHD filter, or Poisson multi-Bernoulli filter'
+        default='ic_phd', description="The papers' PHD, or a Poisson multi-Bernoulli filter"
     )
-    preset: Preset = Field(default='recommended', description='Where values left None come from')
-    particles: int = Field(
-        default=10000,
-        ge=1,
-        le=5_000_000,
-        description='Largest number of particles after resampling [1]',
+    preset: Preset = Field(
+        default='paper_000', description='ic_phd: where values left None come from'
     )
-    particles_minimum: int | None = Field(
-        default=None,
-        ge=0,
-        description='Smallest number of particles after resampling, if any mass [1]',
-    )
-    particles_per_target: int | None = Field(
-        default=None, ge=1, description='Particles for each expected target, within the bounds [1]'
-    )
-    survival_probability: float | None = Field(
-        default=None,
-        ge=0.0,
-        le=1.0,
-        description='p_s, that a target still exists after one step [1]',
-    )
-    births: Literal['measurement', 'uniform', 'gaussian'] | None = Field(
-        default=None,
-        description='Where births are drawn: at each measurement, anywhere, or as in 003',
-    )
-    birth_particles: int | None = Field(
-        default=None,
-        ge=1,
-        le=1_000_000,
-        description='Particles of a birth (measurement: for each) [1]',
-    )
-    birth_prior: Literal['unexplored', 'constant'] | None = Field(
-        default=None, description='Whether births at measurements have intensity N0/V e(x) or N0/V'
-    )
-    expected_targets: float | None = Field(
-        default=None, gt=0.0, description='N0, targets expected in all before the search [1]'
-    )
-    birth_targets: float | None = Field(
-        default=None,
-        ge=0.0,
-        description='Y V, targets expected to appear at a batch (not at z) [1]',
-    )
-    corrector: Literal['running', 'predicted'] | None = Field(
-        default=None,
-        description='Divide by the running intensity (000, eq. 16) or predicted (002, eq. 9)',
-    )
-    resampling: Literal['systematic', 'stratified', 'multinomial'] | None = Field(
-        default=None, description='Resampling scheme'
-    )
-    jitter_differential: float | None = Field(
-        default=None,
-        ge=0.0,
-        le=2.0,
-        description='Share of a difference of two particles in a jitter [1]',
-    )
-    jitter_deviation: float | None = Field(
-        default=None,
-        ge=0.0,
-        description='Deviation of the Gaussian part of the jitter of duplicates [m]',
-    )
-    extraction: Literal['measurement', 'kmeans'] | None = Field(
-        default=None, description='Clusters for marking: partition by measurement, or K-means'
+    expected_targets: float = Field(
+        default=12.0, gt=0.0, description='N0, targets expected in all before the search [1]'
     )
     found_radius: float | None = Field(
-        default=None, gt=0.0, description='T_r, largest radius of a cluster that is found [m]'
-    )
-    found_radius_kind: Literal['rms', 'maximum'] | None = Field(
         default=None,
-        description='Radius of a cluster: weighted root mean square, or farthest particle',
-    )
-    found_mass: float | None = Field(
-        default=None, ge=0.0, description='T_m, smallest mass of a cluster that is found [1]'
-    )
-    removal: Literal['soft', 'closest', 'every', 'none'] | None = Field(
-        default=None, description='What a found target does to measurements: soft gate, or removal'
-    )
-    removal_distance: float | None = Field(
-        default=None, gt=0.0, description='T_z, largest distance of a removed measurement [m]'
-    )
-    refine_found: bool | None = Field(
-        default=None, description='Whether found targets go on being refined by their measurements'
-    )
-    pose_error: float | None = Field(
-        default=None, ge=0.0, description='Deviation of the error of a robot position, per axis [m]'
-    )
-    use_detection_covariances: bool | None = Field(
-        default=None,
-        description='Whether covariances of detections win over the covariance of the sensor',
+        gt=0.0,
+        description='T_r, largest root mean square radius of what is found [m]',
     )
     exploration_spacing: float | None = Field(
         default=None, gt=0.0, description='Spacing of the exploration grid [m]'
-    )
-    kmeans_iterations: int | None = Field(
-        default=None, ge=1, le=1000, description='Largest number of K-means iterations [1]'
-    )
-    pmb: PmbSettings = Field(
-        default_factory=PmbSettings, description='Of the Poisson multi-Bernoulli filter'
     )
     threads: int | None = Field(
         default=None,
@@ -382,15 +268,106 @@ class FilterSettings(Settings):
         le=256,
         description='Threads for large particle sets; results do not depend [1]',
     )
+    particles: int | None = Field(
+        default=None,
+        ge=1,
+        le=5_000_000,
+        description='ic_phd: largest number of particles after resampling [1]',
+    )
+    particles_minimum: int | None = Field(
+        default=None,
+        ge=0,
+        description='ic_phd: smallest number of particles after resampling, if any mass [1]',
+    )
+    particles_per_target: int | None = Field(
+        default=None,
+        ge=1,
+        description='ic_phd: l, particles for each expected target, within the bounds [1]',
+    )
+    survival_probability: float | None = Field(
+        default=None,
+        ge=0.0,
+        le=1.0,
+        description='ic_phd: p_s, that a target still exists after one step [1]',
+    )
+    births: Literal['measurement', 'uniform', 'gaussian'] | None = Field(
+        default=None,
+        description='ic_phd: births at each measurement, anywhere (001), or as in 003',
+    )
+    birth_particles: int | None = Field(
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description='ic_phd: J, particles of a birth (measurement: for each) [1]',
+    )
+    birth_targets: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='ic_phd: Y V, targets expected to appear at a batch (not at z) [1]',
+    )
+    jitter_deviation: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='ic_phd: deviation of the noise that moves copies of a particle apart [m]',
+    )
+    found_mass: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='ic_phd: T_m, smallest mass of a cluster that is found [1]',
+    )
+    removal: Literal['closest', 'every'] | None = Field(
+        default=None,
+        description='ic_phd: which measurements near a found target are removed (000, or 003)',
+    )
+    removal_distance: float | None = Field(
+        default=None,
+        gt=0.0,
+        description='ic_phd: T_z, largest distance of a removed measurement [m]',
+    )
+    kmeans_iterations: int | None = Field(
+        default=None, ge=1, le=1000, description='ic_phd: largest number of K-means iterations [1]'
+    )
+    pose_error: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='pmb: deviation of the error of a robot position, per axis; none: as it says '
+        '[m]',
+    )
+    use_detection_covariances: bool | None = Field(
+        default=None,
+        description='pmb: whether covariances of detections replace that of the sensor',
+    )
+    pmb: PmbSettings = Field(
+        default_factory=PmbSettings, description='Of the Poisson multi-Bernoulli filter'
+    )
 
     def resolved(self) -> FilterSettings:
-        """Return a copy in which the preset's values stand where nothing was given.
-
-        Lengths that depend on the sensor or the environment may still be None.
-        """
-        values = {
-            name: value
-            for name, value in PRESETS[self.preset].items()
-            if getattr(self, name) is None or name not in self.model_fields_set
-        }
+        """Return a copy in which what was not given has the value of the method or preset."""
+        filled = PRESETS[self.preset] if self.method == 'ic_phd' else _PMB
+        values = {name: value for name, value in filled.items() if getattr(self, name) is None}
         return self.model_copy(update=values)
+
+
+@dataclass(frozen=True)
+class IcPhdNumbers:
+    """The settings of the PHD filter, none of them left open; see `FilterSettings`."""
+
+    expected_targets: float
+    found_radius: float
+    particles: int
+    particles_minimum: int
+    particles_per_target: int
+    survival_probability: float
+    births: str
+    birth_particles: int
+    birth_targets: float
+    jitter_deviation: float
+    found_mass: float
+    removal: str
+    removal_distance: float
+    kmeans_iterations: int
+
+    @classmethod
+    def of(cls, settings: FilterSettings) -> IcPhdNumbers:
+        """Return the numbers of resolved settings."""
+        return cls(**{item.name: getattr(settings, item.name) for item in fields(cls)})

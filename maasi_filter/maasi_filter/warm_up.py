@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from maasi_filter.ic_phd.phd import prepare_measurements
-from maasi_filter.ic_phd.search_filter import LEAST_CLUSTER_MASS, AgentMeasurement
-from maasi_filter.ic_phd.unconfirmed_targets import LostTargets
 from maasi_filter.make_filter import make_filter
 from maasi_filter.models.detection import PARAMETERS, detection_probability
 from maasi_filter.models.pose import Pose
+from maasi_filter.records import AgentMeasurement
 from maasi_filter.settings import (
     DetectionSettings,
     FilterSettings,
     NoiseSettings,
-    Preset,
     SensorSettings,
 )
 
@@ -32,14 +29,8 @@ def warm_up() -> None:
         ):
             noise = NoiseSettings(range=0.5, bearing=0.1, elevation=0.1)
             sensor = SensorSettings(detection=detection, noise=noise).build('warm_up', dimension)
-            presets: tuple[Preset, ...] = ('recommended', 'paper_000', 'paper_003')
-            variants = [
-                FilterSettings(
-                    preset=preset, particles=500, birth_particles=50, particles_minimum=50
-                )
-                for preset in presets
-            ]
-            for settings in (*variants, FilterSettings(method='pmb')):
+            ic_phd = FilterSettings(particles=500, birth_particles=50, particles_minimum=50)
+            for settings in (ic_phd, FilterSettings(method='pmb')):
                 search = make_filter(settings, bounds, np.random.default_rng(0))
                 for step in range(6):
                     position = np.array([3.0 + 0.2 * step, 3.0, 3.0])
@@ -54,19 +45,5 @@ def warm_up() -> None:
                 positions = np.full((1, 3), 3.0)
                 search.exploration.expected_new(sensor.detection, positions, np.zeros(1), 1.0)
                 search.exploration.at(positions)
-                lost = LostTargets(dimension, 1e-3, LEAST_CLUSTER_MASS)
-                pose = Pose(positions[0])
-                seen = prepare_measurements(
-                    sensor.measurement.measure(positions[:, :dimension] + 1.0, pose),
-                    sensor.covariance[None],
-                    pose,
-                )
-                lost.add(seen, np.ones(1, np.bool_), pose, sensor.detection, 0.0)
-                lost.clusters(
-                    np.zeros((0, dimension)),
-                    np.zeros((0, dimension, dimension)),
-                    search.exploration,
-                    0.0,
-                )
     origin = np.zeros(3)
     detection_probability(0, np.zeros(PARAMETERS), origin, origin, 0.0)

@@ -221,29 +221,21 @@ def unseen_parts(
     for viewer in members:
         places, yaws = _poses(viewer, size)
         kernel = viewer.sensor.detection.kernel()
-        if kernel is None:
-            for place, yaw in zip(places, yaws):
-                rest = np.flatnonzero(~seen)
-                pose = Pose.from_yaw(place, yaw)
-                found = viewer.sensor.detection.probability(nodes[rest], pose) >= probability
-                seen[rest[found]] = True
-        else:
-            _, lower, step = grid.kernel()
-            shape = np.ones(3, np.int64)
-            shape[: grid.dimension] = grid.values.shape
-            _mark_seen(
-                seen,
-                shape,
-                lower,
-                step,
-                places,
-                yaws,
-                grid.dimension,
-                kernel[0],
-                kernel[1],
-                reach_of(*kernel),
-                probability,
-            )
+        _, lower, step = grid.kernel()
+        shape = np.ones(3, np.int64)
+        shape[: grid.dimension] = grid.values.shape
+        _mark_seen(
+            seen,
+            shape,
+            lower,
+            step,
+            places,
+            yaws,
+            grid.dimension,
+            *kernel,
+            reach_of(*kernel),
+            probability,
+        )
     return _parts(grid, seen, nodes)
 
 

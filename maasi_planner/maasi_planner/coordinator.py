@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
-from maasi_filter.ic_phd.search_filter import EXPLORATION_CELLS
+from maasi_filter.exploration import Exploration, default_spacing
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
 from maasi_planner.candidates import CandidateSet
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
@@ -96,8 +95,7 @@ class Coordinator:
         bounds = environment.array()
         spacing = settings.exploration_spacing
         if spacing is None:
-            size = float(np.prod(bounds[:, 1] - bounds[:, 0]))
-            spacing = size ** (1.0 / self.dimension) / EXPLORATION_CELLS[self.dimension]
+            spacing = default_spacing(bounds)
         self.exploration = Exploration(bounds, spacing)
         self.obstacles = Obstacles.from_settings(environment.obstacles)
         self.clusters: list[Cluster] = []

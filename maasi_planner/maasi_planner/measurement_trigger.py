@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
 from maasi_planner.settings import PlannerSettings
 
 

@@ -18,8 +18,8 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from maasi_filter.ic_phd.clusters import Cluster
 from maasi_filter.models.pose import Pose
+from maasi_filter.records import Cluster
 from maasi_filter.ros.conversions import (
     cluster_from_ros,
     particles_to_ros,

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
 from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 from maasi_planner.obstacles import Obstacles
 
 if TYPE_CHECKING:
-    from maasi_filter.ic_phd.search_filter import FoundTarget
+    from maasi_filter.records import FoundTarget
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

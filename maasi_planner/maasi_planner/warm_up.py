@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles

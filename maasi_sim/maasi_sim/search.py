@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_filter.ic_phd.found_targets import FoundTarget
-from maasi_filter.ic_phd.search_filter import AgentMeasurement
 from maasi_filter.make_filter import make_filter
 from maasi_filter.models.pose import Pose
+from maasi_filter.records import AgentMeasurement, FoundTarget
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles

@@ -24,7 +24,8 @@ from maasi_filter import (
     SensorSettings,
     warm_up,
 )
-from maasi_filter.ic_phd.phd import associate, position_measurements, prepare_measurements
+from maasi_filter.ic_phd.phd import associate, position_measurements
+from maasi_filter.models.measurement_set import prepare_measurements
 
 FloatArray = NDArray[np.float64]
 BOUNDS = np.array([[0.0, 260.0]] * 3)

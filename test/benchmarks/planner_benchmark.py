@@ -12,10 +12,10 @@ from collections.abc import Callable
 import numpy as np
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
 from maasi_filter.models.detection import ExponentialDetection
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,

@@ -25,8 +25,8 @@ from maasi_filter.ic_phd.found_targets import (
     refine,
     remove_measurements,
 )
-from maasi_filter.ic_phd.phd import prepare_measurements
 from maasi_filter.metrics import normalised_error
+from maasi_filter.models.measurement_set import prepare_measurements
 
 POSE = Pose.from_yaw([40.0, 50.0, 45.0], 0.3)
 MODELS = {2: RangeBearing(), 3: RangeBearingElevation()}

@@ -7,8 +7,8 @@ from searches import DEGREES, RADIANS, cube_sensor, follow_one_target
 
 from maasi_filter import Pose
 from maasi_filter.ic_phd.found_targets import bounded_below, missing_spread, refine
-from maasi_filter.ic_phd.phd import prepare_measurements
 from maasi_filter.metrics import normalised_error
+from maasi_filter.models.measurement_set import prepare_measurements
 
 TARGETS = 200
 

@@ -5,8 +5,8 @@ import pytest
 from test_filter_node import running, seen_from_a
 
 from maasi_filter.filter_memory import FilterMemory
-from maasi_filter.ic_phd.found_targets import FoundTarget
 from maasi_filter.kept_found_targets import KeptFoundTargets, checked_found
+from maasi_filter.records import FoundTarget
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTargetArray
 

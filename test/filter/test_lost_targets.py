@@ -16,8 +16,8 @@ from maasi_filter import (
     SearchFilter,
 )
 from maasi_filter.ic_phd.births import LEAST_UNEXPLORED
-from maasi_filter.ic_phd.phd import prepare_measurements
 from maasi_filter.ic_phd.unconfirmed_targets import MOST_DETECTIONS, LostTargets
+from maasi_filter.models.measurement_set import prepare_measurements
 
 FLOOR = np.array([[0.0, 100.0]] * 2)
 DETECTION = ExponentialDetection(0.9, [20.0, 20.0])

@@ -10,12 +10,8 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 
 from maasi_filter import ExponentialDetection, Pose, RangeBearing, RangeBearingElevation
-from maasi_filter.ic_phd.phd import (
-    Workspace,
-    associate,
-    position_measurements,
-    prepare_measurements,
-)
+from maasi_filter.ic_phd.phd import Workspace, associate, position_measurements
+from maasi_filter.models.measurement_set import prepare_measurements
 from maasi_filter.vector_math import arctan2, exponential, sines
 
 ORIGIN = Pose([0.0, 0.0, 0.0])

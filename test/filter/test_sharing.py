@@ -5,7 +5,7 @@ import pytest
 from searches import FLOOR, floor_sensor
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, SearchFilter
-from maasi_filter.ic_phd.found_targets import FoundTarget
+from maasi_filter.records import FoundTarget
 
 POSE = Pose([1.0, 1.0, 1.0])
 VALUES = np.array([[0.1, 0.3]])

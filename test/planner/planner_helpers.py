@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection, GaussianDetection
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Cluster
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,

@@ -10,8 +10,8 @@ import pytest
 from planner_helpers import CUBE, FLOOR, SmallSearch, drone, floor_members, random_team
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
 from maasi_filter.models.pose import Pose
+from maasi_filter.records import Cluster
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,

@@ -8,8 +8,7 @@ serves all kinds.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
@@ -167,27 +166,6 @@ def probabilities(  # type: ignore[no-untyped-def]
     return out
 
 
-class DetectionModel(ABC):
-    """Probability of detection of a target at x by a sensor at pose q."""
-
-    @abstractmethod
-    def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return pi(x, q), shape (n,), in [0, 1].
-
-        Parameters
-        ----------
-        positions : (n, d) array
-            Target positions, metres, frame `map`, d = 2 or 3. With d = 2 the sensor's height
-            plays no part.
-        pose : Pose
-            Of the sensor.
-        """
-
-    def kernel(self) -> tuple[int, FloatArray] | None:
-        """Return (kind, parameters) for `detection_probability`, or None if there is none."""
-        return None
-
-
 def _positions(positions: ArrayLike) -> FloatArray:
     array = np.ascontiguousarray(positions, dtype=float)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
@@ -201,22 +179,36 @@ def _check_probability(probability: float) -> float:
     return float(probability)
 
 
-class _KernelDetection(DetectionModel):
-    """A model whose formula is in `detection_probability`."""
+class DetectionModel:
+    """Probability of detection of a target at x by a sensor at pose q.
+
+    Its formula is in `detection_probability_at`.
+    """
 
     _kind: int
     _parameters: FloatArray
 
     def kernel(self) -> tuple[int, FloatArray]:
+        """Return (kind, parameters) for `detection_probability_at`."""
         return self._kind, self._parameters
 
     def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
+        """Return pi(x, q), shape (n,), in [0, 1].
+
+        Parameters
+        ----------
+        positions : (n, d) array
+            Target positions, metres, frame `map`, d = 2 or 3. With d = 2 the sensor's height
+            plays no part.
+        pose : Pose
+            Of the sensor.
+        """
         return probabilities(
             self._kind, self._parameters, _positions(positions), pose.position, pose.yaw
         )
 
 
-class _RadialDetection(_KernelDetection):
+class _RadialDetection(DetectionModel):
     def __init__(self, probability: float, size: Sequence[float]) -> None:
         values = np.array(size, dtype=float)
         if values.shape not in ((2,), (3,)) or not (values > 0.0).all():
@@ -248,7 +240,7 @@ class GaussianDetection(_RadialDetection):
     _kind = GAUSSIAN
 
 
-class BoxDetection(_KernelDetection):
+class BoxDetection(DetectionModel):
     """pi = G inside a box around the sensor and 0 outside (000, eq. (25) and (34)).
 
     Parameters
@@ -304,34 +296,3 @@ class BoxDetection(_KernelDetection):
         if edge <= self.edge:
             return self
         return BoxDetection(self.lower.tolist(), self.upper.tolist(), self.gain, self.frame, edge)
-
-
-class FunctionDetection(DetectionModel):
-    """A user's own probability of detection.
-
-    Parameters
-    ----------
-    function : callable
-        Takes positions (n, d) [m, map] and a Pose, returns n numbers in [0, 1].
-    """
-
-    def __init__(self, function: Callable[[FloatArray, Pose], ArrayLike]) -> None:
-        self._function = function
-
-    def probability(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Return the function's values.
-
-        Raises
-        ------
-        ValueError
-            If it returns another number of values, or one outside [0, 1].
-        """
-        array = _positions(positions)
-        values = np.array(self._function(array, pose), dtype=float)
-        if values.shape != (len(array),):
-            raise ValueError(
-                f'detection function: got shape {values.shape}, allowed is ({len(array)},)'
-            )
-        if not ((values >= 0.0) & (values <= 1.0)).all():
-            raise ValueError('detection function: got values outside [0, 1], or not finite')
-        return values

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.ic_phd.found_targets import FoundTarget
 from maasi_filter.pmb.births import Births
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import (
@@ -21,6 +20,7 @@ from maasi_filter.pmb.factors import (
     Scan,
     likelihoods,
 )
+from maasi_filter.records import FoundTarget
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -18,9 +18,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.exploration import interpolate_at
-from maasi_filter.ic_phd.phd import MeasurementSet
 from maasi_filter.models.detection import PARAMETERS, DetectionModel, detection_probability_at
 from maasi_filter.models.measurement import wrap
+from maasi_filter.models.measurement_set import MeasurementSet
 from maasi_filter.models.pose import Pose
 from maasi_filter.vector_math import arctan2
 

@@ -16,42 +16,44 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.exploration import Exploration, check_bounds
-from maasi_filter.ic_phd.clusters import Cluster
-from maasi_filter.ic_phd.found_targets import FoundTarget
-from maasi_filter.ic_phd.phd import prepare_measurements
-from maasi_filter.ic_phd.search_filter import (
-    EXPLORATION_CELLS,
-    FOUND_RADIUS_DEVIATIONS,
-    LEAST_CLUSTER_MASS,
-    AgentMeasurement,
-    FilterResult,
+from maasi_filter.clutter import measurement_space
+from maasi_filter.exploration import Exploration, check_bounds, default_spacing
+from maasi_filter.measurement_check import (
+    CheckedMeasurement,
+    check_measurements,
+    check_taken,
+    pose_error_of,
 )
-from maasi_filter.ic_phd.state_check import check_exploration
 from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.measurement_set import prepare_measurements
 from maasi_filter.pmb import state as pmb_state
 from maasi_filter.pmb.association import associate
 from maasi_filter.pmb.births import Births, draw_births
-from maasi_filter.pmb.checks import Checked, check_step, pose_error_of
-from maasi_filter.pmb.clutter import ClutterEstimate, measurement_space
+from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import Component, merge
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, MISS, SCALE, TERMS, Scan, make_scan
-from maasi_filter.pmb.found import check_taken, nearest, same_estimate
+from maasi_filter.pmb.found import nearest, same_estimate
 from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
+from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
-from maasi_filter.state_file import (
-    StateFileError,
-    generator_state,
-    restored_generator,
-    text,
-    untext,
-    write_state,
+from maasi_filter.state_check import (
+    cluster_arrays,
+    clusters_of,
+    common_arrays,
+    construction,
+    exploration_of,
+    naming,
 )
+from maasi_filter.state_file import write_state
 
 FloatArray = NDArray[np.float64]
 
 LEAST_EXISTENCE = 1e-4
+# Of a potential target that planners hear of.
+LEAST_CLUSTER_MASS = 0.1
+# T_r where it is not given, in deviations of the range.
+FOUND_RADIUS_DEVIATIONS = 2.0
 # Squared normalised distance up to which components may be one target.
 SAME_PLACE = 6.0
 # Expected detections of a found target: one narrow detection alone is not enough.
@@ -89,17 +91,13 @@ class PmbFilter:
     ) -> None:
         self.settings = settings
         self._numbers = settings.resolved()
-        assert self._numbers.expected_targets is not None
         self._expected_targets = self._numbers.expected_targets
         self.bounds = check_bounds(bounds)
         self.dimension = len(self.bounds)
         self.generator = generator
-        size = self.bounds[:, 1] - self.bounds[:, 0]
-        spacing = self._numbers.exploration_spacing
-        if spacing is None:
-            spacing = float(np.prod(size)) ** (1.0 / self.dimension)
-            spacing /= EXPLORATION_CELLS[self.dimension]
-        self.exploration = Exploration(self.bounds, spacing)
+        self.exploration = Exploration(
+            self.bounds, settings.exploration_spacing or default_spacing(self.bounds)
+        )
         self.components: list[Component] = []
         self.clusters: list[Cluster] = []
         self._clutter = ClutterEstimate()
@@ -158,7 +156,7 @@ class PmbFilter:
             If anything is not finite, a covariance is not positive definite, shapes or dimensions
             do not fit, or a robot is there twice. Nothing has changed then.
         """
-        members = check_step(measurements, steps, time, self._numbers, self.dimension)
+        members = check_measurements(measurements, steps, time, self._numbers, self.dimension)
         dropped: dict[str, int] = {}
         newly_found: list[FoundTarget] = []
         changed = self._predict(time)
@@ -176,7 +174,7 @@ class PmbFilter:
 
     def _correct(
         self,
-        member: Checked,
+        member: CheckedMeasurement,
         newly_found: list[FoundTarget],
         dropped: dict[str, int],
         time: float,
@@ -221,7 +219,7 @@ class PmbFilter:
         self.exploration.update(scan.detection, member.pose)
         return changed
 
-    def _scan(self, member: Checked, dropped: dict[str, int]) -> Scan:
+    def _scan(self, member: CheckedMeasurement, dropped: dict[str, int]) -> Scan:
         """Return a member's scan without what is out of its sensor's range."""
         if math.isfinite(member.sensor.maximum_range):
             reach = member.values[:, 0] <= member.sensor.maximum_range
@@ -240,7 +238,9 @@ class PmbFilter:
         )
         return make_scan(prepared, member.pose, detection)
 
-    def _bear(self, member: Checked, scan: Scan, births: Births, existence: FloatArray) -> None:
+    def _bear(
+        self, member: CheckedMeasurement, scan: Scan, births: Births, existence: FloatArray
+    ) -> None:
         """Add a component for each detection that may be of a target not seen before."""
         grid: FloatArray | None = None
         for j in np.flatnonzero(existence >= LEAST_EXISTENCE).tolist():
@@ -273,7 +273,7 @@ class PmbFilter:
         self,
         item: Component,
         moved: bool,
-        member: Checked,
+        member: CheckedMeasurement,
         newly_found: list[FoundTarget],
         time: float,
     ) -> bool:
@@ -354,7 +354,7 @@ class PmbFilter:
             key=lambda cluster: -cluster.mass,
         )
 
-    def _found_radius(self, member: Checked) -> float:
+    def _found_radius(self, member: CheckedMeasurement) -> float:
         """Return T_r [m]."""
         if self._numbers.found_radius is not None:
             return self._numbers.found_radius
@@ -483,16 +483,11 @@ class PmbFilter:
         grid = self.exploration.kernel()[0].shape
         number = self._numbers.pmb.particles
         return {
-            'settings': text(self.settings.model_dump_json(exclude_unset=True)),
-            'generator': text(generator_state(self.generator)),
-            'bounds': self.bounds,
-            'spacing': np.array(self.exploration.spacing),
-            'exploration': self.exploration.values,
+            **common_arrays(self.settings, self.generator, self.exploration),
+            **cluster_arrays(self.clusters, self.dimension),
             'counters': np.array([self._scans, self._last_id]),
             'last_time': np.array(np.nan if self._last_time is None else self._last_time),
-            **pmb_state.to_arrays(
-                self.components, self.clusters, self._clutter, (number, self.dimension), grid
-            ),
+            **pmb_state.to_arrays(self.components, self._clutter, (number, self.dimension), grid),
         }
 
     @classmethod
@@ -506,24 +501,14 @@ class PmbFilter:
         StateFileError
             If an array is missing, or has a wrong shape or number; `path` is named.
         """
-        try:
+        with naming(path):
             return cls._restored(state)
-        except KeyError as error:
-            raise StateFileError(f'{path}: does not hold a usable state: no {error}') from None
-        except (ValueError, TypeError) as error:
-            raise StateFileError(f'{path}: does not hold a usable state: {error}') from None
 
     @classmethod
     def _restored(cls, state: Mapping[str, NDArray[Any]]) -> PmbFilter:
         pmb_state.check(state)
-        search = cls(
-            FilterSettings.model_validate_json(untext(state['settings'])),
-            state['bounds'],
-            restored_generator(untext(state['generator'])),
-        )
-        search.exploration = Exploration(search.bounds, float(state['spacing']))
-        check_exploration(state['exploration'], search.exploration.values.shape)
-        search.exploration.values[...] = state['exploration']
+        search = cls(*construction(state))
+        search.exploration = exploration_of(state)
         search._frame[2] = search.exploration.kernel()[2]
         search._scans, search._last_id = (int(number) for number in state['counters'])
         last = float(state['last_time'])
@@ -531,7 +516,7 @@ class PmbFilter:
         grid = search.exploration.kernel()[0].shape
         number = search._numbers.pmb.particles
         search.components = pmb_state.components_of(state, number, grid, search._frame)
-        search.clusters = pmb_state.clusters_of(state)
+        search.clusters = clusters_of(state)
         search._clutter = pmb_state.clutter_of(state)
         return search
 

@@ -6,33 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from maasi_filter.ic_phd.found_targets import FoundTarget
-from maasi_filter.ic_phd.search_filter import SAME_TARGET
-from maasi_filter.models.sensor import is_covariance
 from maasi_filter.pmb.component import Component
+from maasi_filter.records import FoundTarget
 
-
-def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> None:
-    """Refuse targets with numbers that are not finite, or of another dimension.
-
-    Raises
-    ------
-    ValueError
-        Naming the robot, the target and what is allowed.
-    """
-    for target in targets:
-        shapes = target.position.shape, target.covariance.shape
-        if shapes != ((dimension,), (dimension, dimension)):
-            raise ValueError(
-                f'{robot}: target {target.id}: got {len(target.position)} dimensions, allowed '
-                f'is {dimension}'
-            )
-        if not (np.isfinite(target.position).all() and is_covariance(target.covariance)):
-            raise ValueError(
-                f'{robot}: target {target.id}: got position {target.position.tolist()} with '
-                f'covariance {target.covariance.tolist()}, allowed are finite numbers and a '
-                'positive definite matrix'
-            )
+# Two estimates whose squared normalised difference is below this may be one target.
+SAME_TARGET = 16.0
 
 
 def nearest(target: FoundTarget, components: Sequence[Component]) -> Component | None:

@@ -16,11 +16,9 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_filter.ic_phd.clusters import Cluster
-from maasi_filter.ic_phd.found_targets import FoundTarget
-from maasi_filter.ic_phd.search_filter import AgentMeasurement
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import AgentMeasurement, Cluster, FoundTarget
 from maasi_msgs.msg import Cluster as ClusterMessage
 from maasi_msgs.msg import Detection, DetectionArray
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage

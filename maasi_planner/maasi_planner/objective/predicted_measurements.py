@@ -145,11 +145,6 @@ def first_row(item: Events) -> Events:
     return Events(item.times[:1], item.places[:1], item.turns[:1], item.own[:1], item.total[:1])
 
 
-def kernel_of(view: RobotView) -> tuple[int, FloatArray] | None:
-    """Return kind and parameters of a robot's detection model, if it has a kernel."""
-    return view.sensor.detection.kernel()
-
-
 def reach_of(kind: int, parameters: FloatArray) -> float:
     """Return the horizontal distance beyond which pi is 0, metres; inf if there is none."""
     if kind != BOX:
@@ -183,16 +178,6 @@ def tail_events(view: RobotView, horizon: int, extend: bool) -> Events:
         view.tail is not None and len(view.tail) > 1,
         extend,
     )
-
-
-def required_kernel(name: str, view: RobotView) -> tuple[int, FloatArray]:
-    kernel = kernel_of(view)
-    if kernel is None:
-        raise ValueError(
-            f'{name}: got a detection model without a kernel, allowed here are exponential, '
-            'gaussian and box'
-        )
-    return kernel
 
 
 def rows_of(planned: list[Events]) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:

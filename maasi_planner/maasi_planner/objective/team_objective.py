@@ -34,7 +34,6 @@ from maasi_planner.objective.predicted_measurements import (
     first_row,
     joined,
     reach_of,
-    required_kernel,
     rows_of,
     stacked,
     starts_of,
@@ -108,7 +107,7 @@ class TeamObjective:
         team, weights, names = self.team, self.weights, self.names
         robots = [team.robots[name] for name in names]
         horizon = max((int(trajectories[name].lengths.max(initial=0)) for name in names), default=0)
-        kernels = [required_kernel(name, view) for name, view in zip(names, robots)]
+        kernels = [view.sensor.detection.kernel() for view in robots]
         planned = [
             events(
                 trajectories[name].positions,
@@ -127,7 +126,7 @@ class TeamObjective:
         for name in team.names():
             if name not in names:
                 view = team.robots[name]
-                kernel = required_kernel(name, view)
+                kernel = view.sensor.detection.kernel()
                 settled.append((view, kernel, tail_events(view, horizon, weights.extend)))
         first = 0 if weights.present else 1
         lengths = joined([trajectories[name].lengths for name in names], np.int64)

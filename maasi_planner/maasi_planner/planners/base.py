@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.records import Cluster
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotView, TeamView

@@ -88,10 +88,7 @@ class Lawnmower(Planner):
             return self.settings.lane_spacing
         widths = []
         for name in team.names():
-            kernel = team.robots[name].sensor.detection.kernel()
-            if kernel is None:
-                continue
-            kind, parameters = kernel
+            kind, parameters = team.robots[name].sensor.detection.kernel()
             if kind == BOX:
                 widths.append(
                     float(min(parameters[4] - parameters[1], parameters[5] - parameters[2]))

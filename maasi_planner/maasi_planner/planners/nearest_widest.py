@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.ic_phd.clusters import Cluster
+from maasi_filter.records import Cluster
 from maasi_planner.planners.base import (
     Planner,
     apart,

@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.ic_phd.clusters import Cluster
-from maasi_filter.ic_phd.found_targets import FoundTarget
-from maasi_filter.ic_phd.search_filter import AgentMeasurement, FilterResult
+from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
 
 FloatArray = NDArray[np.float64]
 
 
-class TargetFilter(Protocol):
+class SearchFilter(Protocol):
     """A filter that finds targets from the detections of several robots.
 
     Attributes

@@ -9,17 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.ic_phd.search_filter import POSE_ERROR_OF_BOX, AgentMeasurement
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
+from maasi_filter.records import AgentMeasurement, FoundTarget
 from maasi_filter.settings import FilterSettings
 
 FloatArray = NDArray[np.float64]
 
+# A box's edge is as uncertain as the robot's position: at least this share of its half size.
+POSE_ERROR_OF_BOX = 0.05
+
 
 @dataclass
-class Checked:
+class CheckedMeasurement:
     """A checked measurement: every detection has a covariance, and their order is fixed.
 
     Parameters
@@ -39,18 +42,18 @@ class Checked:
     index: int
     pose_error: float
 
-    def only(self, keep: NDArray[np.bool_]) -> Checked:
+    def only(self, keep: NDArray[np.bool_]) -> CheckedMeasurement:
         """Return a copy with some of the detections."""
         return replace(self, values=self.values[keep], covariances=self.covariances[keep])
 
 
-def check_step(
+def check_measurements(
     measurements: Sequence[AgentMeasurement],
     steps: int,
     time: float,
     settings: FilterSettings,
     dimension: int,
-) -> list[Checked]:
+) -> list[CheckedMeasurement]:
     """Return the measurements of a step in the order of the robots' names.
 
     Raises
@@ -81,7 +84,7 @@ def pose_error_of(sensor: Sensor, settings: FilterSettings, dimension: int) -> f
     return 0.0
 
 
-def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) -> Checked:
+def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) -> CheckedMeasurement:
     name, sensor = measurement.robot, measurement.sensor
     if sensor.dimension != d:
         raise ValueError(f'{name}: sensor: got {sensor.dimension} dimensions, allowed is {d}')
@@ -104,7 +107,7 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
             pose_error = max(pose_error, reported)
     # The order in which a sensor lists its detections means nothing, so it decides nothing.
     order = np.lexsort(values.T[::-1])
-    return Checked(
+    return CheckedMeasurement(
         name,
         measurement.pose,
         sensor,
@@ -141,3 +144,26 @@ def _reported_error(name: str, reported: FloatArray, d: int) -> float:
             '(3, 3) matrix with finite variances from 0'
         )
     return math.sqrt(float(variances[:d].max()))
+
+
+def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> None:
+    """Refuse targets with numbers that are not finite, or of another dimension.
+
+    Raises
+    ------
+    ValueError
+        Naming the robot, the target and what is allowed.
+    """
+    for target in targets:
+        shapes = target.position.shape, target.covariance.shape
+        if shapes != ((dimension,), (dimension, dimension)):
+            raise ValueError(
+                f'{robot}: target {target.id}: got {len(target.position)} dimensions, allowed '
+                f'is {dimension}'
+            )
+        if not (np.isfinite(target.position).all() and is_covariance(target.covariance)):
+            raise ValueError(
+                f'{robot}: target {target.id}: got position {target.position.tolist()} with '
+                f'covariance {target.covariance.tolist()}, allowed are finite numbers and a '
+                'positive definite matrix'
+            )

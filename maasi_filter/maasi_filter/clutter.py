@@ -1,0 +1,41 @@
+"""False detections: the volume in which they fall, and how many there are at least."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.sensor import Sensor
+
+FloatArray = NDArray[np.float64]
+
+# No sensor is without: false detections of a scan that are expected at least.
+LEAST_PER_SCAN = 0.05
+
+
+def measurement_space(sensor: Sensor, bounds: FloatArray) -> float:
+    """Return the volume of the sensor's measurements [m rad, in 3D m rad^2].
+
+    Ranges up to the sensor's largest, the diagonal of the environment, or the farthest corner of
+    its field of view; all angles.
+    """
+    size = bounds[:, 1] - bounds[:, 0]
+    reach = min(sensor.maximum_range, math.sqrt(float((size * size).sum())))
+    if isinstance(sensor.detection, BoxDetection):
+        corner = np.maximum(np.abs(sensor.detection.lower), np.abs(sensor.detection.upper))
+        corner = corner[: len(bounds)] + sensor.detection.edge
+        # A box of a floor's two axes has any height.
+        if len(corner) == len(bounds):
+            reach = min(reach, math.sqrt(float((corner * corner).sum())))
+    return reach * 2.0 * math.pi * (math.pi if len(bounds) == 3 else 1.0)
+
+
+def least_clutter(sensor: Sensor, bounds: FloatArray) -> float:
+    """Return the smallest intensity of false detections, per unit of measurement space.
+
+    Without it a few stray particles explain a false detection, which is then found.
+    """
+    return LEAST_PER_SCAN / measurement_space(sensor, bounds)

@@ -1,0 +1,217 @@
+"""The PHD corrector Psi on weighted particles (000, (13), (16)).
+
+Particles are worked on in chunks of fixed size whose sums are added in order, so that results do
+not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_filter.models.detection import fill_probabilities
+from maasi_filter.models.measurement import TWO_PI, wrap
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
+
+FloatArray = NDArray[np.float64]
+
+CHUNK = 2048
+# Detections that are worked on at a time: bounds the memory of psi.
+BLOCK = 16
+# Sums may be added in vector lanes; all numbers are finite.
+SUMS = {'reassoc', 'nsz', 'nnan'}
+# Rows of a chunk's working array.
+X, Y, Z, RANGE, BEARING, ELEVATION, ROWS = range(7)
+
+
+class Scan(NamedTuple):
+    """Detections of one robot, and how its sensor saw them.
+
+    values (m, d) in m and rad; information (d, d) the inverse of R; log_norm the logarithm of the
+    Gaussian's peak; kind and parameters of pi(x, q); position (3,) [m], cosine and sine of the
+    robot's yaw.
+    """
+
+    values: FloatArray
+    information: FloatArray
+    log_norm: float
+    kind: int
+    parameters: FloatArray
+    position: FloatArray
+    cosine: float
+    sine: float
+
+
+def make_scan(values: FloatArray, sensor: Sensor, pose: Pose) -> Scan:
+    """Return detections (m, d) as the corrector takes them."""
+    kind, parameters = sensor.detection.kernel()
+    _, log_determinant = np.linalg.slogdet(2.0 * math.pi * sensor.covariance)
+    return Scan(
+        np.ascontiguousarray(values),
+        np.asarray(np.linalg.inv(sensor.covariance), float),
+        -0.5 * float(log_determinant),
+        kind,
+        parameters,
+        pose.position,
+        math.cos(pose.yaw),
+        math.sin(pose.yaw),
+    )
+
+
+@njit(cache=True, error_model='numpy')
+def _fill_offsets(particles, scan, rows):  # type: ignore[no-untyped-def]
+    """Fill offset, range and angles of particles (n, d) from the sensor."""
+    use_wide_vectors()
+    number, d = particles.shape
+    for i in range(number):
+        x = particles[i, 0] - scan.position[0]
+        y = particles[i, 1] - scan.position[1]
+        z = particles[i, 2] - scan.position[2] if d == 3 else 0.0
+        rows[X, i] = x
+        rows[Y, i] = y
+        rows[Z, i] = z
+        rows[RANGE, i] = math.sqrt(x * x + y * y + z * z)
+    for i in range(number):
+        x = rows[X, i]
+        y = rows[Y, i]
+        rows[BEARING, i] = arctan2(y, x)
+        rows[ELEVATION, i] = arctan2(rows[Z, i], math.sqrt(x * x + y * y))
+
+
+@njit(cache=True, error_model='numpy', fastmath=SUMS)
+def _fill_psi(z, scan, rows, weights, psi):  # type: ignore[no-untyped-def]
+    """Replace pi in `psi` (n,) by psi_z = pi N(z; g(x), R); return its weighted sum (13)."""
+    use_wide_vectors()
+    solid = len(z) == 3
+    i00, i11, i01 = scan.information[0, 0], scan.information[1, 1], 2.0 * scan.information[0, 1]
+    i22 = scan.information[2, 2] if solid else 0.0
+    i02 = 2.0 * scan.information[0, 2] if solid else 0.0
+    i12 = 2.0 * scan.information[1, 2] if solid else 0.0
+    z0 = z[0]
+    z1 = wrap(z[1])
+    z2 = z[2] if solid else 0.0
+    total = 0.0
+    for i in range(len(weights)):
+        e0 = z0 - rows[RANGE, i]
+        e1 = z1 - rows[BEARING, i]
+        e1 = e1 - TWO_PI if e1 >= math.pi else e1
+        e1 = e1 + TWO_PI if e1 < -math.pi else e1
+        e2 = z2 - rows[ELEVATION, i]
+        square = e0 * (e0 * i00 + e1 * i01) + e1 * e1 * i11
+        square += e2 * (e0 * i02 + e1 * i12 + e2 * i22)
+        value = psi[i] * exponential(scan.log_norm - 0.5 * square)
+        psi[i] = value
+        total += value * weights[i]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _explain_chunks(first, last, particles, weights, scan, probability, psi, sums):  # type: ignore[no-untyped-def]
+    """Fill pi (n,), psi (m, n), and the weighted sums (chunks, m) of psi in chunks."""
+    rows = np.empty((ROWS, CHUNK))
+    for chunk in range(first, last):
+        begin = chunk * CHUNK
+        end = min(len(weights), begin + CHUNK)
+        part = probability[begin:end]
+        _fill_offsets(particles[begin:end], scan, rows)
+        fill_probabilities(
+            scan.kind,
+            scan.parameters,
+            rows[X],
+            rows[Y],
+            rows[Z],
+            end - begin,
+            scan.cosine,
+            scan.sine,
+            part,
+        )
+        for m in range(len(scan.values)):
+            psi[m, begin:end] = part
+            sums[chunk, m] = _fill_psi(
+                scan.values[m], scan, rows, weights[begin:end], psi[m, begin:end]
+            )
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _add_chunks(first, last, psi, normaliser, factor):  # type: ignore[no-untyped-def]
+    """Add psi_z / C(z) of each detection to the factor (n,) of chunks."""
+    for chunk in range(first, last):
+        begin = chunk * CHUNK
+        end = min(len(factor), begin + CHUNK)
+        for m in range(len(normaliser)):
+            share = 1.0 / normaliser[m]
+            for i in range(begin, end):
+                factor[i] += share * psi[m, i]
+
+
+def run_chunks(
+    function: Callable[[int, int], None], number: int, pool: ThreadPoolExecutor | None
+) -> None:
+    """Call `function(first, last)` for ranges of chunks of `number` particles, in threads."""
+    count = max(1, -(-number // CHUNK))
+    if pool is None:
+        function(0, count)
+        return
+    part = max(4, -(-count // 8))
+    ranges = [(first, min(first + part, count)) for first in range(0, count, part)]
+    for future in [pool.submit(function, *item) for item in ranges]:
+        future.result()
+
+
+def phd_correct(
+    particles: FloatArray,
+    weights: FloatArray,
+    scan: Scan,
+    background: FloatArray,
+    pool: ThreadPoolExecutor | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the factor of each particle's weight, and C(z) (000, (13), (16)).
+
+    The factor is 1 - pi + sum over z of psi_z / C(z), with C(z) = background + <psi_z, D>.
+
+    Parameters
+    ----------
+    particles : (n, d) array
+        Metres, frame `map`.
+    weights : (n,) array
+        Of the running intensity D.
+    scan : Scan
+        m detections.
+    background : (m,) array
+        What else explains each detection: the intensities of clutter and of births at it, above
+        0, per unit of measurement space.
+    pool : ThreadPoolExecutor, optional
+        For large sets.
+
+    Returns
+    -------
+    factor : (n,) array
+    normaliser : (m,) array
+        C(z), per unit of measurement space.
+    """
+    number, count = len(weights), len(scan.values)
+    chunks = max(1, -(-number // CHUNK))
+    probability = np.empty(number)
+    factor = np.empty(number)
+    normaliser = np.array(background)
+    for first in range(0, max(count, 1), BLOCK):
+        block = scan._replace(values=scan.values[first : first + BLOCK])
+        psi = np.empty((len(block.values), number))
+        sums = np.empty((chunks, len(block.values)))
+        explain = (particles, weights, block, probability, psi, sums)
+        run_chunks(lambda c, e, work=explain: _explain_chunks(c, e, *work), number, pool)  # type: ignore[misc]
+        if first == 0:
+            np.subtract(1.0, probability, out=factor)
+        here = normaliser[first : first + BLOCK]
+        here += sums.cumsum(axis=0)[-1]
+        add = (psi, here, factor)
+        run_chunks(lambda c, e, work=add: _add_chunks(c, e, *work), number, pool)  # type: ignore[misc]
+    return factor, normaliser

@@ -1,0 +1,403 @@
+"""The papers' filter: a particle PHD filter with an iterated corrector (000, sections 3.2, 3.3)."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_filter.clutter import least_clutter
+from maasi_filter.exploration import Exploration, check_bounds, default_spacing
+from maasi_filter.ic_phd.births import (
+    MeasurementBirths,
+    gaussian_births,
+    measurement_births,
+    noise_in_space,
+    uniform_births,
+)
+from maasi_filter.ic_phd.clusters import clusters_of, kmeans
+from maasi_filter.ic_phd.corrector import make_scan, phd_correct
+from maasi_filter.ic_phd.found import SAME_TARGET, FoundTargets, distance, kept_measurements
+from maasi_filter.ic_phd.resampling import jittered, resample
+from maasi_filter.ic_phd.state import check
+from maasi_filter.measurement_check import CheckedMeasurement, check_measurements, check_taken
+from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
+from maasi_filter.settings import FilterSettings, IcPhdNumbers
+from maasi_filter.state_check import (
+    cluster_arrays,
+    common_arrays,
+    construction,
+    exploration_of,
+    found_arrays,
+    found_of,
+    naming,
+)
+from maasi_filter.state_check import clusters_of as saved_clusters
+from maasi_filter.state_file import write_state
+
+FloatArray = NDArray[np.float64]
+
+# Threads only pay off for sets of this size.
+PARALLEL_PARTICLES = 65_536
+# Particles of a birth when there are more detections than there are particles for.
+LEAST_BIRTHS = 20
+
+
+class IcPhdFilter:
+    """Particle PHD filter with an iterated corrector, K-means, and removal of found targets.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        What is left None comes from the preset.
+    bounds : (d, 2) array
+        Of the environment E, metres; d = 2 or 3.
+    generator : numpy.random.Generator
+        Every random draw comes from it.
+
+    Attributes
+    ----------
+    particles : (n, d) array
+        Metres, frame `map`.
+    weights : (n,) array
+        They sum to the expected number of targets that are not found yet.
+    clusters : list of Cluster
+        Potential targets, heaviest first.
+    exploration : Exploration
+        e, updated with every measurement.
+    """
+
+    def __init__(
+        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+    ) -> None:
+        self.settings = settings
+        self._settings = settings.resolved()
+        self._numbers = IcPhdNumbers.of(self._settings)
+        self.bounds = check_bounds(bounds)
+        self.dimension = len(self.bounds)
+        self.generator = generator
+        self.exploration = Exploration(
+            self.bounds, settings.exploration_spacing or default_spacing(self.bounds)
+        )
+        self.particles: FloatArray = np.empty((0, self.dimension))
+        self.weights: FloatArray = np.empty(0)
+        self.clusters: list[Cluster] = []
+        self._found = FoundTargets()
+        self._centres: FloatArray = np.empty((0, self.dimension))
+        self._pool: ThreadPoolExecutor | None = None
+
+    @property
+    def found_targets(self) -> list[FoundTarget]:
+        """Targets found so far, in the order of being found."""
+        return self._found.targets
+
+    @property
+    def expected_number(self) -> float:
+        """Expected number of targets in the intensity, the mass of the particles."""
+        return float(self.weights.sum())
+
+    def step(
+        self, measurements: Sequence[AgentMeasurement], steps: int, time: float
+    ) -> FilterResult:
+        """Predict over `steps` control steps, correct with every robot of M_k, extract and mark.
+
+        Parameters
+        ----------
+        measurements : sequence of AgentMeasurement
+            M_k, in any order; they are processed in the order of the robots' names. May be empty.
+        steps : int
+            Control steps since the last batch, from 0.
+        time : float
+            Seconds, kept with what is found.
+
+        Raises
+        ------
+        ValueError
+            If anything is not finite, shapes or dimensions do not fit, or a robot is there twice.
+            Nothing has changed then.
+        """
+        dropped: dict[str, int] = {}
+        members = check_measurements(measurements, steps, time, self._settings, self.dimension)
+        members = [self._without_found(member, dropped) for member in members]
+        # Prediction, 000 (12): targets stand still and survive with p_s.
+        self.weights = self.weights * self._numbers.survival_probability**steps
+        if self._numbers.births != 'measurement':
+            self._append(*self._born_anywhere(members))
+        for place, member in enumerate(members):
+            self._correct(member, members[:place], dropped)
+        if any(len(member.values) for member in members):
+            self._resample()
+        newly_found = self._extract(members, time)
+        return FilterResult(
+            list(self.clusters), newly_found, bool(newly_found), self.expected_number, dropped
+        )
+
+    def _correct(
+        self,
+        member: CheckedMeasurement,
+        before: Sequence[CheckedMeasurement],
+        dropped: dict[str, int],
+    ) -> None:
+        """Correct with the detections of one robot, 000 (13) and (16).
+
+        D^o(x) = (1 - pi(x) + sum over z of psi_z(x) / C(z)) D^{o-1}(x), where
+        C(z) = kappa(z) + <psi_z, D^{o-1}>, and births are part of D^{o-1}.
+        """
+        births = self._births(member, before)
+        clutter = max(member.sensor.clutter, least_clutter(member.sensor, self.bounds))
+        scan = make_scan(member.values, member.sensor, member.pose)
+        factor, normaliser = phd_correct(
+            self.particles, self.weights, scan, clutter + births.totals, self._threads()
+        )
+        self.weights = self.weights * factor
+        self._append(births.particles, (births.intensity / normaliser[:, None]).ravel())
+        self.exploration.update(member.sensor.detection, member.pose)
+        self._count_unexplained(member, normaliser <= clutter, dropped)
+
+    def _births(
+        self, member: CheckedMeasurement, before: Sequence[CheckedMeasurement]
+    ) -> MeasurementBirths:
+        """Return births at the detections of a robot, none with the other kinds of births."""
+        numbers = self._numbers
+        count = len(member.values)
+        if numbers.births != 'measurement' or not count:
+            return MeasurementBirths(np.empty((0, self.dimension)), np.zeros((count, 0)))
+        room = numbers.particles // (2 * count)
+        return measurement_births(
+            member.values,
+            member.sensor,
+            member.pose,
+            self.bounds,
+            numbers.expected_targets,
+            max(LEAST_BIRTHS, min(numbers.birth_particles, room)),
+            self.generator,
+            [(other.sensor.detection, other.pose) for other in before],
+        )
+
+    def _born_anywhere(
+        self, members: Sequence[CheckedMeasurement]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return births that belong to no measurement: anywhere (001), or 003's Gaussian."""
+        numbers = self._numbers
+        expected, number = numbers.birth_targets, numbers.birth_particles
+        if numbers.births == 'uniform' and members:
+            return uniform_births(self.bounds, expected, number, self.generator)
+        seen = [member for member in members if len(member.values)]
+        if numbers.births == 'uniform' or not seen:
+            return np.empty((0, self.dimension)), np.empty(0)
+        centres = np.concatenate([m.sensor.measurement.inverse(m.values, m.pose) for m in seen])
+        spreads = [noise_in_space(m.values, m.sensor, m.pose) for m in seen]
+        spread = np.average(spreads, axis=0, weights=[len(m.values) for m in seen])
+        return gaussian_births(centres, spread, self.bounds, expected, number, self.generator)
+
+    def _append(self, particles: FloatArray, weights: FloatArray) -> None:
+        self.particles = np.concatenate([self.particles, particles])
+        self.weights = np.concatenate([self.weights, weights])
+
+    def _resample(self) -> None:
+        """Resample to l particles for each expected target, within bounds."""
+        numbers = self._numbers
+        expected = self.expected_number
+        if not expected > 1e-12:
+            self.particles, self.weights = np.empty((0, self.dimension)), np.empty(0)
+            return
+        wanted = math.ceil(numbers.particles_per_target * expected)
+        number = min(max(wanted, numbers.particles_minimum, 1), numbers.particles)
+        index = resample(self.weights, number, self.generator)
+        self.particles = jittered(
+            self.particles, index, numbers.jitter_deviation, self.bounds, self.generator
+        )
+        self.weights = np.full(number, expected / number)
+
+    def _extract(self, members: Sequence[CheckedMeasurement], time: float) -> list[FoundTarget]:
+        """Find clusters by K-means, and mark the narrow ones as found (000, section 3.3).
+
+        k is the rounded expected number. A cluster with a radius of at most T_r and a mass of at
+        least T_m is a found target, and its particles go; so do those of a narrow cluster that may
+        be a target found before.
+        """
+        numbers = self._numbers
+        if not members or not self.expected_number > 0.0:
+            self.clusters = self.clusters if len(self.weights) else []
+            return []
+        label, centres = kmeans(
+            self.particles,
+            self.weights,
+            max(1, round(self.expected_number)),
+            self.generator,
+            self._centres,
+            numbers.kmeans_iterations,
+        )
+        clusters = clusters_of(self.particles, self.weights, label, len(centres))
+        narrow = {
+            g
+            for g, cluster in clusters.items()
+            if cluster.radius <= numbers.found_radius and cluster.mass >= numbers.found_mass
+        }
+        newly_found = []
+        for g in sorted(narrow):
+            position, covariance = clusters[g].position, clusters[g].covariance
+            covariance = covariance + numbers.jitter_deviation**2 * np.eye(self.dimension)
+            known = [distance(position, covariance, target) for target in self.found_targets]
+            if min(known, default=math.inf) < SAME_TARGET:
+                continue
+            credit = _nearest_member(position, members)
+            target = FoundTarget(
+                self._found.next_id(), position, covariance, credit.robot, credit.index, time
+            )
+            self._found.targets.append(target)
+            newly_found.append(target)
+        alive = ~np.isin(label, list(narrow))
+        self.particles, self.weights = self.particles[alive], self.weights[alive]
+        remaining = [g for g in clusters if g not in narrow]
+        self._centres = centres[remaining]
+        self.clusters = sorted((clusters[g] for g in remaining), key=lambda item: -item.mass)
+        return newly_found
+
+    def _without_found(
+        self, member: CheckedMeasurement, dropped: dict[str, int]
+    ) -> CheckedMeasurement:
+        """Return a measurement without detections of found targets, and those from too far."""
+        reach = member.values[:, 0] <= member.sensor.maximum_range
+        _count(dropped, 'range', int((~reach).sum()))
+        member = member.only(reach)
+        centres = member.sensor.measurement.inverse(member.values, member.pose)
+        keep = kept_measurements(
+            centres,
+            self.found_targets,
+            self._numbers.removal_distance,
+            self._numbers.removal == 'every',
+        )
+        _count(dropped, 'found', int((~keep).sum()))
+        return member.only(keep)
+
+    def _count_unexplained(
+        self, member: CheckedMeasurement, unexplained: NDArray[np.bool_], dropped: dict[str, int]
+    ) -> None:
+        """Count detections that no particle and no birth explains, by the reason."""
+        centres = member.sensor.measurement.inverse(member.values[unexplained], member.pose)
+        inside = ((centres >= self.bounds[:, 0]) & (centres <= self.bounds[:, 1])).all(axis=1)
+        _count(dropped, 'outside', int((~inside).sum()))
+        _count(dropped, 'unseen', int(inside.sum()))
+
+    def _threads(self) -> ThreadPoolExecutor | None:
+        threads = self.settings.threads or os.cpu_count() or 1
+        if len(self.weights) < PARALLEL_PARTICLES or threads < 2:
+            return None
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(threads)
+        return self._pool
+
+    # What other filters have found.
+
+    def own_found_targets(self) -> list[FoundTarget]:
+        """Return the found targets that this filter found itself."""
+        return self._found.own()
+
+    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
+        """Take over what the filter of another robot has found; return whether anything changed.
+
+        The independent robots of 002, section 4, share their found targets.
+
+        Parameters
+        ----------
+        robot : str
+            Whose filter.
+        targets : sequence of FoundTarget
+            All that its filter found itself, as they stand there; taken before `step`.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite, or dimensions do not fit. Nothing has changed then.
+        """
+        check_taken(robot, targets, self.dimension)
+        added, changed = self._found.take_over(robot, targets)
+        self._forget(added)
+        return changed
+
+    def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
+        """Add targets that were found before this filter was made; return those that are new.
+
+        They keep their ids. Where another target has such an id already, the next free one is
+        used.
+
+        Parameters
+        ----------
+        targets : sequence of FoundTarget
+            With finite positions and covariances of this dimension.
+        """
+        added = self._found.keep(targets)
+        self._forget(added)
+        return added
+
+    def _forget(self, targets: Sequence[FoundTarget]) -> None:
+        """Delete the particles that found targets explain: those within T_z."""
+        for target in targets:
+            offset = self.particles - target.position
+            keep = (offset * offset).sum(axis=1) > self._numbers.removal_distance**2
+            self.particles, self.weights = self.particles[keep], self.weights[keep]
+
+    # The state in a file.
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the whole state, random generator included, to one file.
+
+        The file is replaced in one piece: a crash leaves the old one or the new one.
+        """
+        write_state(path, self.state())
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return the whole state, random generator included, as arrays for a file."""
+        return {
+            **common_arrays(self.settings, self.generator, self.exploration),
+            **found_arrays(self.found_targets, self.dimension),
+            **cluster_arrays(self.clusters, self.dimension),
+            'particles': self.particles,
+            'weights': self.weights,
+            'centres': self._centres,
+        }
+
+    @classmethod
+    def from_state(
+        cls, state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
+    ) -> IcPhdFilter:
+        """Return the filter of a state; it continues to the bit as the saved one would have.
+
+        Raises
+        ------
+        StateFileError
+            If an array is missing, or has a wrong shape or number; `path` is named.
+        """
+        with naming(path):
+            check(state)
+            search = cls(*construction(state))
+            search.exploration = exploration_of(state)
+            search.particles, search.weights = state['particles'], state['weights']
+            search.clusters = saved_clusters(state)
+            search._found = FoundTargets(found_of(state))
+            search._centres = state['centres']
+        return search
+
+
+def _nearest_member(
+    position: FloatArray, members: Sequence[CheckedMeasurement]
+) -> CheckedMeasurement:
+    """Return the robot whose detection is nearest to a place, the last one where none has any."""
+    apart = []
+    for member in members:
+        centres = member.sensor.measurement.inverse(member.values, member.pose)
+        squares = ((centres - position) ** 2).sum(axis=1)
+        apart.append(float(squares.min()) if len(squares) else math.inf)
+    best = int(np.argmin(apart))
+    return members[best] if math.isfinite(apart[best]) else members[-1]
+
+
+def _count(dropped: dict[str, int], reason: str, number: int) -> None:
+    if number:
+        dropped[reason] = dropped.get(reason, 0) + number

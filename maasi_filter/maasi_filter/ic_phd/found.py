@@ -1,0 +1,131 @@
+"""Found targets: they take their measurements with them (000, section 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.records import FoundTarget
+
+FloatArray = NDArray[np.float64]
+
+# Two estimates whose squared normalised difference is below this may be one target.
+SAME_TARGET = 16.0
+
+
+def distance(position: FloatArray, covariance: FloatArray, target: FoundTarget) -> float:
+    """Return the squared normalised distance between an estimate and a found target."""
+    offset = position - target.position
+    return float(offset @ np.linalg.solve(covariance + target.covariance, offset))
+
+
+def kept_measurements(
+    centres: FloatArray, targets: Sequence[FoundTarget], limit: float, every: bool
+) -> NDArray[np.bool_]:
+    """Return which of m detections stay once found targets took theirs.
+
+    Parameters
+    ----------
+    centres : (m, d) array
+        g^-1(z), metres.
+    limit : float
+        T_z, metres.
+    every : bool
+        Whether all detections within T_z of a found target go (003, algorithm 1), or only the
+        closest one to each found target (000, section 3.3; 001, algorithm 1).
+    """
+    keep = np.ones(len(centres), np.bool_)
+    for target in targets:
+        apart = np.sqrt(((centres - target.position) ** 2).sum(axis=1))
+        near = keep & (apart <= limit)
+        if every:
+            keep &= ~near
+        elif near.any():
+            keep[int(np.argmin(np.where(near, apart, np.inf)))] = False
+    return keep
+
+
+class FoundTargets:
+    """The found targets of a filter: its own, and those of other robots' filters.
+
+    Attributes
+    ----------
+    targets : list of FoundTarget
+        In the order of being found.
+    """
+
+    def __init__(self, targets: Sequence[FoundTarget] = ()) -> None:
+        self.targets = list(targets)
+
+    def next_id(self) -> int:
+        """Return the number of the next one."""
+        return 1 + max((target.id for target in self.targets), default=0)
+
+    def own(self) -> list[FoundTarget]:
+        """Return those that this filter found itself."""
+        return [target for target in self.targets if not target.origin]
+
+    def _nearest(self, target: FoundTarget) -> int:
+        """Return the index of the nearest one that may be the same target, or -1."""
+        apart = [distance(target.position, target.covariance, known) for known in self.targets]
+        best = int(np.argmin(apart)) if apart else -1
+        return best if apart and apart[best] < SAME_TARGET else -1
+
+    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> tuple[list, bool]:
+        """Merge what another robot's filter has found; return those that are new, and any change.
+
+        A target that two robots found belongs to the one that was first, at the same time to the
+        first by name, and follows that one's estimate (002, section 4).
+        """
+        added: list[FoundTarget] = []
+        changed = False
+        for target in targets:
+            indices = {(item.robot, item.origin): f for f, item in enumerate(self.targets)}
+            f = indices.get((robot, target.id), -1)
+            if f < 0:
+                f = self._nearest(target)
+                known = self.targets[f]
+                if f >= 0 and (known.time, known.robot) <= (target.time, robot):
+                    continue
+            number = self.targets[f].id if f >= 0 else self.next_id()
+            taken = replace(target, id=number, robot=robot, origin=target.id)
+            if f < 0:
+                self.targets.append(taken)
+                added.append(taken)
+            elif _is_equal(taken, self.targets[f]):
+                continue
+            else:
+                self.targets[f] = taken
+            changed = True
+        return added, changed
+
+    def keep(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
+        """Add targets that were found before a restart; return those that are new.
+
+        They keep their ids. Where another target has such an id already, the next free one is
+        used.
+        """
+        own = {target.id: target for target in self.targets}
+        kept = {target.id for target in targets}
+        since = [target for target in self.targets if target.id not in kept]
+        new: list[FoundTarget] = []
+        for target in targets:
+            rivals = [own[target.id]] if target.id in own else since
+            apart = [distance(target.position, target.covariance, known) for known in rivals]
+            if min(apart, default=np.inf) < SAME_TARGET:
+                continue
+            added = replace(target, id=self.next_id() if target.id in own else target.id)
+            self.targets.append(added)
+            new.append(added)
+        return new
+
+
+def _is_equal(one: FoundTarget, other: FoundTarget) -> bool:
+    return (
+        (one.origin, one.robot) == (other.origin, other.robot)
+        and np.array_equal(one.position, other.position)
+        and np.array_equal(one.covariance, other.covariance)
+    )

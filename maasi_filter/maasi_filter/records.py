@@ -1,0 +1,124 @@
+"""What a search filter takes and gives: measurements, clusters, found targets, results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class AgentMeasurement:
+    """What one robot measured at one step; an empty one counts too.
+
+    Parameters
+    ----------
+    robot : str
+        Its name; robots are processed in the order of their names.
+    pose : Pose
+        Of the sensor at the time of the measurement.
+    sensor : Sensor
+        What it measured with.
+    values : (m, d) array
+        Detections: range, bearing and, in 3D, elevation; m, rad, rad.
+    covariances : (m, d, d) array, optional
+        Of each detection, in place of the sensor's; not used by the PHD filter.
+    index : int
+        That robot's measurement index.
+    position_covariance : (3, 3) array, optional
+        What the robot says of the error of its own position, square metres. Covariances of
+        detections are taken to have it in them already.
+    """
+
+    robot: str
+    pose: Pose
+    sensor: Sensor
+    values: FloatArray
+    covariances: FloatArray | None = None
+    index: int = 0
+    position_covariance: FloatArray | None = None
+
+
+@dataclass
+class Cluster:
+    """A potential target.
+
+    Parameters
+    ----------
+    position : (d,) array
+        Weighted mean, metres, frame `map`.
+    covariance : (d, d) array
+        Weighted covariance, square metres.
+    radius : float
+        Weighted root mean square distance from the mean, metres.
+    mass : float
+        Expected number of targets in it.
+    """
+
+    position: FloatArray
+    covariance: FloatArray
+    radius: float
+    mass: float
+
+
+@dataclass
+class FoundTarget:
+    """A target marked as found.
+
+    Parameters
+    ----------
+    id : int
+        From 1, in the order of being found.
+    position : (d,) array
+        Metres, frame `map`.
+    covariance : (d, d) array
+        Of the error of `position`, square metres.
+    robot : str
+        Whose measurement completed it.
+    measurement : int
+        That robot's measurement index then.
+    time : float
+        Seconds.
+    origin : int
+        Its number in the filter of another robot that it was taken over from; 0 for the filter's
+        own.
+    """
+
+    id: int
+    position: FloatArray
+    covariance: FloatArray
+    robot: str
+    measurement: int
+    time: float
+    origin: int = 0
+
+
+@dataclass
+class FilterResult:
+    """What a step brought.
+
+    Parameters
+    ----------
+    clusters : list of Cluster
+        Potential targets after the step, found ones not among them.
+    newly_found : list of FoundTarget
+        Targets found in this step.
+    found_changed : bool
+        Whether any found target is new or has moved.
+    expected_number : float
+        Expected number of targets that are not found.
+    dropped : dict
+        Detections that were not used: reason to count.
+    """
+
+    clusters: list[Cluster]
+    newly_found: list[FoundTarget]
+    found_changed: bool
+    expected_number: float
+    dropped: dict[str, int] = field(default_factory=dict)
