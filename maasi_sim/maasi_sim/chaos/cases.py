@@ -39,7 +39,13 @@ _SEARCH: dict[str, Any] = {
         'mambo': {'type': 'mambo', 'start': [1.9, 1.9, 1.0], 'candidates': _GRID},
         'turtlebot': {'type': 'turtlebot3_burger', 'start': [0, 0, 0], 'candidates': _GRID},
     },
-    'filter': {'preset': 'recommended', 'particles': 2000},
+    'filter': {
+        'preset': 'paper_000',
+        'particles': 2000,
+        'found_radius': 0.02,
+        'removal_distance': 0.05,
+        'jitter_deviation': 0.003,
+    },
     'planner': {'name': 'maasi', 'measurement': 'periodic'},
 }
 _BUILDINGS: dict[str, Any] = {

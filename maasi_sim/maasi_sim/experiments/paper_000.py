@@ -98,7 +98,7 @@ _DEGREES = {
     'angles': 'degrees',
 }
 PAPER_FILTER = {'preset': 'paper_000', 'particles': 10000}
-RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 10000}
+RECOMMENDED_FILTER = {'method': 'pmb'}
 _GRID = {'grid': [3, 3, 3], 'spacing': 120.0, 'corner': [10.0, 10.0, 10.0]}
 _RING = {'ring': 6, 'distance': 12.0}
 

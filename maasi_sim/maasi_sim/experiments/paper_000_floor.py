@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _FLOOR_FILTER = floor_filter('paper_000', particles=10000, found_radius=0.02, removal_distance=0.05)
-_RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 10000}
+_RECOMMENDED_FILTER = {'method': 'pmb'}
 _AS_CHOICE = Choice(
     'weight of exploration in AS', '5', 'That of 001, where AS is from; 000 does not give it.'
 )

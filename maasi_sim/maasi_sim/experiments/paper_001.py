@@ -48,7 +48,7 @@ _NOISE = {
     'angles': 'degrees',
 }
 _PAPER_FILTER = {'preset': 'paper_001', 'particles': 5000}
-_RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 5000}
+_RECOMMENDED_FILTER = {'method': 'pmb'}
 _RING = {'ring': 6, 'distance': 12.0}
 _GRID = {'grid': [3, 3, 3], 'spacing': 115.0, 'corner': [10.0, 10.0, 10.0]}
 _UNIFORM = {'count': 12, 'distribution': 'uniform'}

@@ -27,7 +27,7 @@ _LOW, _HIGH = -30.0, 300.0
 # 120 and 320 steps of both agents.
 _HOMOGENEOUS, _HETEROGENEOUS = 240, 640
 _PAPER_FILTER = {'preset': 'paper_002', 'particles': 10000}
-_RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 10000}
+_RECOMMENDED_FILTER = {'method': 'pmb'}
 _GRID = {'grid': [5, 5], 'spacing': 72.5, 'corner': [-10.0, -10.0]}
 _CENTRALIZED, _INDEPENDENT = 'centralized', 'independent'
 _SHARED = 'centralized, one exploration'

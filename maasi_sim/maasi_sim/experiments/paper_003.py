@@ -34,7 +34,7 @@ _PAPER_FILTER = {
     'birth_particles': 500,
     'expected_targets': 18.0,
 }
-_RECOMMENDED_FILTER = {'preset': 'recommended', 'particles': 10000, 'expected_targets': 18.0}
+_RECOMMENDED_FILTER = {'method': 'pmb', 'expected_targets': 18.0}
 _TRUE_NUMBER = 18
 _RING = {'ring': 8, 'distance': 9.0}
 _OURS = 'MI with exploration'
