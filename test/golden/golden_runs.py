@@ -77,7 +77,8 @@ class Log:
             found=len(found),
             expected=float(result.expected_number),
             explored=search_filter.exploration.explored_fraction(),
-            mean=[cluster.position.tolist() for cluster in result.clusters],
+            # In an order of their own: that of equal masses is the processor's.
+            mean=sorted(cluster.position.tolist() for cluster in result.clusters),
             bits=bits(
                 *(item for c in result.clusters for item in (c.position, c.covariance, c.mass)),
                 *(item for target in found for item in (target.position, target.covariance)),

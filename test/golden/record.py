@@ -7,7 +7,15 @@ import sys
 import time
 from pathlib import Path
 
-from golden_files import TOLERANCE, Difference, differences, path_of, read, rounded, write
+from golden_files import (
+    Difference,
+    differences,
+    path_of,
+    read,
+    rounded,
+    tolerance_for,
+    write,
+)
 from golden_runs import Recording, runs
 
 EQUAL, MOVED, WRONG_INPUT = 0, 1, 2
@@ -45,11 +53,11 @@ def main(arguments: list[str] | None = None) -> int:
     for item in found:
         print(item)
     number = sum(len(item) for item in made.values())
-    tolerance = 'to the bit' if options.against else f'tolerance {TOLERANCE:g}'
+    how = ', to the bit' if options.against else ''
     spent = time.monotonic() - begin
-    print(f'{number} runs in {spent:.0f} s, {tolerance}: {len(found)} quantities moved')
+    print(f'{number} runs in {spent:.0f} s{how}: {len(found)} quantities moved')
     if options.save:
-        write(options.save, made)  # type: ignore[arg-type]
+        write(options.save, made)
     if options.write:
         for name, recordings in made.items():
             write(path_of(name), {key: rounded(item) for key, item in recordings.items()})
@@ -58,11 +66,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _compared(made: dict[str, dict[str, Recording]], against: Path | None) -> list[Difference]:
     """Return what differs from the stored runs, or to the bit from those of a file."""
-    every = read(against) if against else {}
+    every, elsewhere = read(against) if against else ({}, '')
     found = []
     for name, recordings in made.items():
-        path = path_of(name)
-        stored = every.get(name, {}) if against else read(path) if path.exists() else {}
+        stored = every.get(name, {})
+        if not against and path_of(name).exists():
+            stored, elsewhere = read(path_of(name))
+        tolerance = 0.0 if against else tolerance_for(elsewhere)
         for key in [*stored, *(key for key in recordings if key not in stored)]:
             run = f'{name}, {key}'
             if key not in stored:
@@ -70,8 +80,9 @@ def _compared(made: dict[str, dict[str, Recording]], against: Path | None) -> li
             elif key not in recordings:
                 found.append(Difference(run, None, 'run', 'one before, none now'))
             else:
-                tolerance = 0.0 if against else TOLERANCE
                 found += differences(run, stored[key], recordings[key], tolerance)
+    if elsewhere:
+        print(f'stored on another machine: {elsewhere}')
     return found
 
 
