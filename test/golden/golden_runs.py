@@ -11,7 +11,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from maasi_filter import SearchFilter
+from maasi_filter import IcPhdFilter, PmbFilter, SearchFilter
 from maasi_planner.coordinator import Coordinator
 from maasi_sim.buildings.mission import CuboidMission
 from maasi_sim.buildings.scenario import CuboidScenario, load_any_scenario, mission_of
@@ -126,12 +126,15 @@ def bits(*values: Any) -> str:
 def noted() -> Iterator[Log]:
     """Note what the filters, planners and searches of buildings in this process do meanwhile."""
     log = Log()
-    update, plan, fly = SearchFilter.step, Coordinator.plan, CuboidMission.run
+    plan, fly = Coordinator.plan, CuboidMission.run
 
-    def noted_update(self: Any, measurements: Any, *arguments: Any, **options: Any) -> Any:
-        result = update(self, measurements, *arguments, **options)
-        log.updated(self, [item.robot for item in measurements], result)
-        return result
+    def noting(update: Callable[..., Any]) -> Callable[..., Any]:
+        def noted_update(self: Any, measurements: Any, *arguments: Any, **options: Any) -> Any:
+            result = update(self, measurements, *arguments, **options)
+            log.updated(self, [item.robot for item in measurements], result)
+            return result
+
+        return noted_update
 
     def noted_plan(self: Any, step: int, *arguments: Any, **options: Any) -> Any:
         decision = plan(self, step, *arguments, **options)
@@ -144,7 +147,8 @@ def noted() -> Iterator[Log]:
         return record
 
     with (
-        patch.object(SearchFilter, 'step', noted_update),
+        patch.object(IcPhdFilter, 'step', noting(IcPhdFilter.step)),
+        patch.object(PmbFilter, 'step', noting(PmbFilter.step)),
         patch.object(Coordinator, 'plan', noted_plan),
         patch.object(CuboidMission, 'run', noted_flight),
     ):
