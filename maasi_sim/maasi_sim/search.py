@@ -341,6 +341,7 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
                 counts[name] += 1
             if measured:
                 positions = [target.position for target in found_targets()]
+                truth = world.targets_at(step)
                 scores = score(positions, truth, radius, scenario.scoring.order)
                 complete = complete or (bool(len(truth)) and scores.complete)
                 progress.append(
@@ -374,6 +375,7 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
             moved = robot.body.state.pose.position - before
             robot.distance += float(np.sqrt((moved * moved).sum()))
     found = found_targets()
+    truth = np.asarray(world.targets_at(max(step, 0)), dtype=float)
     scores = score([item.position for item in found], truth, radius, scenario.scoring.order)
     return SearchResult(
         end_reason=end_reason,

@@ -28,6 +28,8 @@ IntArray = NDArray[np.int64]
 LEAST_EFFECTIVE = 0.4
 # Smallest part of a factor that is taken in at a time.
 LEAST_STEP = 1.0 / 64.0
+# Of the mean variance, what each axis has at least.
+LEAST_EIGENVALUE = 1e-9
 # Moves end when as many are accepted as there are particles, or after so many sweeps.
 MOST_SWEEPS = 8
 
@@ -302,3 +304,7 @@ class Density:
 
     def _measure(self) -> None:
         _moments(self.particles, self.weights, self.mean, self.covariance)
+        # Particles in one plane still have a covariance that can be inverted.
+        d = len(self.mean)
+        least = LEAST_EIGENVALUE * float(np.trace(self.covariance)) / d + 1e-18
+        self.covariance[np.arange(d), np.arange(d)] += least

@@ -30,7 +30,7 @@ from maasi_filter.pmb import state as pmb_state
 from maasi_filter.pmb.association import associate
 from maasi_filter.pmb.births import Births, draw_births
 from maasi_filter.pmb.clutter import ClutterEstimate
-from maasi_filter.pmb.component import Component, merge
+from maasi_filter.pmb.component import LEAST_SUPPORT, Component, merge
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, MISS, SCALE, TERMS, Scan, make_scan
 from maasi_filter.pmb.found import nearest, same_estimate
@@ -243,7 +243,10 @@ class PmbFilter:
     ) -> None:
         """Add a component for each detection that may be of a target not seen before."""
         grid: FloatArray | None = None
-        for j in np.flatnonzero(existence >= LEAST_EXISTENCE).tolist():
+        # A detection that points out of the environment has few draws inside.
+        total, squares = births.weights.sum(axis=1), np.square(births.weights).sum(axis=1)
+        supported = np.square(total) > LEAST_SUPPORT * squares
+        for j in np.flatnonzero(supported & (existence >= LEAST_EXISTENCE)).tolist():
             if grid is None:
                 grid = self.exploration.kernel()[0].copy()
             head = scan.head.copy()

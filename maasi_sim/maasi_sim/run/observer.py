@@ -12,6 +12,7 @@ from rosbags.typesys.store import Typestore
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.scoring import Scores, score, scoring_radius
 from maasi_sim.scenario.schema import Scenario
+from maasi_sim.world.world import World
 
 FloatArray = NDArray[np.float64]
 
@@ -136,11 +137,12 @@ class _Update:
 class _Tally:
     """Counts what the filters have found, update by update."""
 
-    def __init__(self, scenario: Scenario, truth: FloatArray, begin: float) -> None:
+    def __init__(self, scenario: Scenario, world: World, begin: float) -> None:
         self.scenario = scenario
-        self.truth = truth
+        self.world = world
+        self.truth = np.asarray(world.targets, dtype=float)
         self.begin = begin
-        self.radius = scoring_radius(scenario, truth)
+        self.radius = scoring_radius(scenario, self.truth)
         self.measurements = dict.fromkeys(scenario.names(), 0)
         self.progress: list[Progress] = []
         self.completed: Progress | None = None
@@ -183,6 +185,9 @@ class _Tally:
         # All filters believe in the same targets.
         self._expected[update.namespace] = float(message.expected_number)
         self.expected_number = max(self._expected.values())
+        if self.world.walk > 0.0:
+            self.truth = self.world.targets_at(int(message.step))
+            changed = True
         if changed or self._last_scores is None:
             self._last_scores = self._scores()
         now = Progress(
@@ -248,7 +253,8 @@ class RunObserver:
         self.name = name
         self.scenario = scenario
         self.seed = seed
-        self.truth = np.asarray(scenario.world(seed).targets, dtype=float)
+        self.world = scenario.world(seed)
+        self.truth = np.asarray(self.world.targets, dtype=float)
         self._types = types
         spaces = list(scenario.namespaces())
         self._update_topics = {within(space, UPDATE): space for space in spaces}
@@ -262,7 +268,7 @@ class RunObserver:
         }
         # When it began [s]: the time of a clock that it follows has no beginning.
         self._begin: float | None = None
-        self._tally = _Tally(scenario, self.truth, 0.0)
+        self._tally = _Tally(scenario, self.world, 0.0)
         self._updates: list[tuple[str, Any]] = []
         self._arrays: dict[str, list[Any]] = {space: [] for space in spaces}
         self._history: list[_Update] = []
@@ -379,7 +385,7 @@ class RunObserver:
         """Return the tally with the updates of several filters in the order of steps and names."""
         if not self._history:
             return self._tally
-        tally = _Tally(self.scenario, self.truth, self._begin or 0.0)
+        tally = _Tally(self.scenario, self.world, self._begin or 0.0)
         for update in sorted(
             self._history,
             key=lambda item: (item.message.step, item.namespace, item.message.batch_id),
@@ -471,7 +477,7 @@ class RunObserver:
             self.name,
             self.scenario,
             self.seed,
-            self.truth,
+            tally.truth,
             found=tally.found,
             progress=list(tally.progress),
             measurements={name: tally.measurements[name] for name in sorted(tally.measurements)},

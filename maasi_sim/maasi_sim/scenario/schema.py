@@ -6,11 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import (
     EnvironmentSettings,
     FilterSettings,
@@ -29,6 +32,7 @@ from maasi_sim.world.camera import RenderSettings
 from maasi_sim.world.laser_scan import LaserSettings
 from maasi_sim.world.odometry import OdometrySettings
 from maasi_sim.world.robots import BatterySettings
+from maasi_sim.world.truth import SimulatedSettings
 from maasi_sim.world.world import TargetSettings, World
 
 
@@ -87,6 +91,15 @@ class RobotSettings(Settings):
     battery: BatterySettings = Field(
         default_factory=BatterySettings, description='Its battery, simulated'
     )
+    simulated: SimulatedSettings = Field(
+        default_factory=SimulatedSettings,
+        description='What is true of it in the simulation, where that differs from what the '
+        'robots believe',
+    )
+
+    def true_sensor(self, name: str, bounds: NDArray[np.float64]) -> Sensor:
+        """Return its true ranging sensor; bounds (d, 2) [m] of the environment."""
+        return self.simulated.sensor(self.sensor, name, bounds)
 
     @property
     def external(self) -> bool:
@@ -241,7 +254,7 @@ class Scenario(Settings):
 
     def world(self, seed: int) -> World:
         """Return the true world of a run."""
-        return World.from_settings(self.environment, self.targets, seed)
+        return World.from_settings(self.environment, self.targets, seed, self.step)
 
     def content(self) -> dict[str, Any]:
         """Return all settings as plain values; `load_scenario` reads them back the same."""

@@ -42,6 +42,12 @@ class OdometrySettings(Settings):
         description='Deviation of the drift of the heading after one metre; grows with its root '
         '[rad]',
     )
+    position_offset: float = Field(
+        default=0.0,
+        ge=0.0,
+        description='Length of a constant error of the position, in a direction drawn for each '
+        'run; level where the robot is on the floor [m]',
+    )
 
 
 @dataclass(frozen=True)
@@ -83,11 +89,21 @@ class OdometryModel:
         Of the run.
     robot : str
         Whose odometry it is.
+    reported : OdometrySettings, optional
+        What the covariance is of; none: `settings`.
 
     """
 
-    def __init__(self, settings: OdometrySettings, start: Pose, seed: int, robot: str) -> None:
+    def __init__(
+        self,
+        settings: OdometrySettings,
+        start: Pose,
+        seed: int,
+        robot: str,
+        reported: OdometrySettings | None = None,
+    ) -> None:
         self.settings = settings
+        self.reported = reported or settings
         self.seed = seed
         self.robot = robot
         # Plain numbers throughout: for so few of them arrays take several times as long.
@@ -98,10 +114,14 @@ class OdometryModel:
         self._last = self._from_start(*start.position.tolist())
         self._offset = (0.0, 0.0)
         self._turn = 0.0
+        axes = 3 if start.position[2] > 0.0 else 2
+        self._constant = self._drawn_offset(axes)
+        offset = np.zeros(3)
+        offset[:axes] = self.reported.position_offset**2 / axes
         self._noise_covariance = np.diag(
-            [settings.position_noise**2 + _LEAST_VARIANCE] * 3
+            [*(self.reported.position_noise**2 + _LEAST_VARIANCE + offset)]
             + [_LEAST_VARIANCE] * 2
-            + [settings.heading_noise**2 + _LEAST_VARIANCE]
+            + [self.reported.heading_noise**2 + _LEAST_VARIANCE]
         )
         # Covariance of the drift of x, y of the estimate and heading h: xx, xy, yy, xh, yh, hh.
         self._drift = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -124,7 +144,8 @@ class OdometryModel:
         x, y, z = self._from_start(*state.pose.position.tolist())
         move_x, move_y = x - self._last[0], y - self._last[1]
         way = math.sqrt(move_x * move_x + move_y * move_y)
-        if way > 0.0 and (settings.position_drift > 0.0 or settings.heading_drift > 0.0):
+        drifts = (settings, self.reported)
+        if way > 0.0 and any(item.position_drift + item.heading_drift > 0.0 for item in drifts):
             root = math.sqrt(way)
             before = self._place(x, y)
             self._turn += settings.heading_drift * root * dh
@@ -148,7 +169,8 @@ class OdometryModel:
         turning = state.angular_velocity.tolist()
         return OdometryReading(
             Pose(
-                np.array([place[0] + noise * nx, place[1] + noise * ny, z + noise * nz]),
+                np.array([place[0] + noise * nx, place[1] + noise * ny, z + noise * nz])
+                + self._constant,
                 np.array(
                     [w1 * w2 - z1 * z2, w1 * x2 - z1 * y2, w1 * y2 + z1 * x2, w1 * z2 + z1 * w2]
                 ),
@@ -157,6 +179,14 @@ class OdometryModel:
             np.array([v + linear * n for v, n in zip(velocity, twist_noise[:3])]),
             np.array([v + angular * n for v, n in zip(turning, twist_noise[3:])]),
         )
+
+    def _drawn_offset(self, axes: int) -> Array:
+        """Return the constant error of the position, (3,) [m]."""
+        offset = np.zeros(3)
+        if self.settings.position_offset > 0.0:
+            drawn = noise_stream(self.seed, self.robot, 0, 'offset').standard_normal(axes)
+            offset[:axes] = drawn * (self.settings.position_offset / math.hypot(*drawn))
+        return offset
 
     def _from_start(self, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Return a position of the map in the frame of the start."""
@@ -183,14 +213,14 @@ class OdometryModel:
         a = -(sine * move_x + cosine * move_y)
         b = cosine * move_x - sine * move_y
         xx, xy, yy, xh, yh, hh = self._drift
-        place = way * self.settings.position_drift**2
+        place = way * self.reported.position_drift**2
         self._drift = (
             xx + 2.0 * a * xh + a * a * hh + place,
             xy + a * yh + b * xh + a * b * hh,
             yy + 2.0 * b * yh + b * b * hh + place,
             xh + a * hh,
             yh + b * hh,
-            hh + way * self.settings.heading_drift**2,
+            hh + way * self.reported.heading_drift**2,
         )
 
     def _covariance(self) -> Array:

@@ -44,7 +44,7 @@ class RangingSensor:
         self.reach = min(reach, sensor.maximum_range)
         self._spread = np.linalg.cholesky(sensor.covariance)
 
-    def measure(self, pose: Pose, step: int) -> Array:
+    def measure(self, pose: Pose, step: int, targets: Array | None = None) -> Array:
         """
         Return one sweep.
 
@@ -54,6 +54,8 @@ class RangingSensor:
             True pose of the robot.
         step : int
             Discrete step.
+        targets : ndarray, shape (n, 3) or (n, 2), optional
+            Where the targets are by now, if they have moved [m, map].
 
         Returns
         -------
@@ -67,7 +69,7 @@ class RangingSensor:
         # As many draws whatever is detected: what happens to one target leaves the others alone.
         chance = generator.random(count)
         noise = generator.standard_normal((count, dimension))
-        positions = self.targets[:, :dimension]
+        positions = (self.targets if targets is None else targets)[:, :dimension]
         values = self.sensor.measurement.measure(positions, pose)
         seen = chance < self.sensor.detection.probability(positions, pose)
         seen &= values[:, 0] <= self.sensor.maximum_range

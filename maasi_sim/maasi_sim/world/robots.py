@@ -76,7 +76,9 @@ class Equipment:
     laser : LaserSettings or None
         Laser scanner.
     odometry : OdometrySettings
-        Noise and drift.
+        Noise and drift, as it reports them.
+    true_odometry : OdometrySettings or None
+        As they are, where that is something else.
     battery : BatterySettings
         Capacity and drain.
 
@@ -89,6 +91,7 @@ class Equipment:
     laser: LaserSettings | None
     odometry: OdometrySettings
     battery: BatterySettings
+    true_odometry: OdometrySettings | None = None
 
 
 class Leader(Protocol):
@@ -153,7 +156,9 @@ class SimulatedRobot:
         self._flies = equipment.motion.model != 'unicycle' and start.position[2] > 0.0
         self._resting = False
         self.battery = Battery(equipment.battery)
-        self._odometry = OdometryModel(equipment.odometry, start, seed, name)
+        self._odometry = OdometryModel(
+            equipment.true_odometry or equipment.odometry, start, seed, name, equipment.odometry
+        )
         self.odometry: OdometryReading = self._odometry.step(self.state, 0)
         self._leader: Leader | None = None
         self.camera: CameraRenderer | None = None
@@ -254,7 +259,7 @@ class SimulatedRobot:
         """Return a sweep of the ranging sensor, (m, d) [m, rad]."""
         if self.ranging is None:
             raise ValueError(f'{self.name}: has no ranging sensor')
-        return self.ranging.measure(self.state.pose, step)
+        return self.ranging.measure(self.state.pose, step, self.world.targets_3d_at(step))
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, what this robot uses; nothing changes."""

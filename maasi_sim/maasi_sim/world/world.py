@@ -41,6 +41,12 @@ class TargetSettings(Settings):
         gt=0.0,
         description="Clustered: deviation around the centres; none: 1/15 of the space's size [m]",
     )
+    walk: float = Field(
+        default=0.0,
+        ge=0.0,
+        description='Deviation of a random walk on each axis after one second; ranging sensors '
+        'only [m/sqrt(s)]',
+    )
 
     @model_validator(mode='after')
     def _one_way(self) -> TargetSettings:
@@ -62,12 +68,19 @@ class World:
         True positions [m].
     obstacles : Obstacles
         In their own size.
+    walk : float
+        Deviation of the targets' random walk on each axis in one step [m].
+    seed : int
+        Of the walk.
 
     """
 
     bounds: Array
     targets: Array
     obstacles: Obstacles = field(default_factory=Obstacles.none)
+    walk: float = 0.0
+    seed: int = 0
+    _way: list[Array] = field(default_factory=list, compare=False, repr=False)
 
     @property
     def dimension(self) -> int:
@@ -77,14 +90,32 @@ class World:
     @property
     def targets_3d(self) -> Array:
         """Targets with three coordinates, shape (n, 3); those of a floor have z = 0 [m]."""
-        return np.pad(self.targets, ((0, 0), (0, 3 - self.dimension)))
+        return self.targets_3d_at(0)
+
+    def targets_at(self, step: int) -> Array:
+        """Return where the targets are at a discrete step, (n, d) [m]; bounds turn them back."""
+        if self.walk == 0.0:
+            return self.targets
+        if not self._way:
+            self._way.append(self.targets)
+        low, high = self.bounds[:, 0], self.bounds[:, 1]
+        while len(self._way) <= step:
+            generator = noise_stream(self.seed, step=len(self._way), purpose='walk')
+            moved = self._way[-1] + self.walk * generator.standard_normal(self.targets.shape)
+            moved = np.where(moved < low, 2.0 * low - moved, moved)
+            self._way.append(np.where(moved > high, 2.0 * high - moved, moved))
+        return self._way[step]
+
+    def targets_3d_at(self, step: int) -> Array:
+        """Return the same with three coordinates, (n, 3)."""
+        return np.pad(self.targets_at(step), ((0, 0), (0, 3 - self.dimension)))
 
     @classmethod
     def from_settings(
-        cls, environment: EnvironmentSettings, targets: TargetSettings, seed: int
+        cls, environment: EnvironmentSettings, targets: TargetSettings, seed: int, step: float = 1.0
     ) -> World:
         """
-        Build the world of a run: the same for the same seed.
+        Build the world of a run: the same for the same seed; `step` is its length [s].
 
         Raises
         ------
@@ -100,7 +131,7 @@ class World:
             positions = draw_targets(
                 targets, bounds, noise_stream(seed, purpose='targets'), obstacles
             )
-        return cls(bounds, positions, obstacles)
+        return cls(bounds, positions, obstacles, targets.walk * step**0.5, seed)
 
 
 def check_positions(positions: ArrayLike, bounds: Array) -> Array:

@@ -1,0 +1,242 @@
+"""Quality of the two filters in whole searches, side by side: `./scripts/quality`.
+
+Runs the scenario in this process, once for each seed, condition and method, and prints a table.
+Seeds and conditions are in `quality_conditions.py`; numbers for documents are from the block
+`report`, which nothing is tuned on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from quality_conditions import CONDITIONS, SEEDS
+from scipy.stats import beta, chi2, t
+
+from maasi_filter import warm_up
+from maasi_filter.metrics import match_targets, normalised_error, restricted_mean
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import Scenario
+from maasi_sim.search import search
+
+METHODS = ('ic_phd', 'pmb')
+SCENARIO = 'ranging_drone_3d'
+CAP = 400
+# A planner that never ends a search.
+PERSISTENT = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
+# A found target is true within this distance of a true one, one to one, metres.
+RADIUS = 5.0
+HEAD = (
+    '| condition | method | complete | false found per run | RMSE [m] | NEES | measurements '
+    '| difference to ic_phd | filter step [ms] |\n|---|---|---|---|---|---|---|---|---|'
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one search came to.
+
+    Attributes
+    ----------
+    seed : int
+        Of all random numbers.
+    found, targets, false_found : int
+        True targets that were found, true targets, and found targets that are none.
+    squares, normalised : float
+        Sums of the squared errors of the found ones, square metres, and of the same normalised
+        with their covariances.
+    measurements : int
+        Taken in all.
+    step : float
+        Mean CPU time of a filter step, seconds; wall time, on one thread.
+    """
+
+    seed: int
+    found: int
+    targets: int
+    false_found: int
+    squares: float
+    normalised: float
+    measurements: int
+    step: float
+
+    @property
+    def finished(self) -> bool:
+        """Whether all were found."""
+        return self.found == self.targets
+
+
+@cache
+def _content() -> dict[str, Any]:
+    return load_scenario(SCENARIO).model_dump(by_alias=True, exclude_unset=True)
+
+
+def prepared(condition: str, method: str, seed: int) -> Scenario:
+    """Return the scenario of one run, with no limit but the number of measurements."""
+    content: dict[str, Any] = json.loads(json.dumps(_content()))
+    content['planner'] = {**content['planner'], **PERSISTENT}
+    content['filter']['method'] = method
+    content['limits'] = {**content.get('limits', {}), 'time': 1e4}
+    content['scoring'] = {**content.get('scoring', {}), 'radius': RADIUS}
+    for change in CONDITIONS[condition]:
+        change(content, seed)
+    return Scenario.model_validate(content)
+
+
+def run_one(condition: str, method: str, seed: int) -> Run:
+    """Run one search up to CAP measurements."""
+    scenario = prepared(condition, method, seed)
+    result = search(scenario, seed, CAP)
+    d = scenario.dimension
+    found = np.array([target.position for target in result.found_targets]).reshape(-1, d)
+    match = match_targets(found, result.truth, RADIUS)
+    normalised = sum(
+        normalised_error(found[i] - result.truth[j], result.found_targets[i].covariance)
+        for i, j in match.pairs
+    )
+    return Run(
+        seed=seed,
+        found=match.true_found,
+        targets=len(result.truth),
+        false_found=match.false_found,
+        squares=match.true_found * match.rmse**2 if match.true_found else 0.0,
+        normalised=normalised,
+        measurements=result.total_measurements,
+        step=float(np.mean(result.filter_times)),
+    )
+
+
+def summary(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return the figures of a row, with 95 % intervals.
+
+    Complete runs: Clopper and Pearson. False found targets: Poisson. Measurements: restricted
+    mean, Kaplan and Meier, for runs that did not finish.
+    """
+    number = len(runs)
+    complete = sum(run.finished for run in runs)
+    false = sum(run.false_found for run in runs)
+    found = max(sum(run.found for run in runs), 1)
+    times = restricted_mean(
+        [run.measurements if run.finished else None for run in runs],
+        CAP,
+        [float(run.measurements) for run in runs],
+    )
+    return {
+        'runs': number,
+        'complete': complete,
+        'complete_interval': [
+            float(beta.ppf(0.025, complete, number - complete + 1)) if complete else 0.0,
+            float(beta.ppf(0.975, complete + 1, number - complete)) if complete < number else 1.0,
+        ],
+        'false_per_run': false / number,
+        'false_interval': [
+            float(chi2.ppf(0.025, 2 * false)) / 2 / number if false else 0.0,
+            float(chi2.ppf(0.975, 2 * false + 2)) / 2 / number,
+        ],
+        'rmse': math.sqrt(sum(run.squares for run in runs) / found),
+        'nees': sum(run.normalised for run in runs) / found,
+        'measurements': times.mean,
+        'measurements_half_width': 1.96 * times.standard_error,
+        'step_ms': 1e3 * float(np.median([run.step for run in runs])),
+    }
+
+
+def difference(runs: Sequence[Run], others: Sequence[Run]) -> tuple[float, float]:
+    """Return the mean difference in measurements on the same seeds, and half its 95 % interval.
+
+    A run that did not finish counts as CAP.
+    """
+    theirs = {run.seed: run.measurements if run.finished else CAP for run in others}
+    gaps = np.array(
+        [
+            (run.measurements if run.finished else CAP) - theirs[run.seed]
+            for run in runs
+            if run.seed in theirs
+        ],
+        float,
+    )
+    if len(gaps) < 2:
+        return math.nan, math.nan
+    half = t.ppf(0.975, len(gaps) - 1) * gaps.std(ddof=1) / math.sqrt(len(gaps))
+    return float(gaps.mean()), float(half)
+
+
+def show(condition: str, method: str, row: dict[str, Any], gap: tuple[float, float] | None) -> str:
+    """Return a row of the table in Markdown."""
+    low, high = row['complete_interval']
+    text = f'| {condition} | {method} | {row["complete"]}/{row["runs"]} ({low:.2f} to {high:.2f})'
+    low, high = row['false_interval']
+    text += f' | {row["false_per_run"]:.2f} ({low:.2f} to {high:.2f})'
+    text += f' | {row["rmse"]:.2f} | {row["nees"]:.2f}'
+    text += f' | {row["measurements"]:.0f} +- {row["measurements_half_width"]:.0f}'
+    text += ' | -' if gap is None else f' | {gap[0]:+.0f} +- {gap[1]:.0f}'
+    return text + f' | {row["step_ms"]:.1f} |'
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the searches and print the table."""
+    parser = argparse.ArgumentParser(prog='quality', description=__doc__)
+    parser.add_argument('conditions', nargs='*', help='parts of their names; none: all of them')
+    parser.add_argument('--method', nargs='*', choices=METHODS, default=METHODS)
+    parser.add_argument('--seeds', choices=sorted(SEEDS), default='development')
+    parser.add_argument('--runs', type=int, default=20, metavar='N', help='first N of the block')
+    parser.add_argument('--jobs', type=int, default=1, metavar='N', help='processes')
+    parser.add_argument(
+        '--json',
+        type=Path,
+        metavar='FILE',
+        help='keep runs and table there; go on with those that are',
+    )
+    options = parser.parse_args(arguments)
+    wanted = [
+        name
+        for name in CONDITIONS
+        if not options.conditions or any(part in name for part in options.conditions)
+    ]
+    if not wanted:
+        parser.error(f'conditions: read {options.conditions}, known are {", ".join(CONDITIONS)}')
+    if not 1 <= options.runs <= len(SEEDS[options.seeds]):
+        parser.error(f'--runs: read {options.runs}, allowed is 1 to {len(SEEDS[options.seeds])}')
+    seeds = SEEDS[options.seeds][: options.runs]
+    warm_up()
+    kept: dict[str, Any] = {}
+    if options.json is not None and options.json.exists():
+        kept = json.loads(options.json.read_text(encoding='utf-8'))
+    print(HEAD, flush=True)
+    begin = time.perf_counter()
+    with ProcessPoolExecutor(max(options.jobs, 1)) as pool:
+        for condition in wanted:
+            done: dict[str, list[Run]] = {}
+            for method in options.method:
+                key = f'{condition} | {method}'
+                there = {run['seed']: Run(**run) for run in kept.get(key, {}).get('runs', [])}
+                missing = [seed for seed in seeds if seed not in there]
+                count = len(missing)
+                new = pool.map(run_one, [condition] * count, [method] * count, missing)
+                there.update({run.seed: run for run in new})
+                runs = [there[seed] for seed in seeds]
+                done[method] = runs
+                gap = None
+                if method != 'ic_phd' and 'ic_phd' in done:
+                    gap = difference(runs, done['ic_phd'])
+                row = summary(runs)
+                kept[key] = {'runs': [asdict(run) for run in there.values()], 'table': row}
+                if options.json is not None:
+                    options.json.write_text(json.dumps(kept, indent=1) + '\n', encoding='utf-8')
+                print(show(condition, method, row, gap), flush=True)
+    print(f'{time.perf_counter() - begin:.0f} s', file=sys.stderr)
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
