@@ -126,6 +126,8 @@ def components_of(
             f'{particles}'
         )
     targets = found_of(state)
+    # Of one scan's components it is the same array, as before.
+    shared = list(grids)
     empty = np.empty((0, 0, 0))
     heads = np.split(state['heads'], np.cumsum(state['head_counts'])[:-1])
     terms = np.split(state['terms'], np.cumsum(state['term_counts'])[:-1])
@@ -137,7 +139,7 @@ def components_of(
             state['weights'][c].copy(),
             heads[c].copy(),
             terms[c].copy(),
-            empty if number < 0 else grids[number],
+            empty if number < 0 else shared[number],
             frame,
         )
         components.append(

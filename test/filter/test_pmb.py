@@ -1,0 +1,244 @@
+"""The Poisson multi-Bernoulli filter against closed forms and exact posteriors."""
+
+import numpy as np
+import pytest
+from exact_pmbm import ExactPmbm
+from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, plane_sensor
+
+from maasi_filter import Exploration, FilterSettings, Pose
+from maasi_filter.pmb.births import draw_births
+from maasi_filter.measurement_check import check_measurements
+from maasi_filter.clutter import LEAST_PER_SCAN, measurement_space
+from maasi_filter.pmb.clutter import PRIOR_SCANS, ClutterEstimate
+from maasi_filter.pmb.filter import PmbFilter
+
+TARGET = np.array([[60.0, 45.0]])
+# Where the robot measures from, in turn.
+PLACES = [(30.0, 30.0), (50.0, 70.0), (80.0, 20.0), (40.0, 50.0)]
+
+
+def observe(generator, sensor, targets, position):
+    """Return noisy values of all targets."""
+    values = sensor.measurement.measure(targets, Pose(np.asarray(position, float)))
+    noise = np.sqrt(np.diagonal(sensor.covariance))
+    return values + noise * generator.standard_normal(values.shape)
+
+
+def moments(mass):
+    """Return mean and covariance of weights (n,) of the cells."""
+    mass = mass / mass.sum()
+    mean = mass @ cells()
+    offset = cells() - mean
+    return mean, (mass[:, None] * offset).T @ offset
+
+
+def test_one_target_without_clutter_is_the_bayesian_posterior():
+    generator = np.random.default_rng(3)
+    sensor = plane_sensor()
+    search = plane_filter(particles=4000)
+    exact = np.ones(SIDE**2)
+    for step, place in enumerate(PLACES):
+        values = observe(generator, sensor, TARGET, place)
+        search.step([measured(sensor, place, values, step)], 1, step)
+        probability, likelihood = densities(sensor, place, values)
+        exact = exact * probability * likelihood[0]
+    best = max(search.components, key=lambda item: item.existence)
+    mean, covariance = moments(exact)
+    assert best.existence > 0.99
+    deviation = np.sqrt(np.diagonal(covariance))
+    np.testing.assert_allclose(best.density.mean, mean, atol=0.12 * deviation.max())
+    np.testing.assert_allclose(
+        best.density.covariance, covariance, atol=0.12 * np.diagonal(covariance).max()
+    )
+
+
+def test_existence_after_misses_is_that_of_bayes():
+    generator = np.random.default_rng(4)
+    sensor = plane_sensor(clutter=1e-4)
+    search = plane_filter(particles=4000)
+    place = PLACES[0]
+    values = observe(generator, sensor, TARGET, place)
+    search.step([measured(sensor, place, values)], 1, 0.0)
+    (item,) = search.components
+    r = item.existence
+    probability, likelihood = densities(sensor, place, values)
+    density = probability * likelihood[0]
+    for step in range(1, 6):
+        density = density / density.sum()
+        expected = (density * (1.0 - probability)).sum()
+        r = r * expected / (1.0 - r + r * expected)
+        density = density * (1.0 - probability)
+        search.step([measured(sensor, place, [], step)], 1, step)
+        (item,) = search.components
+        assert item.existence == pytest.approx(r, rel=0.02)
+
+
+def test_unseen_targets_are_thinned_as_the_exploration_function_says():
+    sensor = plane_sensor()
+    search = plane_filter()
+    other = Exploration(PLANE, 2.0)
+    for step, place in enumerate(PLACES):
+        search.step([measured(sensor, place, [], step)], 1, step)
+        other.update(sensor.detection, Pose(np.array(place)))
+    np.testing.assert_array_equal(search.exploration.values, other.values)
+    # New targets: lambda = (N0 / V) int e pi g dx, here by a sum over cells.
+    value = sensor.measurement.measure(np.array([[50.0, 30.0]]), Pose(np.array(PLACES[0])))
+    probability, likelihood = densities(sensor, PLACES[0], value)
+    expected = 3.0 / SIDE**2 * (search.exploration.at(cells()) * probability * likelihood[0]).sum()
+    member = search._scan(_checked(sensor, PLACES[0], value), {})
+    births = draw_births(member, search.exploration, 3.0, 20_000, np.random.default_rng(0))
+    assert births.intensity[0] == pytest.approx(expected, rel=0.02)
+
+
+def _checked(sensor, place, value):
+    return check_measurements([measured(sensor, place, value)], 1, 0.0, plane_filter()._numbers, 2)[0]
+
+
+def test_first_detection_exists_with_the_share_of_clutter():
+    sensor = plane_sensor(clutter=2e-4)
+    search = plane_filter(particles=4000)
+    value = [[30.0, 0.5]]
+    search.step([measured(sensor, PLACES[0], value)], 1, 0.0)
+    probability, likelihood = densities(sensor, PLACES[0], value)
+    intensity = 3.0 / SIDE**2 * (probability * likelihood[0]).sum()
+    space = measurement_space(sensor, PLANE)
+    kappa = max(2e-4, LEAST_PER_SCAN / space)
+    assert search.components[0].existence == pytest.approx(
+        intensity / (intensity + kappa), rel=0.03
+    )
+
+
+def test_clutter_is_learnt_as_a_gamma_prior_says():
+    clutter = ClutterEstimate()
+    assert clutter.per_scan('a', 0.0) == LEAST_PER_SCAN
+    assert clutter.per_scan('a', 2.0) == 2.0
+    for _ in range(40):
+        clutter.count('a', 3.0)
+    assert clutter.per_scan('a', 0.0) == pytest.approx(
+        (PRIOR_SCANS * LEAST_PER_SCAN + 120.0) / (PRIOR_SCANS + 40)
+    )
+    assert clutter.per_scan('b', 0.0) == LEAST_PER_SCAN
+
+
+@pytest.mark.parametrize(
+    ('targets', 'tolerance'),
+    [
+        ([[20.0, 30.0], [70.0, 60.0], [60.0, 20.0]], 0.03),
+        ([[60.0, 45.0], [68.0, 50.0]], 0.10),
+        ([[60.0, 45.0], [63.0, 48.0], [58.0, 50.0]], 0.12),
+    ],
+)
+def test_close_to_the_exact_mixture(targets, tolerance):
+    """At most three targets, three scans with misses and clutter: expected numbers by region."""
+    targets = np.array(targets)
+    worst = []
+    for seed in range(4):
+        generator = np.random.default_rng([seed, 8])
+        sensor = plane_sensor(clutter=2e-4)
+        search = plane_filter(seed=seed, particles=2000)
+        exact = ExactPmbm(np.full(SIDE**2, 3.0 / SIDE**2))
+        for step, place in enumerate(PLACES[:3]):
+            seen = targets[generator.random(len(targets)) < 0.8]
+            values = observe(generator, sensor, seen, place)
+            if step == seed % 3 and len(values) < 3:
+                false = [generator.uniform(5.0, 40.0), generator.uniform(-3.0, 3.0)]
+                values = np.concatenate([values, [false]])
+            space = measurement_space(sensor, PLANE)
+            kappa = search._clutter.per_scan('robot', sensor.clutter * space) / space
+            search.step([measured(sensor, place, values, step)], 1, step)
+            exact.update(*densities(sensor, place, values), kappa)
+        density = exact.density()
+        total = sum(item.existence for item in search.components)
+        assert total == pytest.approx(density.sum(), abs=3.0 * tolerance)
+        for target in targets:
+            near = np.linalg.norm(cells() - target, axis=1) < 12.0
+            ours = 0.0
+            for item in search.components:
+                inside = np.linalg.norm(item.density.particles - target, axis=1) < 12.0
+                ours += item.existence * float(item.density.weights[inside].sum())
+            worst.append(abs(ours - density[near].sum()))
+    assert np.mean(worst) < tolerance
+    assert max(worst) < 3.0 * tolerance
+
+
+def test_moves_leave_the_density_invariant():
+    """Particles of one detection, moved on without new data, keep its moments."""
+    sensor = plane_sensor(bearing=0.3)
+    search = plane_filter(particles=2000)
+    value = [[40.0, 0.5]]
+    search.step([measured(sensor, PLACES[0], value)], 1, 0.0)
+    density = search.components[0].density
+    probability, likelihood = densities(sensor, PLACES[0], value)
+    mean, covariance = moments(probability * likelihood[0])
+    density.particles = density.particles[
+        np.random.default_rng(1).choice(2000, 2000, p=density.weights)
+    ]
+    density.weights = np.full(2000, 1.0 / 2000)
+    for _ in range(20):
+        products, last = density._logs(density.particles)
+        density._move(1.0, products, last, search.generator)
+    density._measure()
+    scale = np.sqrt(np.diagonal(covariance).max())
+    np.testing.assert_allclose(density.mean, mean, atol=0.1 * scale)
+    np.testing.assert_allclose(density.covariance, covariance, atol=0.12 * scale**2)
+
+
+def test_precise_detection_of_a_sparse_cloud_makes_no_duplicate():
+    coarse = plane_sensor(range_noise=20.0, bearing=0.6)
+    fine = plane_sensor(range_noise=0.02, bearing=0.0005)
+    search = plane_filter(particles=300)
+    for step in range(6):
+        sensor = coarse if step == 0 else fine
+        place = PLACES[step % 4]
+        values = sensor.measurement.measure(TARGET, Pose(np.array(place)))
+        search.step([measured(sensor, place, values, step)], 1, step)
+        assert len([item for item in search.components if item.existence > 0.1]) == 1
+    (target,) = search.found_targets
+    assert np.linalg.norm(target.position - TARGET[0]) < 0.2
+
+
+def test_two_targets_three_metres_apart_stay_two():
+    targets = np.array([[60.0, 45.0], [63.0, 45.0]])
+    sensor = plane_sensor(range_noise=0.5, bearing=0.01)
+    generator = np.random.default_rng(0)
+    search = plane_filter(particles=300)
+    for step in range(8):
+        place = PLACES[step % 4]
+        values = observe(generator, sensor, targets, place)
+        search.step([measured(sensor, place, values, step)], 1, step)
+    positions = np.array([target.position for target in search.found_targets])
+    assert len(positions) == 2
+    assert np.abs(positions[positions[:, 0].argsort()] - targets).max() < 1.0
+
+
+def test_found_target_that_is_missed_again_and_again_is_withdrawn():
+    sensor = plane_sensor(range_noise=0.5, bearing=0.01)
+    generator = np.random.default_rng(0)
+    search = plane_filter(particles=300)
+    for step in range(3):
+        values = observe(generator, sensor, TARGET, PLACES[0])
+        search.step([measured(sensor, PLACES[0], values, step)], 1, step)
+    assert len(search.found_targets) == 1
+    changed = False
+    for step in range(3, 40):
+        result = search.step([measured(sensor, (58.0, 45.0), [], step)], 1, step)
+        changed |= result.found_changed and not search.found_targets
+    assert changed
+    assert search.found_targets == []
+
+
+def test_walking_targets_widen_and_spread_what_is_unexplored():
+    sensor = plane_sensor(range_noise=0.5, bearing=0.01)
+    generator = np.random.default_rng(0)
+    settings = {'pmb': {'particles': 1000, 'walk': 0.5}}
+    search = PmbFilter(FilterSettings(method='pmb', **settings), PLANE, generator)
+    for step in range(3):
+        values = observe(generator, sensor, TARGET, PLACES[0])
+        search.step([measured(sensor, PLACES[0], values, step)], 1, float(step))
+    before = search.found_targets[0].covariance
+    total = search.exploration.values.sum()
+    search.step([], 1, 12.0)
+    after = search.found_targets[0].covariance
+    np.testing.assert_allclose(after - before, 0.25 * 10.0 * np.eye(2), atol=0.6)
+    assert search.exploration.values.sum() == pytest.approx(total, rel=1e-12)
+    assert search.exploration.values.min() > 0.0

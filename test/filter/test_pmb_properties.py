@@ -1,0 +1,339 @@
+"""What holds of the multi-Bernoulli filter whatever it measures; its state; its consistency."""
+
+import numpy as np
+import pytest
+from pmb_problems import PLANE, measured, plane_filter, plane_sensor
+from searches import CUBE, cube_sensor, observe, wander
+
+from maasi_filter import (
+    AgentMeasurement,
+    FilterSettings,
+    FoundTarget,
+    FunctionDetection,
+    Pose,
+    Sensor,
+    StateFileError,
+    wrap_angle,
+)
+from maasi_filter.ic_phd.filter import IcPhdFilter
+from maasi_filter.make_filter import load_filter, make_filter
+from maasi_filter.metrics import match_targets, normalised_error
+from maasi_filter.clutter import measurement_space
+from maasi_filter.pmb.filter import PmbFilter
+from maasi_filter.state_file import read_state, write_state
+
+
+def scans(seed, number=25, clutter=1.0, shift=(0.0, 0.0), yaw=0.0, order=None):
+    """Return scans on the plane of four targets, with clutter; two robots in turn."""
+    generator = np.random.default_rng([seed, 3])
+    shift = np.array(shift)
+    sensor = plane_sensor(probability=0.9, range_noise=1.0, bearing=0.03)
+    targets = generator.uniform(20.0, 80.0, (4, 2))
+    out = []
+    for step in range(number):
+        position = generator.uniform(5.0, 95.0, 2)
+        pose = Pose.from_yaw([*(position + shift), 0.0], yaw)
+        values = observe(generator, sensor, targets, Pose([*position, 0.0]))
+        false = generator.uniform([0.0, -np.pi], [100.0, np.pi], (generator.poisson(clutter), 2))
+        values = np.concatenate([values, false])
+        if order is not None:
+            values = values[order.permutation(len(values))]
+        robot = 'ab'[step % 2]
+        out.append(AgentMeasurement(robot, pose, sensor, values, None, step))
+    return out
+
+
+def play(search, measurements, first=0):
+    """Let a filter have measurements one by one."""
+    for step, measurement in enumerate(measurements, start=first):
+        search.step([measurement], 1, float(step))
+    return search
+
+
+def same(one, other):
+    """Check that two filters are equal to the bit."""
+    first, second = one.state(), other.state()
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+
+
+def test_order_of_detections_and_of_robots_does_not_matter():
+    one = play(plane_filter(particles=200), scans(1))
+    other = play(plane_filter(particles=200), scans(1, order=np.random.default_rng(5)))
+    same(one, other)
+    first, second = scans(2, number=2)
+    one.step([first, second], 1, 99.0)
+    other.step([second, first], 1, 99.0)
+    same(one, other)
+
+
+def test_heading_of_the_robot_does_not_matter():
+    one = play(plane_filter(particles=200), scans(1))
+    other = play(plane_filter(particles=200), scans(1, yaw=1.234))
+    for left, right in zip(one.found_targets, other.found_targets, strict=True):
+        np.testing.assert_allclose(left.position, right.position, atol=1e-6)
+
+
+def test_translation_moves_the_result():
+    shift = np.array([1024.0, -512.0])
+    settings = plane_filter(particles=200).settings
+    one = play(PmbFilter(settings, PLANE, np.random.default_rng(0)), scans(1, number=8))
+    moved = PmbFilter(settings, PLANE + shift[:, None], np.random.default_rng(0))
+    play(moved, scans(1, number=8, shift=shift))
+    assert len(one.components) == len(moved.components)
+    for left, right in zip(one.components, moved.components):
+        assert left.existence == pytest.approx(right.existence, rel=1e-4, abs=1e-8)
+        np.testing.assert_allclose(
+            left.density.mean + shift, right.density.mean, atol=1e-3 * left.density.radius
+        )
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_numbers_are_finite_and_not_negative(seed):
+    generator = np.random.default_rng(seed)
+    search = plane_filter(seed=seed, particles=100, expected_targets=10.0 ** (seed - 3))
+    noise = 10.0 ** generator.uniform(-3.0, 1.5)
+    sensor = plane_sensor(probability=1.0, range_noise=noise, bearing=min(noise / 30.0, 3.0))
+    for step in range(30):
+        count = generator.integers(0, 6)
+        values = generator.uniform([0.0, -4.0], [150.0, 4.0], (count, 2))
+        if step % 3 == 0:
+            values = np.repeat(values, 2, axis=0)
+        result = search.step(
+            [measured(sensor, generator.uniform(0.0, 100.0, 2), values, step)], 1, step
+        )
+        assert result.expected_number >= 0.0
+        assert 0.0 <= search.exploration.values.min() <= search.exploration.values.max() <= 1.0
+        for item in search.components:
+            assert 0.0 <= item.existence <= 1.0
+            assert np.isfinite(item.density.particles).all()
+            assert (item.density.weights >= 0.0).all()
+            assert item.density.weights.sum() == pytest.approx(1.0)
+            assert np.linalg.eigvalsh(item.density.covariance).min() > 0.0
+        weights = search.weights
+        assert weights.sum() == pytest.approx(result.expected_number)
+        assert len(search.particles) == len(weights)
+
+
+def test_saved_and_loaded_to_the_bit(tmp_path):
+    measurements = scans(3, number=40)
+    whole = play(plane_filter(particles=200), measurements)
+    part = play(plane_filter(particles=200), measurements[:20])
+    assert part.found_targets
+    part.save(tmp_path / 'state')
+    loaded = load_filter(tmp_path / 'state')
+    assert isinstance(loaded, PmbFilter)
+    same(part, loaded)
+    play(loaded, measurements[20:], first=20)
+    same(whole, loaded)
+
+
+def test_repeatable_to_the_bit():
+    same(play(plane_filter(particles=200), scans(4)), play(plane_filter(particles=200), scans(4)))
+
+
+def test_empty_filter_is_saved(tmp_path):
+    search = plane_filter()
+    search.save(tmp_path / 'state')
+    same(search, load_filter(tmp_path / 'state'))
+
+
+@pytest.mark.parametrize(
+    ('name', 'change'),
+    [
+        ('existence', lambda array: array + 2.0),
+        ('existence', lambda array: np.full_like(array, np.nan)),
+        ('weights', lambda array: array[:, :-1]),
+        ('heads', lambda array: array[:-1]),
+        ('head_counts', lambda array: -array),
+        ('term_counts', lambda array: array + 1),
+        ('grid', lambda array: array + 1000),
+        ('grids', lambda array: array[:, :-1]),
+        ('found_ids', lambda array: np.ones_like(array)),
+        ('exploration', lambda array: array + 1.0),
+        ('robots', lambda array: array[:-1]),
+        ('clutter_robots', lambda array: array[:-1]),
+        ('particles', None),
+    ],
+)
+def test_state_that_does_not_fit_is_refused(tmp_path, name, change):
+    search = play(plane_filter(particles=100), scans(3, number=20))
+    state = search.state()
+    if change is None:
+        del state[name]
+    else:
+        state[name] = change(state[name])
+    write_state(tmp_path / 'state', state)
+    with pytest.raises(StateFileError, match=f'state: does not hold a usable state: .*{name[:4]}'):
+        load_filter(tmp_path / 'state')
+    assert name in search.state() and read_state(tmp_path / 'state')
+
+
+def test_method_is_chosen_by_the_settings(tmp_path):
+    generator = np.random.default_rng(0)
+    assert isinstance(make_filter(FilterSettings(), PLANE, generator), IcPhdFilter)
+    phd = make_filter(FilterSettings(method='ic_phd'), PLANE, generator)
+    assert isinstance(make_filter(FilterSettings(method='pmb'), PLANE, generator), PmbFilter)
+    phd.save(tmp_path / 'state')
+    assert isinstance(load_filter(tmp_path / 'state'), IcPhdFilter)
+    with pytest.raises(ValueError, match='method'):
+        FilterSettings(method='phd')
+    with pytest.raises(ValueError, match='particles'):
+        FilterSettings(pmb={'particles': 3})
+
+
+@pytest.mark.parametrize(
+    ('change', 'text'),
+    [
+        ({'values': np.array([[np.nan, 0.0]])}, 'values: got .* allowed are finite'),
+        ({'values': np.zeros((1, 3))}, r'values: got shape \(1, 3\)'),
+        ({'covariances': np.zeros((2, 2, 2))}, 'covariances: got shape'),
+        ({'covariances': -np.ones((1, 2, 2))}, 'allowed is a symmetric positive definite'),
+        ({'position_covariance': -np.eye(3)}, 'position_covariance: got'),
+        ({'sensor': cube_sensor()}, 'sensor: got 3 dimensions'),
+    ],
+)
+def test_bad_measurements_are_refused_and_change_nothing(change, text):
+    search = play(plane_filter(particles=100), scans(3, number=5))
+    before = search.state()
+    fields = {
+        'robot': 'a',
+        'pose': Pose([1.0, 1.0, 0.0]),
+        'sensor': plane_sensor(),
+        'values': np.array([[10.0, 0.0]]),
+        **change,
+    }
+    with pytest.raises(ValueError, match=text):
+        search.step([AgentMeasurement(**fields)], 1, 9.0)
+    for steps, time in ((-1, 0.0), (True, 0.0), (1, np.inf)):
+        with pytest.raises(ValueError, match=r'steps|time'):
+            search.step([], steps, time)
+    good = measured(plane_sensor(), (1.0, 1.0), [[10.0, 0.0]])
+    with pytest.raises(ValueError, match='each robot once'):
+        search.step([good, good], 1, 9.0)
+    for name, array in before.items():
+        np.testing.assert_array_equal(array, search.state()[name], err_msg=name)
+
+
+def test_detections_that_nothing_explains_are_counted():
+    search = plane_filter()
+    sensor = plane_sensor()
+    sensor.maximum_range = 90.0
+    result = search.step([measured(sensor, (10.0, 10.0), [[95.0, 0.3], [80.0, -2.0]])], 1, 0.0)
+    assert result.dropped == {'range': 1, 'outside': 1}
+
+
+def test_function_of_a_user_detects():
+    generator = np.random.default_rng(2)
+    given = plane_sensor(range_noise=1.0, bearing=0.03)
+    model = FunctionDetection(lambda positions, pose: np.full(len(positions), 0.9))
+    sensor = Sensor('user', model, given.measurement, given.covariance)
+    target = np.array([[60.0, 45.0]])
+    search = plane_filter(particles=200)
+    for step in range(10):
+        position = generator.uniform(5.0, 95.0, 2)
+        values = observe(generator, sensor, target, Pose([*position, 0.0]))
+        search.step([measured(sensor, position, values, step)], 1, step)
+    (found,) = search.found_targets
+    assert np.linalg.norm(found.position - target[0]) < 1.5
+
+
+def test_what_another_filter_found_is_taken_over():
+    search = play(plane_filter(particles=200), scans(3, number=20))
+    own = search.found_targets[0]
+    far = FoundTarget(4, np.array([5.0, 90.0]), 0.1 * np.eye(2), 'x', 2, 1.0)
+    assert search.take_over('x', [far])
+    assert not search.take_over('x', [far])
+    (taken,) = [item for item in search.found_targets if item.origin]
+    assert (taken.robot, taken.origin) == ('x', 4)
+    assert taken.id not in [item.id for item in search.own_found_targets()]
+    moved = FoundTarget(4, np.array([5.5, 90.0]), 0.1 * np.eye(2), 'x', 2, 1.0)
+    assert search.take_over('x', [moved])
+    (taken,) = [item for item in search.found_targets if item.origin]
+    np.testing.assert_array_equal(taken.position, moved.position)
+    # Who was first keeps a target that both have found.
+    later = FoundTarget(5, own.position, own.covariance, 'x', 2, own.time + 1.0)
+    assert not search.take_over('x', [moved, later])
+    earlier = FoundTarget(5, own.position, own.covariance, 'x', 2, own.time - 1.0)
+    assert search.take_over('x', [moved, earlier])
+    assert own.id not in [item.id for item in search.own_found_targets()]
+    with pytest.raises(ValueError, match='dimensions'):
+        search.take_over('x', [FoundTarget(9, np.zeros(3), np.eye(3), 'x', 0, 0.0)])
+    # Its detections make nothing new.
+    sensor = plane_sensor(range_noise=0.3, bearing=0.01)
+    before = len(search.found_targets)
+    for step in range(20, 25):
+        values = sensor.measurement.measure(np.array([[5.5, 90.0]]), Pose([30.0, 80.0, 0.0]))
+        search.step([measured(sensor, (30.0, 80.0), values, step)], 1, float(step))
+    assert len(search.found_targets) == before
+
+
+def test_what_was_found_before_a_restart_is_kept():
+    search = play(plane_filter(particles=200), scans(3, number=20))
+    found = search.found_targets
+    again = plane_filter(particles=200)
+    assert [item.id for item in again.keep_found(found)] == [item.id for item in found]
+    assert again.keep_found(found) == []
+    play(again, scans(3, number=40)[20:], first=20)
+    for item in found:
+        (now,) = [target for target in again.found_targets if target.id == item.id]
+        assert np.linalg.norm(now.position - item.position) < 2.0
+
+
+def cube_search(seed, number, clutter):
+    """Search targets drawn from the prior; return filter, targets and (r, is a target) of steps."""
+    generator = np.random.default_rng([seed, 9])
+    sensor = cube_sensor()
+    sensor.clutter = clutter / measurement_space(sensor, CUBE)
+    targets = generator.uniform(0.0, 260.0, (generator.poisson(12.0), 3))
+    search = PmbFilter(FilterSettings(method='pmb'), CUBE, np.random.default_rng([seed, 10]))
+    pairs = []
+    for step, position in enumerate(wander(generator, number)):
+        values = observe(generator, sensor, targets, Pose(position))
+        low, high = [0.0, -np.pi, -np.pi / 2], [260.0 * 3.0**0.5, np.pi, np.pi / 2]
+        false = generator.uniform(low, high, (generator.poisson(clutter), 3))
+        values = np.concatenate([values, false])
+        values[:, 1] = wrap_angle(values[:, 1])
+        search.step([AgentMeasurement('drone', Pose(position), sensor, values)], 1, float(step))
+        if step % 5 == 4:
+            pairs += judged(search, targets)
+    return search, targets, pairs
+
+
+def judged(search, targets):
+    """Return r of each component, and whether it is a target that no more certain one is."""
+    left = list(range(len(targets)))
+    out = []
+    for item in sorted(search.components, key=lambda item: -item.existence):
+        distances = [
+            normalised_error(item.density.mean - targets[t], item.density.covariance) for t in left
+        ]
+        is_target = bool(distances) and min(distances) < 25.0
+        if is_target:
+            left.pop(int(np.argmin(distances)))
+        out.append((item.existence, is_target))
+    return out
+
+
+def test_covariances_and_existence_are_as_they_say():
+    normalised, errors, pairs = [], [], []
+    for seed in range(20_000, 20_040):
+        search, targets, found = cube_search(seed, 60, 0.5)
+        pairs += found
+        positions = np.array([target.position for target in search.found_targets]).reshape(-1, 3)
+        match = match_targets(positions, targets, 5.0)
+        errors.append(match.false_found)
+        normalised += [
+            normalised_error(positions[i] - targets[j], search.found_targets[i].covariance)
+            for i, j in match.pairs
+        ]
+    assert len(normalised) > 300
+    assert 2.5 < np.mean(normalised) < 3.5
+    assert sum(errors) <= 1
+    existence, true = np.array(pairs, float).T
+    # Of all components with r near 0.7, 70 % are targets; steps of one search are correlated.
+    for low, high in ((0.0, 0.05), (0.1, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 0.95), (0.99, 1.0)):
+        inside = (existence >= low) & (existence < high)
+        assert inside.sum() > 100
+        assert true[inside].mean() == pytest.approx(existence[inside].mean(), abs=0.08), low
