@@ -148,7 +148,10 @@ def found_of(state: Arrays) -> list[FoundTarget]:
 
 def names_of(state: Arrays, field: str, number: int) -> list[str]:
     """Return the names in a field of a state: JSON, `number` of them."""
-    names = json.loads(untext(state[field]))
+    try:
+        names = json.loads(untext(state[field]))
+    except ValueError as error:
+        raise ValueError(f'{field}: {error}') from None
     valid = isinstance(names, list) and all(isinstance(name, str) for name in names)
     if not valid or len(names) != number:
         raise ValueError(f'{field}: got {str(names)[:100]}, allowed are {number} names')

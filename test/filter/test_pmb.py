@@ -6,9 +6,9 @@ from exact_pmbm import ExactPmbm
 from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, plane_sensor
 
 from maasi_filter import Exploration, FilterSettings, Pose
-from maasi_filter.pmb.births import draw_births
-from maasi_filter.measurement_check import check_measurements
 from maasi_filter.clutter import LEAST_PER_SCAN, measurement_space
+from maasi_filter.measurement_check import check_measurements
+from maasi_filter.pmb.births import draw_births
 from maasi_filter.pmb.clutter import PRIOR_SCANS, ClutterEstimate
 from maasi_filter.pmb.filter import PmbFilter
 
@@ -91,7 +91,9 @@ def test_unseen_targets_are_thinned_as_the_exploration_function_says():
 
 
 def _checked(sensor, place, value):
-    return check_measurements([measured(sensor, place, value)], 1, 0.0, plane_filter()._numbers, 2)[0]
+    return check_measurements([measured(sensor, place, value)], 1, 0.0, plane_filter()._numbers, 2)[
+        0
+    ]
 
 
 def test_first_detection_exists_with_the_share_of_clutter():

@@ -9,16 +9,14 @@ from maasi_filter import (
     AgentMeasurement,
     FilterSettings,
     FoundTarget,
-    FunctionDetection,
     Pose,
-    Sensor,
     StateFileError,
     wrap_angle,
 )
+from maasi_filter.clutter import measurement_space
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.metrics import match_targets, normalised_error
-from maasi_filter.clutter import measurement_space
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.state_file import read_state, write_state
 
@@ -222,21 +220,6 @@ def test_detections_that_nothing_explains_are_counted():
     sensor.maximum_range = 90.0
     result = search.step([measured(sensor, (10.0, 10.0), [[95.0, 0.3], [80.0, -2.0]])], 1, 0.0)
     assert result.dropped == {'range': 1, 'outside': 1}
-
-
-def test_function_of_a_user_detects():
-    generator = np.random.default_rng(2)
-    given = plane_sensor(range_noise=1.0, bearing=0.03)
-    model = FunctionDetection(lambda positions, pose: np.full(len(positions), 0.9))
-    sensor = Sensor('user', model, given.measurement, given.covariance)
-    target = np.array([[60.0, 45.0]])
-    search = plane_filter(particles=200)
-    for step in range(10):
-        position = generator.uniform(5.0, 95.0, 2)
-        values = observe(generator, sensor, target, Pose([*position, 0.0]))
-        search.step([measured(sensor, position, values, step)], 1, step)
-    (found,) = search.found_targets
-    assert np.linalg.norm(found.position - target[0]) < 1.5
 
 
 def test_what_another_filter_found_is_taken_over():

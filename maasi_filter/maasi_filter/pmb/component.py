@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 from maasi_filter.pmb.births import Births
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import (
-    GIVEN,
-    KIND,
     MISS,
-    MODEL,
-    MOST_PROBABLE,
     SCALE,
     Scan,
     likelihoods,
@@ -107,9 +103,6 @@ class Component:
         density = self.density
         gated = self._gated(scan)
         probability = np.empty(len(density.weights))
-        if scan.head[KIND] == GIVEN:
-            given = scan.detection.probability(density.particles, scan.pose)
-            probability = np.minimum(given, MOST_PROBABLE)
         seen = np.empty((len(gated), len(probability)))
         detected = likelihoods(
             scan.head,
@@ -152,8 +145,6 @@ class Component:
         taken = np.flatnonzero(share > LEAST_SHARE)
         head = scan.head.copy()
         head[MISS] = nothing / ((1.0 - detected) * self.existence)
-        if head[KIND] == GIVEN:
-            head[MODEL] = detected
         scale = share[taken] / view.likelihood[taken]
         terms = scan.terms[view.gated[taken]]
         terms[:, SCALE] += np.log(scale)

@@ -26,8 +26,8 @@ from maasi_filter.vector_math import arctan2
 
 FloatArray = NDArray[np.float64]
 
-# pi is a number, not a model's.
-GIVEN = -1
+# Kind of pi of a factor that is no scan's: 1 everywhere.
+ALWAYS = -1
 # With 1, a single miss would end a component that certainly exists.
 MOST_PROBABLE = 0.98
 # An environment is never seen beyond doubt: the model of the sensor is not that good.
@@ -69,7 +69,7 @@ class Scan:
 
 def make_scan(measurements: MeasurementSet, pose: Pose, detection: DetectionModel) -> Scan:
     """Return a scan as rows of numbers."""
-    kind, parameters = detection.kernel() or (GIVEN, np.zeros(PARAMETERS))
+    kind, parameters = detection.kernel()
     head = np.zeros(HEAD)
     head[SENSOR : SENSOR + 3] = pose.position
     head[COS], head[SIN] = math.cos(pose.yaw), math.sin(pose.yaw)
@@ -96,8 +96,7 @@ def gaussian_factor(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArra
     d = len(mean)
     head = np.zeros(HEAD)
     head[COS] = 1.0
-    head[KIND] = GIVEN
-    head[MODEL] = 1.0
+    head[KIND] = ALWAYS
     head[TERMS] = 1
     terms = np.zeros((1, TERM))
     _, log_determinant = np.linalg.slogdet(covariance)
@@ -113,9 +112,9 @@ def gaussian_factor(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArra
 
 @njit(cache=True, error_model='numpy')
 def probability_at(head, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return pi at a position, capped; for GIVEN what the head says."""
-    if head[KIND] < 0.0:
-        return head[MODEL]
+    """Return pi at a position, capped."""
+    if head[KIND] == ALWAYS:
+        return 1.0
     value = detection_probability_at(
         int(head[KIND]),
         head[MODEL:],
@@ -194,16 +193,12 @@ def log_products(heads, terms, grid, frame, positions, products, last):  # type:
 
 @njit(cache=True, error_model='numpy')
 def likelihoods(head, terms, positions, weights, probability, seen):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill pi (n,) and pi g_j (m, n) at particles; return p_D = sum w pi.
-
-    With kind GIVEN, `probability` holds pi already.
-    """
+    """Fill pi (n,) and pi g_j (m, n) at particles; return p_D = sum w pi."""
     d = positions.shape[1]
     total = 0.0
     for i in range(positions.shape[0]):
         z = positions[i, 2] if d == 3 else 0.0
-        if head[KIND] >= 0.0:
-            probability[i] = probability_at(head, positions[i, 0], positions[i, 1], z)
+        probability[i] = probability_at(head, positions[i, 0], positions[i, 1], z)
         total += weights[i] * probability[i]
         for j in range(terms.shape[0]):
             seen[j, i] = probability[i] * math.exp(

@@ -31,30 +31,30 @@ _ARRAYS: dict[str, tuple[str, str]] = {
     **{name: item for name, item in COMMON.items() if not name.startswith('found_')},
     'counters': ('i', '2'),
     'last_time': ('f', ''),
-    'existence': ('f', 'c'),
-    'hits': ('f', 'c'),
-    'scan': ('i', 'c'),
-    'pose_error': ('f', 'c'),
-    'found_radius': ('f', 'c'),
-    'particles': ('f', 'c n d'),
-    'weights': ('f', 'c n'),
-    'head_counts': ('i', 'c'),
+    'existence': ('f', 'b'),
+    'hits': ('f', 'b'),
+    'scan': ('i', 'b'),
+    'pose_error': ('f', 'b'),
+    'found_radius': ('f', 'b'),
+    'particles': ('f', 'b n d'),
+    'weights': ('f', 'b n'),
+    'head_counts': ('i', 'b'),
     'heads': ('f', 'h HEAD'),
-    'term_counts': ('i', 'c'),
+    'term_counts': ('i', 'b'),
     'terms': ('f', 't TERM'),
-    'grid': ('i', 'c'),
-    'found_ids': ('i', 'c'),
-    'found_measurements': ('i', 'c'),
-    'found_origins': ('i', 'c'),
-    'found_times': ('f', 'c'),
-    'found_positions': ('f', 'c d'),
-    'found_covariances': ('f', 'c d d'),
+    'grid': ('i', 'b'),
+    'found_ids': ('i', 'b'),
+    'found_measurements': ('i', 'b'),
+    'found_origins': ('i', 'b'),
+    'found_times': ('f', 'b'),
+    'found_positions': ('f', 'b d'),
+    'found_covariances': ('f', 'b d d'),
     'clutter_scans': ('i', 'r'),
     'clutter_counts': ('f', 'r'),
 }
 _SIZES = {'HEAD': HEAD, 'TERM': TERM}
-# What may be without a number: no step yet, and a radius that is not limited.
 _NOT_NEGATIVE = ('hits', 'pose_error', 'found_radius', 'cluster_masses', 'clutter_counts')
+# What may be without a number: no step yet, and a radius that is not limited.
 _UNDEFINED = ('last_time', 'found_radius')
 
 
