@@ -1,7 +1,17 @@
 """Runs do what they did when they were stored."""
 
+from copy import deepcopy
+
 import pytest
-from golden_files import FOLDER, differences, path_of, read, tolerance_for
+from golden_files import (
+    FOLDER,
+    TOLERANCE,
+    differences,
+    path_of,
+    read,
+    rounded,
+    tolerance_for,
+)
 from golden_runs import runs
 
 GOLDEN = runs()
@@ -28,3 +38,42 @@ def test_nothing_is_stored_that_is_not_run():
     assert sorted(path.name for path in FOLDER.iterdir()) == sorted(
         path_of(name).name for name in GOLDEN
     )
+
+
+def test_differences_say_where_and_by_how_much():
+    before = {
+        'size': 200.0,
+        'found': {'step': [4, 9], 'robot': ['a', 'b'], 'position': [[1.0, 2.0], [3.0, 4.0]]},
+        'end': {'steps': 20, 'rmse': float('nan')},
+    }
+    assert differences('run', before, deepcopy(before), 0.0) == []
+    now = deepcopy(before)
+    now['found']['position'][1][0] += 1e-4
+    assert differences('run', before, now, 1e-6) == []
+    now['found']['position'][1][0] += 3e-4
+    [found] = map(str, differences('run', before, now, 1e-6))
+    assert found.startswith('run: step 9: found.position: moved by 0.0004 m, 2e-06 of the size')
+    now = deepcopy(before)
+    now['found']['robot'][0] = 'c'
+    now['end']['steps'] = 21
+    assert list(map(str, differences('run', before, now, 1.0))) == [
+        'run: step 4: found.robot: a before, c now; so in 1 of 2',
+        'run: at the end: steps: 20 before, 21 now',
+    ]
+    now = deepcopy(before)
+    now['found'] = {column: values[:1] for column, values in now['found'].items()}
+    [found] = map(str, differences('run', before, now, 1e-6))
+    assert found == 'run: step 9: number of found: 2 before, 1 now'
+    # A kind of event that there was not before.
+    now = {**deepcopy(before), 'snapshots': {'step': [7], 'cuboid': [2]}}
+    [found] = map(str, differences('run', before, now, 1e-6))
+    assert found == 'run: step 7: number of snapshots: 0 before, 1 now'
+
+
+def test_stored_numbers_are_rounded_below_the_tolerance():
+    recording = {'size': 260.0, 'found': {'position': [[123.456789123]], 'bits': ['a']}, 'end': {}}
+    stored = rounded(recording)
+    assert 'bits' not in stored['found']
+    moved = abs(stored['found']['position'][0][0] - 123.456789123)
+    assert 0.0 < moved <= 0.1 * TOLERANCE * 260.0
+    assert differences('run', stored, recording, TOLERANCE) == []

@@ -139,7 +139,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(f'wrote {options.document} with {len(shown)} experiments')
         return code
     except MixedWorkers as error:
-        return _refuse(f'{error}; --mixed-workers makes runs on both', WRONG_INPUT)
+        return _refuse(f'{error}; --mixed-workers allows it', WRONG_INPUT)
     except (NoRoom, WorkersLost) as error:
         return _refuse(f'{error}; the runs until now are kept', STOPPED)
     except KeyboardInterrupt:
