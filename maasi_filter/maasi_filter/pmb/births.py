@@ -59,6 +59,8 @@ class Births:
         pi(x) g(z | x).
     weights : (m, n) array
         The same times e(x).
+    means, covariances : (m, d) and (m, d, d) arrays
+        Of the draws.
     intensity : (m,) array
         lambda_j = (N0 / V) int e pi g(z_j | x) dx, of detections of targets not seen before.
     """
@@ -66,6 +68,8 @@ class Births:
     particles: FloatArray
     volume: FloatArray
     weights: FloatArray
+    means: FloatArray
+    covariances: FloatArray
     intensity: FloatArray
 
 
@@ -106,4 +110,7 @@ def draw_births(
     unseen = np.maximum(exploration.at(flat), LEAST_UNEXPLORED).reshape(count, number)
     weights = unseen * volume
     intensity = expected_targets / exploration.volume * weights.mean(axis=1)
-    return Births(particles, volume, weights, intensity)
+    means = particles.mean(axis=1)
+    spread = particles - means[:, None]
+    covariances = np.einsum('mia,mib->mab', spread, spread) / number
+    return Births(particles, volume, weights, means, covariances, intensity)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from maasi_filter.pmb.births import Births
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import (
+    LEAST_FACTOR,
     MISS,
     SCALE,
     Scan,
@@ -27,6 +28,7 @@ GATE = 6.0
 LEAST_SUPPORT = 10.0
 # Squared normalised distance up to which such draws are tried.
 SUPPORT_DISTANCE = 36.0
+SUPPORT_DRAWS = 100
 # Associations and changes of the log density that are not worth a term or a factor.
 LEAST_SHARE = 1e-4
 LEAST_CHANGE = 1e-3
@@ -113,8 +115,8 @@ class Component:
             seen,
         )
         view = View(probability, detected, gated, seen, seen @ density.weights)
-        for k, j in enumerate(gated.tolist()):
-            self._support(view, k, births.particles[j], births.volume[j])
+        for k in range(len(gated)):
+            self._support(view, k, births)
         return view
 
     def odds(self, view: View) -> FloatArray:
@@ -149,7 +151,7 @@ class Component:
         terms = scan.terms[view.gated[taken]]
         terms[:, SCALE] += np.log(scale)
         factor = head[MISS] * (1.0 - view.probability) + scale @ view.seen[taken]
-        logs = np.log(np.maximum(factor, 1e-300))
+        logs = np.log(np.maximum(factor, LEAST_FACTOR))
         drawn = [k for k in taken.tolist() if k in view.drawn and share[k] > 0.05]
         if drawn:
             self._restart(head, terms, factor, view, drawn, share, births, generator)
@@ -170,19 +172,19 @@ class Component:
         near = np.abs(measurements.values[:, 0] - math.sqrt(float(offset @ offset))) < reach
         return np.flatnonzero(near)
 
-    def _support(self, view: View, k: int, particles: FloatArray, volume: FloatArray) -> None:
+    def _support(self, view: View, k: int, births: Births) -> None:
         """Take a likelihood from the detection's draws where particles are too sparse for it."""
         shares = view.seen[k] * self.density.weights
         total = view.likelihood[k]
         if total > 0.0 and total * total >= LEAST_SUPPORT * float(shares @ shares):
             return
-        mean = volume @ particles / max(float(volume.sum()), 1e-300)
-        offset = mean - self.density.mean
-        spread = particles - mean
-        covariance = self.density.covariance + spread.T @ spread / len(particles)
+        j = view.gated[k]
+        offset = births.means[j] - self.density.mean
+        covariance = self.density.covariance + births.covariances[j]
         if float(offset @ np.linalg.solve(covariance, offset)) > SUPPORT_DISTANCE:
             return
-        drawn = np.exp(np.minimum(self.density.log_at(particles), 600.0)) * volume
+        logs = self.density.log_at(births.particles[j, :SUPPORT_DRAWS])
+        drawn = np.exp(np.minimum(logs, 600.0)) * births.volume[j, :SUPPORT_DRAWS]
         square = float(drawn @ drawn)
         if square > 0.0 and float(drawn.sum()) ** 2 > LEAST_SUPPORT * square:
             view.likelihood[k] = float(drawn.mean())
@@ -206,7 +208,7 @@ class Component:
         particles = [density.particles]
         weights = [density.weights * np.maximum(factor, 0.0)]
         for k in drawn:
-            particles.append(births.particles[view.gated[k]])
+            particles.append(births.particles[view.gated[k], :SUPPORT_DRAWS])
             weights.append(share[k] * view.drawn[k] / view.drawn[k].sum())
         density.restart(head, terms, np.concatenate(particles), np.concatenate(weights), generator)
 

@@ -17,7 +17,6 @@ from maasi_filter.pmb.factors import (
     FIRST,
     TERMS,
     gaussian_factor,
-    log_product_at,
     log_products,
 )
 
@@ -106,22 +105,26 @@ def _sweep(heads, terms, grid, frame, exponent, particles, products, last, draws
     number, d = particles.shape
     half = number // 2
     accepted = 0
-    place = np.zeros(3)
-    for i in range(number):
-        first, size = (half, number - half) if i < half else (0, half)
-        a = first + min(int(draws[i, 0] * size), size - 1)
-        b = first + min(int(draws[i, 1] * size), size - 1)
-        scale = 2.38 / math.sqrt(2.0 * d) * (0.1 + 0.9 * draws[i, 2])
-        for k in range(d):
-            place[k] = particles[i, k] + scale * (particles[a, k] - particles[b, k])
-        product, newest = log_product_at(heads, terms, grid, frame, d, place[0], place[1], place[2])
-        gain = product - products[i] + exponent * (newest - last[i])
-        if gain >= math.log(max(draws[i, 3], 1e-300)):
+    for start, end in ((0, half), (half, number)):
+        other, size = (half, number - half) if start == 0 else (0, half)
+        places = np.empty((end - start, d))
+        for i in range(start, end):
+            a = other + min(int(draws[i, 0] * size), size - 1)
+            b = other + min(int(draws[i, 1] * size), size - 1)
+            scale = 2.38 / math.sqrt(2.0 * d) * (0.1 + 0.9 * draws[i, 2])
             for k in range(d):
-                particles[i, k] = place[k]
-            products[i] = product
-            last[i] = newest
-            accepted += 1
+                places[i - start, k] = particles[i, k] + scale * (particles[a, k] - particles[b, k])
+        product = np.empty(end - start)
+        newest = np.empty(end - start)
+        log_products(heads, terms, grid, frame, places, product, newest)
+        for i in range(start, end):
+            j = i - start
+            gain = product[j] - products[i] + exponent * (newest[j] - last[i])
+            if gain >= math.log(max(draws[i, 3], 1e-300)):
+                particles[i] = places[j]
+                products[i] = product[j]
+                last[i] = newest[j]
+                accepted += 1
     return accepted
 
 

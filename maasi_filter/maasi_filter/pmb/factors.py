@@ -18,11 +18,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.exploration import interpolate_at
-from maasi_filter.models.detection import PARAMETERS, DetectionModel, detection_probability_at
-from maasi_filter.models.measurement import wrap
+from maasi_filter.models.detection import (
+    PARAMETERS,
+    DetectionModel,
+    fill_probabilities,
+    offsets,
+)
+from maasi_filter.models.measurement import TWO_PI
 from maasi_filter.models.measurement_set import MeasurementSet
 from maasi_filter.models.pose import Pose
-from maasi_filter.vector_math import arctan2
+from maasi_filter.vector_math import arctan2, exponential
 
 FloatArray = NDArray[np.float64]
 
@@ -32,7 +37,8 @@ ALWAYS = -1
 MOST_PROBABLE = 0.98
 # An environment is never seen beyond doubt: the model of the sensor is not that good.
 LEAST_UNEXPLORED = 1e-3
-LOG_NOTHING = -690.0
+# What a factor is at least.
+LEAST_FACTOR = 1e-60
 
 # A head: sensor position, cos and sin of its yaw, kind of pi, c_0, first term, terms, parameters.
 SENSOR, COS, SIN, KIND, MISS, FIRST, TERMS, MODEL = 0, 3, 4, 5, 6, 7, 8, 9
@@ -111,97 +117,128 @@ def gaussian_factor(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArra
 
 
 @njit(cache=True, error_model='numpy')
-def probability_at(head, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return pi at a position, capped."""
+def _look(head, positions, offset, probability):  # type: ignore[no-untyped-def]
+    """Fill offsets (3, n) from a scan's sensor and pi (n,), capped."""
+    number = positions.shape[0]
+    offsets(positions, 0, number, head[SENSOR : SENSOR + 3], offset[0], offset[1], offset[2])
     if head[KIND] == ALWAYS:
-        return 1.0
-    value = detection_probability_at(
+        probability[:] = 1.0
+        return
+    fill_probabilities(
         int(head[KIND]),
         head[MODEL:],
-        x - head[SENSOR],
-        y - head[SENSOR + 1],
-        z - head[SENSOR + 2],
+        offset[0],
+        offset[1],
+        offset[2],
+        number,
         head[COS],
         head[SIN],
+        probability,
     )
-    return min(value, MOST_PROBABLE)
+    for i in range(number):
+        probability[i] = min(probability[i], MOST_PROBABLE)
+
+
+@njit(cache=True, error_model='numpy', fastmath={'contract'})
+def _point(offset, solid, measured):  # type: ignore[no-untyped-def]
+    """Fill range, bearing and elevation (3, n) of offsets; in 2D the elevation is 0."""
+    x, y, z = offset
+    for i in range(x.shape[0]):
+        level = math.sqrt(x[i] * x[i] + y[i] * y[i])
+        measured[0, i] = math.sqrt(level * level + z[i] * z[i])
+        measured[1, i] = arctan2(y[i], x[i])
+        measured[2, i] = arctan2(z[i], level) if solid else 0.0
+
+
+@njit(cache=True, error_model='numpy', fastmath={'contract'})
+def _add_term(term, sensor, origin, factor, out):  # type: ignore[no-untyped-def]
+    """Add factor c_j g(z_j | x) (n,); `origin` is measured (3, n), or offsets if Cartesian."""
+    cartesian = term[CARTESIAN] > 0.5
+    shift = sensor if cartesian else np.zeros(3)
+    turn = 0.0 if cartesian else 1.0 / TWO_PI
+    z0, z1, z2 = term[CENTRE] - shift[0], term[CENTRE + 1] - shift[1], term[CENTRE + 2] - shift[2]
+    scale = term[SCALE]
+    i00, i01, i02 = term[INFORMATION], term[INFORMATION + 1], term[INFORMATION + 2]
+    i11, i12, i22 = term[INFORMATION + 4], term[INFORMATION + 5], term[INFORMATION + 8]
+    u, v, w = origin
+    for i in range(out.shape[0]):
+        a = u[i] - z0
+        b = v[i] - z1
+        b -= TWO_PI * math.floor(b * turn + 0.5)
+        c = w[i] - z2
+        square = a * (a * i00 + 2.0 * (b * i01 + c * i02)) + b * (b * i11 + 2.0 * c * i12)
+        out[i] += factor[i] * exponential(scale - 0.5 * (square + c * c * i22))
 
 
 @njit(cache=True, error_model='numpy')
-def log_likelihood_at(head, term, d, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return log of c_j g(z_j | x)."""
-    if term[CARTESIAN] > 0.5:
-        a = x - term[CENTRE]
-        b = y - term[CENTRE + 1]
-        c = z - term[CENTRE + 2] if d == 3 else 0.0
-    else:
-        dx = x - head[SENSOR]
-        dy = y - head[SENSOR + 1]
-        dz = z - head[SENSOR + 2] if d == 3 else 0.0
-        level = math.sqrt(dx * dx + dy * dy)
-        a = math.sqrt(level * level + dz * dz) - term[CENTRE]
-        b = wrap(arctan2(dy, dx) - term[CENTRE + 1])
-        c = arctan2(dz, level) - term[CENTRE + 2] if d == 3 else 0.0
-    i = INFORMATION
-    square = a * (a * term[i] + 2.0 * (b * term[i + 1] + c * term[i + 2]))
-    square += b * (b * term[i + 4] + 2.0 * c * term[i + 5]) + c * c * term[i + 8]
-    return term[SCALE] - 0.5 * square
+def add_log_factors(heads, terms, first, last, positions, out):  # type: ignore[no-untyped-def]
+    """Add the logs of the factors from `first` to before `last` at positions (n, d) to `out`."""
+    number, d = positions.shape
+    offset = np.empty((3, number))
+    measured = np.empty((3, number))
+    probability = np.empty(number)
+    total = np.empty(number)
+    product = np.ones(number)
+    for k in range(first, last):
+        head = heads[k]
+        _look(head, positions, offset, probability)
+        for i in range(number):
+            total[i] = head[MISS] * (1.0 - probability[i])
+        begin = int(head[FIRST])
+        end = begin + int(head[TERMS])
+        spherical = False
+        for j in range(begin, end):
+            spherical = spherical or terms[j, CARTESIAN] < 0.5
+        if spherical:
+            _point(offset, d == 3, measured)
+        for j in range(begin, end):
+            origin = offset if terms[j, CARTESIAN] > 0.5 else measured
+            _add_term(terms[j], head[SENSOR : SENSOR + 3], origin, probability, total)
+        for i in range(number):
+            product[i] *= max(total[i], LEAST_FACTOR)
+        # A product of four factors neither overflows nor vanishes; one logarithm serves it.
+        if (k - first) % 4 == 3 or k == last - 1:
+            for i in range(number):
+                out[i] += math.log(product[i])
+                product[i] = 1.0
 
 
 @njit(cache=True, error_model='numpy')
-def log_factor_at(head, terms, d, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return log f(x); `terms` are those of all factors."""
-    probability = probability_at(head, x, y, z)
-    total = head[MISS] * (1.0 - probability)
-    first = int(head[FIRST])
-    for k in range(first, first + int(head[TERMS])):
-        total += probability * math.exp(log_likelihood_at(head, terms[k], d, x, y, z))
-    return math.log(total) if total > 1e-300 else LOG_NOTHING
-
-
-@njit(cache=True, error_model='numpy')
-def log_product_at(heads, terms, grid, frame, d, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the log of the prior and of all factors but the last, and that of the last.
+def log_products(heads, terms, grid, frame, positions, products, last):  # type: ignore[no-untyped-def]
+    """Fill the log of the prior and of all factors but the last, and that of the last.
 
     `grid` is e at birth, or empty; `frame` has lower and upper bounds and the grid's step.
     """
-    inside = frame[0, 0] <= x <= frame[1, 0] and frame[0, 1] <= y <= frame[1, 1]
-    if d == 3:
-        inside = inside and frame[0, 2] <= z <= frame[1, 2]
-    if not inside:
-        return -np.inf, 0.0
-    total = 0.0
-    if grid.shape[0]:
-        unseen = interpolate_at(grid, frame[0], frame[2], x, y, z)
-        total = math.log(max(unseen, LEAST_UNEXPLORED))
-    last = heads.shape[0] - 1
-    for k in range(last):
-        total += log_factor_at(heads[k], terms, d, x, y, z)
-    return total, log_factor_at(heads[last], terms, d, x, y, z)
+    number, d = positions.shape
+    for i in range(number):
+        products[i] = 0.0
+        last[i] = 0.0
+        for a in range(d):
+            if not frame[0, a] <= positions[i, a] <= frame[1, a]:
+                products[i] = -np.inf
+        if grid.shape[0]:
+            z = positions[i, 2] if d == 3 else 0.0
+            unseen = interpolate_at(grid, frame[0], frame[2], positions[i, 0], positions[i, 1], z)
+            products[i] += math.log(max(unseen, LEAST_UNEXPLORED))
+    count = heads.shape[0] - 1
+    add_log_factors(heads, terms, 0, count, positions, products)
+    add_log_factors(heads, terms, count, count + 1, positions, last)
 
 
 @njit(cache=True, error_model='numpy')
-def log_products(heads, terms, grid, frame, positions, products, last):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill both parts of the log density at positions (n, d)."""
-    d = positions.shape[1]
-    for i in range(positions.shape[0]):
-        z = positions[i, 2] if d == 3 else 0.0
-        products[i], last[i] = log_product_at(
-            heads, terms, grid, frame, d, positions[i, 0], positions[i, 1], z
-        )
-
-
-@njit(cache=True, error_model='numpy')
-def likelihoods(head, terms, positions, weights, probability, seen):  # type: ignore[no-untyped-def]  # pragma: no cover
+def likelihoods(head, terms, positions, weights, probability, seen):  # type: ignore[no-untyped-def]
     """Fill pi (n,) and pi g_j (m, n) at particles; return p_D = sum w pi."""
-    d = positions.shape[1]
+    number, d = positions.shape
+    offset = np.empty((3, number))
+    measured = np.empty((3, number))
+    _look(head, positions, offset, probability)
+    if terms.shape[0]:
+        _point(offset, d == 3, measured)
+    for j in range(terms.shape[0]):
+        origin = offset if terms[j, CARTESIAN] > 0.5 else measured
+        seen[j] = 0.0
+        _add_term(terms[j], head[SENSOR : SENSOR + 3], origin, probability, seen[j])
     total = 0.0
-    for i in range(positions.shape[0]):
-        z = positions[i, 2] if d == 3 else 0.0
-        probability[i] = probability_at(head, positions[i, 0], positions[i, 1], z)
+    for i in range(number):
         total += weights[i] * probability[i]
-        for j in range(terms.shape[0]):
-            seen[j, i] = probability[i] * math.exp(
-                log_likelihood_at(head, terms[j], d, positions[i, 0], positions[i, 1], z)
-            )
     return total
