@@ -54,7 +54,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             self, 'cmd_vel', self.settings.command_type, self.settings.lockstep
         )
         self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
-        self.create_wall_timer(_LOOK_PERIOD, self._publisher.look)
+        self.create_wall_timer(_LOOK_PERIOD, self._publisher.refresh)
         lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
         quality = QoSProfile(
             depth=1,

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from maasi_drivers.camera_driver import CameraDriver, Picture
-from maasi_drivers.mavlink_driver import MavlinkRobot
+from typing import Any
+
+from maasi_drivers.agent.agent_driver import AgentDriver
+from maasi_drivers.links.mavlink.mavlink_robot_link import MavlinkRobotLink
+from maasi_drivers.links.topic_link import TopicLink
+from maasi_drivers.vision.camera_input import CameraInput
 from maasi_filter.ros.lifecycle_node import run
 
 
-class MavlinkCameraDriver(MavlinkRobot[Picture], CameraDriver):
-    """A vehicle with an autopilot and a camera; see `CameraDriver`."""
+class MavlinkCameraDriver(AgentDriver):
+    """A vehicle with a camera; see `MavlinkRobotLink` and `CameraInput`."""
+
+    def __init__(self, **options: Any) -> None:
+        links = {'topics': TopicLink, 'mavlink': MavlinkRobotLink}
+        super().__init__(links, CameraInput, **options)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_drivers.vision.marker_reading import read_markers
 from maasi_filter.make_filter import make_filter
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import AgentMeasurement, FoundTarget
@@ -175,19 +176,13 @@ class _Robot:
                 self.pose.covariance[:3, :3],
             )
         image = self.body.image(step, time)
-        covariance = self.pose.covariance if self.pose.covariance.any() else None
-        seen = self.detector.detect(image, self.pose.pose, covariance)
-        positions = seen.positions
-        dimension = self.sensor.covariance.shape[0]
-        if dimension == 3:
-            positions = np.pad(positions, ((0, 0), (0, 1)))
-        inside = self.sensor.detection.probability(positions, self.pose.pose) > 0.0
+        reading = read_markers(image, self.pose, self.detector, self.sensor)
         return AgentMeasurement(
             self.name,
             self.pose.pose,
             self.sensor,
-            seen.values[inside],
-            seen.covariances[inside],
+            reading.values,
+            reading.covariances,
             index,
             self.pose.covariance[:3, :3],
         )

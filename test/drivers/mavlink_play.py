@@ -103,7 +103,7 @@ class Play:
     def until(self, condition, limit=60.0):
         end = self.now + limit
         while not condition():
-            assert self.now < end, (self.vehicle.trouble, self.reports[-8:])
+            assert self.now < end, (self.vehicle.fault, self.reports[-8:])
             self.turn()
 
     def fly(self):
@@ -124,7 +124,7 @@ class Play:
             self.vehicle.set_target(position + ahead * np.array(direction), 0.3)
 
     def until_lost(self):
-        self.until(lambda: self.vehicle.trouble)
+        self.until(lambda: self.vehicle.fault)
 
     @property
     def speed(self):

@@ -295,11 +295,11 @@ def test_a_calibration_replaces_that_of_the_parameters(play):
     team.until(lambda: team.calibrations.get_subscription_count())
     team.calibrations.publish(wrong)
     team.until(lambda: driver.dropped['calibration'] == 1)
-    assert driver.camera.width == 160
+    assert driver.sensor_input.camera.width == 160
     wrong.distortion_model = 'plumb_bob'
     team.calibrations.publish(wrong)
-    team.until(lambda: driver.camera.width == 320)
-    assert driver.camera.mount == team.settings.camera.mount
+    team.until(lambda: driver.sensor_input.camera.width == 320)
+    assert driver.sensor_input.camera.mount == team.settings.camera.mount
     team.calibrations.publish(CameraInfo(width=640, height=480))
     team.images.publish(image_message(np.full((240, 320, 3), 120, np.uint8)))
     team.ask(0)

@@ -19,11 +19,12 @@ from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, parameters_of, rendered
 
-from maasi_drivers.agent.agent_driver import _WATCH_PERIOD
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
 from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.agent.watchdog import PERIOD as WATCH_PERIOD
+from maasi_drivers.links.mambo.mambo_robot_link import _POLL_PERIOD
 from maasi_drivers.links.mambo.settings import MamboSettings
-from maasi_drivers.mambo_driver import _POLL_PERIOD, MamboDriver
+from maasi_drivers.mambo_driver import MamboDriver
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.measurement_feed import FeedPacket
@@ -259,7 +260,7 @@ def test_what_is_waited_for_is_short_enough():
     settings, firmware = MamboSettings(), FirmwareSettings()
     sensors = 0.5
     assert settings.link_timeout > sensors
-    assert settings.link_timeout + 2.0 * _POLL_PERIOD + _WATCH_PERIOD <= LATEST
+    assert settings.link_timeout + 2.0 * _POLL_PERIOD + WATCH_PERIOD <= LATEST
     # Without new commands its firmware has it hover.
     assert firmware.command_timeout <= LATEST
 

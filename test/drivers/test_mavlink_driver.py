@@ -19,13 +19,14 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
 from std_srvs.srv import Trigger
 
-from maasi_drivers.agent import agent_driver
+from maasi_drivers.agent import battery_watch
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
 from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.agent.robot_stop import STOPPED as STOPPED_BY_SERVICE
+from maasi_drivers.links.mavlink.mavlink_robot_link import _POLL_PERIOD
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
-from maasi_drivers.mavlink_driver import _POLL_PERIOD, MavlinkDriver
+from maasi_drivers.mavlink_driver import MavlinkDriver
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.models.pose import Pose, compose
 from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
@@ -225,7 +226,7 @@ def test_a_localiser_says_where_the_frame_of_the_autopilot_is(fly):
     def until(condition):
         flight.until(lambda: say() or condition())
 
-    flight.until(lambda: UNTIL_ARM in flight.driver.trouble)
+    flight.until(lambda: UNTIL_ARM in flight.driver.health.text)
     assert flight.call('arm').message == 'no pose'
     until(lambda: flight.team.states and flight.call('arm').success)
     until(lambda: flight.state.goal_status != AgentState.UNAVAILABLE)
@@ -350,15 +351,15 @@ def test_goals_that_are_not_finite_or_outside_the_geofence_are_refused(fly, capf
         assert flight.team.refused(goal)
     flight.until(lambda: flight.driver.dropped['goal'] == 4)
     assert 'allowed are finite numbers' in capfd.readouterr().err
-    assert 'the geofence' in flight.driver._problem(flight.team.goal([0.0, 3.5, 0.8]))
+    assert 'the geofence' in flight.driver.goals.problem(flight.team.goal([0.0, 3.5, 0.8]))
     assert flight.vehicle.running
     assert flight.team.takes([0.0, 2.5, 0.8])
 
 
 def test_without_a_geofence_it_is_not_sent_into_the_ground(fly):
     flight = fly()
-    assert 'the geofence' in flight.driver._problem(flight.team.goal([0.0, 1.0, -0.1]))
-    assert flight.driver._problem(flight.team.goal([0.0, 1.0, 0.1])) is None
+    assert 'the geofence' in flight.driver.goals.problem(flight.team.goal([0.0, 1.0, -0.1]))
+    assert flight.driver.goals.problem(flight.team.goal([0.0, 1.0, 0.1])) is None
 
 
 def test_blown_out_of_the_geofence_it_comes_back(fly):
@@ -445,7 +446,7 @@ def test_the_pilot_takes_over_and_keeps_it(fly, capfd):
 
 
 def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
-    monkeypatch.setattr(agent_driver, '_BATTERY_PATIENCE', 2.5)
+    monkeypatch.setattr(battery_watch, '_PATIENCE', 2.5)
     flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
     # One that stays the same has been heard all the same.
     begin = time.monotonic()

@@ -81,7 +81,7 @@ def test_a_vehicle_is_armed_and_brought_to_its_height(firmware):
     assert play.speed < STOPPED
     took_off = play.commands(mavlink.MAV_CMD_NAV_TAKEOFF)
     assert bool(took_off) == (firmware == 'arducopter')
-    assert play.vehicle.trouble == ''
+    assert play.vehicle.fault == ''
 
 
 @firmwares
@@ -103,7 +103,7 @@ def test_nothing_is_armed_without_being_told(firmware):
     play = Play(firmware, arm=False)
     play.run(20.0)
     assert play.vehicle.phase is Phase.WAITING
-    assert play.vehicle.trouble == 'vehicle: not armed: arm is false'
+    assert play.vehicle.fault == 'vehicle: not armed: arm is false'
     assert not play.autopilot.armed
     assert not play.commands(ARM)
     assert not play.commands(mavlink.MAV_CMD_DO_SET_MODE)
@@ -115,14 +115,14 @@ def test_nothing_is_armed_while_the_driver_is_not_active():
     play.vehicle.active = False
     play.run(10.0)
     assert not play.commands(ARM)
-    assert 'not active' in play.vehicle.trouble
+    assert 'not active' in play.vehicle.fault
 
 
 def test_nothing_is_armed_without_a_failsafe_for_the_link():
     play = Play(autopilot={'parameters': {'FS_GCS_ENABLE': 0}})
     play.run(10.0)
     assert not play.commands(ARM)
-    assert 'failsafe FS_GCS_ENABLE is 0, and require_failsafe is true' in play.vehicle.trouble
+    assert 'failsafe FS_GCS_ENABLE is 0, and require_failsafe is true' in play.vehicle.fault
     play = Play(autopilot={'parameters': {'FS_GCS_ENABLE': 0}}, require_failsafe=False)
     assert play.fly().autopilot.armed
 
@@ -154,7 +154,7 @@ def test_nothing_is_armed_where_another_ground_station_would_do_for_the_driver(p
     play = Play(autopilot={'parameters': parameters})
     play.run(10.0)
     assert text in play.said
-    assert text in play.vehicle.trouble
+    assert text in play.vehicle.fault
     assert not play.commands(ARM)
 
 
@@ -163,7 +163,7 @@ def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver():
     play.station = play.vehicle.settings.own_system
     play.run(10.0)
     assert not play.commands(ARM)
-    assert 'another program sends heartbeats with system id 240' in play.vehicle.trouble
+    assert 'another program sends heartbeats with system id 240' in play.vehicle.fault
     play.station = None
     play.run(6.0)
     assert play.permit() == ''
@@ -211,8 +211,8 @@ def test_a_vehicle_that_does_not_rise_lands_and_says_why():
     play = Play(rise_timeout=6.0)
     play.autopilot.body.limits = replace(play.autopilot.body.limits, climb=0.0)
     play.run(20.0)
-    assert 'it came no nearer to its height in 6 s: at ' in play.vehicle.trouble
-    assert 'm of 2.0 m' in play.vehicle.trouble
+    assert 'it came no nearer to its height in 6 s: at ' in play.vehicle.fault
+    assert 'm of 2.0 m' in play.vehicle.fault
     assert not play.autopilot.armed
 
 
@@ -235,7 +235,7 @@ def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on():
     play.autopilot.take_mode('GUIDED')
     play.run(10.0)
     assert 'GUIDED is back' in play.said
-    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
     assert play.permit() == ''
     play.fly()
 
@@ -244,16 +244,16 @@ def test_the_loss_of_gnss_is_seen_in_flight():
     play = Play().fly().go(SPEED)
     play.autopilot.lose_gnss()
     play.run(1.5)
-    assert play.vehicle.trouble == 'vehicle: GNSS is lost (GPS_RAW_INT.fix_type 1)'
+    assert play.vehicle.fault == 'vehicle: GNSS is lost (GPS_RAW_INT.fix_type 1)'
     play.run(9.0)
-    assert play.vehicle.trouble == 'vehicle: the autopilot has lost its position estimate'
+    assert play.vehicle.fault == 'vehicle: the autopilot has lost its position estimate'
 
 
 def test_an_autopilot_that_restarts_is_left_alone():
     play = Play().fly().go(SPEED)
     play.autopilot.restart()
     play.run(5.0)
-    assert 'vehicle: is disarmed' in play.vehicle.trouble
+    assert 'vehicle: is disarmed' in play.vehicle.fault
     assert 'the autopilot has restarted' in play.said
     armed = len(play.commands(ARM))
     assert play.permit() == 'the autopilot has restarted: start the driver again'
@@ -270,7 +270,7 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
     play.run(12.0)
     assert 'the autopilot has restarted' in play.said
     # Messages, parameters and origin are those of the new start.
-    assert 'FS_GCS_ENABLE is 0' in play.vehicle.trouble
+    assert 'FS_GCS_ENABLE is 0' in play.vehicle.fault
     assert_allclose(play.vehicle.origin[:2], [3.0, 4.0], atol=0.05)
     play.autopilot.parameters['FS_GCS_ENABLE'] = 5.0
     play.autopilot.restart()
@@ -283,7 +283,7 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
 def test_nothing_takes_off_before_the_service_is_called(firmware):
     play = Play(firmware, permitted=False)
     play.run(20.0)
-    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
     assert not play.commands(ARM)
     assert not play.commands(mavlink.MAV_CMD_DO_SET_MODE)
     assert play.permit() == ''
@@ -294,7 +294,7 @@ def test_nothing_takes_off_before_the_service_is_called(firmware):
     if firmware == 'ardusub':
         play.autopilot._disarm('Disarming motors')
         play.run(2.0)
-    assert UNTIL_ARM in play.vehicle.trouble
+    assert UNTIL_ARM in play.vehicle.fault
     assert not play.autopilot.armed
     assert play.permit() == ''
     play.fly()
@@ -312,7 +312,7 @@ def test_a_driver_restarted_while_its_vehicle_lands_does_not_take_off_again():
     play.run(20.0)
     assert not play.autopilot.armed
     assert play.autopilot.mode_name == 'LAND'
-    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
     assert not play.commands(ARM)[1:]
     assert play.permit() == ''
     play.fly()
@@ -329,7 +329,7 @@ def test_a_driver_restarted_in_the_air_sends_it_nowhere_before_it_may():
         play.turn()
     assert len(play.sent('SET_POSITION_TARGET_LOCAL_NED')) == sent
     assert_allclose(play.autopilot.body.position, here, atol=0.05)
-    assert 'not by this driver' in play.vehicle.trouble
+    assert 'not by this driver' in play.vehicle.fault
     # Its end is not the end of what others fly.
     play.vehicle.finish('land')
     play.run(2.0)
@@ -341,13 +341,13 @@ def test_a_driver_restarted_in_the_air_sends_it_nowhere_before_it_may():
 def test_a_correction_after_a_refusal_does_not_take_it_off():
     play = Play(autopilot={'parameters': {'FS_GCS_ENABLE': 0}})
     play.run(10.0)
-    assert 'FS_GCS_ENABLE is 0' in play.vehicle.trouble
-    assert UNTIL_ARM in play.vehicle.trouble
+    assert 'FS_GCS_ENABLE is 0' in play.vehicle.fault
+    assert UNTIL_ARM in play.vehicle.fault
     assert 'FS_GCS_ENABLE is 0' in play.permit()
     play.autopilot.parameters['FS_GCS_ENABLE'] = 5.0
     play.autopilot._sender.param_value_send(b'FS_GCS_ENABLE', 5.0, 9, 1, 0)
     play.run(20.0)
-    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
     assert not play.commands(ARM)
     assert play.permit() == ''
     play.fly()
@@ -361,7 +361,7 @@ def test_a_permission_that_is_not_used_ends():
     armed = len(play.commands(ARM))
     play.run(20.0)
     assert len(play.commands(ARM)) == armed
-    assert play.vehicle.trouble == f'vehicle: not armed: {UNTIL_ARM}'
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
 
 
 def test_a_stop_before_it_is_armed_ends_the_permission():
@@ -391,14 +391,14 @@ def test_reasons_against_arming_are_shown():
     play.run(12.0)
     assert 'PreArm: Battery below minimum' in play.said
     assert 'MAV_CMD_COMPONENT_ARM_DISARM: FAILED' in play.said
-    assert 'PreArm: Battery below minimum' in play.vehicle.trouble
+    assert 'PreArm: Battery below minimum' in play.vehicle.fault
     assert not play.autopilot.armed
 
 
 def test_before_the_estimate_nothing_is_asked_for():
     play = Play(autopilot={'estimator_time': 15.0})
     play.run(14.0)
-    assert 'no position estimate yet' in play.vehicle.trouble
+    assert 'no position estimate yet' in play.vehicle.fault
     assert not play.commands(ARM)
     play.fly()
 
@@ -409,7 +409,7 @@ def test_vehicles_of_another_kind_or_id_are_left_alone(kind):
     play.run(8.0)
     assert not play.autopilot.armed
     assert not play.sent('COMMAND_LONG')
-    assert ('is left alone' in play.vehicle.trouble) == ('system' not in kind)
+    assert ('is left alone' in play.vehicle.fault) == ('system' not in kind)
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf])
@@ -453,7 +453,7 @@ def test_with_a_cut_link_it_stops_and_the_driver_says_so(firmware):
     play.cut()
     play.run(AT_MOST)
     assert np.linalg.norm(play.autopilot.body.velocity[:2]) < STOPPED
-    assert play.vehicle.trouble == 'link: nothing heard from system 1'
+    assert play.vehicle.fault == 'link: nothing heard from system 1'
     assert not play.vehicle.flying
     assert 'link: nothing heard for 0.6 s' in play.said
 
@@ -495,7 +495,7 @@ def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
     play = Play(firmware).fly().go(SPEED)
     play.autopilot.take_mode({'px4': 'POSCTL'}.get(firmware, 'ALT_HOLD'))
     play.run(AT_MOST)
-    assert 'the pilot has taken over: mode' in play.vehicle.trouble
+    assert 'the pilot has taken over: mode' in play.vehicle.fault
     assert 'the driver lets go' in play.said
     sent = len(play.to_autopilot.messages)
     for _ in range(200):
@@ -546,7 +546,7 @@ def test_after_landing_it_is_not_armed_again():
     play.vehicle.finish('land')
     play.run(15.0)
     assert not play.autopilot.armed
-    assert play.vehicle.trouble == f'vehicle: is disarmed: it has landed, {UNTIL_ARM}'
+    assert play.vehicle.fault == f'vehicle: is disarmed: it has landed, {UNTIL_ARM}'
     armed = len(play.commands(ARM))
     play.run(10.0)
     assert len(play.commands(ARM)) == armed
@@ -557,7 +557,7 @@ def test_a_vehicle_that_is_disarmed_in_the_air_is_left_alone():
     play.autopilot._disarm('Crash: Disarming')
     play.run(AT_MOST)
     assert play.vehicle.phase is Phase.STOPPED
-    assert 'by the autopilot or the pilot (Crash: Disarming)' in play.vehicle.trouble
+    assert 'by the autopilot or the pilot (Crash: Disarming)' in play.vehicle.fault
     assert 'disarmed by the autopilot or the pilot (Crash: Disarming)' in play.said
     armed = len(play.commands(ARM))
     play.run(10.0)
@@ -572,7 +572,7 @@ def test_a_copter_that_the_pilot_has_in_the_air_is_taken_over_without_arming():
     other.autopilot.mode = ARDUCOPTER.external
     other.autopilot._hold()
     other.run(6.0)
-    assert 'it is armed in GUIDED, not by this driver' in other.vehicle.trouble
+    assert 'it is armed in GUIDED, not by this driver' in other.vehicle.fault
     assert not other.sent('SET_POSITION_TARGET_LOCAL_NED')
     assert other.permit() == ''
     other.run(0.5)

@@ -17,8 +17,8 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, image_message, numbers, start_guard
 from sensor_msgs.msg import BatteryState
 
-from maasi_drivers.agent.agent_driver import _WATCH_PERIOD
 from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.agent.watchdog import PERIOD as WATCH_PERIOD
 from maasi_drivers.guard_node import _STOP_PERIOD
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
@@ -56,7 +56,7 @@ def steps_until_stopped(team, move=None):
 def test_what_is_waited_for_is_short_enough():
     settings = DriverSettings.model_validate({'environment': TURTLEBOT['environment']})
     # A stalled driver looks once more before it believes that the odometry is gone.
-    assert settings.odometry_timeout + 3.0 * _WATCH_PERIOD <= LATEST
+    assert settings.odometry_timeout + 3.0 * WATCH_PERIOD <= LATEST
     assert LIVELINESS_LEASE + _STOP_PERIOD <= LATEST
     assert settings.frozen_pose_timeout + 2.0 * STEP <= LATEST
     assert settings.sensor_patience + 2.0 * STEP <= LATEST
@@ -199,7 +199,7 @@ def test_a_camera_that_was_never_there_is_said(play):
 
 
 def test_a_minimum_without_a_charge_is_warned_of(play, monkeypatch):
-    monkeypatch.setattr('maasi_drivers.agent.agent_driver._BATTERY_PATIENCE', 0.3)
+    monkeypatch.setattr('maasi_drivers.agent.battery_watch._PATIENCE', 0.3)
     driver, team = play(battery_minimum=0.2)
     team.until(lambda: team.move() or 'battery' in driver._warned)
     # An unknown charge does not end what a low one began.

@@ -581,7 +581,7 @@ def test_a_linked_robot_is_where_its_autopilot_is(make_team, vehicle_link):
     # While it is away nothing is heard from it.
     team.spin_until(lambda: not flies())
     with vehicle_link.vehicle() as vehicle:
-        assert vehicle.trouble == 'link: nothing heard from system 1'
+        assert vehicle.fault == 'link: nothing heard from system 1'
     team.spin_until(flies)
     assert not drone.of('odom') and not drone.of('battery_state')
 

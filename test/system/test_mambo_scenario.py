@@ -42,7 +42,7 @@ def test_a_mambo_reached_by_pyparrot_and_a_turtlebot_find_all(tmp_path):
     assert 'Success in setting up the wifi network to the drone' in log
     for phase in ('taking off', 'climbing', 'flying'):
         assert f'] [mambo.driver]: {phase}' in log
-    assert 'has not said that it lands' not in log
+    assert 'has not reported that it lands' not in log
 
 
 def test_it_is_not_run_in_lockstep(tmp_path):

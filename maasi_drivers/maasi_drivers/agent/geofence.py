@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Between the height at the start and the geofence, where none is given [m].
+# Between the start's height and the geofence, where none is given [m].
 _HEIGHT = 1.0
 # How far outside it may drift before it lands [m].
 MARGIN = 0.5
@@ -38,6 +38,26 @@ def make_fence(
         return np.array(given)
     fence = np.array([[0.0, 0.0], [0.0, 0.0], [ground, start + _HEIGHT]])
     fence[: len(bounds)] = bounds + np.array([-radius, radius])
+    return fence
+
+
+def make_vehicle_fence(
+    given: list[list[float]] | None, bounds: FloatArray, radius: float, ground: float, start: float
+) -> FloatArray:
+    """
+    Return the lowest and highest x, y, z (3, 2) of the goals of a vehicle that may also dive.
+
+    As `make_fence`; by default from 1 m below the lower to 1 m above the higher one of ground and
+    start, but not below the ground for what starts above it.
+    """
+    if given is not None:
+        return np.array(given)
+    fence = np.array(
+        [[0.0, 0.0], [0.0, 0.0], [min(ground, start) - _HEIGHT, max(ground, start) + _HEIGHT]]
+    )
+    fence[: len(bounds)] = bounds + np.array([-radius, radius])
+    if start > ground:
+        fence[2, 0] = max(fence[2, 0], ground)
     return fence
 
 

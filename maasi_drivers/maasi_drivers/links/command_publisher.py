@@ -35,7 +35,7 @@ class CommandPublisher:
     topic : str
         Relative name.
     kind : {'auto', 'stamped', 'twist'}
-        auto: found out from the graph, by `look`.
+        auto: found out from the graph, by `refresh`.
     lockstep : bool
         Whether no command may be lost; there, auto is stamped.
     """
@@ -52,7 +52,7 @@ class CommandPublisher:
         self._kind: type = TwistStamped
         self._auto = kind == 'auto' and not lockstep
         if self._auto:
-            self.look()
+            self.refresh()
         else:
             self._use(Twist if kind == 'twist' else TwistStamped)
 
@@ -62,7 +62,7 @@ class CommandPublisher:
         self._kind = kind
         self._publisher = self._node.create_publisher(kind, self.topic, self._quality)
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Look who listens, and for what type; to be called again and again."""
         if not self._auto or self.listeners():
             return

@@ -107,13 +107,18 @@ class MarkerDetector:
             If the image has another size than the calibrated one, or the covariance is not finite.
 
         """
-        camera, settings = self.camera, self.settings
+        self.check_size(image)
+        blobs = segment(image, self.settings.segmentation)
+        return self.locate(blobs, pose, pose_covariance)
+
+    def check_size(self, image: NDArray[np.uint8]) -> None:
+        """Raise `ValueError` for an image of another size than the calibrated one."""
+        camera = self.camera
         if image.shape[:2] != (camera.height, camera.width):
             raise ValueError(
                 f'image: got {image.shape[1]} x {image.shape[0]} px, allowed is the size of the '
                 f'calibration, {camera.width} x {camera.height} px'
             )
-        return self.locate(segment(image, settings.segmentation), pose, pose_covariance)
 
     def locate(
         self, blobs: Blobs, pose: Pose, pose_covariance: ArrayLike | None = None

@@ -11,6 +11,7 @@ import struct
 import time
 import zlib
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -246,6 +247,24 @@ class ReceivedPacket:
 
     packet: FeedPacket
     taken: float
+
+
+@dataclass(frozen=True)
+class FeedPeer:
+    """
+    The robot that sends a feed.
+
+    Attributes
+    ----------
+    address : str
+        Of the only sender that is used.
+    on_pose : callable
+        Takes stamp [ns] and pose of each of its images.
+
+    """
+
+    address: str
+    on_pose: Callable[[int, FeedPose], None]
 
 
 class FeedReceiver:

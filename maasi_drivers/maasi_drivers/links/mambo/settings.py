@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from maasi_filter.settings import Finite, Settings
@@ -112,6 +114,10 @@ class MamboSettings(Settings):
         'spare; none: the environment with the radius around it, from the ground to 1 m above '
         'the start [m, map]',
     )
+
+    def pose_covariance(self) -> NDArray[np.float64]:
+        """Return the covariance (6, 6) of a pose, by the settings' deviations [m^2, rad^2]."""
+        return np.diag([self.position_noise**2] * 3 + [self.attitude_noise**2] * 3)
 
     @model_validator(mode='after')
     def _consistent(self) -> MamboSettings:

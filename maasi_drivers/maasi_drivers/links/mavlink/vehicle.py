@@ -188,7 +188,7 @@ class Vehicle:
         )
 
     @property
-    def trouble(self) -> str:
+    def fault(self) -> str:
         """Why it cannot go anywhere; empty where it can."""
         if self._lost:
             return f'link: nothing heard from system {self.settings.system}'
@@ -261,7 +261,7 @@ class Vehicle:
         if self._displaced:
             return 'the autopilot has restarted: start the driver again'
         if self._lost or self.phase in (Phase.RELEASED, Phase.ENDING, Phase.REFUSED):
-            return self.trouble
+            return self.fault
         if self.armed and self.firmware is not None and self.mode != self.firmware.external:
             return f'it is flown in {self.firmware.mode_name(self.mode)}'
         if not (self.settings.arm or self.armed):

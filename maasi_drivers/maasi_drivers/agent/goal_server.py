@@ -1,0 +1,187 @@
+"""The action `go_to` of a robot: which goals it takes, and how they end."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
+
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.robot_frames import RobotFrames
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
+from maasi_drivers.links.robot_link import RobotLink
+from maasi_filter.ros.conversions import pose_to_ros
+from maasi_msgs.action import GoToWaypoint
+
+_FEEDBACK_PERIOD = 500_000_000
+# At the end: longest wait for the last results, and executor tasks that send them [s].
+_SETTLE_TIME, _LAST_TASKS = 0.3, 5
+
+
+class GoalServer:
+    """
+    Takes goals of `go_to` (maasi_msgs/GoToWaypoint).
+
+    The newest goal replaces the one before. One that cannot be taken is aborted at once, with the
+    reason in its result: the protocol has no reason in a rejection.
+
+    Parameters
+    ----------
+    driver : RobotNode
+        The robot's node.
+    link : RobotLink
+        Informed of each goal.
+    frames : RobotFrames
+        Transforms waypoints into the map.
+
+    Attributes
+    ----------
+    away : bool
+        Whether the robot has left the team, in lockstep.
+
+    """
+
+    def __init__(self, driver: RobotNode, link: RobotLink, frames: RobotFrames) -> None:
+        self._driver = driver
+        self._link = link
+        self._frames = frames
+        self.away = False
+        # Goals that have ended, until their results are sent.
+        self._ended: dict[bytes, Goal] = {}
+        self._feedback_at = 0
+
+    def offer(self) -> None:
+        """Create the action server."""
+        ActionServer(
+            self._driver,
+            GoToWaypoint,
+            'go_to',
+            self._conclude,
+            handle_accepted_callback=self._answer,
+            cancel_callback=self._cancel,
+        )
+
+    def clear(self) -> None:
+        """Discard results that were not sent; they go with the action server."""
+        self._ended.clear()
+
+    def end(self, status: GoalStatus, reason: str) -> None:
+        """End the present goal, if there is one."""
+        goal = self._driver.follower.end(status, reason)
+        if goal is not None:
+            self.finish(goal)
+
+    def finish(self, goal: Goal) -> None:
+        """Have the result of a goal sent: the executor calls `_conclude` for it."""
+        self._link.goal_ended(goal)
+        self._ended[bytes(goal.handle.goal_id.uuid)] = goal
+        goal.handle.execute()
+
+    def settle(self) -> None:
+        """Wait until the results of ended goals are sent, before the node is destroyed."""
+        executor = self._driver.executor
+        if not self._ended or executor is None:
+            return
+        deadline = time.monotonic() + _SETTLE_TIME
+        while self._ended and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.01)
+        # Concluded results are sent by later tasks.
+        for _ in range(_LAST_TASKS):
+            executor.spin_once(timeout_sec=0.0)
+
+    def publish_feedback(self, placed: StampedPose) -> None:
+        """Publish the distance left, twice a second by the stamps of the poses."""
+        follower = self._driver.follower
+        if (
+            follower.status == GoalStatus.MOVING
+            and placed.stamp - self._feedback_at >= _FEEDBACK_PERIOD
+            and follower.goal is not None
+        ):
+            self._feedback_at = placed.stamp
+            distance = follower.distance(placed.pose.position)
+            follower.goal.handle.publish_feedback(GoToWaypoint.Feedback(distance=distance))
+
+    def problem(self, request: GoToWaypoint.Goal) -> str | None:
+        """Return why a goal is refused: field, what was read, what is allowed; else None."""
+        driver = self._driver
+        if not driver.active:
+            return 'the driver is not active'
+        if self.away:
+            return 'the robot has left'
+        if driver.health.text:
+            return f'the robot cannot go on: {driver.health.text}'
+        latest = driver.history.latest
+        now = driver.get_clock().now().nanoseconds if latest is None else latest.stamp
+        if problem := self._frames.to_map(request.waypoint, now):
+            return problem
+        point = request.waypoint.pose.position
+        position = (point.x, point.y, point.z)
+        if not np.isfinite(position).all():
+            return f'waypoint.pose.position: read {list(position)}, allowed are finite numbers [m]'
+        margin = driver.settings.radius
+        for axis, (low, high) in enumerate(driver.bounds.tolist()):
+            if not low - margin <= position[axis] <= high + margin:
+                return (
+                    f'waypoint.pose.position.{"xyz"[axis]}: read {position[axis]}, '
+                    f'allowed is {low - margin:g} to {high + margin:g} [m]'
+                )
+        if not (np.isfinite(request.tolerance) and request.tolerance >= 0.0):
+            return f'tolerance: read {request.tolerance}, allowed are finite numbers from 0 [m]'
+        return self._link.goal_problem(position)
+
+    # ---- the action --------------------------------------------------------------------------
+
+    def _answer(self, handle: ServerGoalHandle) -> None:
+        """Take a goal, or abort it with the reason."""
+        problem = self.problem(handle.request)
+        # After `problem`, which transforms the waypoint into the map.
+        goal = _goal_of(handle)
+        if problem is not None:
+            self._driver.drop('goal', f'go_to: {problem}')
+            goal.status, goal.reason = GoalStatus.ABORTED, problem
+            self.finish(goal)
+            return
+        replaced = self._driver.follower.take(goal)
+        if replaced is not None:
+            self.finish(replaced)
+        self._link.goal_taken(goal)
+
+    def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        goal = self._driver.follower.current
+        if goal is None or goal.handle is not handle:
+            # It has ended or was replaced.
+            return CancelResponse.REJECT
+        self.end(GoalStatus.CANCELED, 'cancelled')
+        if not self._driver.settings.lockstep:
+            self._link.hold()
+        self._link.goal_cancelled()
+        return CancelResponse.ACCEPT
+
+    def _conclude(self, handle: ServerGoalHandle) -> GoToWaypoint.Result:
+        goal = self._ended.pop(bytes(handle.goal_id.uuid), None)
+        if goal is None:
+            return GoToWaypoint.Result(reason='the driver was cleaned up')
+        if goal.status == GoalStatus.REACHED:
+            handle.succeed()
+        elif goal.status == GoalStatus.CANCELED and handle.is_cancel_requested:
+            handle.canceled()
+        else:
+            handle.abort()
+        result = GoToWaypoint.Result(reached=goal.status == GoalStatus.REACHED, reason=goal.reason)
+        latest = self._driver.history.latest
+        result.pose = pose_to_ros(self._driver.start_pose if latest is None else latest.pose)
+        return result
+
+
+def _goal_of(handle: ServerGoalHandle) -> Goal:
+    request = handle.request
+    point = request.waypoint.pose.position
+    return Goal(
+        id=int(request.goal_id),
+        step=int(request.step),
+        waypoint=np.array([point.x, point.y, point.z]),
+        tolerance=float(request.tolerance),
+        handle=handle,
+    )

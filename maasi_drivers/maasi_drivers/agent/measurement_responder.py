@@ -1,0 +1,191 @@
+"""A robot's answers to measurement batches: batch, image and pose to detections."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from maasi_drivers.agent.measurement_queue import Frame, MeasurementQueue, MeasurementRequest
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.sensor_input import SensorInput
+from maasi_drivers.agent.sensor_reading import SensorReading
+from maasi_drivers.agent.watchdog import Watchdog
+from maasi_filter.ros.conversions import (
+    MOST_DETECTIONS,
+    detections_to_ros,
+    pose_to_ros,
+    stamp_from_ros,
+    stamp_to_ros,
+)
+from maasi_filter.ros.qos import RELIABLE
+from maasi_filter.ros.stamps import JUMP, batch_id_limit
+from maasi_msgs.msg import DetectionArray, MeasurementBatch
+
+# How far stamps of images or batches may be ahead of the odometry [ns].
+_AHEAD = 2_000_000_000
+
+
+class MeasurementResponder:
+    """
+    Answers each batch that the robot is in by the detections of one image or sweep.
+
+    Subscribes
+    ----------
+    `measurement_batch` of the team (maasi_msgs/MeasurementBatch)
+
+    Publishes
+    ---------
+    `detections` (maasi_msgs/DetectionArray)
+
+    Parameters
+    ----------
+    driver : RobotNode
+        The robot's node.
+    sensor : SensorInput
+        Its sensor.
+    watchdog : Watchdog
+        Informed of each image.
+
+    Attributes
+    ----------
+    left_out : Counter
+        Detections that were not published: reason to number.
+
+    """
+
+    def __init__(self, driver: RobotNode, sensor: SensorInput, watchdog: Watchdog) -> None:
+        self._driver = driver
+        self._sensor = sensor
+        self._watchdog = watchdog
+        self._queue: MeasurementQueue[Any] = MeasurementQueue(driver.history, sensor.offset)
+        self._answer: DetectionArray | None = None
+        self.left_out: Counter[str] = Counter()
+
+    def set_up(self) -> None:
+        """Create publisher and subscription."""
+        driver = self._driver
+        self._publisher = driver.create_publisher(DetectionArray, 'detections', RELIABLE)
+        driver.create_subscription(
+            MeasurementBatch, driver.team_topic('measurement_batch'), self._on_batch, RELIABLE
+        )
+        driver.expect_subscribers(self._publisher, names={'filter_node', 'planner_node'})
+
+    @property
+    def open_batches(self) -> int:
+        """Batches without an answer yet."""
+        return len(self._queue)
+
+    def reset(self) -> None:
+        """Discard what belongs to another time."""
+        self._queue.clear()
+        self._answer = None
+
+    def take_frame(self, topic: str, stamp: int, data: Any, repeated: bool) -> None:
+        """Take an image or sweep; see `RobotNode.take_frame`."""
+        driver = self._driver
+        if not driver.active or self._is_ahead('image stamp', f'{topic}.header.stamp', stamp):
+            return
+        latest = self._queue.latest
+        if latest is not None and stamp <= latest:
+            if latest - stamp <= JUMP:
+                driver.drop(
+                    'image stamp',
+                    f'{topic}.header.stamp: read {stamp} ns, allowed are stamps after {latest} ns',
+                )
+                return
+            driver.get_logger().warning(
+                f'{topic}.header.stamp jumped back by {1e-9 * (latest - stamp):.3f} s'
+            )
+            self._queue.clear()
+        self._watchdog.note_frame(topic, repeated)
+        self._queue.add_frame(Frame(stamp, data))
+        self.serve()
+
+    def serve(self) -> None:
+        """Answer the batches whose image and pose are known."""
+        while (found := self._queue.next()) is not None:
+            request, frame, pose = found
+            try:
+                reading = self._sensor.detect(frame.data, pose)
+            except ValueError as error:
+                # No empty answer: a miss is information. The next image answers instead.
+                self._driver.drop('image', str(error))
+                continue
+            self._queue.answered()
+            self._publish(request, frame.stamp, pose, reading)
+
+    def _on_batch(self, message: MeasurementBatch) -> None:
+        driver = self._driver
+        if not driver.active:
+            return
+        stamp = stamp_from_ros(message.stamp)
+        if message.id > batch_id_limit(0):
+            driver.drop('batch', f'measurement_batch.id: read {message.id}, allowed are small ones')
+            return
+        if self._is_ahead('batch', 'measurement_batch.stamp', stamp):
+            return
+        answer = self._answer
+        if (
+            answer is not None
+            and answer.batch_id == message.id
+            and stamp_from_ros(answer.header.stamp) >= stamp
+        ):
+            # Duplicate batch: publish the cached answer again, a restarted peer may need it.
+            self._publisher.publish(answer)
+            return
+        for member in message.members:
+            if member.robot == driver.robot:
+                request = MeasurementRequest(int(message.id), stamp, int(member.measurement))
+                for old in self._queue.add_request(request):
+                    driver.drop('batch', f'batch {old.batch}: no image for it, too many newer ones')
+                self.serve()
+                return
+
+    def _is_ahead(self, reason: str, what: str, stamp: int) -> bool:
+        """Return whether a stamp [ns] is far ahead of the odometry, and drop it then.
+
+        In lockstep the step decides, and nothing is ahead of it.
+        """
+        latest = self._driver.history.latest
+        if self._driver.settings.lockstep or latest is None or stamp <= latest.stamp + _AHEAD:
+            return False
+        self._driver.drop(
+            reason,
+            f'{what}: read {stamp} ns, allowed is up to {_AHEAD * 1e-9:g} s after the odometry, '
+            f'{latest.stamp + _AHEAD} ns',
+        )
+        return True
+
+    def _publish(
+        self, request: MeasurementRequest, stamp: int, pose: StampedPose, reading: SensorReading
+    ) -> None:
+        driver = self._driver
+        values, covariances = reading.values, reading.covariances
+        dropped = sum(reading.dropped.values())
+        self.left_out.update(reading.dropped)
+        beyond = len(values) - MOST_DETECTIONS
+        if beyond > 0:
+            driver.drop(
+                'too many detections',
+                f'{self._sensor.name}: {len(values)} detections, allowed are {MOST_DETECTIONS}',
+                beyond,
+            )
+            values = values[:MOST_DETECTIONS]
+            covariances = None if covariances is None else covariances[:MOST_DETECTIONS]
+            dropped += beyond
+        answer = DetectionArray(
+            batch_id=request.batch,
+            step=driver.step_of(stamp),
+            robot=driver.robot,
+            measurement=request.measurement,
+            sensor=driver.sensor.name,
+            detections=detections_to_ros(values, covariances),
+            dropped=dropped,
+        )
+        answer.header.stamp = stamp_to_ros(stamp)
+        answer.header.frame_id = driver.settings.frame
+        answer.pose.pose = pose_to_ros(pose.pose)
+        answer.pose.covariance = pose.covariance.ravel()
+        self._publisher.publish(answer)
+        self._answer = answer

@@ -1,0 +1,152 @@
+"""Faults that a driver finds by itself: silent odometry, a frozen pose, a silent sensor."""
+
+from __future__ import annotations
+
+import time
+
+from maasi_drivers.agent.battery_watch import BatteryWatch
+from maasi_drivers.agent.health import FROZEN_POSE, ODOMETRY, SENSOR
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.sensor_input import SensorInput
+from maasi_drivers.agent.state_publisher import StatePublisher
+from maasi_drivers.links.robot_link import RobotLink
+
+PERIOD = 0.1
+# Checks from one state of a robot without odometry to the next.
+_CHECKS_PER_STATE = 2
+# Without a first pose for so long a warning is logged [s].
+_PATIENCE = 3.0
+# A robot whose odometry is silent for so much longer than its timeout, in wall time, is stopped
+# without a fault: a simulated clock may be slow [s].
+_CLOCK_PATIENCE = 0.5
+
+
+class Watchdog:
+    """
+    Stops a robot without odometry, with a frozen pose or with a silent sensor.
+
+    Parameters
+    ----------
+    driver : RobotNode
+        The robot's node.
+    link : RobotLink
+        To it.
+    sensor : SensorInput
+        Its sensor.
+    state : StatePublisher
+        Publishes the fault of a robot without odometry.
+    battery : BatteryWatch
+        Its battery.
+
+    Attributes
+    ----------
+    moving : bool
+        Whether the last command must change pose and images.
+
+    """
+
+    def __init__(
+        self,
+        driver: RobotNode,
+        link: RobotLink,
+        sensor: SensorInput,
+        state: StatePublisher,
+        battery: BatteryWatch,
+    ) -> None:
+        self._driver = driver
+        self._link = link
+        self._sensor = sensor
+        self._state = state
+        self._battery = battery
+        self.moving = False
+        # Stamps of the last change of the pose, and of the pose at the last image [ns].
+        self._changed_at = 0
+        self._sensed_at: int | None = None
+        self._checked_at = time.monotonic()
+        self._stalled = False
+        self._checks = 0
+
+    def reset(self) -> None:
+        """Discard what belongs to another time."""
+        self._sensed_at = None
+        self.moving = False
+
+    def check(self) -> None:
+        """Stop a robot without odometry; called on wall time, as the clock may stand still."""
+        driver = self._driver
+        if not driver.active:
+            return
+        self._checks += 1
+        now, before = time.monotonic(), self._checked_at
+        self._checked_at = now
+        self._stalled = now - before > 2.0 * PERIOD and not self._stalled
+        if self._stalled:
+            # This process was suspended: odometry may be waiting in the queue.
+            return
+        self._link.poll()
+        self._battery.check(now)
+        health, silence = driver.health, driver.silence
+        age, timeout = silence.length, driver.settings.odometry_timeout
+        if driver.history.latest is None and ODOMETRY not in health:
+            wall = silence.wall
+            if wall > _PATIENCE and self._link.expects_pose():
+                driver.warn_throttled('no odometry', f'no {driver.pose_name} yet, for {wall:.0f} s')
+        elif age > timeout or ODOMETRY in health:
+            text = f'no {driver.pose_name} for {age:.1f} s'
+            if health.begin(ODOMETRY, text):
+                driver.get_logger().warning(f'{text}: stopping the robot')
+                self._checks = 0
+            self._link.hold()
+            if self._checks % _CHECKS_PER_STATE == 0:
+                self._state.publish_status()
+        elif silence.wall > timeout + _CLOCK_PATIENCE:
+            # The simulated clock is slow or stands, which real robots do not.
+            self._link.hold()
+
+    def note_pose(self, placed: StampedPose) -> None:
+        """Check a new pose, before it is added to the history; not in lockstep."""
+        self._check_frozen(placed)
+        self._check_sensor(placed)
+
+    def pose_is_back(self) -> None:
+        """Begin the sensor's timeout anew: it may have been silent with the odometry."""
+        self._sensed_at = None
+
+    def note_frame(self, topic: str, repeated: bool) -> None:
+        """Note an image or sweep; see `RobotNode.take_frame`."""
+        latest, health = self._driver.history.latest, self._driver.health
+        if latest is None:
+            return
+        # A robot at rest may see the same twice; a sensor that hung has to deliver something new.
+        if not repeated or not (self.moving or SENSOR in health):
+            self._sensed_at = latest.stamp
+            if health.end(SENSOR):
+                self._driver.get_logger().info(f'{topic}: received again')
+
+    def _check_frozen(self, placed: StampedPose) -> None:
+        """Stop a robot whose pose stays the same to the bit under a command to move."""
+        driver = self._driver
+        timeout, before = driver.settings.frozen_pose_timeout, driver.history.latest
+        same = before is not None and placed.pose == before.pose
+        if not same and driver.health.end(FROZEN_POSE):
+            driver.get_logger().info('the pose changes again')
+        if not timeout or not same or not self.moving:
+            self._changed_at = placed.stamp
+            return
+        age = 1e-9 * (placed.stamp - self._changed_at)
+        if age > timeout:
+            text = f'the pose has not changed for {age:.1f} s'
+            if driver.health.begin(FROZEN_POSE, text):
+                driver.get_logger().warning(f'odom: {text}: stopping the robot')
+
+    def _check_sensor(self, placed: StampedPose) -> None:
+        """Stop a robot whose sensor is silent."""
+        timeout = self._driver.settings.sensor_patience
+        if self._sensed_at is None:
+            self._sensed_at = placed.stamp
+        age = 1e-9 * (placed.stamp - self._sensed_at)
+        if timeout and age > timeout:
+            text = f'no new {self._sensor.name} for {age:.1f} s'
+            if self._driver.health.begin(SENSOR, text):
+                self._driver.get_logger().warning(f'{text}: stopping the robot')

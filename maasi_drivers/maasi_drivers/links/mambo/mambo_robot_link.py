@@ -1,0 +1,299 @@
+"""A Parrot Mambo on WiFi or Bluetooth as a driver's robot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+
+from maasi_drivers.agent import geofence
+from maasi_drivers.agent.arm_permission import offer_arm
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.odometry_topic import OdometryTopic
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.waypoint_follower import Goal
+from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
+from maasi_drivers.links.mambo.pilot import MamboPilot, Phase, tilt_limit
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.robot_link import FloatArray, RobotLink
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros
+from maasi_filter.ros.lifecycle_node import SettingsError
+from maasi_filter.ros.qos import sensor_reader
+from maasi_planner.motion import MotionModel, RobotState
+
+# Longest time between two updates of the pilot [s].
+_POLL_PERIOD = 0.05
+# At the end: longest wait until the drone reports that it lands, and between two checks [s].
+_LANDING_TIME, _LANDING_PERIOD = 1.0, 0.02
+# Share of a new difference of positions in the velocity.
+_SMOOTHING = 0.5
+# Kind of fault.
+_FLIGHT = 'flight'
+_RISING = (Phase.TAKING_OFF, Phase.CLIMBING)
+
+
+class MamboRobotLink(RobotLink):
+    """
+    A Parrot Mambo that pyparrot talks to.
+
+    It takes off when the service `arm` was called and `mambo.arm` is true, flies by its own
+    position events or by a topic of another system (`mambo.pose`), and lands at the end, on a low
+    battery, and when link or pose are lost for long.
+
+    Subscribes
+    ----------
+    `pose` (geometry_msgs/PoseStamped) or `odom` (nav_msgs/Odometry) where `mambo.pose` says so
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger): it takes off once
+    """
+
+    def __init__(self, driver: RobotNode) -> None:
+        super().__init__(driver)
+        self._mambo = driver.settings.mambo or MamboSettings()
+        self._phase = Phase.CONNECTING
+        self._link: MamboLink | None = None
+        self._pilot: MamboPilot | None = None
+
+    def prepare(self) -> None:
+        """Make the geofence; check that a connection is possible."""
+        settings = self.driver.settings
+        self._fence = geofence.make_fence(
+            self._mambo.geofence,
+            self.driver.bounds,
+            settings.radius,
+            self._mambo.ground,
+            settings.start[2],
+        )
+        if settings.motion.model == 'unicycle':
+            raise SettingsError(
+                f"parameter motion.model: read 'unicycle', allowed with link {settings.link} "
+                'is that of a flying robot, as mambo'
+            )
+        try:
+            self._make_link().check()
+        except MamboLinkError as error:
+            raise SettingsError(f'parameter link: {error}') from error
+
+    def _make_link(self) -> MamboLink:
+        mambo, settings = self._mambo, self.driver.settings
+        return MamboLink(
+            'ble' if settings.link == 'mambo_ble' else 'wifi',
+            mambo.address,
+            mambo.port,
+            tilt_limit(settings.motion),
+            mambo.climb,
+            mambo.land_after,
+        )
+
+    # ---- link and life cycle -----------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Connect; it takes off once the driver is active."""
+        driver = self.driver
+        self._link = self._make_link()
+        self._link.connect()
+        driver.create_wall_timer(min(driver.settings.step, _POLL_PERIOD), self._update)
+        offer_arm(driver, self._arm)
+        if self._mambo.pose == 'odometry':
+            OdometryTopic(driver)
+        elif self._mambo.pose == 'pose':
+            quality = sensor_reader(driver.settings.lockstep)
+            driver.create_subscription(PoseStamped, 'pose', self._on_pose, quality)
+        driver.expect(lambda: self._pilot is not None and self._pilot.phase is Phase.FLYING)
+
+    def close(self) -> None:
+        """Leave the drone to its firmware."""
+        self._pilot = None
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    def activate(self) -> None:
+        """Begin a flight."""
+        if self._link is not None:
+            self._phase = Phase.CONNECTING
+            self._pilot = MamboPilot(
+                self._link, self._motion, self._mambo, self.driver.start_pose, self._fence
+            )
+
+    def _arm(self) -> str:
+        """Let the drone take off; return why not, empty where it may."""
+        problem = self.driver.arm_problem()
+        if self._pilot is None or problem:
+            return problem or 'the driver is not active'
+        return self._pilot.permit(time.monotonic())
+
+    def send(self, placed: StampedPose, command: Sequence[float]) -> None:
+        """Fly a velocity command."""
+        if self._pilot is None:
+            return
+        try:
+            self._pilot.fly(np.array(command))
+        except ValueError as error:
+            self.driver.drop('command', str(error))
+
+    def hold(self) -> None:
+        """Have the drone hover."""
+        if self._pilot is not None:
+            self._pilot.hover()
+
+    def stop(self) -> None:
+        """Land, and wait until the drone reports that it does."""
+        pilot, link = self._pilot, self._link
+        if pilot is None or link is None:
+            return
+        self._pilot = None
+        pilot.end('the driver stops')
+        end = time.monotonic() + _LANDING_TIME
+        while link.connected and link.airborne and link.flying_state != 'landing':
+            if time.monotonic() > end:
+                self.driver.get_logger().error(
+                    'the drone has not reported that it lands: its firmware lands by itself when '
+                    'it receives nothing'
+                )
+                break
+            time.sleep(_LANDING_PERIOD)
+
+    def latch_stop(self) -> None:
+        """Have the drone land as after a cancelled goal; on the ground it stays there."""
+        if self._pilot is not None:
+            self._pilot.goal_cancelled(time.monotonic())
+
+    def poll(self) -> None:
+        """Report why the drone does not start."""
+        self.driver.publish_fault()
+
+    def status(self) -> dict[str, Any]:
+        """Return the state of drone and flight."""
+        link = self._link
+        if link is None:
+            return {}
+        return {
+            'flight': self._phase.value,
+            'drone': link.flying_state,
+            'bad position events': link.bad_events,
+            'listener started again': link.revived,
+            **{f'datagrams dropped: {key}': number for key, number in link.dropped.items()},
+        }
+
+    # ---- what comes in -----------------------------------------------------------------------
+
+    def _update(self) -> None:
+        driver = self.driver
+        now, pilot, link = time.monotonic(), self._pilot, self._link
+        if link is not None:
+            link.keep_alive()
+        driver.arrivals.observe(now, driver.get_clock().now().nanoseconds)
+        if pilot is None or link is None or not driver.active:
+            return
+        pilot.update(now)
+        self._judge(pilot)
+        if link.battery >= 0.0:
+            # The drone reports only changes.
+            driver.take_charge(link.battery)
+        state, stamp = pilot.state, driver.arrivals.stamp(now)
+        if stamp is None:
+            # A simulated time has not begun: nothing is late.
+            driver.silence.end()
+        latest = driver.history.latest
+        if (
+            self._mambo.pose == 'events'
+            and pilot.has_pose
+            and state is not None
+            and stamp is not None
+            and (latest is None or stamp > latest.stamp)
+        ):
+            driver.take_pose(
+                StampedPose(
+                    stamp,
+                    state.pose,
+                    pilot.reckoning.covariance(),
+                    state.velocity,
+                    state.angular_velocity,
+                )
+            )
+
+    def _judge(self, pilot: MamboPilot) -> None:
+        """Log the phase, and report the fault of the pilot."""
+        if pilot.phase is not self._phase:
+            self._phase = pilot.phase
+            why = '' if pilot.phase in _RISING else pilot.problem
+            self.driver.get_logger().info(pilot.phase.value + (f': {why}' if why else ''))
+        # While it takes off, a goal that it has already is kept.
+        if pilot.problem and pilot.phase in _RISING and self.driver.follower.current is not None:
+            return
+        self.driver.judge(_FLIGHT, pilot.problem, 'flying: goals are accepted')
+
+    def observe(self, placed: StampedPose) -> None:
+        """Hand a pose of another system to the pilot."""
+        if self._pilot is not None and self._mambo.pose != 'events':
+            self._pilot.take_pose(
+                time.monotonic(), RobotState(placed.pose, placed.velocity, placed.angular_velocity)
+            )
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        driver = self.driver
+        if not driver.active:
+            return
+        stamp = stamp_from_ros(message.header.stamp)
+        if not driver.is_new_pose('pose.header.stamp', stamp):
+            return
+        frame = message.header.frame_id.lstrip('/')
+        try:
+            if frame != driver.settings.frame:
+                raise ValueError(
+                    f'header.frame_id: read {frame!r}, allowed is {driver.settings.frame!r}'
+                )
+            placed = self._with_velocity(stamp, pose_from_ros(message.pose))
+        except ValueError as error:
+            driver.drop('pose', f'pose: {error}')
+            return
+        driver.take_pose(placed)
+
+    def _with_velocity(self, stamp: int, pose: Pose) -> StampedPose:
+        latest = self.driver.history.latest
+        velocity = np.zeros(3)
+        if latest is not None:
+            passed = 1e-9 * (stamp - latest.stamp)
+            measured = (pose.position - latest.pose.position) / passed
+            velocity = latest.velocity + _SMOOTHING * (measured - latest.velocity)
+        return StampedPose(stamp, pose, self._mambo.pose_covariance(), velocity, np.zeros(3))
+
+    # ---- goals and control -------------------------------------------------------------------
+
+    def make_motion(self) -> MotionModel:
+        """Return the controller, which the pilot uses as well."""
+        self._motion = super().make_motion()
+        return self._motion
+
+    def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
+        """Return the command for the state at which it takes effect, and the goal reached."""
+        pilot = self._pilot
+        flies = pilot is not None and pilot.phase is Phase.FLYING and pilot.has_pose
+        return super().steer(pilot.ahead() if pilot and flies else robot, step)
+
+    def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
+        """Return whether pose and images must change: a command on the ground moves nothing."""
+        if self._pilot is not None and self._pilot.phase is not Phase.FLYING:
+            return False
+        return super().is_moving(placed, command)
+
+    def goal_problem(self, position: Sequence[float]) -> str | None:
+        """Refuse waypoints outside the geofence."""
+        return geofence.goal_problem(self._fence, position)
+
+    def goal_taken(self, goal: Goal) -> None:
+        """Keep the drone in the air."""
+        if self._pilot is not None:
+            self._pilot.goal_taken()
+
+    def goal_cancelled(self) -> None:
+        """Land the drone if no other goal follows."""
+        if self._pilot is not None:
+            self._pilot.goal_cancelled(time.monotonic())

@@ -1,0 +1,219 @@
+"""A Mambo with a program of its own as a driver's robot: poses by the feed, orders by UDP (001)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from maasi_drivers.agent import geofence
+from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission, offer_arm
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.pose_speed import PoseSpeed
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.robot_link import RobotLink
+from maasi_drivers.links.waypoint_orders import OrderKind, OrderSender
+from maasi_drivers.vision.measurement_feed import FeedPeer, FeedPose, FeedState
+from maasi_filter.models.pose import Pose, compose, inverse, quaternion_product
+from maasi_filter.ros.lifecycle_node import SettingsError
+
+# Between two orders [s]; without them the program on board hovers, then lands.
+_PERIOD = 0.1
+# The climb after take-off ends within this of its altitude [m].
+_ALTITUDE_TOLERANCE = 0.1
+# At the end: orders to land, and the time between them [s].
+_LAST_ORDERS, _LAST_PERIOD = 5, 0.05
+# Kind of fault.
+_FLIGHT = 'flight'
+
+
+class OnboardLink(RobotLink):
+    """
+    A drone with a program of its own; see docs/measurement_feed.md.
+
+    The feed carries blobs and pose, orders go back ten times a second: be on the ground, hover, or
+    fly to a waypoint.
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger): it takes off once, if `mambo.arm` is true
+    """
+
+    def __init__(self, driver: RobotNode) -> None:
+        super().__init__(driver)
+        self._mambo = driver.settings.mambo or MamboSettings()
+        self._sender: OrderSender | None = None
+        self._speed = PoseSpeed()
+        self._order = OrderKind.LAND
+        self._target = driver.start_pose.position
+        self._up = False
+        self._rising_since: float | None = None
+        self._lost_since: float | None = None
+        # Why it landed.
+        self._landed_for = ''
+        self._feed_state: FeedState | None = None
+        self._permission = ArmPermission(self._mambo.arm_timeout)
+
+    def prepare(self) -> None:
+        """Check the settings, and make the geofence."""
+        driver, settings = self.driver, self.driver.settings
+        if settings.image_source != 'feed':
+            raise SettingsError(
+                f'parameter image_source: read {settings.image_source!r}, allowed with link '
+                'mambo_feed is feed'
+            )
+        driver.feed_peer = FeedPeer(self._mambo.address, self._take_feed_pose)
+        self._fence = geofence.make_fence(
+            self._mambo.geofence,
+            driver.bounds,
+            settings.radius,
+            self._mambo.ground,
+            settings.start[2],
+        )
+        # Positions of the feed are relative to this.
+        place = [*settings.start[:2], self._mambo.ground]
+        self._origin = Pose.from_yaw(place, settings.yaw)
+
+    # ---- link and life cycle -----------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Send orders from now on: to be on the ground until it is active and may fly."""
+        self._sender = OrderSender(self._mambo.address, self._mambo.order_port)
+        self.driver.create_wall_timer(_PERIOD, self._send_order)
+        self.driver.expect(lambda: self._up)
+        offer_arm(self.driver, self._arm)
+
+    def close(self) -> None:
+        """Leave the drone to its program."""
+        if self._sender is not None:
+            self._sender.close()
+            self._sender = None
+
+    def activate(self) -> None:
+        """Begin a flight."""
+        self._up, self._landed_for = False, ''
+        self._rising_since = self._lost_since = None
+
+    def _arm(self) -> str:
+        """Let the drone take off; return why not, empty where it may."""
+        problem = self.driver.arm_problem()
+        if not problem and not self._mambo.arm:
+            problem = 'on the ground: it may not take off (parameter mambo.arm)'
+        if not problem and self._feed_state is not FeedState.GROUND:
+            problem = 'it is in the air, or not heard'
+        if not problem:
+            self._up, self._landed_for, self._rising_since = False, '', None
+            self._permission.give(time.monotonic())
+        return problem
+
+    def send(self, placed: StampedPose, command: Sequence[float]) -> None:
+        """Order it to its target; its own program flies."""
+        if self._up and not self._landed_for:
+            target = self.driver.follower.target
+            self._target = placed.pose.position if target is None else target
+            self._order = OrderKind.HOLD if self.driver.health.text else OrderKind.GO
+
+    def hold(self) -> None:
+        """Have the drone hover."""
+        if self._order is OrderKind.GO:
+            self._order = OrderKind.HOLD
+
+    def stop(self) -> None:
+        """Land: the order is sent some times, as datagrams may be lost."""
+        self._permission.end()
+        self._land('the driver stops')
+        for _ in range(_LAST_ORDERS):
+            self._send_order()
+            time.sleep(_LAST_PERIOD)
+
+    def poll(self) -> None:
+        """Land a drone whose feed has been silent for long."""
+        driver = self.driver
+        risen = self._rising_since is not None
+        silent = risen and driver.silence.length > driver.settings.odometry_timeout
+        now = time.monotonic()
+        self._lost_since = (self._lost_since or now) if silent else None
+        if self._lost_since is not None and now - self._lost_since > self._mambo.land_after:
+            self._land('nothing heard from the drone')
+
+    def goal_problem(self, position: Sequence[float]) -> str | None:
+        """Refuse waypoints outside the geofence."""
+        return geofence.goal_problem(self._fence, position)
+
+    def status(self) -> dict[str, Any]:
+        """Return the present order."""
+        return {'order': self._order.name.lower(), 'landed for': self._landed_for}
+
+    def _send_order(self) -> None:
+        if self._sender is None:
+            return
+        order = self._order if self.driver.active or self._landed_for else OrderKind.LAND
+        relative = compose(inverse(self._origin), Pose(self._target))
+        problem = self._sender.send(order, relative.position)
+        if problem:
+            self.driver.warn_throttled('orders', problem)
+
+    # ---- the flight --------------------------------------------------------------------------
+
+    def _take_feed_pose(self, stamp: int, pose: FeedPose) -> None:
+        """Take the drone's own pose at an image of the feed."""
+        driver = self.driver
+        if not driver.active or not driver.is_new_pose('feed', stamp):
+            return
+        if pose.battery >= 0.0:
+            driver.take_charge(pose.battery)
+        place = compose(self._origin, Pose(pose.position, _orientation(pose)))
+        driver.judge(_FLIGHT, self._next_order(pose, place), 'flying: goals are accepted')
+        placed = self._speed.place(stamp, place)
+        driver.take_pose(replace(placed, covariance=self._mambo.pose_covariance()))
+
+    def _next_order(self, pose: FeedPose, place: Pose) -> str:
+        """Order what the flight needs next; return why no goals are taken, or nothing."""
+        mambo, now = self._mambo, time.monotonic()
+        self._feed_state = pose.state
+        if self._landed_for:
+            landed = pose.state == FeedState.GROUND
+            if landed:
+                return f'landed: {self._landed_for}, {UNTIL_ARM}'
+            return f'landing: {self._landed_for}'
+        if not mambo.arm:
+            return 'on the ground: it may not take off (parameter mambo.arm)'
+        if 0.0 <= pose.battery < mambo.battery_minimum:
+            return self._land(f'battery at {pose.battery:.2f}, below {mambo.battery_minimum:.2f}')
+        too_far = geofence.outside(self._fence, place.position)
+        if too_far:
+            return self._land(too_far)
+        if self._up:
+            down = pose.state != FeedState.AIR
+            return self._land(f'the drone is {pose.state.name.lower()} by itself') if down else ''
+        if self._rising_since is None:
+            if not self._permission.holds(now):
+                return f'on the ground, {UNTIL_ARM}'
+            self._permission.end()
+            self._rising_since = now
+        start = self.driver.start_pose.position
+        self._target, self._order = start, OrderKind.GO
+        height = start[2] - place.position[2]
+        self._up = pose.state == FeedState.AIR and abs(height) <= _ALTITUDE_TOLERANCE
+        if not self._up and now - self._rising_since > mambo.take_off_timeout:
+            return self._land(f'it did not come to its altitude in {mambo.take_off_timeout:g} s')
+        return '' if self._up else 'taking off'
+
+    def _land(self, reason: str) -> str:
+        self._landed_for = self._landed_for or reason
+        self._order = OrderKind.LAND
+        return self._landed_for
+
+
+def _orientation(pose: FeedPose) -> np.ndarray:
+    """Return w, x, y, z of yaw, then pitch, then roll."""
+    turned = np.array([1.0, 0.0, 0.0, 0.0])
+    for axis, angle in ((3, pose.yaw), (2, pose.pitch), (1, pose.roll)):
+        turn = np.zeros(4)
+        turn[0], turn[axis] = np.cos(0.5 * angle), np.sin(0.5 * angle)
+        turned = quaternion_product(turned, turn)
+    return turned

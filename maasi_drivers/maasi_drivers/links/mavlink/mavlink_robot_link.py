@@ -1,0 +1,292 @@
+"""A vehicle that speaks MAVLink as a driver's robot."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from maasi_drivers.agent import geofence
+from maasi_drivers.agent.arm_permission import offer_arm
+from maasi_drivers.agent.arrival_clock import ArrivalClock
+from maasi_drivers.agent.health import BATTERY, ODOMETRY
+from maasi_drivers.agent.odometry import PoseHistory, StampedPose
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.links.mavlink.estimate import Telemetry
+from maasi_drivers.links.mavlink.link import VehicleLink
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.links.robot_link import FloatArray, RobotLink
+from maasi_filter.models.pose import Pose, compose
+
+_POLL_PERIOD = 0.02
+# Kinds of faults.
+_VEHICLE, _GEOFENCE = 'vehicle', 'geofence'
+# Farther outside the geofence is a fault [m].
+_FENCE_MARGIN = 0.5
+# At the end: longest wait until the autopilot confirms that it holds or lands [s].
+_STOP_TIME = 1.0
+# Between a localiser's pose and the autopilot's for the same instant, at most [ns].
+_LONGEST_LAG = 300_000_000
+# Closer than this to its target, the vehicle keeps its heading [m].
+_TURNING = 0.3
+# Of MAVLink's MAV_SEVERITY: up to here errors, warnings, information; the rest is for debugging.
+_ERROR, _WARNING, _INFO = 3, 4, 6
+
+
+class MavlinkRobotLink(RobotLink):
+    """
+    A vehicle with an autopilot, which flies to set-points.
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger): it takes off once, or is taken over in the air
+    """
+
+    def __init__(self, driver: RobotNode) -> None:
+        super().__init__(driver)
+        settings = driver.settings
+        self._mavlink = settings.mavlink or MavlinkSettings()
+        self._link: VehicleLink | None = None
+        # Whether poses of a localiser define where the autopilot's frame is in the map.
+        self._localised = settings.poses != 'odometry'
+        if not self._localised:
+            driver.pose_name = 'LOCAL_POSITION_NED'
+        self._local_poses = PoseHistory()
+        self._charge_reports = 0
+        # Not the one of the driver: telemetry and images have different delays.
+        self._arrivals = ArrivalClock()
+        self._map_from_local = Pose.from_yaw(
+            [*settings.start[:2], self._mavlink.ground], -self._mavlink.map_yaw
+        )
+        self._local_origin = np.zeros(3)
+        # Number of the last telemetry.
+        self._taken = -1
+        self._heading: float | None = None
+        self._ending = False
+        self._fence = geofence.make_vehicle_fence(
+            self._mavlink.geofence,
+            driver.bounds,
+            settings.radius,
+            self._mavlink.ground,
+            settings.start[2],
+        )
+
+    # ---- link and life cycle -----------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Open the connection; the vehicle is armed only once the driver is active."""
+        driver = self.driver
+        link = VehicleLink(self._mavlink, driver.settings.start[2] - self._mavlink.ground)
+        self._link = link
+        driver.create_wall_timer(_POLL_PERIOD, self._update)
+        offer_arm(driver, self._arm)
+
+        def flying() -> bool:
+            with link.vehicle() as vehicle:
+                return vehicle.flying
+
+        driver.expect(flying)
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    def _arm(self) -> str:
+        """Let the vehicle take off; return why not, empty where it may."""
+        driver, link = self.driver, self._link
+        problem = driver.arm_problem()
+        if link is None or problem:
+            return problem or 'the driver is not active'
+        if self._localised and (driver.history.latest is None or ODOMETRY in driver.health):
+            return f'no {driver.pose_name}'
+        with link.vehicle() as vehicle:
+            problem = vehicle.permit(time.monotonic())
+        if not problem:
+            self._ending = False
+        return problem
+
+    def send(self, placed: StampedPose, command: Sequence[float]) -> None:
+        """Send the position that the command leads to, or its target if that is nearer."""
+        position, yaw = placed.pose.position, placed.pose.yaw
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        along, aside, up = command[:3]
+        ahead = self._mavlink.lead * np.array(
+            [cosine * along - sine * aside, sine * along + cosine * aside, up]
+        )
+        target = self.driver.follower.target
+        way = np.zeros(3) if target is None else target - position
+        if float(ahead @ ahead) < float(way @ way):
+            way = ahead
+        if self._heading is None:
+            self._heading = yaw
+        travels = self.driver.settings.motion.heading == 'travel'
+        if travels and math.hypot(way[0], way[1]) > _TURNING:
+            self._heading = math.atan2(way[1], way[0])
+        self._send_target(position + way, self._heading)
+
+    def hold(self) -> None:
+        """Have the vehicle stay at its last pose."""
+        latest = self.driver.history.latest
+        # Without a pose the last set-point stays, a short way ahead.
+        if latest is not None and ODOMETRY not in self.driver.health:
+            self._send_target(latest.pose.position, latest.pose.yaw)
+
+    def stop(self) -> None:
+        """Have the vehicle hold its position or land, and wait until it confirms."""
+        if self._link is None:
+            return
+        self._ending = True
+        if not self._link.finish(self._mavlink.at_end, _STOP_TIME):
+            self.driver.get_logger().error(
+                f'at_end: {self._mavlink.at_end}: not confirmed by the autopilot; only its own '
+                'failsafe is left'
+            )
+        self._log_reports()
+
+    def latch_stop(self) -> None:
+        """End the permission to take off."""
+        if self._link is not None:
+            with self._link.vehicle() as vehicle:
+                vehicle.forbid()
+
+    def poll(self) -> None:
+        """Report why the vehicle does not start."""
+        self.driver.publish_fault()
+
+    def expects_pose(self) -> bool:
+        """Return whether no fault of the vehicle explains a missing pose."""
+        return _VEHICLE not in self.driver.health
+
+    def status(self) -> dict[str, Any]:
+        """Return the state of the vehicle."""
+        if self._link is None:
+            return {}
+        with self._link.vehicle() as vehicle:
+            return {
+                'vehicle': vehicle.phase.name,
+                **{f'parameter {key}': item for key, item in vehicle.parameters.items()},
+                **{f'ignored: {key}': number for key, number in vehicle.dropped.items()},
+            }
+
+    def goal_problem(self, position: Sequence[float]) -> str | None:
+        """Refuse waypoints outside the geofence."""
+        return geofence.goal_problem(self._fence, position)
+
+    def _send_target(self, position: FloatArray, yaw: float) -> None:
+        if self._link is None:
+            return
+        goal = compose(self._map_from_local.inverse(), Pose.from_yaw(self._inside(position), yaw))
+        with self._link.vehicle() as vehicle:
+            vehicle.set_target(goal.position + self._local_origin, goal.yaw)
+
+    # ---- what comes in -----------------------------------------------------------------------
+
+    def _update(self) -> None:
+        driver, link = self.driver, self._link
+        if link is None:
+            return
+        with link.vehicle() as vehicle:
+            vehicle.active = driver.active and not self._ending
+            fault, charge = vehicle.fault, vehicle.charge
+            reports = vehicle.charge_reports
+            telemetry, self._local_origin = vehicle.telemetry, vehicle.origin
+        if link.failure:
+            fault = f'link: {link.failure}'
+        self._log_reports()
+        self._arrivals.observe(time.monotonic(), driver.get_clock().now().nanoseconds)
+        if not driver.active:
+            return
+        self._judge(fault)
+        if reports != self._charge_reports:
+            self._charge_reports = reports
+            driver.take_charge(charge)
+            if BATTERY in driver.health and not self._ending:
+                self._ending = True
+                link.finish(self._mavlink.on_low_battery, 0.0)
+        if telemetry is not None and telemetry.number != self._taken:
+            self._taken = telemetry.number
+            self._take_telemetry(telemetry)
+
+    def _log_reports(self) -> None:
+        """Log the reports of the vehicle."""
+        if self._link is None:
+            return
+        with self._link.vehicle() as vehicle:
+            reports = vehicle.reports()
+        logger = self.driver.get_logger()
+        for severity, text in reports:
+            if severity <= _ERROR:
+                logger.error(text)
+            elif severity <= _WARNING:
+                logger.warning(text)
+            elif severity <= _INFO:
+                logger.info(text)
+            else:
+                logger.debug(text)
+
+    def _judge(self, fault: str) -> None:
+        """Report the fault of the vehicle, and log each new text of it."""
+        before = self.driver.health.get(_VEHICLE)
+        self.driver.judge(_VEHICLE, fault, 'the vehicle accepts set-points')
+        if fault:
+            self._heading = None
+            if before and fault != before:
+                self.driver.get_logger().info(fault)
+
+    def _take_telemetry(self, telemetry: Telemetry) -> None:
+        driver = self.driver
+        stamp = self._arrivals.stamp(telemetry.arrival - self._mavlink.latency)
+        if stamp is None:
+            # A simulated time has not begun: nothing is late.
+            driver.silence.end()
+        latest = (self._local_poses if self._localised else driver.history).latest
+        if stamp is None or (latest is not None and stamp <= latest.stamp):
+            return
+        local = Pose(telemetry.position - self._local_origin, telemetry.orientation)
+        placed = StampedPose(
+            stamp,
+            local if self._localised else compose(self._map_from_local, local),
+            np.zeros((6, 6)),
+            self._map_from_local.rotation() @ telemetry.velocity,
+            telemetry.rates,
+        )
+        if self._localised:
+            self._local_poses.add(placed)
+        else:
+            driver.take_pose(placed)
+
+    def observe(self, placed: StampedPose) -> None:
+        """Align the autopilot's frame with a localiser's pose, and check the geofence."""
+        if self._localised:
+            self._align(placed)
+        self._check_fence(placed.pose.position)
+
+    def _align(self, placed: StampedPose) -> None:
+        """Compute where the autopilot's frame is in the map, from its pose at the same time."""
+        local = self._local_poses.at(placed.stamp) or self._local_poses.latest
+        if local is None or abs(local.stamp - placed.stamp) > _LONGEST_LAG:
+            return
+        turn = Pose.from_yaw(np.zeros(3), placed.pose.yaw - local.pose.yaw)
+        position = placed.pose.position - turn.rotation() @ local.pose.position
+        self._map_from_local = Pose(position, turn.orientation)
+
+    def _check_fence(self, position: FloatArray) -> None:
+        driver = self.driver
+        outside = float(np.abs(position - self._inside(position)).max())
+        if outside <= _FENCE_MARGIN:
+            if not outside and driver.health.end(_GEOFENCE):
+                driver.get_logger().info('inside the geofence again')
+                driver.follower.stay()
+            return
+        if _VEHICLE not in driver.health:
+            text = f'{outside:.1f} m outside the geofence, at {np.round(position, 2).tolist()} m'
+            if driver.health.begin(_GEOFENCE, text):
+                driver.get_logger().error(f'{text}: it returns')
+
+    def _inside(self, position: FloatArray) -> FloatArray:
+        return np.clip(position, self._fence[:, 0], self._fence[:, 1])

@@ -1,0 +1,292 @@
+"""A camera as a robot's sensor: image source, decoding, detection."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.sensor_input import SensorInput
+from maasi_drivers.agent.sensor_reading import SensorReading
+from maasi_drivers.vision.camera_settings import CameraSettings, load_calibration
+from maasi_drivers.vision.camera_view import box_view_margin
+from maasi_drivers.vision.image_encoding import decode_image, image_to_array
+from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
+from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_drivers.vision.marker_reading import read_markers
+from maasi_drivers.vision.measurement_feed import FeedReceiver
+from maasi_drivers.vision.segmentation import Blobs
+from maasi_drivers.warm_up import warm_up
+from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.pose import Pose
+from maasi_filter.ros.conversions import stamp_from_ros
+from maasi_filter.ros.lifecycle_node import SettingsError
+from maasi_filter.ros.qos import RELIABLE, SENSOR, sensor_reader
+
+ImageArray = NDArray[np.uint8]
+# Decodes an image, or returns the blobs found on board; called only for images that answer a batch.
+Picture = Callable[[], ImageArray | Blobs]
+
+# Between two reads of a video or feed [s].
+_POLL_PERIOD = 0.01
+# Exposure is judged by each so many rows and columns.
+_EXPOSURE_STRIDE = 4
+# Largest share of clipped pixels.
+_MOST_CLIPPED = 0.01
+
+
+def _known(blobs: Blobs) -> Blobs:
+    return blobs
+
+
+class CameraInput(SensorInput[Picture]):
+    """
+    A camera that sees markers on the floor.
+
+    Calibration: from the file of the parameter `calibration_file`, else from the parameters;
+    a `camera_info` with a focal length replaces either.
+
+    Images come from a topic, or by the parameter `image_source` from a video (a stream, a device
+    or a file), or as blobs that were found on board (measurement feed).
+
+    Subscribes
+    ----------
+    `camera/image_raw` (sensor_msgs/Image) or `camera/image_raw/compressed`;
+    `camera/camera_info` (sensor_msgs/CameraInfo), whose calibration replaces the parameters'
+
+    Parameters
+    ----------
+    driver : RobotNode
+        The robot's node.
+
+    Attributes
+    ----------
+    camera : CameraSettings
+        With the calibration in use.
+
+    """
+
+    name = 'image'
+
+    def __init__(self, driver: RobotNode) -> None:
+        super().__init__(driver)
+        self._video: VideoSource | None = None
+        self._feed: FeedReceiver | None = None
+        self._calibration: tuple[object, ...] | None = None
+        self._checksum: int | None = None
+        self._counted: Counter[str] = Counter()
+
+    def prepare(self) -> None:
+        """Open the image source, and make the detector."""
+        settings = self.driver.settings
+        if settings.camera is None:
+            raise SettingsError(
+                'parameter camera: got nothing, allowed are the settings of a camera '
+                '(camera.width, ...)'
+            )
+        if settings.image_source != 'topic':
+            try:
+                self._open_source()
+            except (ImageSourceError, OSError) as error:
+                raise SettingsError(f'parameter image_source: {error}') from error
+        camera = settings.camera
+        if settings.calibration_file:
+            try:
+                camera = load_calibration(settings.calibration_file, camera)
+            except (OSError, ValueError) as error:
+                raise SettingsError(f'parameter calibration_file: {error}') from error
+        self._use(camera)
+        self.offset = round(settings.camera.stamp_offset * 1e9)
+
+    def _use(self, camera: CameraSettings) -> None:
+        driver, settings = self.driver, self.driver.settings
+        detector = MarkerDetector(camera, driver.dimension)
+        if isinstance(driver.sensor.detection, BoxDetection):
+            margin = box_view_margin(
+                detector.camera,
+                settings.sensor.detection.lower or [],
+                settings.sensor.detection.upper or [],
+                max(settings.start[2], 0.0),
+            )
+            if margin < 0.0:
+                driver.get_logger().warning(
+                    'sensor.detection: the box is not all inside the field of view of the camera'
+                    + (f', by {-margin:.1f} px' if np.isfinite(margin) else '')
+                )
+        self.camera, self._detector = camera, detector
+
+    def set_up(self) -> None:
+        """Compile and connect."""
+        driver, settings = self.driver, self.driver.settings
+        warm_up()
+        grey = np.full((self.camera.height, self.camera.width, 3), 120, np.uint8)
+        # Images are read-only views of messages.
+        view = np.frombuffer(grey.tobytes(), np.uint8).reshape(grey.shape)
+        height = max(settings.start[2], 0.1)
+        self._detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0), np.zeros((6, 6)))
+        if settings.image_source != 'topic':
+            driver.create_wall_timer(_POLL_PERIOD, self._poll_source)
+        quality = sensor_reader(settings.lockstep)
+        driver.create_subscription(CameraInfo, 'camera/camera_info', self._on_calibration, quality)
+        if settings.image_source != 'topic':
+            return
+        # Reliable images are sent again when lost: on a slow network that delays the next ones.
+        if settings.image_reliability == 'reliable':
+            quality = RELIABLE if settings.lockstep else SENSOR
+        if settings.image_transport == 'raw':
+            driver.create_subscription(Image, 'camera/image_raw', self._on_image, quality)
+        else:
+            driver.create_subscription(
+                CompressedImage, 'camera/image_raw/compressed', self._on_compressed, quality
+            )
+
+    def close(self) -> None:
+        """Close video or feed."""
+        for source in (self._video, self._feed):
+            if source is not None:
+                source.close()
+        self._video = self._feed = None
+
+    # ---- image to detections -----------------------------------------------------------------
+
+    def detect(self, data: Picture, pose: StampedPose) -> SensorReading:
+        """Decode an image, and return the markers in it."""
+        picture = data()
+        reading = read_markers(picture, pose, self._detector, self.driver.sensor)
+        if not isinstance(picture, Blobs):
+            self._check_exposure(picture)
+        return reading
+
+    def _check_exposure(self, image: ImageArray) -> None:
+        """Warn of an image whose colours are clipped: markers are missed there, or misplaced."""
+        sample = image[::_EXPOSURE_STRIDE, ::_EXPOSURE_STRIDE]
+        share = float(np.mean(sample.max(axis=2) == np.iinfo(np.uint8).max))
+        if share > _MOST_CLIPPED:
+            self.driver.warn_throttled(
+                'exposure',
+                f'image: {share:.0%} of the pixels are clipped at 255, good is at most '
+                f'{_MOST_CLIPPED:.0%}: lower the exposure, or markers are missed or misplaced',
+            )
+
+    # ---- image source: video or feed ----------------------------------------------------------
+
+    def _open_source(self) -> None:
+        if self.driver.settings.image_source == 'video':
+            self._video = VideoSource(self.driver.settings.video)
+            return
+        peer = self.driver.feed_peer
+        address, port = self.driver.settings.feed_address, self.driver.settings.feed_port
+        try:
+            self._feed = FeedReceiver(port, address, None if peer is None else peer.address)
+        except OSError as error:
+            raise OSError(
+                f'feed_address, feed_port: UDP port {port} of {address}: {error.strerror}, allowed '
+                'is a free port of an address of this host'
+            ) from error
+
+    def _poll_source(self) -> None:
+        self.driver.arrivals.observe(time.monotonic(), self.driver.get_clock().now().nanoseconds)
+        if self._video is not None:
+            self._take_video(self._video)
+        if self._feed is not None:
+            self._take_feed(self._feed)
+
+    def _take_video(self, source: VideoSource) -> None:
+        if source.error:
+            self.driver.warn_throttled('video', source.error)
+        frame = source.take()
+        stamp = None if frame is None else self.driver.arrivals.stamp(frame.received)
+        if frame is None or stamp is None:
+            return
+        image = frame.image
+        try:
+            self._detector.check_size(image)
+        except ValueError as error:
+            self.driver.drop('image', f'video: {error}')
+            return
+        self.driver.take_frame(
+            'video', stamp, lambda: image, repeated=self._is_repeated(image.tobytes())
+        )
+
+    def _take_feed(self, feed: FeedReceiver) -> None:
+        camera, peer = self.camera, self.driver.feed_peer
+        for item in feed.take():
+            packet, stamp = item.packet, self.driver.arrivals.stamp(item.taken)
+            if stamp is None:
+                continue
+            if (packet.width, packet.height) != (camera.width, camera.height):
+                self.driver.drop(
+                    'image',
+                    f'feed: width, height: read {packet.width} x {packet.height} px, allowed is '
+                    f'the size of the calibration, {camera.width} x {camera.height} px',
+                )
+                continue
+            if packet.pose is not None and peer is not None:
+                peer.on_pose(stamp, packet.pose)
+            self.driver.take_frame('feed', stamp, partial(_known, packet.blobs))
+        for reason, number in feed.counts.items():
+            new = number - self._counted[reason]
+            if new and reason != 'received':
+                self._counted[reason] = number
+                self.driver.drop(f'feed: {reason}', f'feed: {feed.problem or reason}', new)
+
+    # ---- image source: topic ------------------------------------------------------------------
+
+    def _on_calibration(self, message: CameraInfo) -> None:
+        calibration = (
+            message.width,
+            message.height,
+            message.k.tolist(),
+            list(message.d),
+            message.distortion_model,
+        )
+        # Without a focal length the camera has not been calibrated.
+        if calibration == self._calibration or message.k[0] == 0.0:
+            return
+        self._calibration = calibration
+        try:
+            self._use(self.camera.with_calibration(*calibration))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            self.driver.drop('calibration', f'camera/camera_info: {error}')
+
+    def _on_image(self, message: Image) -> None:
+        try:
+            image = image_to_array(
+                message.height, message.width, message.encoding, message.step, message.data
+            )
+            self._detector.check_size(image)
+        except ValueError as error:
+            self.driver.drop('image', f'camera/image_raw: {error}')
+            return
+        self.driver.take_frame(
+            'camera/image_raw',
+            stamp_from_ros(message.header.stamp),
+            lambda: image,
+            repeated=self._is_repeated(message.data),
+        )
+
+    def _on_compressed(self, message: CompressedImage) -> None:
+        topic = 'camera/image_raw/compressed'
+        stamp = stamp_from_ros(message.header.stamp)
+        self.driver.take_frame(
+            topic,
+            stamp,
+            lambda: decode_image(message.data, message.format),
+            repeated=self._is_repeated(message.data),
+        )
+
+    def _is_repeated(self, data: Any) -> bool:
+        """Return whether an image is the one before to the bit: noise never is."""
+        if self.driver.settings.lockstep or not self.driver.settings.sensor_patience:
+            return False
+        before, self._checksum = self._checksum, crc32(data)
+        return self._checksum == before
