@@ -59,10 +59,7 @@ ROS_FILES = (
 # Not ament_index_python, which looks up where files are installed.
 ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*')
 # Sets of modules that import each other. None is to be added.
-KNOWN_CYCLES = (
-    frozenset({'maasi_sim.run.replay', 'maasi_sim.run.replay_node'}),
-    frozenset({'maasi_sim.buildings.report', 'maasi_sim.run.report', 'maasi_sim.run.run_folder'}),
-)
+KNOWN_CYCLES: tuple[frozenset[str], ...] = ()
 
 
 @cache

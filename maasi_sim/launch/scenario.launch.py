@@ -27,11 +27,11 @@ def end_launch(event: ProcessExited, context: LaunchContext) -> EmitEvent:
 
 def show(scenario: str, team: str) -> Node:
     """Return RViz with the view of a scenario, for a team in a namespace."""
-    from maasi_sim.buildings.scenario import load_any_scenario
+    from maasi_sim.missions import load_mission
     from maasi_sim.run.rviz_view import shown_topics
-    from maasi_sim.scenario.loading import config_folder, find_scenario
+    from maasi_sim.scenario.loading import config_folder
 
-    three = load_any_scenario(find_scenario(scenario), {}).dimension == 3
+    three = load_mission(scenario).scenario.dimension == 3
     view = config_folder() / 'rviz' / ('search_3d.rviz' if three else 'search.rviz')
     return Node(
         package='rviz2',

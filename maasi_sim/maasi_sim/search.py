@@ -21,12 +21,12 @@ from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.team import Decision
-from maasi_sim.run.scoring import score, scoring_radius
 from maasi_sim.scenario.schema import (
     Scenario,
     planner_settings,
     steps_of,
 )
+from maasi_sim.targets.scoring import score, scoring_radius
 from maasi_sim.world.simulation import simulated_robot, step_of_event
 from maasi_sim.world.world import World
 

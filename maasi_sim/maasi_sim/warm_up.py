@@ -10,7 +10,7 @@ from typing import Any
 import maasi_filter
 import maasi_planner
 from maasi_drivers.warm_up import warm_up as warm_up_drivers
-from maasi_sim.buildings.scenario import CuboidScenario, load_any_scenario, mission_of
+from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.world.simulation import simulated_robot
 
@@ -26,9 +26,7 @@ def warm_up() -> None:
             robot = simulated_robot(robot_name, scenario, world, scenario.seed)
             robot.warm_up()
             robot.step(1, scenario.step)
-    scenario_of_buildings = load_any_scenario('buildings_four')
-    if isinstance(scenario_of_buildings, CuboidScenario):
-        mission_of(scenario_of_buildings).run(1)
+    mission_of(load_cuboid_scenario('buildings_four')).run(1)
 
 
 def warm_up_all() -> None:

@@ -17,7 +17,8 @@ import numpy as np
 
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import Domain, NodeProcess, find_executable, stop
-from maasi_sim.run.replay import FILTER, REPLAYED, read_recording
+from maasi_sim.run.recording import FILTER, read_recording
+from maasi_sim.run.replay import REPLAYED
 from maasi_sim.run.replay_node import ReplayNode
 
 SECONDS = 40.0

@@ -14,9 +14,10 @@ import numpy as np
 from maasi_filter import IcPhdFilter, PmbFilter, SearchFilter
 from maasi_planner.coordinator import Coordinator
 from maasi_sim.buildings.mission import CuboidMission
-from maasi_sim.buildings.scenario import CuboidScenario, load_any_scenario, mission_of
+from maasi_sim.buildings.scenario import CuboidScenario, mission_of
 from maasi_sim.experiments.experiment import Experiment
 from maasi_sim.experiments.registry import experiments
+from maasi_sim.missions import load_mission
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.search import search
 
@@ -158,17 +159,17 @@ def noted() -> Iterator[Log]:
 def run_scenario(path: Path, seed: int) -> Recording:
     """Run a scenario in this process and return what it did."""
     seeded = {'seed': (('seed',), seed)}
-    scenario = load_any_scenario(path, seeded)
+    scenario = load_mission(path, seeded).scenario
     if isinstance(scenario, CuboidScenario):
         # A limit on wall time would make a decision depend on the machine.
         unhurried = {'time': (('planner', 'time_limit'), 1e9)}
-        scenario = load_any_scenario(path, {**seeded, **unhurried})
+        scenario = load_mission(path, {**seeded, **unhurried}).scenario
         assert isinstance(scenario, CuboidScenario)
         with noted() as log:
             record = mission_of(scenario).run(STEP_LIMIT)
         return log.recording({'steps': record.steps, 'complete': record.complete, **record.how})
     limit = min(TIME_LIMIT, scenario.limits.time)
-    scenario = load_any_scenario(path, {**seeded, 'limit': (('limits', 'time'), limit)})
+    scenario = load_mission(path, {**seeded, 'limit': (('limits', 'time'), limit)}).scenario
     with noted() as log:
         result = search(scenario, seed)  # type: ignore[arg-type]
     end = {
@@ -196,7 +197,7 @@ def runs() -> dict[str, dict[str, Callable[[], Recording]]]:
     known: dict[str, dict[str, Callable[[], Recording]]] = {}
     for path in sorted(SCENARIOS.glob('*.yaml')):
         try:
-            load_any_scenario(path).check_pace(True, None)
+            load_mission(path).scenario.check_pace(True, None)
         except ScenarioError:
             continue
         known[path.stem] = {

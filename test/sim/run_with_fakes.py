@@ -4,7 +4,8 @@ import json
 import sys
 from pathlib import Path
 
-from maasi_sim.run import node_plan, processes, run_scenario
+from maasi_sim.run import node_plan, run_scenario, supervisor
+from maasi_sim.targets import mission
 
 FAKES = Path(__file__).with_name('fake_nodes.py')
 
@@ -17,12 +18,12 @@ class FakePlan(node_plan.NodePlan):
         return [sys.executable, str(FAKES), self.executable, *rest]
 
 
-def plan_fakes(scenario, *, seed, lockstep, rate, recorder, file):
+def plan_fakes(scenario, run):
     """Return the plans of a clock, drivers, a filter and a planner."""
     script = json.loads(sys.argv[1])
     names = scenario.names()
-    common = {'robots': names, 'lockstep': lockstep, 'step': scenario.step}
-    targets = [float(value) for row in scenario.world(seed).targets for value in row]
+    common = {'robots': names, 'lockstep': run.lockstep, 'step': scenario.step}
+    targets = [float(value) for row in scenario.world(run.seed).targets for value in row]
 
     def plan(role, name, namespace='', **more):
         parameters = {**common, **script.get(f'{namespace}/{name}'.strip('/'), {})}
@@ -40,7 +41,9 @@ def plan_fakes(scenario, *, seed, lockstep, rate, recorder, file):
             topics=('/clock', '/lockstep/step'),
         ),
         *(
-            plan('driver', 'driver', name, topics=(f'/{name}/state', f'/{name}/cmd_vel'))
+            plan(
+                'driver', 'driver', name, topics=(f'/{name}/state', f'/{name}/cmd_vel'), drives=True
+            )
             for name in names
         ),
         plan(
@@ -54,8 +57,8 @@ def plan_fakes(scenario, *, seed, lockstep, rate, recorder, file):
 
 
 def main():
-    node_plan.plan_nodes = plan_fakes
-    processes.find_executable = lambda package, executable: Path(executable)
+    mission.plan_nodes = plan_fakes
+    supervisor.find_executable = lambda package, executable: Path(executable)
     return run_scenario.main(sys.argv[2:])
 
 

@@ -11,46 +11,51 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.buildings import Dynamics
 from maasi_planner.buildings.node_settings import CuboidPlannerSettings
+from maasi_sim.buildings.building_mission import BuildingMission
+from maasi_sim.buildings.nodes import plan_nodes
 from maasi_sim.buildings.observer import CuboidRecord, Moment, SnapshotRecord
-from maasi_sim.buildings.report import cuboid_summary, write_cuboid_report
 from maasi_sim.buildings.scenario import (
-    any_scenario_from_content,
-    load_any_scenario,
+    check_cuboid_scenario,
+    load_cuboid_scenario,
     mission_of,
 )
 from maasi_sim.buildings.simulation import CuboidSimulation, MassPointBody
-from maasi_sim.run.node_plan import plan_nodes
+from maasi_sim.missions import load_mission
+from maasi_sim.run.node_plan import RunSettings
+from maasi_sim.run.report_files import write_report
+from maasi_sim.scenario.layering import Layer
 from maasi_sim.scenario.schema import Scenario, ScenarioError
 
 NAMES = ['buildings_four', 'buildings_obstacles', 'buildings_one']
 
 
 def scenario_with(change, name='buildings_one'):
-    content = load_any_scenario(name).content()
+    content = load_cuboid_scenario(name).content()
     change(content)
-    return any_scenario_from_content(content, 'test')
+    return check_cuboid_scenario(Layer(content, {(): 'test'}))
 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_our_scenarios_load_and_are_read_back(name, tmp_path):
-    scenario = load_any_scenario(name)
+    scenario = load_cuboid_scenario(name)
     assert scenario.planner.name == 'cuboid_mpc'
     copy = tmp_path / 'copy.yaml'
     copy.write_text(scenario.text())
-    assert load_any_scenario(copy) == scenario
+    assert load_cuboid_scenario(copy) == scenario
     cells = {'buildings_one': 36, 'buildings_four': 32, 'buildings_obstacles': 16}
     assert len(scenario.mission().cells) == cells[name]
 
 
 def test_other_scenarios_are_as_they_were():
-    assert isinstance(load_any_scenario('mambo_turtlebot'), Scenario)
+    assert isinstance(load_mission('mambo_turtlebot').scenario, Scenario)
 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
-    scenario = load_any_scenario(name)
+    scenario = load_cuboid_scenario(name)
     plans = plan_nodes(
-        scenario, seed=4, lockstep=True, rate=None, recorder=True, file=Path('/s.yaml')
+        scenario,
+        RunSettings(seed=4, lockstep=True, rate=None, recorder=True, file=Path('/s.yaml')),
     )
     assert [plan.full_name for plan in plans] == [
         '/sim_node',
@@ -134,7 +139,7 @@ def test_a_body_flies_the_velocity_that_a_plan_leads_to():
 
 
 def test_a_robot_without_commands_brakes():
-    simulation = CuboidSimulation(load_any_scenario('buildings_one'), 1)
+    simulation = CuboidSimulation(load_cuboid_scenario('buildings_one'), 1)
     robot = simulation.robots['red']
     for _ in range(4):
         robot.command([0.0, 8.0, 0.0, 0.0])
@@ -164,7 +169,7 @@ def test_the_link_has_a_range_and_robots_leave():
 
 
 def record_of(name='buildings_obstacles'):
-    scenario = load_any_scenario(name)
+    scenario = load_cuboid_scenario(name)
     run = mission_of(scenario).run(200)
     shots = [
         SnapshotRecord(
@@ -201,7 +206,8 @@ def record_of(name='buildings_obstacles'):
 
 def test_report_and_picture(tmp_path):
     record = record_of()
-    report = write_cuboid_report(record, tmp_path)
+    mission = BuildingMission(record.name, record.scenario)
+    report = write_report(mission, record, tmp_path)
     assert json.loads((tmp_path / 'report.json').read_text()) == report
     assert (tmp_path / 'report.png').stat().st_size > 20_000
     assert report['cuboids'] == {'total': 16, 'visited': 16, 'missed': [], 'lost': []}
@@ -210,11 +216,11 @@ def test_report_and_picture(tmp_path):
     assert sum(report['measurements'].values()) == len(report['snapshots']) >= 16
     chances = [shot['detection_probability'] for shot in report['snapshots']]
     assert report['least_detection_probability'] == min(chances) > 0.7
-    assert '16 of 16 cuboids visited' in cuboid_summary(report)
+    assert '16 of 16 cuboids visited' in mission.summary(report)
     # A way through the building is seen.
     path = record.trajectories['red']
     path[3, 1:], path[4, 1:] = [240.0, 215.0, 10.0], [330.0, 215.0, 10.0]
     record.snapshots.clear()
-    worse = write_cuboid_report(record, tmp_path)
+    worse = write_report(mission, record, tmp_path)
     assert worse['collisions'] > 0 and worse['missed'] == 16
     assert worse['least_detection_probability'] is None

@@ -9,10 +9,11 @@ from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_sim.run.node_plan import NodePlan, in_team, plan_nodes, with_followed_clock
+from maasi_sim.run.node_plan import NodePlan, RunSettings, in_team, with_followed_clock
 from maasi_sim.scenario.loading import config_folder, load_scenario
 from maasi_sim.scenario.schema import ScenarioError
 from maasi_sim.sim_settings import SimNodeSettings
+from maasi_sim.targets.nodes import plan_nodes
 
 SCENARIOS = sorted(
     path.stem
@@ -23,7 +24,8 @@ SCENARIOS = sorted(
 
 def plans_of(scenario, **changes):
     options = {'seed': 4, 'lockstep': True, 'rate': None, 'recorder': True, 'file': Path('/s.yaml')}
-    return {plan.full_name: plan for plan in plan_nodes(scenario, **{**options, **changes})}
+    run = RunSettings(**{**options, **changes})
+    return {plan.full_name: plan for plan in plan_nodes(scenario, run)}
 
 
 def read_back(plan, model):

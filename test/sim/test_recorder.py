@@ -12,11 +12,10 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_sim.buildings.scenario import load_any_scenario
+from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.processes import Domain
 from maasi_sim.run.recorder_node import Recorder
-from maasi_sim.run.run_scenario import make_observer
 
 PATIENCE = 120.0
 RELIABLE = QoSProfile(
@@ -43,10 +42,10 @@ class Session:
         file = folder / 'scenario.yaml'
         file.write_text(yaml.safe_dump(SCENARIO))
         types = load_types()
-        observer = make_observer('session', load_any_scenario(file, {}), 1, types)
+        mission = load_mission(file)
         self.path = folder / 'bag'
         self.bag = BagWriter(self.path, types)
-        self.recorder = Recorder(number, observer, self.bag)
+        self.recorder = Recorder(number, mission.observer(types), mission.scenario.step, self.bag)
         self.node = rclpy.create_node('robot', context=context)
         self.clock = self.node.create_publisher(Clock, '/clock', RELIABLE)
         self.odometry = self.node.create_publisher(Odometry, '/rover/odom', RELIABLE)

@@ -9,11 +9,15 @@ import pytest
 import yaml
 
 from maasi_sim.run.bag import Bag, BagWriter, load_types
-from maasi_sim.run.observer import RunObserver, observe_bag, within
-from maasi_sim.run.report import END_REASONS, build_report, path_length, plot_report, summary
-from maasi_sim.run.report import write_report as write
-from maasi_sim.run.scoring import matching_radius, score
+from maasi_sim.run.report_files import END_REASONS, path_length, write_report
+from maasi_sim.run.run_record import RunEnd
+from maasi_sim.run.topics import within
 from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.targets.mission import TargetMission
+from maasi_sim.targets.observer import TargetObserver
+from maasi_sim.targets.report import build_report, summary
+from maasi_sim.targets.report_figure import plot_report
+from maasi_sim.targets.scoring import matching_radius, score
 
 KEYS = [
     'scenario',
@@ -41,13 +45,17 @@ KEYS = [
 ]
 
 
+def write(record, folder):
+    return write_report(TargetMission(record.name, record.scenario), record, folder)
+
+
 class Run:
     """Messages of a run in which everything is put in by hand."""
 
     def __init__(self, scenario, types, sink=None, namespace='', observer=None):
         self.types = types
         self.scenario = scenario
-        self.observer = observer or RunObserver('hand', scenario, 7, types)
+        self.observer = observer or TargetObserver('hand', scenario, 7, types)
         self.namespace = namespace
         self.sink = sink
         self.found = []
@@ -261,7 +269,7 @@ def test_matching_is_one_to_one():
 
 def test_report_has_the_keys_of_the_contract(run):
     run.update(1.0)
-    assert list(build_report(run.observer.record('time_limit', 2.0, 1.0))) == KEYS
+    assert list(build_report(run.observer.record(RunEnd('time_limit', 2.0, 1.0)))) == KEYS
 
 
 def test_report_of_a_complete_run(run):
@@ -278,7 +286,7 @@ def test_report_of_a_complete_run(run):
     run.declare(0.9, [1.0, 1.51])
     run.update(0.9, ['mambo'])
     assert run.observer.completed.batch == 3
-    report = build_report(run.observer.record('all_found', 1.0, 0.3))
+    report = build_report(run.observer.record(RunEnd('all_found', 1.0, 0.3)))
     assert report['true_found'] == 3
     assert report['missed'] == 0
     assert report['false_found'] == 1
@@ -326,7 +334,7 @@ def test_targets_of_several_filters_count_once_whoever_speaks_first(two_filters,
         run.update(0.95, [name])
     observer = one.observer
     assert observer.end_step == 18
-    report = build_report(observer.record('all_found', 1.0, 0.3))
+    report = build_report(observer.record(RunEnd('all_found', 1.0, 0.3)))
     assert [(item['id'], item['agent']) for item in report['found']] == [
         (1, 'mambo'),
         (2, 'second'),
@@ -407,7 +415,7 @@ def test_what_comes_after_the_end_does_not_count(run):
     run.decide(0.8, {'mambo': [2.0, 2.0]})
     run.state(0.8, 'mambo', [2.0, 2.0, 1.0])
     run.update(0.8)
-    record = run.observer.record('all_found', 5.0, 1.0)
+    record = run.observer.record(RunEnd('all_found', 5.0, 1.0))
     report = build_report(record)
     assert len(report['found']) == 3
     assert report['measurements']['mambo'] == 3
@@ -421,7 +429,7 @@ def test_refined_positions_win_over_those_first_declared(run):
     run.update(0.5)
     run.found[0].position.x = 0.501
     run.update(0.6)
-    (found,) = run.observer.record('time_limit', 1.0, 1.0).found
+    (found,) = run.observer.record(RunEnd('time_limit', 1.0, 1.0)).found
     assert found.position[0] == pytest.approx(0.501)
 
 
@@ -440,7 +448,7 @@ def test_completeness_that_is_lost_again_does_not_count(types, tmp_path):
     run.update(0.6)
     run.found[0].position.x = 0.5
     run.update(0.7)
-    report = build_report(run.observer.record('planner_done', 1.0, 1.0))
+    report = build_report(run.observer.record(RunEnd('planner_done', 1.0, 1.0)))
     assert report['measurements_to_find_all'] == 3
 
 
@@ -448,7 +456,7 @@ def test_report_without_targets(types, tmp_path):
     run = Run(scenario_of(tmp_path, []), types)
     run.decide(0.0, {'mambo': [0.5, 0.5]}, explored=0.99)
     run.update(0.5)
-    report = write(run.observer.record('planner_done', 1.0, 1.0), tmp_path)
+    report = write(run.observer.record(RunEnd('planner_done', 1.0, 1.0)), tmp_path)
     assert report['targets'] == []
     assert report['rmse'] is None
     assert report['measurements_to_find_all'] is None
@@ -456,7 +464,7 @@ def test_report_without_targets(types, tmp_path):
 
 
 def test_report_of_a_run_in_which_nothing_happened(run, tmp_path):
-    report = write(run.observer.record('interrupted', 0.0, 0.0), tmp_path)
+    report = write(run.observer.record(RunEnd('interrupted', 0.0, 0.0)), tmp_path)
     assert report['true_found'] == 0
     assert report['missed'] == 3
     assert report['real_time_factor'] is None
@@ -469,7 +477,7 @@ def test_robots_that_leave_and_come_back_are_events(run):
     run.step(0.1, ['second'])
     run.step(0.15, ['mambo', 'second'])
     node = {'time': 0.12, 'node': '/filter_node', 'event': 'restarted'}
-    report = build_report(run.observer.record('time_limit', 1.0, 1.0, [node]))
+    report = build_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0, [node])))
     assert report['events'] == [
         {'time': 0.05, 'agent': 'mambo', 'event': 'lost'},
         node,
@@ -482,7 +490,7 @@ def test_robots_that_say_they_cannot_go_on_are_events_without_lockstep(run):
     run.state(0.5, 'mambo', [0.5, 0.5, 1.0], status=5, reason='odometry is stale')
     run.state(0.6, 'mambo', [0.5, 0.5, 1.0], status=5, reason='odometry is stale')
     run.state(0.9, 'mambo', [0.5, 0.5, 1.0])
-    assert run.observer.record('time_limit', 1.0, 1.0).events == [
+    assert run.observer.record(RunEnd('time_limit', 1.0, 1.0)).events == [
         {'time': 0.5, 'agent': 'mambo', 'event': 'lost', 'reason': 'odometry is stale'},
         {'time': 0.9, 'agent': 'mambo', 'event': 'joined'},
     ]
@@ -497,17 +505,21 @@ def test_a_recording_gives_the_same_report(types, tmp_path):
             run.state(time, 'mambo', [*position, 1.0])
             run.declare(time, position)
             run.update(time)
-    live = build_report(run.observer.record('all_found', 1.0, 0.5))
+    live = build_report(run.observer.record(RunEnd('all_found', 1.0, 0.5)))
     with Bag(tmp_path) as bag:
-        observer = observe_bag(bag, 'hand', scenario, 7)
-        assert build_report(observer.record('all_found', 1.0, 0.5)) == live
+        observer = TargetObserver('hand', scenario, 7, types)
+        for topic, _, _, data in bag.raw(observer.topics):
+            observer.add(topic, data)
+            if topic in observer.update_topics:
+                observer.settle()
+        assert build_report(observer.record(RunEnd('all_found', 1.0, 0.5))) == live
 
 
 def test_written_files_can_be_read(run, tmp_path):
     run.declare(0.5, [0.5, 0.52])
     run.declare(0.5, [1.9, 1.9])
     run.update(0.5)
-    report = write(run.observer.record('time_limit', 1.0, 1.0), tmp_path)
+    report = write(run.observer.record(RunEnd('time_limit', 1.0, 1.0)), tmp_path)
     assert json.loads((tmp_path / 'report.json').read_text()) == report
     picture = cv2.imread(str(tmp_path / 'report.png'))
     assert picture.shape[0] > 600 and picture.shape[1] > 1000
@@ -524,7 +536,7 @@ def test_picture_in_space(types, tmp_path):
         run.state(1.0, name, [100.0, 50.0, 30.0])
     run.declare(0.5, run.observer.truth[0] + 0.5, 'drone1', deviation=1.0)
     run.update(0.5, ['drone1', 'drone2'])
-    record = run.observer.record('time_limit', 1.0, 1.0)
+    record = run.observer.record(RunEnd('time_limit', 1.0, 1.0))
     figure = plot_report(record)
     (world,) = [axes for axes in figure.axes if axes.name == '3d']
     labels = [text.get_text() for text in world.get_legend().get_texts()]
@@ -535,7 +547,7 @@ def test_picture_with_obstacles_names_them(types, tmp_path):
     obstacles = [{'centre': [1.0, 1.0], 'radius': 0.1}]
     environment = {'bounds': [[0.0, 2.0], [0.0, 2.0]], 'obstacles': obstacles}
     run = Run(scenario_of(tmp_path, TARGETS, environment=environment), types)
-    figure = plot_report(run.observer.record('time_limit', 1.0, 1.0))
+    figure = plot_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0)))
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert 'obstacle' in labels
 
@@ -544,7 +556,7 @@ def test_summary_says_what_matters(run):
     run.declare(0.5, [0.5, 0.5])
     run.declare(0.5, [1.9, 1.9])
     run.update(0.5)
-    text = summary(build_report(run.observer.record('time_limit', 1.0, 0.5)))
+    text = summary(build_report(run.observer.record(RunEnd('time_limit', 1.0, 0.5))))
     assert '1 of 3 targets found, 1 false' in text
     assert END_REASONS['time_limit'] in text
     assert '2.0 times real time' in text
@@ -561,6 +573,6 @@ def test_radius_of_the_scenario_wins(types, tmp_path):
     run = Run(scenario_of(tmp_path, TARGETS, scoring={'radius': 0.3}), types)
     run.declare(0.5, [0.5, 0.75])
     run.update(0.5)
-    report = build_report(run.observer.record('time_limit', 1.0, 1.0))
+    report = build_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0)))
     assert report['true_found'] == 1
     assert report['scoring'] == {'radius': 0.3, 'c': 0.3, 'p': 2.0}

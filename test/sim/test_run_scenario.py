@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.run_folder import make_folder
 from maasi_sim.run.run_options import Options, build_parser
-from maasi_sim.run.run_scenario import ScenarioRun
+from maasi_sim.run.scenario_run import ScenarioRun
 from maasi_sim.scenario.layering import ScenarioError
 
 WITH_FAKES = Path(__file__).with_name('run_with_fakes.py')
@@ -391,9 +391,10 @@ def test_a_wrong_planner_is_named_with_the_option():
 def test_options_win_over_the_scenario():
     options = Options('mambo', planner='lawnmower', seed=9, time_limit=3.0)
     run = ScenarioRun(options, interruption=False)
-    assert run.scenario.planner.name == 'lawnmower'
-    assert run.scenario.limits.time == 3.0
-    assert run.seed == run.scenario.seed == 9
+    scenario = run.mission.scenario
+    assert scenario.planner.name == 'lawnmower'
+    assert scenario.limits.time == 3.0
+    assert scenario.seed == 9
 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path):

@@ -13,10 +13,10 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.ros.marker_board import MarkerBoard
-from maasi_sim.buildings.scenario import load_any_scenario
+from maasi_sim.missions import load_mission
 from maasi_sim.run.processes import Domain
 from maasi_sim.run.rviz_view import view_text
-from maasi_sim.scenario.loading import config_folder, find_scenario
+from maasi_sim.scenario.loading import config_folder
 
 
 def topics_of(text):
@@ -38,7 +38,7 @@ def test_the_files_name_no_robot(name):
     ],
 )
 def test_every_display_fits_its_publisher(monkeypatch, scenario, kinds):
-    displays = topics_of(view_text(load_any_scenario(find_scenario(scenario), {})))
+    displays = topics_of(view_text(load_mission(scenario)))
     with Domain() as domain:
         for name, value in domain.environment().items():
             monkeypatch.setenv(name, value)

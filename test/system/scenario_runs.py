@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.replay import plain
+from maasi_sim.run.recording import plain
 
 # Far more than any of the runs takes, for a machine that is busy with something else.
 PATIENCE = 400.0

@@ -9,16 +9,16 @@ import pytest
 import yaml
 from scenario_runs import PATIENCE, command, of_topic, processes_with, run_scenario
 
-from maasi_sim.buildings.scenario import load_any_scenario, mission_of
+from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.replay import plain
+from maasi_sim.run.recording import plain
 
 pytestmark = pytest.mark.system
 
 
 def small(tmp_path, **changes):
     """Return the file of a search of one building by two robots, 16 cuboids."""
-    content = load_any_scenario('buildings_four').content()
+    content = load_cuboid_scenario('buildings_four').content()
     content['robots'] = {name: content['robots'][name] for name in ('blue', 'green')}
     content['planner']['objects'] = content['planner']['objects'][:1]
     content['planner'].update(horizon=6, time_limit=1e9)
@@ -46,7 +46,7 @@ def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path
     nodes = [f'{robot}_{node}' for robot in robots for node in ('cuboid_planner', 'guard')]
     assert logs == [*nodes, 'sim_node']
 
-    mission = mission_of(load_any_scenario(file, {'seed': (('seed',), 3)}))
+    mission = mission_of(load_cuboid_scenario(file, {'seed': (('seed',), 3)}))
     record = mission.run(200)
     assert report['time_to_find_all'] == record.steps
     for name, path in record.paths.items():
@@ -61,7 +61,7 @@ def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path
 
 
 def test_the_link_has_a_range_and_batteries_fail(tmp_path):
-    content = load_any_scenario('buildings_four').content()
+    content = load_cuboid_scenario('buildings_four').content()
     robots = {name: content['robots'][name] for name in ('blue', 'green')}
     for robot in robots.values():
         robot['hazard'].update(alpha=14.0, recharge_steps=[2, 4])

@@ -13,10 +13,9 @@ from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import run
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import SearchLink, SearchLinkArray
-from maasi_sim.buildings.scenario import CuboidScenario, load_any_scenario
+from maasi_sim.buildings.scenario import load_cuboid_scenario
 from maasi_sim.buildings.simulation import CuboidSimulation
 from maasi_sim.scenario.layering import Key
-from maasi_sim.scenario.schema import ScenarioError
 from maasi_sim.sim_node import SimNode
 
 # Share of a step after which the link passes on what it has, though some said nothing.
@@ -45,12 +44,7 @@ class CuboidSimNode(SimNode):
 
     def load(self, path: str, overrides: Mapping[str, tuple[Key, Any]]) -> Any:
         """See `SimNode.load`."""
-        scenario = load_any_scenario(path, overrides)
-        if not isinstance(scenario, CuboidScenario):
-            raise ScenarioError(
-                f"{path}: planner.name: read {scenario.planner.name!r}, allowed is 'cuboid_mpc'"
-            )
-        return scenario
+        return load_cuboid_scenario(path, overrides)
 
     def simulate(self) -> Any:
         """See `SimNode.simulate`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +12,8 @@ from rosbags.typesys.store import Typestore
 
 from maasi_planner.buildings import Mission
 from maasi_sim.buildings.scenario import CuboidScenario
-from maasi_sim.run.observer import STEP, seconds
+from maasi_sim.run.run_record import RunEnd, RunRecord, TeamLog
+from maasi_sim.run.topics import STEP
 
 FloatArray = NDArray[np.float64]
 
@@ -42,23 +44,15 @@ class Moment:
 
 
 @dataclass
-class CuboidRecord:
-    """All that a report needs of a run.
+class CuboidRecord(RunRecord):
+    """What a search of buildings has come to.
 
     Attributes
     ----------
-    name : str
-        Of the scenario.
-    scenario : CuboidScenario
-        With all layers.
-    seed : int
-        Of the run.
     mission : Mission
         What was searched.
     snapshots : list of SnapshotRecord
         In the order of steps and robots; of a cuboid there can be several.
-    trajectories : dict
-        By robot: time [s], x, y, z [m], (n, 4).
     choices : dict
         Decisions by how they were made.
     active : (n, 2) array
@@ -67,30 +61,16 @@ class CuboidRecord:
         Of decisions [s].
     most_heard : int
         Robots heard at once, at most.
-    events : list of dict
-        Robots lost and back, batteries that failed, nodes restarted or dead.
-    end_reason : str
-        Why it ended.
-    end_time, wall_time : float
-        Simulated time at the end, wall time from the first step [s].
     completed : Moment or None
         When the last cuboid was visited.
     """
 
-    name: str
-    scenario: CuboidScenario
-    seed: int
     mission: Mission
     snapshots: list[SnapshotRecord] = field(default_factory=list)
-    trajectories: dict[str, FloatArray] = field(default_factory=dict)
     choices: dict[str, int] = field(default_factory=dict)
     active: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     solve_times: FloatArray = field(default_factory=lambda: np.zeros(0))
     most_heard: int = 0
-    events: list[dict[str, Any]] = field(default_factory=list)
-    end_reason: str = ''
-    end_time: float = 0.0
-    wall_time: float = 0.0
     completed: Moment | None = None
 
 
@@ -109,27 +89,23 @@ class CuboidObserver:
         Message types.
     """
 
-    #: As `RunObserver` has them; there are no filters here.
-    update_topics: tuple[str, ...] = ()
-    result_topics: tuple[str, ...] = ()
+    #: There are no filters.
+    update_topics: Sequence[str] = ()
+    result_topics: Sequence[str] = ()
 
     def __init__(self, name: str, scenario: CuboidScenario, seed: int, types: Typestore) -> None:
         self.name = name
         self.scenario = scenario
         self.seed = seed
         self.mission = scenario.mission()
-        self._types = types
+        self._team = TeamLog(types)
         self._decision_topics = {f'/{name}/decision': name for name in scenario.names()}
         self._state_topics = {f'/{name}/state': name for name in scenario.names()}
         self._decisions: dict[str, list[Any]] = {name: [] for name in scenario.names()}
         self._states: dict[str, list[bytes]] = {name: [] for name in scenario.names()}
         self._visited_at: dict[int, Moment] = {}
         self._done: dict[str, int] = {}
-        self._team: list[str] | None = None
-        # As in `RunObserver`.
-        self._begin: float | None = None
         self._shots = 0
-        self.events: list[dict[str, Any]] = []
         self.news = False
 
     @property
@@ -138,17 +114,17 @@ class CuboidObserver:
         return [STEP, *self._decision_topics, *self._state_topics]
 
     @property
-    def truth(self) -> FloatArray:
-        """Centres of the cuboids, (N, 3) [m]: what there is to visit."""
-        return self.mission.centres
-
-    @property
     def found(self) -> int:
         """Cuboids visited so far."""
         return len(self._visited_at)
 
     @property
-    def total_measurements(self) -> int:
+    def total(self) -> int:
+        """Number of cuboids."""
+        return len(self.mission.cells)
+
+    @property
+    def measurements(self) -> int:
         """Snapshots so far."""
         return self._shots
 
@@ -181,18 +157,18 @@ class CuboidObserver:
     def add(self, topic: str, data: bytes) -> None:
         """Take a serialised message; what is not in `topics` is left alone."""
         if topic in self._decision_topics:
-            self._take(self._decision_topics[topic], self._decode(data, 'CuboidDecision'))
+            self._take(self._decision_topics[topic], self._team.decode(data, 'CuboidDecision'))
         elif topic in self._state_topics:
             self._states[self._state_topics[topic]].append(data)
         elif topic == STEP and self.completed is None:
-            self._note_team(self._decode(data, 'LockstepStep'))
+            self._team.note(self._team.decode(data, 'LockstepStep'))
 
     def settle(self) -> None:
         """Do nothing: each message was taken as it came."""
 
     def _take(self, name: str, decision: Any) -> None:
         self._decisions[name].append(decision)
-        moment = Moment(self._time(decision.header.stamp), int(decision.step))
+        moment = Moment(self._team.time(decision.header.stamp), int(decision.step))
         for shot in decision.snapshots:
             self._shots += 1
             known = self._visited_at.get(int(shot.cuboid))
@@ -202,45 +178,18 @@ class CuboidObserver:
         if decision.done:
             self._done.setdefault(name, moment.step)
 
-    def _time(self, stamp: Any) -> float:
-        return seconds(stamp) - (self._begin or 0.0)
-
-    def _note_team(self, step: Any) -> None:
-        if self._begin is None:
-            self._begin = seconds(step.stamp)
-        team = list(step.robots)
-        if self._team is not None:
-            for word, names in (
-                ('lost', set(self._team) - set(team)),
-                ('joined', set(team) - set(self._team)),
-            ):
-                for name in sorted(names):
-                    time = self._time(step.stamp)
-                    self.events.append({'time': time, 'agent': name, 'event': word})
-        self._team = team
-
-    def _decode(self, data: bytes, name: str) -> Any:
-        return self._types.deserialize_cdr(data, f'maasi_msgs/msg/{name}')
-
-    def record(
-        self,
-        end_reason: str,
-        end_time: float,
-        wall_time: float,
-        events: list[dict[str, Any]] | None = None,
-    ) -> CuboidRecord:
+    def record(self, end: RunEnd) -> CuboidRecord:
         """Return the record of the run; one that is complete ends where it became so."""
         completed = self.completed
-        if completed is not None:
-            end_time = completed.time
+        end_time = end.time if completed is None else completed.time
         record = CuboidRecord(
             self.name,
             self.scenario,
             self.seed,
             self.mission,
-            end_reason=end_reason,
+            end_reason=end.reason,
             end_time=end_time,
-            wall_time=wall_time,
+            wall_time=end.wall_time,
         )
         if self.found == len(self.mission.cells):
             record.completed = max(self._visited_at.values(), key=lambda moment: moment.step)
@@ -249,7 +198,7 @@ class CuboidObserver:
         for name, decisions in self._decisions.items():
             activity = SEARCHING
             for item in decisions:
-                moment = self._time(item.header.stamp)
+                moment = self._team.time(item.header.stamp)
                 if moment > end_time:
                     continue
                 record.choices[item.how] = record.choices.get(item.how, 0) + 1
@@ -277,16 +226,10 @@ class CuboidObserver:
         record.snapshots.sort(key=lambda shot: (shot.step, shot.agent, shot.cuboid))
         record.active = np.array(sorted(active.items()), dtype=float).reshape(-1, 2)
         record.solve_times = np.array(times)
-        for name, states in self._states.items():
-            rows = []
-            for data in states:
-                state = self._decode(data, 'AgentState')
-                place = state.pose.pose.position
-                moment = self._time(state.header.stamp)
-                if moment <= end_time:
-                    rows.append((moment, place.x, place.y, place.z))
-            record.trajectories[name] = np.array(rows, dtype=float).reshape(-1, 4)
-        record.events = sorted(
-            record.events + self.events + (events or []), key=lambda event: float(event['time'])
-        )
+        for name, raw in self._states.items():
+            states = [self._team.decode(data, 'AgentState') for data in raw]
+            record.trajectories[name] = self._team.trajectory(
+                state for state in states if self._team.time(state.header.stamp) <= end_time
+            )
+        record.add_events(self._team.events, end.events)
         return record

@@ -21,15 +21,10 @@ from maasi_planner.buildings import (
     plan_mission,
 )
 from maasi_sim.buildings.mission import CuboidMission, SearchRobot
+from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.checks import check_names, event_problems
-from maasi_sim.scenario.layering import Key, Layer, ScenarioError, dotted, to_yaml, validate
-from maasi_sim.scenario.loading import check_scenario, read_scenario
-from maasi_sim.scenario.schema import (
-    EventSettings,
-    LimitSettings,
-    RecordSettings,
-    Scenario,
-)
+from maasi_sim.scenario.layering import Key, Layer, ScenarioError, refuse, validate
+from maasi_sim.scenario.loading import read_scenario
 from maasi_sim.world.odometry import OdometrySettings
 from maasi_sim.world.robots import BatterySettings
 from maasi_sim.world.world import TargetSettings, World
@@ -72,48 +67,17 @@ class CuboidPlanner(CuboidSettings):
     name: Literal['cuboid_mpc'] = Field(description='Planner')
 
 
-class CuboidScenario(Settings):
-    """A whole scenario file of a search of buildings, all layers merged."""
+class CuboidScenario(BaseScenario):
+    """A scenario file of a search of buildings, all layers merged."""
 
-    version: Literal[1] = Field(description='Of this format')
-    description: str = Field(default='', description='What it shows, in words')
     environment: EnvironmentSettings = Field(description='Where robots may be, in 3D')
     step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT [s]')
-    seed: int = Field(default=1, ge=0, description='Of all random numbers, unless given otherwise')
     robots: dict[str, SearchRobotSettings] = Field(min_length=1, description='Robots by name')
     planner: CuboidPlanner = Field(description='Planner of each robot, and what is searched')
-    events: list[EventSettings] = Field(default_factory=list, description='What happens to robots')
-    stop: Literal['all_found', 'planner_done'] = Field(
-        default='all_found',
-        description='When the run ends well: the team has visited all cuboids, or every planner '
-        'knows that',
-    )
-    on_exit: Literal['end', 'respawn'] = Field(
-        default='end', description='A node that dies ends the run, or is started again'
-    )
-    limits: LimitSettings = Field(default_factory=LimitSettings, description='When to give up')
-    record: RecordSettings = Field(default_factory=RecordSettings, description='Recording')
-
-    @property
-    def dimension(self) -> int:
-        """3."""
-        return self.environment.dimension
-
-    @property
-    def external_clock(self) -> bool:
-        """False: no other program moves these robots."""
-        return False
-
-    def names(self) -> list[str]:
-        """Return the robots' names in order."""
-        return sorted(self.robots)
 
     def namespaces(self) -> dict[str, list[str]]:
         """Return nothing: there is no filter, and no planner of the team."""
         return {}
-
-    def check_pace(self, lockstep: bool, rate: float | None) -> None:
-        """Do nothing: links that are topics keep any pace."""
 
     def mission(self) -> Mission:
         """Return what is searched."""
@@ -123,56 +87,34 @@ class CuboidScenario(Settings):
         """Return the true world of a run: there are no targets."""
         return World.from_settings(self.environment, TargetSettings(count=0), seed)
 
-    def content(self) -> dict[str, Any]:
-        """Return all settings as plain values."""
-        return self.model_dump(mode='python', by_alias=True)
 
-    def text(self) -> str:
-        """Return all settings as a scenario file that needs no other layer."""
-        return to_yaml(self.content())
+def is_cuboid_scenario(layer: Layer) -> bool:
+    """Return whether a tree of values is a scenario of a search of buildings."""
+    planner = layer.data.get('planner')
+    return isinstance(planner, dict) and planner.get('name') == NAME
 
 
-AnyScenario = Scenario | CuboidScenario
+def check_cuboid_scenario(layer: Layer) -> CuboidScenario:
+    """Return the scenario of a tree of values with all layers merged."""
+    scenario = validate(CuboidScenario, layer)
+    refuse(layer, _problems(scenario))
+    return scenario
 
 
-def load_any_scenario(
+def load_cuboid_scenario(
     path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
-) -> AnyScenario:
-    """Read a scenario file of either kind, as `load_scenario` does.
+) -> CuboidScenario:
+    """Read a scenario file of a search of buildings, as `load_scenario` does.
 
     Raises
     ------
     ScenarioError
         With file, line, key, what was read and what is allowed.
     """
-    return any_scenario(read_scenario(path, overrides))
-
-
-def any_scenario_from_content(content: dict[str, Any], origin: str) -> AnyScenario:
-    """Return the scenario of values with all layers merged.
-
-    Raises
-    ------
-    ScenarioError
-        As `load_any_scenario`.
-    """
-    return any_scenario(Layer(content, {(): origin}))
-
-
-def any_scenario(layer: Layer) -> AnyScenario:
-    """Return the scenario of a tree of values with all layers merged."""
-    planner = layer.data.get('planner')
-    if not (isinstance(planner, dict) and planner.get('name') == NAME):
-        return check_scenario(layer)
-    scenario = validate(CuboidScenario, layer)
-    problems = list(_problems(scenario))
-    if problems:
-        raise ScenarioError(
-            '\n'.join(
-                f'{layer.origin(problem)}: {dotted(problem)}: {text}' for problem, text in problems
-            )
-        )
-    return scenario
+    layer = read_scenario(path, overrides)
+    if not is_cuboid_scenario(layer):
+        raise ScenarioError(f"{path}: planner.name: allowed is '{NAME}'")
+    return check_cuboid_scenario(layer)
 
 
 def _problems(scenario: CuboidScenario) -> Iterator[tuple[Key, str]]:

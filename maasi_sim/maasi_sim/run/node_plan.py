@@ -8,18 +8,44 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from maasi_sim.buildings.scenario import AnyScenario, CuboidScenario
-from maasi_sim.run.observer import BATCH, DECISIONS, FOUND, STEP, UPDATE, within
+from maasi_drivers.agent.driver_settings import GuardSettings
+from maasi_filter.ros.node_settings import LIVELINESS_LEASE
+from maasi_filter.ros.parameters import flatten
+from maasi_sim.run.topics import CLOCK, STEP, within
+from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import to_yaml
-from maasi_sim.scenario.schema import (
-    RobotSettings,
-    Scenario,
-    planner_settings,
-)
 
-CLOCK = '/clock'
-# The time is that of the sim.
-_SIMULATED = {'use_sim_time': True}
+# The time is that of the simulation.
+SIMULATED = {'use_sim_time': True}
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How a scenario is run.
+
+    Attributes
+    ----------
+    seed : int
+        Of all random numbers.
+    lockstep : bool
+        Step by step, or free running.
+    rate : float, optional
+        Simulated over wall time; None: as fast as possible in lockstep, else 1.
+    recorder : bool
+        Whether the simulation waits for a recorder.
+    file : Path
+        Scenario file with all layers, for the simulation.
+    """
+
+    seed: int
+    lockstep: bool
+    rate: float | None
+    recorder: bool
+    file: Path
+
+    def common(self, scenario: BaseScenario) -> dict[str, Any]:
+        """Return the parameters that all nodes have."""
+        return {'step': scenario.step, 'seed': self.seed, 'lockstep': self.lockstep}
 
 
 @dataclass(frozen=True)
@@ -42,6 +68,8 @@ class NodePlan:
         Whether it takes part in lockstep.
     is_clock : bool
         Whether the time is its.
+    drives : bool
+        Whether it commands a robot, which is stopped when the node dies.
     remaps : dict
         Names of topics that are called otherwise.
     given : dict
@@ -57,6 +85,7 @@ class NodePlan:
     says_ready: bool = True
     says_done: bool = True
     is_clock: bool = False
+    drives: bool = False
     remaps: Mapping[str, str] = field(default_factory=dict)
     given: Mapping[str, Any] = field(default_factory=dict)
 
@@ -103,74 +132,6 @@ class NodePlan:
         ]
 
 
-def plan_nodes(
-    scenario: AnyScenario,
-    *,
-    seed: int,
-    lockstep: bool,
-    rate: float | None,
-    recorder: bool,
-    file: Path,
-) -> list[NodePlan]:
-    """Return the nodes that a scenario needs: sim, drivers and guards, filter, planner.
-
-    In a search of buildings: sim, and for each robot a planner and a guard.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        With all layers.
-    seed : int
-        Of the run.
-    lockstep : bool
-        Step by step, or free running.
-    rate : float, optional
-        Simulated over wall time; None: as fast as it goes in lockstep, else 1.
-    recorder : bool
-        Whether the sim waits for a recorder.
-    file : Path
-        Scenario file with all layers, for the sim.
-
-    Raises
-    ------
-    ScenarioError
-        If a link cannot keep this pace.
-    """
-    scenario.check_pace(lockstep, rate)
-    common = {'step': scenario.step, 'seed': seed, 'lockstep': lockstep}
-    simulation: dict[str, Any] = {
-        'scenario': str(file),
-        'seed': seed,
-        'lockstep': lockstep,
-        'rate': rate if rate is not None else 0.0 if lockstep else 1.0,
-        'recorder': recorder,
-    }
-    alone = isinstance(scenario, CuboidScenario)
-    plans = [
-        NodePlan(
-            'maasi_sim',
-            'cuboid_sim_node' if alone else 'sim_node',
-            'sim_node',
-            parameters={**simulation, **(_SIMULATED if scenario.external_clock else {})},
-            topics=(CLOCK, STEP) if lockstep else (CLOCK,),
-            says_ready=False,
-            says_done=False,
-            is_clock=True,
-        )
-    ]
-    if isinstance(scenario, CuboidScenario):
-        for name in scenario.names():
-            plans.append(_cuboid_plan(name, scenario, common))
-            # It decides once a step, and its commands are for one step.
-            plans.append(_guard_plan(name, common, scenario.step))
-        return plans
-    for name in scenario.names():
-        plans += _robot_plans(name, scenario.robots[name], scenario, common)
-    for namespace, names in scenario.namespaces().items():
-        plans += _team_plans(namespace, names, scenario, common)
-    return plans
-
-
 def in_team(plan: NodePlan, team: str) -> NodePlan:
     """Return the plan of a node below the namespace of a team; the clock is everybody's."""
     if not team:
@@ -187,7 +148,7 @@ def with_followed_clock(plan: NodePlan) -> NodePlan:
     """Return the plan of a node of a run whose clock is another one's."""
     if not plan.is_clock:
         return plan
-    return replace(plan, parameters={**plan.parameters, **_SIMULATED, 'follow_clock': True})
+    return replace(plan, parameters={**plan.parameters, **SIMULATED, 'follow_clock': True})
 
 
 def with_saved_state(plan: NodePlan, folder: Path) -> NodePlan:
@@ -199,137 +160,38 @@ def with_saved_state(plan: NodePlan, folder: Path) -> NodePlan:
     return replace(plan, parameters=parameters)
 
 
-def _cuboid_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -> NodePlan:
-    """Return the planner of a robot that searches buildings for itself."""
-    from maasi_filter.ros.parameters import flatten
-    from maasi_planner.buildings.node_settings import (
-        CuboidPlannerSettings,
-        box_numbers,
-        face_words,
-    )
-
-    robot, search = scenario.robots[name], scenario.planner
-    floor = float(scenario.environment.array()[2, 0])
-    settings = CuboidPlannerSettings.model_validate(
-        {
-            **common,
-            'environment': scenario.environment,
-            'start': robot.start,
-            'yaw': robot.yaw,
-            'dynamics': robot.dynamics,
-            'hazard': robot.hazard,
-            'planner': search.model_dump(exclude={'name', 'objects', 'obstacles'}),
-            'objects': [box_numbers(item, floor) for item in search.objects],
-            'faces': [face_words(item) for item in search.objects],
-            'obstacles': [box_numbers(item, floor) for item in search.obstacles],
-        }
-    )
+def sim_plan(executable: str, scenario: BaseScenario, run: RunSettings) -> NodePlan:
+    """Return the simulation node, whose clock is that of the run."""
+    pace = run.rate if run.rate is not None else 0.0 if run.lockstep else 1.0
+    parameters: dict[str, Any] = {
+        'scenario': str(run.file),
+        'seed': run.seed,
+        'lockstep': run.lockstep,
+        'rate': pace,
+        'recorder': run.recorder,
+        **(SIMULATED if scenario.external_clock else {}),
+    }
     return NodePlan(
-        'maasi_planner',
-        'cuboid_planner_node',
-        'cuboid_planner',
-        name,
-        {**flatten(settings), **_SIMULATED},
-        topics=tuple(f'/{name}/{topic}' for topic in ('state', 'decision', 'cmd_vel', 'link/tx')),
-        given={'search_on_start': True},
+        'maasi_sim',
+        executable,
+        'sim_node',
+        parameters=parameters,
+        topics=(CLOCK, STEP) if run.lockstep else (CLOCK,),
+        says_ready=False,
+        says_done=False,
+        is_clock=True,
     )
 
 
-def _team_plans(
-    namespace: str, names: list[str], scenario: Scenario, common: dict[str, Any]
-) -> list[NodePlan]:
-    """Return filter and planner of robots that share them."""
-    from maasi_filter.ros.node_settings import FilterNodeSettings
-    from maasi_filter.ros.parameters import flatten
-
-    others = [name for name in scenario.names() if name not in names]
-    filter_settings = FilterNodeSettings.model_validate(
-        {
-            **common,
-            'environment': scenario.environment,
-            'filter': scenario.filter,
-            'robots': {name: {'sensor': scenario.robots[name].sensor} for name in names},
-            'share_with': others,
-        }
-    )
-    return [
-        NodePlan(
-            'maasi_filter',
-            'filter_node',
-            'filter_node',
-            namespace,
-            {**flatten(filter_settings.resolved()), **_SIMULATED},
-            topics=(within(namespace, UPDATE), within(namespace, FOUND)),
-        ),
-        NodePlan(
-            'maasi_planner',
-            'planner_node',
-            'planner_node',
-            namespace,
-            {**flatten(planner_settings(scenario, names, common)), **_SIMULATED},
-            topics=(within(namespace, DECISIONS), within(namespace, BATCH)),
-            given={'search_on_start': True},
-        ),
-    ]
-
-
-def _robot_plans(
-    name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
-) -> list[NodePlan]:
-    """Return a robot's driver, and its guard if it has one."""
-    from maasi_drivers.agent.driver_settings import DriverSettings
-    from maasi_filter.ros.parameters import flatten
-
-    settings = DriverSettings.model_validate(
-        {
-            **common,
-            'environment': scenario.environment,
-            'start': robot.start,
-            'yaw': robot.yaw,
-            'radius': robot.radius,
-            'motion': robot.motion,
-            'sensor': robot.sensor,
-            'camera': robot.camera,
-            'link': robot.link,
-            'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
-            'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
-        }
-    )
-    topics = ['state', 'detections', 'robot_description']
-    if robot.link == 'topics':
-        topics.append('cmd_vel')
-    own = name in scenario.namespaces()
-    plans = [
-        NodePlan(
-            'maasi_drivers',
-            robot.driver,
-            'driver',
-            name,
-            {**flatten(settings), **_SIMULATED},
-            # Its batches are those of its own planner, if it has one.
-            remaps={BATCH: within(name, BATCH)} if own else {},
-            topics=tuple(f'/{name}/{topic}' for topic in topics),
-        )
-    ]
-    guarded = robot.link == 'topics' if robot.guard is None else robot.guard
-    if guarded:
-        plans.append(_guard_plan(name, common, 0.0))
-    return plans
-
-
-def _guard_plan(name: str, common: dict[str, Any], period: float) -> NodePlan:
+def guard_plan(robot: str, common: Mapping[str, Any], period: float) -> NodePlan:
     """Return the guard of a robot whose executor may be busy for `period` seconds."""
-    from maasi_drivers.agent.driver_settings import GuardSettings
-    from maasi_filter.ros.node_settings import LIVELINESS_LEASE
-    from maasi_filter.ros.parameters import flatten
-
     lease = max(LIVELINESS_LEASE, period)
     return NodePlan(
         'maasi_drivers',
         'guard_node',
         'guard',
-        name,
-        {**flatten(GuardSettings.model_validate({**common, 'lease': lease})), **_SIMULATED},
+        robot,
+        {**flatten(GuardSettings.model_validate({**common, 'lease': lease})), **SIMULATED},
         says_ready=False,
         says_done=False,
     )

@@ -35,12 +35,12 @@ from maasi_msgs.msg import (
     SearchLink,
     SearchLinkArray,
 )
-from maasi_sim.buildings.observer import CuboidObserver
 from maasi_sim.run.bag import BagError, BagWriter, TopicQos
-from maasi_sim.run.observer import STEP, RunObserver, within
+from maasi_sim.run.mission import Observer
+from maasi_sim.run.topics import CLOCK, STEP, within
 
 NAME = 'recorder'
-CLOCK, READY, DONE = '/clock', '/lockstep/ready', '/lockstep/done'
+READY, DONE = '/lockstep/ready', '/lockstep/done'
 DIAGNOSTICS, ROSOUT = '/diagnostics', '/rosout'
 # What all teams of a domain share.
 _SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)
@@ -98,8 +98,10 @@ class Recorder:
     ----------
     domain : int
         ROS domain.
-    observer : RunObserver
+    observer : Observer
         Is fed with what the report needs.
+    step_length : float
+        Duration of a step [s].
     bag : BagWriter, optional
         Recording; None: nothing is recorded, and only what the observer needs is taken.
     team : str
@@ -110,7 +112,8 @@ class Recorder:
     def __init__(
         self,
         domain: int,
-        observer: RunObserver | CuboidObserver,
+        observer: Observer[Any],
+        step_length: float,
         bag: BagWriter | None,
         team: str = '',
     ) -> None:
@@ -129,6 +132,7 @@ class Recorder:
             use_global_arguments=False,
         )
         self.observer = observer
+        self._step_length = step_length
         self.bag = bag
         self._team = team
         self.name = within(team, f'/{NAME}')
@@ -378,7 +382,7 @@ class Recorder:
 
     def _until(self, taken: list[tuple[str, bytes]], step: int) -> list[tuple[str, bytes]]:
         """Return the messages up to a step, as far as they say to which they belong."""
-        end = stamp_of_step(step, self.observer.scenario.step)
+        end = stamp_of_step(step, self._step_length)
         kept = []
         for topic, data in taken:
             kind = self._subscriptions[topic].msg_type

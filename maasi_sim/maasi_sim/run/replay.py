@@ -6,17 +6,16 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from maasi_sim.run.bag import Bag, BagError
 from maasi_sim.run.node_plan import NodePlan
-from maasi_sim.run.observer import FOUND, UPDATE, within
 from maasi_sim.run.processes import Domain, NodeProcess, find_executable, stop
+from maasi_sim.run.recording import FILTER, Recording, plain, read_recording
+from maasi_sim.run.replay_node import ReplayNode
 from maasi_sim.run.run_folder import make_folder, write_text
+from maasi_sim.run.topics import within
 
-FILTER = 'filter_node'
 EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
 # Wall time that one update may take, and the start of the node, which may have to compile [s].
 _PATIENCE = 60.0
@@ -31,143 +30,6 @@ REPLAYED = {
     'particles_rate': 0.0,
     'markers_rate': 0.0,
 }
-
-
-@dataclass
-class Batch:
-    """One recorded update: what went in, in which order, and what came out.
-
-    Attributes
-    ----------
-    id, step : int
-        Of the batch.
-    stamp : (int, int)
-        Seconds and nanoseconds.
-    members : list of (robot, decision, measurement)
-        That were processed, in their order.
-    detections : list of bytes
-        Serialised DetectionArray of each member.
-    update : dict
-        What the filter published.
-    late : bool
-        Whether it is what one robot sent too late for its batch, or unasked.
-    namespace : str
-        Of the filter; empty for the root.
-    """
-
-    id: int
-    step: int
-    stamp: tuple[int, int]
-    members: list[tuple[str, int, int]]
-    detections: list[bytes]
-    update: Any
-    late: bool = False
-    namespace: str = ''
-
-
-@dataclass
-class Recording:
-    """What a replay takes from a recording.
-
-    Attributes
-    ----------
-    facts : dict
-        Scenario, seed and parameters of each node.
-    batches : list of Batch
-        In order; those of several filters in the order of steps and names.
-    found : dict
-        By the namespace of the filter: found targets at the end, a list of dict.
-    found_batch : dict
-        By the namespace: the batch after which they stood so.
-    """
-
-    facts: dict[str, Any]
-    batches: list[Batch] = field(default_factory=list)
-    found: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
-    found_batch: dict[str, int] = field(default_factory=dict)
-
-    @property
-    def namespaces(self) -> list[str]:
-        """Namespaces of the filters."""
-        return list(self.found)
-
-
-def read_recording(path: Path) -> Recording:
-    """Return what a replay needs of a recording.
-
-    Raises
-    ------
-    BagError
-        If it is none, or measurements that the filter processed are not in it.
-    """
-    with Bag(path) as bag:
-        recording = Recording(bag.scenario())
-        team = recording.facts.get('namespace', '')
-        for name in recording.facts.get('nodes', {}):
-            namespace, _, node = name.strip('/').rpartition('/')
-            if node == FILTER:
-                recording.found[namespace] = []
-        if not recording.found:
-            raise BagError(f'{path}: holds no parameters of {FILTER}')
-        robots = recording.facts['scenario']['robots']
-        topics = {within(team, f'/{name}/detections'): name for name in robots}
-        detections: dict[tuple[str, int], bytes] = {}
-        for topic, kind, _, data in bag.raw(topics):
-            message = bag.decode(data, kind)
-            # An index comes again only where a driver was started again: the first was used.
-            detections.setdefault((topics[topic], int(message.measurement)), data)
-        for namespace in recording.namespaces:
-            last = 0
-            for item in bag.messages([within(team, within(namespace, UPDATE))]):
-                batch = _batch(item.message, detections, path)
-                batch.namespace = namespace
-                batch.late = batch.id <= last
-                last = max(last, batch.id)
-                recording.batches.append(batch)
-            for item in bag.messages([within(team, within(namespace, FOUND))]):
-                recording.found[namespace] = [plain(target) for target in item.message.targets]
-                recording.found_batch[namespace] = int(item.message.batch_id)
-    if len(recording.found) > 1:
-        recording.batches.sort(key=lambda batch: (batch.step, batch.namespace))
-    return recording
-
-
-def _batch(update: Any, detections: dict[tuple[str, int], bytes], path: Path) -> Batch:
-    members = [
-        (member.robot, int(member.decision), int(member.measurement)) for member in update.members
-    ]
-    missing = [
-        key for key in ((name, index) for name, _, index in members) if key not in detections
-    ]
-    if missing:
-        name, index = missing[0]
-        raise BagError(f'{path}: measurement {index} of {name} is not in the recording')
-    stamp = update.header.stamp
-    return Batch(
-        int(update.batch_id),
-        int(update.step),
-        (int(stamp.sec), int(stamp.nanosec)),
-        members,
-        [detections[name, index] for name, _, index in members],
-        plain(update),
-    )
-
-
-def plain(message: Any) -> Any:
-    """Return a message, of `rosbags` or of ROS, as plain values that can be compared."""
-    fields = getattr(message, '__dataclass_fields__', None)
-    names = [name for name in fields if name != '__msgtype__'] if fields else None
-    if names is None and hasattr(message, 'get_fields_and_field_types'):
-        names = list(message.get_fields_and_field_types())
-    if names is not None:
-        return {name: plain(getattr(message, name)) for name in names}
-    if isinstance(message, str):
-        return message
-    if hasattr(message, 'tolist'):
-        return message.tolist()
-    if isinstance(message, (list, tuple)):
-        return [plain(item) for item in message]
-    return message
 
 
 def differences(recorded: list[dict[str, Any]], found: list[dict[str, Any]]) -> list[str]:
@@ -216,8 +78,6 @@ def replay(
         try:
             for process in processes:
                 process.start()
-            from maasi_sim.run.replay_node import ReplayNode
-
             robots = sorted(recording.facts['scenario']['robots'])
             node = ReplayNode(domain.number, robots, recording.namespaces)
             try:
@@ -245,7 +105,7 @@ def _process(facts: dict[str, Any], namespace: str, folder: Path) -> NodeProcess
 
 
 def _feed(
-    node: Any,
+    node: ReplayNode,
     recording: Recording,
     processes: list[NodeProcess],
     interrupted: Callable[[], bool],

@@ -22,8 +22,8 @@ from maasi_msgs.msg import (
     LockstepDone,
     MeasurementBatch,
 )
-from maasi_sim.run.observer import BATCH, FOUND, UPDATE, within
-from maasi_sim.run.replay import FILTER, Batch
+from maasi_sim.run.recording import FILTER, Batch
+from maasi_sim.run.topics import BATCH, FOUND, UPDATE, within
 
 _ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE)
 _LATCHED = QoSProfile(

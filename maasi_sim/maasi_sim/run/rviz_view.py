@@ -7,22 +7,21 @@ from typing import Any
 
 import yaml
 
-from maasi_sim.buildings.scenario import AnyScenario
+from maasi_sim.run.mission import Mission
 from maasi_sim.scenario.loading import config_folder
-from maasi_sim.scenario.schema import Scenario
 
 
-def view_text(scenario: AnyScenario, namespace: str = '') -> str:
+def view_text(mission: Mission[Any], namespace: str = '') -> str:
     """Return RViz's configuration for a run of a scenario.
 
     Parameters
     ----------
-    scenario : Scenario
+    mission : Mission
         Whose robots are shown.
     namespace : str
         Of the team, without slashes; empty for none.
     """
-    name = 'search_3d' if scenario.dimension == 3 else 'search'
+    name = 'search_3d' if mission.scenario.dimension == 3 else 'search'
     path = config_folder() / 'rviz' / f'{name}.rviz'
     content = yaml.safe_load(path.read_text(encoding='utf-8'))
     displays: list[dict[str, Any]] = content['Visualization Manager']['Displays']
@@ -30,15 +29,11 @@ def view_text(scenario: AnyScenario, namespace: str = '') -> str:
     for display in displays:
         if 'Topic' in display:
             display['Topic']['Value'] = team + display['Topic']['Value']
-    if isinstance(scenario, Scenario):
-        for robot in scenario.names():
-            if scenario.robots[robot].camera is not None:
-                topic = f'{team}/{robot}/camera/image_raw'
-                displays.append(_camera(f'Camera of {robot}', topic, shown=True))
-                # What a bag holds.
-                displays.append(
-                    _camera(f'Camera of {robot}, bag', f'{topic}/compressed', shown=False)
-                )
+    for robot in mission.cameras():
+        topic = f'{team}/{robot}/camera/image_raw'
+        displays.append(_camera(f'Camera of {robot}', topic, shown=True))
+        # What a bag holds.
+        displays.append(_camera(f'Camera of {robot}, bag', f'{topic}/compressed', shown=False))
     return yaml.safe_dump(content, sort_keys=False)
 
 

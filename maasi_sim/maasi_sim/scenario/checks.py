@@ -8,16 +8,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from maasi_sim.scenario.layering import (
-    Key,
-    unknown,
-)
-from maasi_sim.scenario.schema import (
-    EventSettings,
-    LimitSettings,
-    RobotSettings,
-    Scenario,
-)
+from maasi_sim.scenario.base import EventSettings, LimitSettings
+from maasi_sim.scenario.layering import Key, unknown
+from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.scenario.visibility import robot_candidates
 
 _ROBOT_NAME = re.compile(r'^[a-z][a-z0-9_]*$')

@@ -7,7 +7,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -247,6 +247,13 @@ def validate(model: type[Model], layer: Layer) -> Model:
         return model.model_validate(layer.data, strict=True)
     except ValidationError as error:
         raise ScenarioError(describe(error, model, layer)) from None
+
+
+def refuse(layer: Layer, problems: Iterable[tuple[Key, str]]) -> None:
+    """Raise a ScenarioError with one line for each problem between keys, if there is one."""
+    lines = [f'{layer.origin(key)}: {dotted(key)}: {text}' for key, text in problems]
+    if lines:
+        raise ScenarioError('\n'.join(lines))
 
 
 def describe(error: ValidationError, model: type[BaseModel], layer: Layer) -> str:

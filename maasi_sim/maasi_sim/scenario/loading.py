@@ -17,6 +17,7 @@ from maasi_sim.scenario.layering import (
     override,
     place,
     read_layer,
+    refuse,
     unknown,
     validate,
 )
@@ -130,13 +131,7 @@ def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
 def check_scenario(layer: Layer) -> Scenario:
     """Return the scenario of a tree of values with all layers merged."""
     scenario = validate(Scenario, layer)
-    problems = list(problems_of(scenario))
-    if problems:
-        raise ScenarioError(
-            '\n'.join(
-                f'{layer.origin(problem)}: {dotted(problem)}: {text}' for problem, text in problems
-            )
-        )
+    refuse(layer, problems_of(scenario))
     return scenario
 
 

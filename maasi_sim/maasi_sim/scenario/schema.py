@@ -15,7 +15,6 @@ from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_drivers.vision.camera_settings import CameraSettings
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import (
-    EnvironmentSettings,
     FilterSettings,
     Finite,
     SensorSettings,
@@ -24,10 +23,8 @@ from maasi_filter.settings import (
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
-from maasi_sim.scenario.layering import (
-    ScenarioError,
-    to_yaml,
-)
+from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.world.camera import RenderSettings
 from maasi_sim.world.laser_scan import LaserSettings
 from maasi_sim.world.odometry import OdometrySettings
@@ -114,39 +111,6 @@ class RobotSettings(Settings):
         return self.link != 'topics' and not self.external
 
 
-class EventSettings(Settings):
-    """Something that happens to a robot."""
-
-    at: float = Field(ge=0.0, description='When [s]')
-    robot: str = Field(description='To whom')
-    do: Literal['leave', 'back'] = Field(description='It goes silent, or it is there again')
-
-
-class LimitSettings(Settings):
-    """When a run is given up."""
-
-    time: float = Field(default=600.0, gt=0.0, description='Simulated time [s]')
-    start: float = Field(
-        default=180.0,
-        gt=0.0,
-        description='Wall time until all nodes are ready; they may have to compile [s]',
-    )
-    silence: float = Field(
-        default=30.0,
-        gt=0.0,
-        description='Wall time without a step until a node counts as hung [s]',
-    )
-    heartbeat: float = Field(
-        default=4.5,
-        ge=2.0,
-        description='Wall time without a sign of life of a node, while it does not wait for a '
-        'processor, until it counts as hung; free running [s]',
-    )
-    restarts: int = Field(
-        default=3, ge=0, description='Restarts of one node with on_exit: respawn [1]'
-    )
-
-
 class ScoringSettings(Settings):
     """How found targets are compared with the truth."""
 
@@ -159,22 +123,9 @@ class ScoringSettings(Settings):
     order: float = Field(default=2.0, ge=1.0, description='p of GOSPA [1]')
 
 
-class RecordSettings(Settings):
-    """What the recording holds."""
+class Scenario(BaseScenario):
+    """A scenario file of a search for targets, all layers merged."""
 
-    images: Literal['jpeg', 'png', 'raw'] = Field(
-        default='jpeg', description='How images are stored; png is lossless and slower'
-    )
-
-
-class Scenario(Settings):
-    """A whole scenario file, all layers merged."""
-
-    version: Literal[1] = Field(description='Of this format')
-    description: str = Field(default='', description='What it shows, in words')
-    environment: EnvironmentSettings = Field(description='Where the targets are')
-    step: float = Field(default=0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')
-    seed: int = Field(default=1, ge=0, description='Of all random numbers, unless given otherwise')
     targets: TargetSettings = Field(description='The truth, for the simulation and the report')
     robots: dict[str, RobotSettings] = Field(min_length=1, description='Robots by name')
     filter: FilterSettings = Field(default_factory=FilterSettings, description='Search filter')
@@ -183,27 +134,7 @@ class Scenario(Settings):
         default_factory=lambda: RenderSettings.model_validate({}),
         description='What simulated cameras see',
     )
-    events: list[EventSettings] = Field(default_factory=list, description='What happens to robots')
-    stop: Literal['all_found', 'planner_done'] = Field(
-        default='all_found',
-        description='When the run ends well: all true targets are found, or the planner says that '
-        'nothing is left to gain',
-    )
-    on_exit: Literal['end', 'respawn'] = Field(
-        default='end', description='A node that dies ends the run, or is started again'
-    )
-    limits: LimitSettings = Field(default_factory=LimitSettings, description='When to give up')
     scoring: ScoringSettings = Field(default_factory=ScoringSettings, description='Scores')
-    record: RecordSettings = Field(default_factory=RecordSettings, description='Recording')
-
-    @property
-    def dimension(self) -> int:
-        """2 or 3."""
-        return self.environment.dimension
-
-    def names(self) -> list[str]:
-        """Return the robots' names in order."""
-        return sorted(self.robots)
 
     def namespaces(self) -> dict[str, list[str]]:
         """Return the robots that share filter and planner, by the namespace of those nodes.
@@ -255,14 +186,6 @@ class Scenario(Settings):
     def world(self, seed: int) -> World:
         """Return the true world of a run."""
         return World.from_settings(self.environment, self.targets, seed, self.step)
-
-    def content(self) -> dict[str, Any]:
-        """Return all settings as plain values; `load_scenario` reads them back the same."""
-        return self.model_dump(mode='python', by_alias=True)
-
-    def text(self) -> str:
-        """Return all settings as a scenario file that needs no other layer."""
-        return to_yaml(self.content())
 
 
 def planner_settings(

@@ -1,21 +1,21 @@
-"""The report of a run: `report.json`, and a picture of it."""
+"""The figure of a search for targets: the search, and targets found over measurements."""
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Ellipse, Rectangle
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from maasi_sim.machine import this_machine
-from maasi_sim.run.observer import Progress, RunRecord
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from maasi_sim.run.report_files import END_REASONS, title
+from maasi_sim.targets.report import build_report
+from maasi_sim.targets.target_record import TargetRecord
 
 FloatArray = NDArray[np.float64]
 
@@ -24,134 +24,9 @@ _COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')
 _TRUE, _FOUND, _FALSE, _PALE = '#222222', '#D62728', '#7B3294', '#9A9A9A'
 _SIGMAS = 3.0
 
-END_REASONS = {
-    'all_found': 'all targets found',
-    'planner_done': 'nothing is left to gain, says the planner',
-    'time_limit': 'time limit',
-    'interrupted': 'interrupted',
-    'node_died': 'a node died',
-    'node_hung': 'a node hung',
-    'not_ready': 'the nodes did not get ready',
-    'no_robot': 'no robot can go on',
-}
 
-
-def build_report(record: RunRecord) -> dict[str, Any]:
-    """Return the report of a run as plain values; nothing in it is infinite or not a number."""
-    scores = record.scores()
-    complete = _completion(record)
-    distances = {
-        name: _number(path_length(trajectory)) for name, trajectory in record.trajectories.items()
-    }
-    wall_time = record.wall_time
-    return {
-        'scenario': record.name,
-        'seed': record.seed,
-        'planner': record.scenario.planner.name,
-        'agents': record.scenario.names(),
-        'targets': [_numbers(position) for position in record.truth],
-        'found': [
-            {
-                'id': target.id,
-                'position': _numbers(target.position),
-                'covariance': [_numbers(row) for row in target.covariance],
-                'agent': target.agent,
-                'measurement': target.measurement,
-                'time': target.time,
-            }
-            for target in record.found
-        ],
-        'true_found': scores.match.true_found,
-        'missed': scores.match.missed,
-        'false_found': scores.match.false_found,
-        'rmse': _number(scores.match.rmse),
-        'gospa': {
-            'total': scores.gospa.total,
-            'localisation': scores.gospa.localisation,
-            'missed': scores.gospa.missed,
-            'false': scores.gospa.false,
-        },
-        'measurements': record.measurements,
-        'measurements_to_find_all': complete.measurements if complete else None,
-        'time_to_find_all': complete.time if complete else None,
-        'decisions': record.decisions,
-        'distance': distances,
-        'end_reason': record.end_reason,
-        'wall_time': wall_time,
-        'real_time_factor': record.end_time / wall_time if wall_time > 0.0 else None,
-        'machine': this_machine(),
-        'events': record.events,
-        'scoring': {'radius': scores.radius, 'c': scores.radius, 'p': scores.order},
-    }
-
-
-def write_report(record: RunRecord, folder: Path) -> dict[str, Any]:
-    """Write `report.json` and `report.png` into a folder and return the report."""
-    report = build_report(record)
-    from maasi_sim.run.run_folder import write_text, write_whole
-
-    text = json.dumps(report, indent=2, allow_nan=False)
-    write_text(folder / 'report.json', text + '\n')
-    figure = plot_report(record)
-    write_whole(folder / 'report.png', lambda path: figure.savefig(path, dpi=110))
-    return report
-
-
-def summary(report: dict[str, Any]) -> str:
-    """Return the report in a few lines."""
-    targets = len(report['targets'])
-    found = f'{report["true_found"]} of {targets} targets found'
-    if report['false_found']:
-        found += f', {report["false_found"]} false'
-    if report['rmse'] is not None:
-        found += f', RMSE {report["rmse"]:.3g} m'
-    measurements = sum(report['measurements'].values())
-    lines = [
-        f'{found} (ended: {END_REASONS.get(report["end_reason"], report["end_reason"])})',
-        f'{measurements} measurements, {report["decisions"]} decisions',
-    ]
-    if report['measurements_to_find_all'] is not None and targets:
-        lines[1] += (
-            f'; all found after {report["measurements_to_find_all"]} measurements and '
-            f'{report["time_to_find_all"]:.1f} s'
-        )
-    if report['real_time_factor'] is not None:
-        lines.append(
-            f'{report["wall_time"]:.1f} s of wall time, '
-            f'{report["real_time_factor"]:.1f} times real time'
-        )
-    return '\n'.join(lines)
-
-
-def path_length(trajectory: FloatArray) -> float:
-    """Return the length of a trajectory of rows time, x, y, z [m]."""
-    return float(np.linalg.norm(np.diff(trajectory[:, 1:], axis=0), axis=1).sum())
-
-
-def _completion(record: RunRecord) -> Progress | None:
-    """Return when all targets were found and stayed so."""
-    complete = None
-    for progress in record.progress:
-        if progress.true_found < len(record.truth):
-            complete = None
-        elif complete is None:
-            complete = progress
-    return complete if len(record.truth) else None
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _numbers(values: FloatArray) -> list[float | None]:
-    return [_number(value) for value in values]
-
-
-def plot_report(record: RunRecord) -> Figure:
+def plot_report(record: TargetRecord) -> Figure:
     """Return a picture: map or 3D view of the search, and targets found over measurements."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(12.5, 7.2), layout='constrained')
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.65, 1.0], height_ratios=[1.5, 1.0])
@@ -174,26 +49,23 @@ def plot_report(record: RunRecord) -> Figure:
     )
     _plot_progress(figure.add_subplot(grid[0, 1]), record)
     _write_summary(figure.add_subplot(grid[1, 1]), record)
-    title = f'{record.name}   seed {record.seed}   planner {record.scenario.planner.name}'
-    figure.suptitle(title, fontsize=13, fontweight='bold')
+    figure.suptitle(title(record), fontsize=13, fontweight='bold')
     return figure
 
 
-def _colours(record: RunRecord) -> dict[str, str]:
+def _colours(record: TargetRecord) -> dict[str, str]:
     names = record.scenario.names()
     return {name: _COLOURS[index % len(_COLOURS)] for index, name in enumerate(names)}
 
 
-def _pairs(record: RunRecord) -> tuple[FloatArray, list[int], list[int]]:
+def _pairs(record: TargetRecord) -> tuple[FloatArray, list[int], list[int]]:
     positions = np.array([target.position for target in record.found], dtype=float)
     right = sorted(found for found, _ in record.scores().match.pairs)
     wrong = [index for index in range(len(record.found)) if index not in right]
     return positions.reshape(-1, record.scenario.dimension), right, wrong
 
 
-def _plot_map(axes: Axes, record: RunRecord) -> None:
-    from matplotlib.patches import Circle, Ellipse, Rectangle
-
+def _plot_map(axes: Axes, record: TargetRecord) -> None:
     bounds = record.scenario.environment.array()
     low, size = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
     axes.add_patch(Rectangle((low[0], low[1]), size[0], size[1], fc='#FAFAF7', ec='#B0B0B0', lw=1))
@@ -263,7 +135,7 @@ def _plot_map(axes: Axes, record: RunRecord) -> None:
     axes.spines[['top', 'right']].set_visible(False)
 
 
-def _plot_space(axes: Any, record: RunRecord) -> None:
+def _plot_space(axes: Any, record: TargetRecord) -> None:
     bounds = record.scenario.environment.array()
     for name, colour in _colours(record).items():
         path = record.trajectories[name]
@@ -326,9 +198,7 @@ def _axes_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     return _SIGMAS * np.sqrt(np.maximum(values, 0.0)), directions
 
 
-def _plot_progress(axes: Axes, record: RunRecord) -> None:
-    from matplotlib.ticker import MaxNLocator
-
+def _plot_progress(axes: Axes, record: TargetRecord) -> None:
     counts = [0, *(item.measurements for item in record.progress)]
     right = [0, *(item.true_found for item in record.progress)]
     every = [0, *(item.found for item in record.progress)]
@@ -348,7 +218,7 @@ def _plot_progress(axes: Axes, record: RunRecord) -> None:
     axes.legend(loc='lower right', fontsize=9, frameon=False)
 
 
-def _write_summary(axes: Axes, record: RunRecord) -> None:
+def _write_summary(axes: Axes, record: TargetRecord) -> None:
     report = build_report(record)
     rmse = '-' if report['rmse'] is None else f'{report["rmse"]:.3g} m'
     complete = '-'

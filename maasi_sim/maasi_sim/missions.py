@@ -1,0 +1,25 @@
+"""The one place where a scenario file becomes a mission."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from maasi_sim.buildings.building_mission import BuildingMission
+from maasi_sim.buildings.scenario import check_cuboid_scenario, is_cuboid_scenario
+from maasi_sim.run.mission import Mission
+from maasi_sim.scenario.layering import Key
+from maasi_sim.scenario.loading import check_scenario, find_scenario, read_scenario
+from maasi_sim.targets.mission import TargetMission
+
+
+def load_mission(
+    path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> Mission[Any]:
+    """Read a scenario file; parameters and errors as of `load_scenario`."""
+    path = find_scenario(path)
+    layer = read_scenario(path, overrides)
+    if is_cuboid_scenario(layer):
+        return BuildingMission(path.stem, check_cuboid_scenario(layer))
+    return TargetMission(path.stem, check_scenario(layer))

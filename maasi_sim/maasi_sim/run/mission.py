@@ -1,0 +1,141 @@
+"""The interface between a run and what it is for: a search for targets, or of buildings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from rosbags.typesys.store import Typestore
+
+from maasi_sim.run.node_plan import NodePlan, RunSettings
+from maasi_sim.run.run_record import RunEnd, RunRecord
+from maasi_sim.scenario.base import BaseScenario
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Record = TypeVar('Record', bound=RunRecord)
+RecordOut = TypeVar('RecordOut', bound=RunRecord, covariant=True)
+
+
+class Completion(Protocol):
+    """When everything was found: simulated time since the first step [s], and step."""
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+
+    @property
+    def step(self) -> int:
+        """Step of the simulation."""
+
+
+class Observer(Protocol[RecordOut]):
+    """Gathers what the report needs from the serialised messages of a run, and tells its end."""
+
+    #: Whether something was found since the caller last reset it.
+    news: bool
+
+    @property
+    def topics(self) -> Sequence[str]:
+        """Topics that it needs."""
+
+    @property
+    def update_topics(self) -> Sequence[str]:
+        """Of these, filter updates: taken before, and added after, the messages they refer to."""
+
+    @property
+    def result_topics(self) -> Sequence[str]:
+        """Of these, what may still arrive for the last step after the run has ended."""
+
+    @property
+    def found(self) -> int:
+        """Number of targets or cuboids found so far."""
+
+    @property
+    def total(self) -> int:
+        """Number of targets or cuboids there are."""
+
+    @property
+    def measurements(self) -> int:
+        """Number of measurements so far, of all robots."""
+
+    @property
+    def explored(self) -> float:
+        """Share of the environment explored."""
+
+    @property
+    def completed(self) -> Completion | None:
+        """When everything was found, where the scenario stops then."""
+
+    @property
+    def settled(self) -> str | None:
+        """Why nothing is left to gain, once all planners say so."""
+
+    @property
+    def end_step(self) -> int | None:
+        """Step at which the search ended by itself; None while it goes on."""
+
+    def add(self, topic: str, data: bytes) -> None:
+        """Add a serialised message; one of another topic is ignored."""
+
+    def settle(self) -> None:
+        """Evaluate the messages added since the last call."""
+
+    def record(self, end: RunEnd) -> RecordOut:
+        """Return the record of the run."""
+
+
+class Mission(Protocol[Record]):
+    """What is searched for: scenario, nodes, observer and report."""
+
+    #: Name of the scenario.
+    name: str
+    #: What happens to what is searched for, in the progress line.
+    found_word: str
+
+    @property
+    def scenario(self) -> BaseScenario:
+        """The scenario with all layers."""
+
+    def prepare(self) -> None:
+        """Give simulated robots the addresses that they have on this host.
+
+        Raises
+        ------
+        OSError
+            If there are none.
+        """
+
+    def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
+        """Return the nodes to start.
+
+        Raises
+        ------
+        ScenarioError
+            If a link cannot keep this pace.
+        """
+
+    def cameras(self) -> list[str]:
+        """Return the robots whose images are shown."""
+
+    def taking_off(self) -> list[str]:
+        """Return the simulated robots that take off by their drivers' service `arm`."""
+
+    def external(self) -> list[str]:
+        """Return the robots that another program moves, and that the user lets take off."""
+
+    def warning(self) -> str:
+        """Return what the user should know of the scenario, or an empty text; takes a while."""
+
+    def observer(self, types: Typestore) -> Observer[Record]:
+        """Return what gathers the messages of a run."""
+
+    def report(self, record: Record) -> dict[str, Any]:
+        """Return the report as plain values."""
+
+    def summary(self, report: dict[str, Any]) -> str:
+        """Return a report in a few lines."""
+
+    def figure(self, record: Record) -> Figure:
+        """Return the figure of the report."""

@@ -1,0 +1,136 @@
+"""The files of a report, and what the reports of all kinds of runs have in common."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maasi_sim.machine import this_machine
+from maasi_sim.run.mission import Mission
+from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
+from maasi_sim.run.run_record import FloatArray, RunRecord
+
+END_REASONS = {
+    'all_found': 'all targets found',
+    'planner_done': 'nothing is left to gain, says the planner',
+    'time_limit': 'time limit',
+    'interrupted': 'interrupted',
+    'node_died': 'a node died',
+    'node_hung': 'a node hung',
+    'not_ready': 'the nodes did not get ready',
+    'no_robot': 'no robot can go on',
+}
+
+
+@dataclass(frozen=True)
+class StoredReport:
+    """A report, what to say of it, and where it is.
+
+    Attributes
+    ----------
+    report : dict
+        What stands in `report.json`.
+    words : str
+        Its summary.
+    folder : Path or None
+        That holds it; None: it could be written nowhere.
+    problem : str
+        Why it is not in the folder of the run; empty if it is.
+    """
+
+    report: dict[str, Any]
+    words: str
+    folder: Path | None
+    problem: str = ''
+
+
+def identity(record: RunRecord) -> dict[str, Any]:
+    """Return the first entries of a report: what was run."""
+    return {
+        'scenario': record.name,
+        'seed': record.seed,
+        'planner': record.scenario.planner.name,
+        'agents': record.scenario.names(),
+    }
+
+
+def ending(record: RunRecord) -> dict[str, Any]:
+    """Return the last entries of a report: how the run ended."""
+    wall = record.wall_time
+    return {
+        'end_reason': record.end_reason,
+        'wall_time': wall,
+        'real_time_factor': record.end_time / wall if wall > 0.0 else None,
+        'machine': this_machine(),
+        'events': record.events,
+    }
+
+
+def pace(report: dict[str, Any]) -> list[str]:
+    """Return the line of a summary on wall time, if it is known."""
+    if report['real_time_factor'] is None:
+        return []
+    return [
+        f'{report["wall_time"]:.1f} s of wall time, '
+        f'{report["real_time_factor"]:.1f} times real time'
+    ]
+
+
+def title(record: RunRecord) -> str:
+    """Return the title of the figure."""
+    return f'{record.name}   seed {record.seed}   planner {record.scenario.planner.name}'
+
+
+def path_length(trajectory: FloatArray) -> float:
+    """Return the length of a trajectory of rows time, x, y, z [m]."""
+    return float(np.linalg.norm(np.diff(trajectory[:, 1:], axis=0), axis=1).sum())
+
+
+def write_report(mission: Mission[Any], record: RunRecord, folder: Path) -> dict[str, Any]:
+    """Write `report.json` and `report.png` into a folder and return the report."""
+    report = mission.report(record)
+    text = json.dumps(report, indent=2, allow_nan=False)
+    write_text(folder / 'report.json', text + '\n')
+    figure = mission.figure(record)
+    write_whole(folder / 'report.png', lambda path: figure.savefig(path, dpi=110))
+    return report
+
+
+def store_report(mission: Mission[Any], record: RunRecord, folder: Path) -> StoredReport:
+    """Write a report into the folder of the run; elsewhere if it must be.
+
+    Elsewhere is a new folder below the first of these that has room: that of temporary files, the
+    home of the user, `/dev/shm`.
+    """
+
+    def stored(report: dict[str, Any], place: Path | None, problem: str = '') -> StoredReport:
+        return StoredReport(report, mission.summary(report), place, problem)
+
+    try:
+        return stored(write_report(mission, record, folder), folder)
+    except (OSError, ResultsError) as error:
+        problem = f'{folder}: the report cannot be written: {_reason(error)}'
+    remove(folder / 'report.json')
+    for base in (Path(tempfile.gettempdir()), Path.home(), Path('/dev/shm')):
+        try:
+            place = Path(tempfile.mkdtemp(prefix='maasi_report_', dir=base))
+        except OSError:
+            continue
+        try:
+            return stored(write_report(mission, record, place), place, problem)
+        except (OSError, ResultsError):
+            remove(place / 'report.json')
+            with contextlib.suppress(OSError):
+                place.rmdir()
+    return stored(mission.report(record), None, problem)
+
+
+def _reason(error: BaseException) -> str:
+    cause = error.__cause__ or error
+    return getattr(cause, 'strerror', None) or str(error)

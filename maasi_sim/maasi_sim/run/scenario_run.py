@@ -1,0 +1,162 @@
+"""One run of a scenario, from the file to the report."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from maasi_sim.missions import load_mission
+from maasi_sim.run.ending import DONE, NODE_FAILED, NOT_ALL_FOUND, NOT_WRITTEN
+from maasi_sim.run.interruption import Interruption
+from maasi_sim.run.node_plan import (
+    NodePlan,
+    RunSettings,
+    in_team,
+    with_followed_clock,
+    with_saved_state,
+)
+from maasi_sim.run.processes import Domain
+from maasi_sim.run.progress import ProgressDisplay
+from maasi_sim.run.report_files import store_report
+from maasi_sim.run.run_folder import make_folder, write_text
+from maasi_sim.run.run_options import Options
+from maasi_sim.run.run_record import RunEnd
+from maasi_sim.run.rviz_view import view_text
+from maasi_sim.run.supervisor import Supervisor
+from maasi_sim.scenario.layering import Key, ScenarioError
+
+if TYPE_CHECKING:
+    from maasi_sim.run.session import Session
+
+
+class ScenarioRun:
+    """One run of a scenario, from the file to the report.
+
+    Parameters
+    ----------
+    options : Options
+        From the command line.
+    interruption : Interruption
+        Ends the run when it becomes true.
+
+    Raises
+    ------
+    ScenarioError
+        If the scenario or the options are wrong.
+    """
+
+    def __init__(self, options: Options, interruption: Interruption) -> None:
+        self.options = options
+        self.interruption = interruption
+        overrides: dict[str, tuple[Key, Any]] = {}
+        if options.planner is not None:
+            overrides['--planner'] = (('planner', 'name'), options.planner)
+        if options.time_limit is not None:
+            overrides['--time-limit'] = (('limits', 'time'), options.time_limit)
+        if options.seed is not None:
+            overrides['--seed'] = (('seed',), options.seed)
+        self.mission = load_mission(options.scenario, overrides)
+        # A node in the namespace of a robot belongs to that robot.
+        if options.namespace.rpartition('/')[2] in self.mission.scenario.names():
+            raise ScenarioError(
+                f"--namespace: read '{options.namespace}', allowed is a name that is none of "
+                'a robot of the scenario'
+            )
+        self.display = ProgressDisplay()
+
+    def execute(self) -> int:
+        """Run it and return the exit code."""
+        options = self.options
+        with Domain(
+            options.domain_id, team=options.namespace, shared=options.follow_clock
+        ) as domain:
+            self.folder = make_folder(options.out)
+            os.environ.update(domain.environment())
+            self.mission.prepare()
+            self.supervisor = Supervisor(
+                self._plan(), self.mission.scenario, options, self.folder, self.display
+            )
+            self.display.say(
+                f'{self.mission.name}: seed {self.mission.scenario.seed}, '
+                f'{len(self.supervisor.processes)} nodes in ROS domain {domain.number}, results in '
+                f'{short(self.folder)}'
+            )
+            # An interruption here is reported once the session starts.
+            with contextlib.suppress(KeyboardInterrupt), self.interruption.at_once():
+                self.supervisor.load()
+            return self._execute(domain)
+
+    def _plan(self) -> list[NodePlan]:
+        """Write the scenario with all layers, and return its nodes."""
+        options, scenario = self.options, self.mission.scenario
+        file = self.folder / 'scenario.yaml'
+        write_text(file, scenario.text())
+        write_text(self.folder / 'view.rviz', view_text(self.mission, options.namespace))
+        run = RunSettings(scenario.seed, options.lockstep, options.rate, recorder=True, file=file)
+        plans = [in_team(plan, options.namespace) for plan in self.mission.plan_nodes(run)]
+        if options.follow_clock:
+            plans = [with_followed_clock(plan) for plan in plans]
+        if scenario.on_exit == 'respawn':
+            plans = [with_saved_state(plan, self.folder / 'state') for plan in plans]
+        return plans
+
+    def _execute(self, domain: Domain) -> int:
+        session: Session | None = None
+        try:
+            # Before anything that takes time, and while this process has a single thread.
+            if not self.interruption:
+                self.supervisor.start()
+            # rclpy starts threads when it is imported, and a process with threads is not forked.
+            from maasi_sim.run.session import Session
+
+            session = Session(
+                self.mission, self.supervisor, self.options, self.interruption, self.display
+            )
+            session.open(domain.number, self.folder)
+            session.run()
+            if session.is_followed:
+                session.close_bag()
+                code = self._report(session)
+                session.keep_clock()
+                return code
+        finally:
+            self.supervisor.stop_all()
+            if session is not None:
+                session.close()
+            self.display.close()
+        return self._report(session)
+
+    def _report(self, session: Session) -> int:
+        """Write the report, say how the run went, and return the exit code."""
+        ending = session.ending
+        end = RunEnd(
+            ending.reason, session.recorder.elapsed, session.wall_time, self.supervisor.events
+        )
+        stored = store_report(self.mission, session.observer.record(end), self.folder)
+        self.display.say(stored.words)
+        if ending.text:
+            self.display.say(f'ended: {ending.text}')
+        if ending.code == NODE_FAILED:
+            for log, text in self.supervisor.failed_logs():
+                self.display.say(f'--- {short(log)}\n{text}')
+        unwritten = session.unwritten + ([stored.problem] if stored.problem else [])
+        for problem in unwritten:
+            self.display.say(f'error: {problem}')
+        place = 'nowhere'
+        if stored.folder is not None:
+            place = short(stored.folder / 'report.json')
+        self.display.say(f'report: {place}')
+        code = ending.code
+        if ending.reason == 'planner_done' and stored.report['missed'] == 0:
+            code = DONE
+        return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
+
+
+def short(path: Path) -> str:
+    """Return a path relative to the working directory, if it is below."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

@@ -1,0 +1,305 @@
+"""A run while its nodes run: waits until they are ready, follows it, and decides when it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from maasi_sim.run.arming import Arming
+from maasi_sim.run.bag import BagError, BagWriter, load_types
+from maasi_sim.run.ending import (
+    DONE,
+    INTERRUPTED,
+    NODE_FAILED,
+    NOT_ALL_FOUND,
+    NOT_WRITTEN,
+    Ending,
+)
+from maasi_sim.run.interruption import Interruption
+from maasi_sim.run.mission import Mission
+from maasi_sim.run.progress import ProgressDisplay, Status
+from maasi_sim.run.recorder_node import Recorder
+from maasi_sim.run.run_options import Options
+from maasi_sim.run.supervisor import Supervisor
+from maasi_sim.scenario.layering import to_yaml
+
+# Bytes that may wait for the disk when the recorder says that it is done with a step.
+_BACKLOG = 8 * 2**20
+# Longest wall time between two checks of processes and topics [s].
+_POLL = 0.02
+# Between two checks for runs that follow the clock [s].
+_FOLLOWERS_PERIOD = 0.5
+# Wall time between two messages on what is waited for [s].
+_START_PATIENCE = 10.0
+
+
+class Session:
+    """Records and follows a run whose nodes have been started.
+
+    Parameters
+    ----------
+    mission : Mission
+        What is run.
+    supervisor : Supervisor
+        Of the nodes.
+    options : Options
+        From the command line.
+    interruption : Interruption
+        Ends the run when it becomes true.
+    display : ProgressDisplay
+        Shows how it goes on.
+
+    Attributes
+    ----------
+    recorder : Recorder
+    observer : Observer
+    ending : Ending
+        How the run ended, after `run`.
+    unwritten : list of str
+        What could not be written, and why.
+    """
+
+    recorder: Recorder
+    ending: Ending
+
+    def __init__(
+        self,
+        mission: Mission[Any],
+        supervisor: Supervisor,
+        options: Options,
+        interruption: Interruption,
+        display: ProgressDisplay,
+    ) -> None:
+        self.mission = mission
+        self.unwritten: list[str] = []
+        self._types = load_types()
+        self.observer = mission.observer(self._types)
+        self._scenario = mission.scenario
+        self._limits = mission.scenario.limits
+        self._supervisor = supervisor
+        self._options = options
+        self._interruption = interruption
+        self._display = display
+        self._bag: BagWriter | None = None
+        self._open = contextlib.ExitStack()
+        # Wall time of the first step and of the end.
+        self._begun: float | None = None
+        self._ended: float | None = None
+
+    def open(self, domain: int, folder: Path) -> None:
+        """Open the recording and join the ROS domain."""
+        if self._options.record:
+            self._bag = BagWriter(folder / 'bag', self._types, self._scenario.record.images)
+            self._open.callback(self.close_bag)
+            self._bag.write_scenario(self._facts(), {'seed': str(self._scenario.seed)})
+        self.recorder = Recorder(
+            domain, self.observer, self._scenario.step, self._bag, self._options.namespace
+        )
+        self._open.callback(self.recorder.close)
+
+    def close(self) -> None:
+        """Leave the ROS domain and close the recording."""
+        self._open.close()
+
+    def close_bag(self) -> None:
+        """Close the recording."""
+        try:
+            if self._bag is not None:
+                self._bag.close()
+        except BagError as error:
+            self.unwritten.append(str(error))
+
+    def run(self) -> None:
+        """Follow the run from the start to the end of its nodes."""
+        team = f'{self._options.namespace}/'.lstrip('/')
+        robots = [team + name for name in self.mission.taking_off()]
+        self._arming = Arming(self.recorder.context, robots)
+        ending = self._wait_until_ready()
+        threading.Thread(target=self._warn, daemon=True).start()
+        self.ending = ending or self._follow()
+        self._arming.close()
+        self._ended = time.monotonic()
+        self.recorder.finish()
+        self._supervisor.stop(self.recorder, self.is_followed, _POLL)
+
+    @property
+    def wall_time(self) -> float:
+        """Wall time from the first step to the end [s]."""
+        if self._begun is None or self._ended is None:
+            return 0.0
+        return self._ended - self._begun
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether another run needs the clock of this one, and may have it."""
+        follows = self._options.follow_clock or self._scenario.external_clock
+        own = self._supervisor.clock_running and not (follows or self._options.lockstep)
+        return bool(own and not self._interruption and self.recorder.followers())
+
+    def keep_clock(self) -> None:
+        """Keep the simulation running until no other run follows its clock."""
+        teams = ', '.join(self.recorder.followers())
+        self._display.say(f'the clock goes on for {teams} (Ctrl-C ends it)')
+        while self.is_followed:
+            self.recorder.wait(_FOLLOWERS_PERIOD)
+            self.recorder.drain()
+
+    def _facts(self) -> str:
+        """Return all that a replay needs, as YAML."""
+        options = self._options
+        facts = {
+            'name': self.mission.name,
+            'seed': self._scenario.seed,
+            'lockstep': options.lockstep,
+            'rate': options.rate,
+            'namespace': options.namespace,
+            'follow_clock': options.follow_clock,
+            'scenario': self._scenario.content(),
+            'nodes': {
+                self._supervisor.without_team(plan.full_name): {
+                    'package': plan.package,
+                    'executable': plan.executable,
+                    'parameters': plan.parameters,
+                }
+                for plan in self._supervisor.plans
+            },
+        }
+        return to_yaml(facts)
+
+    def _warn(self) -> None:
+        warning = self.mission.warning()
+        if warning:
+            self._display.say(f'warning: {warning}')
+
+    def _wait_until_ready(self) -> Ending | None:
+        """Wait until every node takes part, the recorder last; return an ending if one does not."""
+        recorder, supervisor = self.recorder, self._supervisor
+        begin = time.monotonic()
+        patience = _START_PATIENCE
+        self._name_external_robots()
+        expected = [plan.full_name for plan in supervisor.plans if plan.says_ready]
+        needed = [topic for plan in supervisor.plans for topic in plan.topics]
+        while True:
+            ending = self._check()
+            if ending is not None:
+                return ending
+            recorder.discover()
+            # What the nodes send while they start is recorded as it comes.
+            recorder.drain()
+            ready = recorder.take_ready()
+            self._arming.call(ready)
+            late = [name for name in expected if name not in ready]
+            missing = recorder.missing(needed)
+            if not late and not missing:
+                break
+            waited = time.monotonic() - begin
+            what = ', '.join(
+                [f'{name} is not ready' for name in late]
+                or [f'nobody publishes {topic}' for topic in missing]
+            )
+            if waited > self._limits.start:
+                supervisor.failed.update(late)
+                return Ending('not_ready', NODE_FAILED, f'{what} after {self._limits.start:g} s')
+            if waited > patience:
+                self._display.say(f'waiting: {what}')
+                patience += _START_PATIENCE
+            recorder.wait(_POLL)
+        for complaint in recorder.complaints:
+            self._display.say(f'warning: {complaint}')
+        # Their executors run, even if no heartbeat has arrived so far.
+        for name in expected:
+            supervisor.watch.beat(name, time.monotonic())
+        recorder.publish_ready()
+        return None
+
+    def _name_external_robots(self) -> None:
+        team = self._options.namespace
+        where = f' --namespace {team}' if team else ''
+        domain = self.recorder.context.get_domain_id()
+        for name in self.mission.external():
+            self._display.say(
+                f'{name} is external: it takes off when you call its service arm (search_command '
+                f'arm --robot {name}{where}, with ROS_DOMAIN_ID={domain})'
+            )
+
+    def _follow(self) -> Ending:
+        """Follow the run until it ends, and return how."""
+        recorder, supervisor = self.recorder, self._supervisor
+        limit = round(self._limits.time * 1e9)
+        moved = time.monotonic()
+        last: tuple[int | None, int] = (None, 0)
+        while True:
+            recorder.wait(_POLL)
+            recorder.drain(limit)
+            self._arming.call(recorder.ready)
+            ending = self._check() or self._goal()
+            if ending is not None:
+                return ending
+            now = (recorder.step, recorder.time)
+            if now != last:
+                last, moved = now, time.monotonic()
+                self._begun = self._begun or moved
+                supervisor.running = True
+                self._finish_step()
+            elif supervisor.restarting:
+                # A restarted node may have to compile: `limits.start` holds.
+                moved = time.monotonic()
+            elif time.monotonic() - moved > self._limits.silence:
+                if self._options.follow_clock:
+                    return Ending(
+                        'clock_stopped',
+                        NODE_FAILED,
+                        '/clock, which this run follows, stands still for '
+                        f'{self._limits.silence:g} s',
+                    )
+                return supervisor.standstill(recorder)
+            if self._display.due or self.observer.news:
+                self._show()
+
+    def _finish_step(self) -> None:
+        """Say that the recorder is done with a step, once the disk keeps up."""
+        if self._bag is not None:
+            with contextlib.suppress(BagError):
+                self._bag.wait(_BACKLOG)
+        if self._options.lockstep and self.recorder.step is not None:
+            self.recorder.publish_done(self.recorder.step)
+
+    def _check(self) -> Ending | None:
+        """Return an ending if the run was interrupted or a node has failed."""
+        if self._interruption:
+            return Ending('interrupted', INTERRUPTED)
+        return self._supervisor.check(self.recorder)
+
+    def _goal(self) -> Ending | None:
+        """Return the ending that the scenario asks for, if it has come."""
+        observer = self.observer
+        if observer.completed is not None:
+            return Ending('all_found', DONE)
+        if self._bag is not None and self._bag.failed:
+            return Ending('not_recorded', NOT_WRITTEN)
+        if observer.settled is not None:
+            meant = self._scenario.stop == 'planner_done'
+            return Ending('planner_done', DONE if meant else NOT_ALL_FOUND, observer.settled)
+        if self.recorder.elapsed >= self._limits.time:
+            return Ending('time_limit', NOT_ALL_FOUND)
+        return None
+
+    def _show(self) -> None:
+        observer = self.observer
+        observer.news = False
+        seconds = self.recorder.elapsed
+        wall = time.monotonic() - (self._begun or time.monotonic())
+        self._display.show(
+            Status(
+                time=seconds,
+                measurements=observer.measurements,
+                found=observer.found,
+                targets=observer.total,
+                explored=observer.explored,
+                word=self.mission.found_word,
+                factor=seconds / wall if wall > 0.0 else 0.0,
+            )
+        )

@@ -1,0 +1,250 @@
+"""The nodes of a run as processes: started, watched, restarted and stopped."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from maasi_sim.run.ending import NODE_FAILED, Ending
+from maasi_sim.run.node_plan import NodePlan
+from maasi_sim.run.node_watch import NodeWatch
+from maasi_sim.run.processes import NodeProcess, find_executable, stop
+from maasi_sim.run.progress import ProgressDisplay
+from maasi_sim.run.run_folder import ResultsError, write_text
+from maasi_sim.run.run_options import Options
+from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.warm_up import main_of, warm_up_all
+
+if TYPE_CHECKING:
+    from maasi_sim.run.recorder_node import Recorder
+
+# Wall time between two checks of the processes, where steps come in quick succession [s].
+_CHECK_PERIOD = 0.05
+
+
+class Supervisor:
+    """Starts the nodes of a run, and ends the run or restarts a node that dies or hangs.
+
+    Parameters
+    ----------
+    plans : list of NodePlan
+        Nodes to start.
+    scenario : BaseScenario
+        Its limits, and what to do with a node that dies.
+    options : Options
+        From the command line.
+    folder : Path
+        Of the run: gets parameter files and logs.
+    display : ProgressDisplay
+        Is told what happens.
+
+    Attributes
+    ----------
+    processes : dict
+        By the full name of the node.
+    events : list of dict
+        Nodes that died, hung or were restarted.
+    failed : set of str
+        Nodes because of which the run ended.
+    running : bool
+        Whether the first step has come; before, nodes may take long to start.
+
+    Raises
+    ------
+    ProcessError
+        If an executable is not installed.
+    ResultsError
+        If a parameter file cannot be written.
+    """
+
+    def __init__(
+        self,
+        plans: list[NodePlan],
+        scenario: BaseScenario,
+        options: Options,
+        folder: Path,
+        display: ProgressDisplay,
+    ) -> None:
+        self.plans = plans
+        self.events: list[dict[str, Any]] = []
+        self.failed: set[str] = set()
+        self.running = False
+        self._scenario = scenario
+        self._limits = scenario.limits
+        self._respawn = scenario.on_exit == 'respawn'
+        self._team = options.namespace
+        self._lockstep = options.lockstep
+        self._display = display
+        self._checked = 0.0
+        self.watch = NodeWatch(self._limits.heartbeat, self._limits.start)
+        self._plan_of = {plan.full_name: plan for plan in plans}
+        self.clocks = {plan.full_name for plan in plans if plan.is_clock}
+        parameters = folder / 'parameters'
+        try:
+            parameters.mkdir(exist_ok=True)
+        except OSError as error:
+            raise ResultsError(f'{parameters}: {error.strerror}') from error
+        self.processes = {
+            plan.full_name: _process(plan, parameters, folder, options.log_level) for plan in plans
+        }
+
+    def load(self) -> None:
+        """Load once what the nodes share, where they are forked from this process."""
+        for plan in self.plans:
+            self.processes[plan.full_name].main = main_of(plan.package, plan.executable)
+        if any(process.main is not None for process in self.processes.values()):
+            warm_up_all()
+
+    def start(self) -> None:
+        """Start all nodes."""
+        for process in self.processes.values():
+            process.start()
+            self.watch.begin(process.name, process.pid, time.monotonic())
+
+    def check(self, recorder: Recorder) -> Ending | None:
+        """Return an ending if a node has died or hangs for good; restart it otherwise."""
+        # Asking the system about each process takes longer than a step may.
+        if time.monotonic() - self._checked < _CHECK_PERIOD:
+            return None
+        self._checked = time.monotonic()
+        for name, beat in recorder.heartbeats.items():
+            self.watch.beat(name, beat)
+        recorder.heartbeats.clear()
+        ending = self._check_start() or self._check_heartbeats(recorder)
+        if ending is not None:
+            return ending
+        for name, process in self.processes.items():
+            if not process.running:
+                ending = self._restart(name, process, recorder)
+                if ending is not None:
+                    return ending
+        return None
+
+    def _restart(self, name: str, process: NodeProcess, recorder: Recorder) -> Ending | None:
+        """Restart a node that has died, or return the ending of the run."""
+        text = f'{name} {process.how_it_ended()}'
+        event = {'time': recorder.elapsed, 'node': name, 'event': 'died'}
+        robot = self._robot_of(name)
+        if robot is not None and self._plan_of[name].drives:
+            recorder.stop_robots([robot])
+        # Another simulation would begin with another time.
+        tries = 0 if name in self.clocks else self._limits.restarts
+        if self._respawn and process.restarts < tries:
+            self.events.append({**event, 'event': 'restarted'})
+            recorder.ready.discard(name)
+            process.restart()
+            self.watch.begin(name, process.pid, self._checked)
+            self._display.say(f'{text}; it is started again')
+            return None
+        self.events.append(event)
+        self.failed.add(name)
+        if process.restarts:
+            text += f', after {process.restarts} restarts'
+        return Ending('node_died', NODE_FAILED, text)
+
+    def _check_start(self) -> Ending | None:
+        """Return an ending if a restarted node takes too long to start."""
+        # Before the first step the session waits for the nodes.
+        late = self.watch.late(self._checked) if self.running else []
+        if not late:
+            return None
+        self.failed.update(late)
+        text = f'{", ".join(late)} not ready {self._limits.start:g} s after the start'
+        return Ending('not_ready', NODE_FAILED, text)
+
+    def _check_heartbeats(self, recorder: Recorder) -> Ending | None:
+        """Kill a node that hangs, or return the ending of the run."""
+        for name, silent in self.watch.hung(self._checked).items():
+            plan = self._plan_of[name]
+            # A lockstep step may take long: `limits.silence` holds for the nodes that it awaits.
+            awaited = self._lockstep and (plan.says_done or plan.is_clock)
+            if not self.running or awaited or not self.processes[name].running:
+                continue
+            text = f'{name} hangs: no heartbeat for {silent:.1f} s'
+            self.events.append({'time': recorder.elapsed, 'node': name, 'event': 'hung'})
+            robot = self._robot_of(name)
+            if robot is not None:
+                recorder.stop_robots([robot])
+            if self._respawn and name not in self.clocks:
+                self._display.say(f'{text}; it is killed')
+                self.processes[name].signal(signal.SIGKILL)
+                continue
+            self.failed.add(name)
+            return Ending('node_hung', NODE_FAILED, text)
+        return None
+
+    def standstill(self, recorder: Recorder) -> Ending:
+        """Return the ending of a run whose time has stopped."""
+        silence = f'for {self._limits.silence:g} s'
+        if recorder.step is None:
+            return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
+        steps = recorder.done_steps()
+        late = [
+            plan.full_name
+            for plan in self.plans
+            if plan.says_done and steps.get(plan.full_name, -1) < recorder.step
+        ]
+        self.failed.update(late)
+        who = ', '.join(late) or next(iter(self.clocks))
+        return Ending(
+            'node_hung', NODE_FAILED, f'step {recorder.step}: nothing from {who} {silence}'
+        )
+
+    @property
+    def restarting(self) -> bool:
+        """Whether a restarted node has not had a heartbeat yet."""
+        return any(self.processes[name].restarts for name in self.watch.starting())
+
+    @property
+    def clock_running(self) -> bool:
+        """Whether the simulation runs."""
+        return all(self.processes[name].running for name in self.clocks)
+
+    def stop(self, recorder: Recorder, keep_clock: bool, poll: float) -> None:
+        """Stop the robots, then the nodes, and record what they still send."""
+        kept = self.clocks if keep_clock else set()
+        drivers = [
+            plan.full_name for plan in self.plans if plan.drives or plan.package == 'maasi_drivers'
+        ]
+        others = [name for name in self.processes if name not in kept.union(drivers)]
+        robots = self._scenario.names()
+        # Drivers stop their robots: the simulation, or the robot, must still be there to hear it.
+        # One that hangs does not, and may have sent a command when it is killed: before and after.
+        recorder.stop_robots(robots)
+        stubborn = stop([self.processes[name] for name in drivers])
+        recorder.stop_robots(robots)
+        recorder.wait(poll)
+        recorder.drain()
+        stubborn += stop([self.processes[name] for name in others])
+        recorder.drain()
+        if stubborn:
+            self._display.say(f'had to be killed: {", ".join(stubborn)}')
+
+    def stop_all(self) -> None:
+        """Stop every process that still runs."""
+        stop(list(self.processes.values()))
+
+    def failed_logs(self) -> Iterator[tuple[Path, str]]:
+        """Yield the log file and its last lines of each node that failed."""
+        for process in self.processes.values():
+            if process.name in self.failed:
+                yield process.log, process.last_words()
+
+    def without_team(self, name: str) -> str:
+        """Return the name of a node without the namespace of the team."""
+        return name.removeprefix(f'/{self._team}') if self._team else name
+
+    def _robot_of(self, node: str) -> str | None:
+        name = self.without_team(node).strip('/').partition('/')[0]
+        return name if name in self._scenario.robots else None
+
+
+def _process(plan: NodePlan, parameters: Path, folder: Path, level: str | None) -> NodeProcess:
+    """Write the parameter file of a node and return its process."""
+    path = parameters / f'{plan.file_name}.yaml'
+    write_text(path, plan.parameter_text())
+    command = plan.command(find_executable(plan.package, plan.executable), path, level)
+    return NodeProcess(plan.full_name, command, folder / f'{plan.file_name}.log')

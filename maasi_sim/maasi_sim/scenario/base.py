@@ -1,0 +1,106 @@
+"""What the scenario files of all kinds of missions have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import Field
+
+from maasi_filter.settings import EnvironmentSettings, Settings
+from maasi_sim.scenario.layering import to_yaml
+
+
+class EventSettings(Settings):
+    """Something that happens to a robot."""
+
+    at: float = Field(ge=0.0, description='When [s]')
+    robot: str = Field(description='To whom')
+    do: Literal['leave', 'back'] = Field(description='It goes silent, or it is there again')
+
+
+class LimitSettings(Settings):
+    """When a run is given up."""
+
+    time: float = Field(default=600.0, gt=0.0, description='Simulated time [s]')
+    start: float = Field(
+        default=180.0,
+        gt=0.0,
+        description='Wall time until all nodes are ready; they may have to compile [s]',
+    )
+    silence: float = Field(
+        default=30.0,
+        gt=0.0,
+        description='Wall time without a step until a node counts as hung [s]',
+    )
+    heartbeat: float = Field(
+        default=4.5,
+        ge=2.0,
+        description='Wall time without a sign of life of a node, while it does not wait for a '
+        'processor, until it counts as hung; free running [s]',
+    )
+    restarts: int = Field(
+        default=3, ge=0, description='Restarts of one node with on_exit: respawn [1]'
+    )
+
+
+class RecordSettings(Settings):
+    """What the recording holds."""
+
+    images: Literal['jpeg', 'png', 'raw'] = Field(
+        default='jpeg', description='How images are stored; png is lossless and slower'
+    )
+
+
+class BaseScenario(Settings):
+    """A whole scenario file, all layers merged."""
+
+    version: Literal[1] = Field(description='Of this format')
+    description: str = Field(default='', description='What it shows, in words')
+    environment: EnvironmentSettings = Field(description='Where the search takes place')
+    step: float = Field(default=0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')
+    seed: int = Field(default=1, ge=0, description='Of all random numbers, unless given otherwise')
+    robots: Mapping[str, Any] = Field(min_length=1, description='Robots by name')
+    planner: Any = Field(description='Planner')
+    events: list[EventSettings] = Field(default_factory=list, description='What happens to robots')
+    stop: Literal['all_found', 'planner_done'] = Field(
+        default='all_found',
+        description='When the run ends well: all true targets are found, or all cuboids visited; '
+        'or every planner says that nothing is left to gain',
+    )
+    on_exit: Literal['end', 'respawn'] = Field(
+        default='end', description='A node that dies ends the run, or is started again'
+    )
+    limits: LimitSettings = Field(default_factory=LimitSettings, description='When to give up')
+    record: RecordSettings = Field(default_factory=RecordSettings, description='Recording')
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.environment.dimension
+
+    @property
+    def external_clock(self) -> bool:
+        """Whether the time is that of a program that moves a robot."""
+        return False
+
+    def names(self) -> list[str]:
+        """Return the robots' names in order."""
+        return sorted(self.robots)
+
+    def check_pace(self, lockstep: bool, rate: float | None) -> None:
+        """Check that it can be run in lockstep, or at a rate (simulated over wall time).
+
+        Raises
+        ------
+        ScenarioError
+            If it cannot: links other than topics run in real time.
+        """
+
+    def content(self) -> dict[str, Any]:
+        """Return all settings as plain values, that are read back the same."""
+        return self.model_dump(mode='python', by_alias=True)
+
+    def text(self) -> str:
+        """Return all settings as a scenario file that needs no other layer."""
+        return to_yaml(self.content())

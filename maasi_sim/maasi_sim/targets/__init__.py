@@ -1,0 +1,1 @@
+"""Searches for targets: nodes, observer, scores and report."""

@@ -1,0 +1,96 @@
+"""The report of a search for targets as plain values, and in words."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_sim.run.report_files import END_REASONS, ending, identity, pace, path_length
+from maasi_sim.targets.tally import Progress
+from maasi_sim.targets.target_record import TargetRecord
+
+FloatArray = NDArray[np.float64]
+
+
+def build_report(record: TargetRecord) -> dict[str, Any]:
+    """Return the report of a run as plain values; nothing in it is infinite or not a number."""
+    scores = record.scores()
+    complete = _completion(record)
+    distances = {
+        name: _number(path_length(trajectory)) for name, trajectory in record.trajectories.items()
+    }
+    return {
+        **identity(record),
+        'targets': [_numbers(position) for position in record.truth],
+        'found': [
+            {
+                'id': target.id,
+                'position': _numbers(target.position),
+                'covariance': [_numbers(row) for row in target.covariance],
+                'agent': target.agent,
+                'measurement': target.measurement,
+                'time': target.time,
+            }
+            for target in record.found
+        ],
+        'true_found': scores.match.true_found,
+        'missed': scores.match.missed,
+        'false_found': scores.match.false_found,
+        'rmse': _number(scores.match.rmse),
+        'gospa': {
+            'total': scores.gospa.total,
+            'localisation': scores.gospa.localisation,
+            'missed': scores.gospa.missed,
+            'false': scores.gospa.false,
+        },
+        'measurements': record.measurements,
+        'measurements_to_find_all': complete.measurements if complete else None,
+        'time_to_find_all': complete.time if complete else None,
+        'decisions': record.decisions,
+        'distance': distances,
+        **ending(record),
+        'scoring': {'radius': scores.radius, 'c': scores.radius, 'p': scores.order},
+    }
+
+
+def summary(report: dict[str, Any]) -> str:
+    """Return the report in a few lines."""
+    targets = len(report['targets'])
+    found = f'{report["true_found"]} of {targets} targets found'
+    if report['false_found']:
+        found += f', {report["false_found"]} false'
+    if report['rmse'] is not None:
+        found += f', RMSE {report["rmse"]:.3g} m'
+    measurements = sum(report['measurements'].values())
+    lines = [
+        f'{found} (ended: {END_REASONS.get(report["end_reason"], report["end_reason"])})',
+        f'{measurements} measurements, {report["decisions"]} decisions',
+    ]
+    if report['measurements_to_find_all'] is not None and targets:
+        lines[1] += (
+            f'; all found after {report["measurements_to_find_all"]} measurements and '
+            f'{report["time_to_find_all"]:.1f} s'
+        )
+    return '\n'.join(lines + pace(report))
+
+
+def _completion(record: TargetRecord) -> Progress | None:
+    """Return when all targets were found and stayed so."""
+    complete = None
+    for progress in record.progress:
+        if progress.true_found < len(record.truth):
+            complete = None
+        elif complete is None:
+            complete = progress
+    return complete if len(record.truth) else None
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _numbers(values: FloatArray) -> list[float | None]:
+    return [_number(value) for value in values]

@@ -1,0 +1,59 @@
+"""All that the report of a search for targets needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_sim.run.run_record import RunRecord
+from maasi_sim.targets.scoring import Scores, score, scoring_radius
+from maasi_sim.targets.tally import Found, Progress
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class TargetRecord(RunRecord):
+    """What a search for targets has come to.
+
+    Attributes
+    ----------
+    truth : (n, d) array
+        True targets [m].
+    found : list of Found
+        At the end.
+    progress : list of Progress
+        After each filter update.
+    measurements : dict
+        Number by robot.
+    decisions : int
+        Waypoints chosen, of all robots.
+    waypoints : dict
+        By robot: chosen ones in order, (n, 3) [m].
+    measured_at : dict
+        By robot: where it measured, (n, 3) [m].
+    explored, expected_number : float
+        Share of the environment, and targets believed not yet found, at the end.
+    """
+
+    truth: FloatArray
+    found: list[Found] = field(default_factory=list)
+    progress: list[Progress] = field(default_factory=list)
+    measurements: dict[str, int] = field(default_factory=dict)
+    decisions: int = 0
+    waypoints: dict[str, FloatArray] = field(default_factory=dict)
+    measured_at: dict[str, FloatArray] = field(default_factory=dict)
+    explored: float = 0.0
+    expected_number: float = 0.0
+
+    @property
+    def radius(self) -> float:
+        """Distance within which a found target is true [m]."""
+        return scoring_radius(self.scenario, self.truth)
+
+    def scores(self) -> Scores:
+        """Return the scores at the end."""
+        positions = [target.position for target in self.found]
+        return score(positions, self.truth, self.radius, self.scenario.scoring.order)
