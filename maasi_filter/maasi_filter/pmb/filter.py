@@ -33,7 +33,7 @@ from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import LEAST_SUPPORT, Component, merge
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, MISS, SCALE, TERMS, Scan, make_scan
-from maasi_filter.pmb.found import nearest, same_estimate
+from maasi_filter.pmb.found import SAME_TARGET, nearest, same_estimate
 from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
@@ -210,7 +210,11 @@ class PmbFilter:
             if marginals.caused[i].sum() > 0.5 and not item.foreign:
                 item.pose_error = member.pose_error
                 item.found_radius = self._found_radius(member)
-            changed |= self._mark(item, moved, member, newly_found, time)
+            if self._can_be_found(item, moved) and not self._is_known(i, marginals.caused):
+                newly_found.append(self._find(item, member, time))
+                changed = True
+            else:
+                changed |= self._report(item, moved)
         # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
         real = births.intensity / (kappa + births.intensity)
         self._bear(member, scan, births, marginals.new * real)
@@ -272,39 +276,58 @@ class PmbFilter:
                 )
             )
 
-    def _mark(
-        self,
-        item: Component,
-        moved: bool,
-        member: CheckedMeasurement,
-        newly_found: list[FoundTarget],
-        time: float,
-    ) -> bool:
-        """Mark a component as found, report where it is now, or withdraw it."""
-        target, numbers = item.target, self._numbers.pmb
-        if item.foreign:
-            item.existence = CERTAIN
-            return False
-        if target is not None and item.existence < numbers.withdrawn_probability:
-            item.target = None
-            return True
-        if target is not None:
-            if moved:
-                item.target = self._estimate(target, item)
-            return moved
-        if not (
+    def _can_be_found(self, item: Component, moved: bool) -> bool:
+        """Return whether a component surely exists, and it is known well enough where."""
+        return (
             moved
-            and item.existence > numbers.found_probability
+            and item.target is None
+            and item.existence > self._numbers.pmb.found_probability
             and item.hits >= LEAST_HITS
             and item.density.radius <= item.found_radius
-        ):
-            return False
+        )
+
+    def _is_known(self, i: int, caused: FloatArray) -> bool:
+        """Return whether a component may be a found target that this scan has not seen elsewhere.
+
+        A target causes one detection of a scan at most, so a found target that surely caused
+        another one than this component is not it.
+        """
+        density = self.components[i].density
+        for f, other in enumerate(self.components):
+            if other.target is None:
+                continue
+            both = caused[[i, f]]
+            apart = both.max(axis=1, initial=0.0) > 0.5
+            if apart.all() and both[0].argmax() != both[1].argmax():
+                continue
+            offset = density.mean - other.density.mean
+            total = density.covariance + other.density.covariance
+            if float(offset @ np.linalg.solve(total, offset)) < SAME_TARGET:
+                return True
+        return False
+
+    def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
+        """Mark a component as found."""
         d = self.dimension
         nowhere = np.zeros(d), np.zeros((d, d))
         target = FoundTarget(self._next_id(), *nowhere, member.robot, member.index, time)
         item.target = self._estimate(target, item)
-        newly_found.append(item.target)
-        return True
+        return item.target
+
+    def _report(self, item: Component, moved: bool) -> bool:
+        """Report where a found component is now, or withdraw it; return whether it changed."""
+        target = item.target
+        if target is None:
+            return False
+        if item.foreign:
+            item.existence = CERTAIN
+            return False
+        if item.existence < self._numbers.pmb.withdrawn_probability:
+            item.target = None
+            return True
+        if moved:
+            item.target = self._estimate(target, item)
+        return moved
 
     def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
         """Return a target where its particles are, with the robot's position error."""
