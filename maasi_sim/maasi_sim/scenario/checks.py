@@ -12,6 +12,7 @@ from maasi_sim.scenario.base import EventSettings, LimitSettings
 from maasi_sim.scenario.layering import Key, unknown
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.scenario.visibility import robot_candidates
+from maasi_sim.world.truth import SimulatedSettings
 
 _ROBOT_NAME = re.compile(r'^[a-z][a-z0-9_]*$')
 
@@ -126,6 +127,28 @@ def _robot_problems(
     if robot.body == 'external' and robot.link != 'topics':
         yield ('body',), f"read 'external', allowed with link {robot.link} is simulated"
     yield from _sensor_problems(robot, scenario)
+    yield from _simulated_problems(robot, scenario)
+
+
+def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
+    """Yield what a camera or a robot outside the simulation cannot play."""
+    nothing = SimulatedSettings()
+    if robot.camera is not None:
+        for field in ('noise', 'noise_factor', 'probability_factor', 'clutter_per_scan'):
+            value = getattr(robot.simulated, field)
+            if value != getattr(nothing, field):
+                yield (
+                    ('simulated', field),
+                    f'read {value}, which is of a ranging sensor; allowed without a camera',
+                )
+        if scenario.targets.walk > 0.0:
+            yield (
+                ('camera',),
+                f'is there, and targets.walk is {scenario.targets.walk}; allowed are targets that '
+                'stand still, or robots without a camera',
+            )
+    if robot.external and robot.simulated != nothing:
+        yield ('simulated',), 'is given for a robot that is external; allowed are simulated robots'
 
 
 def check_names(name: str) -> Iterator[str]:

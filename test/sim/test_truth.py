@@ -1,0 +1,137 @@
+"""What is true apart from what is believed: sensors, odometry, targets that walk."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from maasi_filter.models.pose import Pose
+from maasi_filter.settings import SensorSettings
+from maasi_planner.motion import RobotState
+from maasi_sim.scenario.layering import ScenarioError
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.search import search
+from maasi_sim.world.odometry import OdometryModel, OdometrySettings
+from maasi_sim.world.ranging_sensor import RangingSensor
+from maasi_sim.world.simulation import Simulation
+from maasi_sim.world.truth import SimulatedSettings
+from maasi_sim.world.world import World
+
+CUBE = np.array([[0.0, 260.0]] * 3)
+POSE = Pose.from_yaw([100.0, 120.0, 80.0], 0.4)
+
+
+def scenario(*values):
+    """Return the 3D scenario with other values: pairs of a dotted key and a value."""
+    overrides = {f'--set {key}': (tuple(key.split('.')), value) for key, value in values}
+    return load_scenario('ranging_drone_3d', overrides)
+
+
+def true_sensor(**values):
+    return SimulatedSettings(**values).sensor(SensorSettings(), 'drone', CUBE)
+
+
+def test_nothing_given_is_what_is_believed():
+    believed = SensorSettings().build('drone', 3)
+    true = true_sensor()
+    assert_array_equal(true.covariance, believed.covariance)
+    assert true.clutter == believed.clutter
+    assert_array_equal(
+        true.detection.probability(POSE.position[None] + 5.0, POSE),
+        believed.detection.probability(POSE.position[None] + 5.0, POSE),
+    )
+
+
+def test_true_noise_and_detection_differ_from_believed_ones():
+    believed = SensorSettings().build('drone', 3)
+    true = true_sensor(noise_factor=1.5, probability_factor=0.7)
+    assert_allclose(true.covariance, 2.25 * believed.covariance)
+    place = POSE.position[None] + 5.0
+    assert_allclose(
+        true.detection.probability(place, POSE), 0.7 * believed.detection.probability(place, POSE)
+    )
+    given = true_sensor(noise={'range': 0.3, 'bearing': 0.1, 'elevation': 0.2})
+    assert_allclose(np.diagonal(given.covariance), [0.09, 0.01, 0.04])
+    assert true_sensor(probability_factor=50.0).detection.gain == 1.0
+
+
+def test_clutter_is_played_as_often_as_told():
+    sensor = true_sensor(clutter_per_scan=2.5)
+    reach = float(np.linalg.norm(CUBE[:, 1] - CUBE[:, 0]))
+    played = RangingSensor(sensor, np.zeros((0, 3)), 3, 'drone', reach)
+    counts = [len(played.measure(POSE, step)) for step in range(2000)]
+    assert_allclose(np.mean(counts), 2.5, atol=0.12)
+
+
+def test_odometry_reports_other_errors_than_it_has():
+    true = OdometrySettings(position_noise=0.5, position_drift=0.1)
+    told = OdometrySettings(position_noise=0.01, heading_noise=0.0)
+    start = Pose.from_yaw([10.0, 10.0, 5.0], 0.0)
+    errors = []
+    for seed in range(300):
+        model = OdometryModel(true, start, seed, 'drone', told)
+        reading = model.step(RobotState(Pose([26.0, 10.0, 5.0])), 1)
+        errors.append(reading.pose.position - [16.0, 0.0, 0.0])
+    assert_allclose(np.std(errors, axis=0), [0.64, 0.64, 0.5], rtol=0.15)
+    assert_allclose(np.diagonal(reading.covariance)[:3], 1e-4, rtol=1e-6)
+
+
+def test_constant_offset_has_its_length_and_is_reported():
+    settings = OdometrySettings(position_noise=0.0, heading_noise=0.0, position_offset=2.0)
+    start = Pose.from_yaw([10.0, 10.0, 5.0], 0.0)
+    directions = []
+    for seed in range(20):
+        model = OdometryModel(settings, start, seed, 'drone')
+        first = model.step(RobotState(start), 1).pose.position
+        last = model.step(RobotState(Pose([50.0, 10.0, 5.0])), 2)
+        assert_allclose(np.linalg.norm(first), 2.0)
+        assert_allclose(last.pose.position - [40.0, 0.0, 0.0], first, atol=1e-12)
+        assert_allclose(np.diagonal(last.covariance)[:3], 4.0 / 3.0)
+        directions.append(first / 2.0)
+    assert np.linalg.norm(np.mean(directions, axis=0)) < 0.5
+
+
+def test_targets_walk_as_told_the_same_each_time_and_stay_inside():
+    inner = np.random.default_rng(0).uniform(100.0, 160.0, (400, 3))
+    world = World(CUBE, inner, walk=0.5, seed=4)
+    last = world.targets_at(100)
+    assert_allclose(np.std(last - inner), 5.0, rtol=0.05)
+    assert_array_equal(World(CUBE, inner, walk=0.5, seed=4).targets_at(100), last)
+    assert_array_equal(world.targets_at(0), inner)
+    small = World(np.array([[0.0, 3.0]] * 3), np.full((50, 3), 1.5), walk=0.5, seed=4)
+    places = small.targets_at(200)
+    assert ((places >= 0.0) & (places <= 3.0)).all()
+
+
+def test_a_scenario_plays_it_in_the_simulation_that_nodes_use():
+    changed = scenario(
+        ('robots.drone.simulated', {'noise_factor': 2.0, 'odometry': {'position_offset': 3.0}}),
+        ('targets.walk', 0.3),
+    )
+    simulation = Simulation(changed, 1)
+    believed = changed.robots['drone'].sensor.build('drone', 3)
+    body = simulation.robots['drone']
+    assert_allclose(body.equipment.sensor.covariance, 4.0 * believed.covariance)
+    assert np.linalg.norm(body.odometry.pose.position) > 2.5
+    assert simulation.world.walk == pytest.approx(0.3 * changed.step**0.5)
+
+
+def test_a_search_counts_walking_targets_where_they_are():
+    changed = scenario(('targets.walk', 1.0))
+    result = search(changed, 1, 5)
+    assert_array_equal(result.truth, changed.world(1).targets_at(result.steps - 1))
+
+
+@pytest.mark.parametrize(
+    ('name', 'key', 'value', 'text'),
+    [
+        ('ranging_drone_3d', 'robots.drone.simulated.noise_factor', 0.0, 'noise_factor'),
+        ('ranging_drone_3d', 'robots.drone.simulated.clutter_per_scan', -1.0, 'clutter_per_scan'),
+        ('ranging_drone_3d', 'robots.drone.simulated.clutter', 1.0, 'clutter'),
+        ('ranging_drone_3d', 'targets.walk', -0.1, 'walk'),
+        ('mambo', 'targets.walk', 0.1, 'targets.walk is 0.1'),
+        ('mambo', 'robots.mambo.simulated.clutter_per_scan', 1.0, 'of a ranging sensor'),
+    ],
+)
+def test_what_cannot_be_played_is_refused(name, key, value, text):
+    with pytest.raises(ScenarioError, match=text):
+        load_scenario(name, {'--set': (tuple(key.split('.')), value)})
