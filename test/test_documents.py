@@ -67,10 +67,9 @@ def dead_links(text: str, folder: Path) -> list[str]:
         path = folder / name
         if not path.exists():
             dead.append(link)
-            continue
-        target = path.read_text() if name else text
-        if anchor and anchor not in anchors(target):
-            dead.append(link)
+        elif anchor:
+            known = anchors(path.read_text() if name else text)
+            dead += [] if anchor in known else [link]
     return dead
 
 
