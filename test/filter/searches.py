@@ -11,13 +11,15 @@ from maasi_filter import (
     FilterSettings,
     NoiseSettings,
     Pose,
-    SearchFilter,
     SensorSettings,
+    make_filter,
     wrap_angle,
 )
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)
+# Of the papers' filter on the floor.
+FLOOR_LENGTHS = {'found_radius': 0.02, 'removal_distance': 0.05, 'jitter_deviation': 0.003}
 DEGREES = NoiseSettings(range=1.5, bearing=0.175, elevation=0.295, as_='variance', angles='degrees')
 RADIANS = NoiseSettings(range=1.5, bearing=0.175, elevation=0.295)
 
@@ -68,7 +70,7 @@ def follow_one_target(
     generator = np.random.default_rng([seed, 5])
     sensor = cube_sensor(noise)
     target = 130.0 + 40.0 * (generator.random((1, 3)) - 0.5)
-    search = SearchFilter(settings or FilterSettings(), CUBE, np.random.default_rng([seed, 6]))
+    search = make_filter(settings or FilterSettings(), CUBE, np.random.default_rng([seed, 6]))
     first = None
     left = after
     for step, position in enumerate(wander(generator, most)):
@@ -105,7 +107,7 @@ def separated(generator, number, lower, upper, apart, dimension):
     return np.array(targets)
 
 
-def mow_floor(seed, pose_error=0.0, camera=False, search=None):
+def mow_floor(seed, pose_error=0.0, camera=False, search=None, settings=None):
     """Search the floor along a lawnmower, there and back; return the filter and the targets.
 
     The true field of view is a hard box; `pose_error` is the deviation of a slowly changing error
@@ -116,7 +118,8 @@ def mow_floor(seed, pose_error=0.0, camera=False, search=None):
     sensor = floor_sensor()
     true_view = BoxDetection([-0.2, -0.2], [0.2, 0.2], 1.0)
     if search is None:
-        search = SearchFilter(FilterSettings(), FLOOR, np.random.default_rng([seed, 2]))
+        generator_of_filter = np.random.default_rng([seed, 2])
+        search = make_filter(settings or FilterSettings(), FLOOR, generator_of_filter)
     path = []
     for row, y in enumerate(np.arange(-0.15, 2.41, 0.3)):
         line = np.arange(-0.3, 2.41, 0.1)

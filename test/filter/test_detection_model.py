@@ -9,7 +9,6 @@ from maasi_filter import (
     BoxDetection,
     DetectionSettings,
     ExponentialDetection,
-    FunctionDetection,
     GaussianDetection,
     Pose,
     detection_probability,
@@ -70,19 +69,6 @@ def test_the_kernel_agrees_with_the_model(model):
     # Two forms of the exponential function, each to a unit in the last place.
     np.testing.assert_allclose(values, inline, rtol=5e-16)
     assert ((values >= 0.0) & (values <= 1.0)).all()
-
-
-def test_a_function_of_the_user_is_checked():
-    pose = Pose([0.0, 0.0, 0.0])
-    good = FunctionDetection(lambda positions, pose: np.full(len(positions), 0.5))
-    assert good.probability(np.zeros((3, 3)), pose).tolist() == [0.5, 0.5, 0.5]
-    assert good.kernel() is None
-    large = FunctionDetection(lambda positions, pose: np.full(len(positions), 1.5))
-    with pytest.raises(ValueError, match=r'outside \[0, 1\]'):
-        large.probability(np.zeros((3, 3)), pose)
-    short = FunctionDetection(lambda positions, pose: [0.5])
-    with pytest.raises(ValueError, match='shape'):
-        short.probability(np.zeros((3, 3)), pose)
 
 
 def test_bad_models_are_refused():

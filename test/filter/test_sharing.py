@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from searches import FLOOR, floor_sensor
+from searches import FLOOR, FLOOR_LENGTHS, floor_sensor
 
-from maasi_filter import AgentMeasurement, FilterSettings, Pose, SearchFilter
+from maasi_filter import AgentMeasurement, FilterSettings, Pose, load_filter, make_filter
 from maasi_filter.records import FoundTarget
 
 POSE = Pose([1.0, 1.0, 1.0])
@@ -12,8 +12,18 @@ VALUES = np.array([[0.1, 0.3]])
 PLACE = np.array([1.0 + 0.1 * np.cos(0.3), 1.0 + 0.1 * np.sin(0.3)])
 
 
-def new_filter(**settings):
-    return SearchFilter(FilterSettings(particles=2000, **settings), FLOOR, np.random.default_rng(1))
+@pytest.fixture(params=['ic_phd', 'pmb'], autouse=True)
+def method(request):
+    """Both filters share in the same way."""
+    return request.param
+
+
+@pytest.fixture
+def new_filter(method):
+    """Return a function that makes a filter with the lengths of the floor."""
+    lengths = FLOOR_LENGTHS if method == 'ic_phd' else {}
+    settings = FilterSettings(method=method, **lengths)
+    return lambda: make_filter(settings, FLOOR, np.random.default_rng(1))
 
 
 def look(search, robot, times, begin=0, values=VALUES):
@@ -28,16 +38,11 @@ def target(position=PLACE, time=3.0, number=1, deviation=0.01):
     return FoundTarget(number, np.array(position), np.diag([deviation**2] * 2), 'other', 5, time)
 
 
-# The lengths of 002 are those of a much larger environment.
-LENGTHS = {'found_radius': 0.05, 'removal_distance': 0.1, 'jitter_deviation': 0.003}
-
-
-@pytest.mark.parametrize('preset, lengths', [('recommended', {}), ('paper_002', LENGTHS)])
-def test_what_another_one_found_is_not_found_again(preset, lengths):
-    alone = new_filter(preset=preset, **lengths)
+def test_what_another_one_found_is_not_found_again(new_filter):
+    alone = new_filter()
     look(alone, 'own', 12)
     assert len(alone.found_targets) == 1
-    search = new_filter(preset=preset, **lengths)
+    search = new_filter()
     assert search.take_over('other', [target()])
     result = look(search, 'own', 12)
     assert [(item.robot, item.origin) for item in search.found_targets] == [('other', 1)]
@@ -46,7 +51,7 @@ def test_what_another_one_found_is_not_found_again(preset, lengths):
     assert search.found_targets[0].position == pytest.approx(PLACE)
 
 
-def test_particles_of_a_target_that_another_one_found_are_deleted():
+def test_particles_of_a_target_that_another_one_found_are_deleted(new_filter):
     search = new_filter()
     far = np.array([[0.1, 0.3], [0.15, -2.0]])
     look(search, 'own', 1, values=far)
@@ -63,7 +68,7 @@ def test_particles_of_a_target_that_another_one_found_are_deleted():
 
 
 @pytest.mark.parametrize('time, owner', [(0.5, 'other'), (100.0, 'own')])
-def test_a_target_of_two_belongs_to_who_was_first(time, owner):
+def test_a_target_of_two_belongs_to_who_was_first(new_filter, time, owner):
     search = new_filter()
     look(search, 'own', 12)
     number = search.found_targets[0].id
@@ -74,7 +79,7 @@ def test_a_target_of_two_belongs_to_who_was_first(time, owner):
     assert bool(search.own_found_targets()) == (owner == 'own')
 
 
-def test_at_the_same_time_the_first_by_name_has_it():
+def test_at_the_same_time_the_first_by_name_has_it(new_filter):
     search = new_filter()
     look(search, 'own', 12)
     time = search.found_targets[0].time
@@ -83,7 +88,7 @@ def test_at_the_same_time_the_first_by_name_has_it():
     assert not search.take_over('z', [target(time=time)])
 
 
-def test_the_estimate_is_that_of_its_owner():
+def test_the_estimate_is_that_of_its_owner(new_filter):
     search = new_filter()
     search.take_over('other', [target()])
     assert not search.take_over('other', [target()])
@@ -95,7 +100,7 @@ def test_the_estimate_is_that_of_its_owner():
     assert search.found_targets[0].position == pytest.approx(moved)
 
 
-def test_bad_targets_are_refused_and_change_nothing():
+def test_bad_targets_are_refused_and_change_nothing(new_filter):
     search = new_filter()
     wrong = [target([np.nan, 1.0]), target(deviation=np.inf), target(deviation=0.0)]
     for item in wrong:
@@ -106,11 +111,11 @@ def test_bad_targets_are_refused_and_change_nothing():
     assert search.found_targets == []
 
 
-def test_a_saved_filter_knows_what_it_took_over(tmp_path):
+def test_a_saved_filter_knows_what_it_took_over(new_filter, tmp_path):
     search = new_filter()
     search.take_over('other', [target()])
     look(search, 'own', 2)
     search.save(tmp_path / 'state')
-    loaded = SearchFilter.load(tmp_path / 'state')
+    loaded = load_filter(tmp_path / 'state')
     assert [(item.robot, item.origin) for item in loaded.found_targets] == [('other', 1)]
     assert not loaded.take_over('other', [target()])

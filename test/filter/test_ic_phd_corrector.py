@@ -1,0 +1,235 @@
+"""The PHD corrector against its equations, summed densely, and against Stone Soup."""
+
+from __future__ import annotations
+
+import datetime
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from maasi_filter import (
+    AgentMeasurement,
+    DetectionSettings,
+    ExponentialDetection,
+    FilterSettings,
+    IcPhdFilter,
+    NoiseSettings,
+    Pose,
+    Sensor,
+    SensorSettings,
+)
+from maasi_filter.ic_phd.corrector import make_scan, phd_correct
+
+SIDE = 40.0
+BOUNDS = np.array([[0.0, SIDE]] * 2)
+
+
+def sensor_of(dimension, generator, probability=0.9):
+    root = generator.normal(0.0, 0.1, (dimension, dimension)) + 0.4 * np.eye(dimension)
+    detection = ExponentialDetection(probability, [10.0] * dimension)
+    return Sensor.ranging('any', detection, root @ root.T)
+
+
+def case(dimension, seed=0, particles=500, detections=4):
+    """Return a sensor, its pose, a cloud with weights, detections, and a background."""
+    generator = np.random.default_rng(seed)
+    sensor = sensor_of(dimension, generator)
+    pose = Pose.from_yaw(generator.normal(0.0, 3.0, 3), 0.5)
+    positions = generator.normal(0.0, 10.0, (particles, dimension))
+    weights = generator.random(particles) * 0.01
+    values = sensor.measurement.measure(positions[:detections], pose) + 0.05
+    return sensor, pose, positions, weights, values, np.geomspace(1e-6, 1.0, detections)
+
+
+def dense(sensor, pose, positions, weights, values, background):
+    """Return the factor and C(z) of (13) and (16), term by term."""
+    probability = sensor.detection.probability(positions, pose)
+    likelihood = np.exp(sensor.measurement.log_density(values, positions, pose, sensor.covariance))
+    psi = probability * likelihood
+    normaliser = background + (psi * weights).sum(axis=1)
+    return 1.0 - probability + (psi / normaliser[:, None]).sum(axis=0), normaliser
+
+
+@pytest.mark.parametrize('detections', [1, 4, 40])
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_the_corrector_is_equation_13(dimension, detections):
+    parts = case(dimension, particles=5000, detections=detections)
+    sensor, pose, positions, weights, values, background = parts
+    scan = make_scan(values, sensor, pose)
+    factor, normaliser = phd_correct(positions, weights, scan, background)
+    expected = dense(*parts)
+    np.testing.assert_allclose(factor, expected[0], rtol=1e-9)
+    np.testing.assert_allclose(normaliser, expected[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_seeing_nothing_leaves_exactly_one_minus_pi(dimension):
+    sensor, pose, positions, weights, values, _ = case(dimension)
+    scan = make_scan(values[:0], sensor, pose)
+    factor, normaliser = phd_correct(positions, weights, scan, np.empty(0))
+    np.testing.assert_array_equal(factor, 1.0 - sensor.detection.probability(positions, pose))
+    assert normaliser.shape == (0,)
+
+
+def test_no_particles_leave_a_detection_to_the_background():
+    sensor, pose, positions, weights, values, background = case(3)
+    scan = make_scan(values, sensor, pose)
+    factor, normaliser = phd_correct(positions[:0], weights[:0], scan, background)
+    assert factor.shape == (0,)
+    np.testing.assert_array_equal(normaliser, background)
+
+
+def test_threads_change_no_bit():
+    sensor, pose, positions, weights, values, background = case(3, particles=100_000)
+    scan = make_scan(values, sensor, pose)
+    alone = phd_correct(positions, weights, scan, background)
+    with ThreadPoolExecutor(3) as pool:
+        together = phd_correct(positions, weights, scan, background, pool)
+    for one, other in zip(alone, together):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_weights_equal_stone_soups():
+    from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
+    from stonesoup.types.array import CovarianceMatrix, StateVector, StateVectors
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.multihypothesis import MultipleHypothesis
+    from stonesoup.types.numeric import Probability
+    from stonesoup.types.prediction import ParticleStatePrediction
+    from stonesoup.updater.particle import SMCPHDUpdater
+
+    class Noiseless(CartesianToElevationBearingRange):
+        """Release 1.9.1 adds random noise to what it predicts before it evaluates the density."""
+
+        def function(self, state, noise=False, **options):
+            return super().function(state, noise=False, **options)
+
+    _, pose, positions, weights, _, _ = case(3)
+    now = datetime.datetime(2024, 1, 1)
+    clutter = 1e-3
+    # Stone Soup has a constant probability of detection, and no heading of the sensor.
+    flat = SensorSettings(
+        detection=DetectionSettings(
+            kind='box', probability=0.85, lower=[-1e3] * 2, upper=[1e3] * 2
+        ),
+        noise=NoiseSettings(range=1.0, bearing=0.2, elevation=0.3),
+    ).build('any', 3)
+    values = flat.measurement.measure(positions[:5], pose) + 0.05
+    model = Noiseless(
+        3,
+        (0, 1, 2),
+        CovarianceMatrix(np.diag([0.3, 0.2, 1.0]) ** 2),
+        translation_offset=StateVector(pose.position),
+    )
+    prediction = ParticleStatePrediction(
+        state_vector=StateVectors(positions.T), weight=weights, timestamp=now
+    )
+    hypotheses = MultipleHypothesis(
+        [
+            SingleHypothesis(
+                prediction,
+                Detection(StateVector([z[2], z[1], z[0]]), timestamp=now, measurement_model=model),
+            )
+            for z in values
+        ]
+    )
+    updater = SMCPHDUpdater(
+        measurement_model=model,
+        prob_detect=Probability(0.85),
+        clutter_intensity=clutter,
+        resampler=None,
+    )
+    theirs = logsumexp(updater.get_log_weights_per_hypothesis(hypotheses).astype(float), axis=1)
+    scan = make_scan(values, flat, pose)
+    factor, _ = phd_correct(positions, weights, scan, np.full(5, clutter))
+    np.testing.assert_allclose(weights * factor, np.exp(theirs), rtol=1e-8)
+
+
+def test_mass_of_a_target_tends_to_one_over_pi():
+    """Detected at rate pi, a mass m becomes (1 - pi) m + pi on average: 1 / pi in the end."""
+    sensor = sensor_of(2, np.random.default_rng(0))
+    position, pose = np.array([[5.0, 5.0]]), Pose([4.0, 4.0, 0.0])
+    probability = float(sensor.detection.probability(position, pose)[0])
+    scan = make_scan(sensor.measurement.measure(position, pose), sensor, pose)
+    factor, _ = phd_correct(position, np.ones(1), scan, np.full(1, 1e-300))
+    mass = 0.0
+    for _ in range(200):
+        mass = (1.0 - probability) * mass + probability * (factor[0] - (1.0 - probability))
+    assert mass == pytest.approx(1.0)
+
+
+# Two robots, births included.
+
+N0 = 12.0
+TARGETS = np.array([[16.0, 20.0], [30.0, 24.0], [12.0, 8.0]])
+# Which robot sees which target; the third is known already.
+SEEN = {'one': [0, 2], 'two': [0, 1, 2]}
+POSES = {'one': Pose([10.0, 14.0, 0.0]), 'two': Pose([24.0, 14.0, 0.0])}
+SENSOR = SensorSettings(
+    detection=DetectionSettings(kind='exponential', probability=0.9, size=[8.0, 8.0]),
+    noise=NoiseSettings(range=1.5, bearing=0.12),
+    clutter=1e-3,
+).build('any', 2)
+
+
+def known_cloud():
+    generator = np.random.default_rng(5)
+    return TARGETS[2] + generator.normal(0.0, 1.5, (3000, 2)), np.full(3000, 0.8 / 3000)
+
+
+def detections(name):
+    return SENSOR.measurement.measure(TARGETS[SEEN[name]], POSES[name])
+
+
+def literal():
+    """Return points and masses after (16) of 000, without what nobody detected.
+
+    The constant intensity Y is summed over a fine grid. Its part Y prod(1 - pi) stays background:
+    the filter has it in the intensity of births, not in particles.
+    """
+    cells = 800
+    axis = (np.arange(cells) + 0.5) * SIDE / cells
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    cloud, weights = known_cloud()
+    points = np.vstack([cloud, grid])
+    intensity = np.concatenate([weights, np.full(len(grid), N0 / len(grid))])
+    background = np.concatenate([np.zeros(len(cloud)), np.full(len(grid), N0 / len(grid))])
+    for name in ('one', 'two'):
+        probability = SENSOR.detection.probability(points, POSES[name])
+        background *= 1.0 - probability
+        values = detections(name)
+        clutter = np.full(len(values), SENSOR.clutter)
+        intensity = intensity * dense(SENSOR, POSES[name], points, intensity, values, clutter)[0]
+    return points, intensity - background
+
+
+def mass_near(points, masses, target):
+    return float(masses[np.linalg.norm(points - target, axis=1) < 6.0].sum())
+
+
+def test_two_robots_correct_as_printed():
+    settings = FilterSettings(
+        preset='paper_002',
+        found_mass=1e9,
+        expected_targets=N0,
+        particles=400_000,
+        particles_per_target=20_000,
+        birth_particles=20_000,
+        jitter_deviation=0.01,
+        kmeans_iterations=1,
+    )
+    search = IcPhdFilter(settings, BOUNDS, np.random.default_rng(0))
+    search.particles, search.weights = known_cloud()
+    search.step(
+        [AgentMeasurement(name, POSES[name], SENSOR, detections(name)) for name in POSES], 1, 0.0
+    )
+    points, masses = literal()
+    assert search.expected_number == pytest.approx(float(masses.sum()), rel=0.03)
+    for target in TARGETS:
+        expected = mass_near(points, masses, target)
+        assert mass_near(search.particles, search.weights, target) == pytest.approx(
+            expected, rel=0.05
+        )

@@ -1,0 +1,184 @@
+"""Births, resampling, K-means and removal of the PHD filter, by quadrature and by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from maasi_filter import ExponentialDetection, Pose, Sensor
+from maasi_filter.ic_phd.births import (
+    gaussian_births,
+    measurement_births,
+    noise_in_space,
+    uniform_births,
+)
+from maasi_filter.ic_phd.clusters import clusters_of, kmeans
+from maasi_filter.ic_phd.found import FoundTargets, kept_measurements
+from maasi_filter.ic_phd.resampling import jittered, resample
+from maasi_filter.records import FoundTarget
+
+POSE = Pose.from_yaw([40.0, 50.0, 45.0], 0.3)
+NOISE = {2: np.diag([2.0, 0.02]), 3: np.diag([2.0, 0.02, 0.03])}
+
+
+def sensor_of(dimension):
+    return Sensor.ranging('any', ExponentialDetection(0.9, [20.0] * dimension), NOISE[dimension])
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_births_weigh_what_the_constant_intensity_predicts(dimension):
+    """Sum of b is the integral of (N0 / V) (1 - pi_before) pi p(z | x), here over a fine grid."""
+    bounds = np.array([[0.0, 100.0]] * dimension)
+    sensor, before = sensor_of(dimension), Pose([70.0, 60.0, 50.0])
+    z = np.array([[25.0, 0.6, 0.3][:dimension]])
+    births = measurement_births(
+        z, sensor, POSE, bounds, 12.0, 40_000, np.random.default_rng(0),
+        [(sensor.detection, before)],
+    )  # fmt: skip
+    axis = np.linspace(0.5, 99.5, 100)
+    grid = np.stack(np.meshgrid(*[axis] * dimension, indexing='ij'), -1).reshape(-1, dimension)
+    likelihood = np.exp(sensor.measurement.log_density(z[0], grid, POSE, NOISE[dimension]))
+    missed = 1.0 - sensor.detection.probability(grid, before)
+    chance = sensor.detection.probability(grid, POSE)
+    expected = (12.0 / 100.0**dimension * missed * chance * likelihood).sum()
+    assert births.totals[0] == pytest.approx(expected, rel=0.02)
+
+
+def test_births_outside_the_bounds_count_nothing():
+    bounds = np.array([[0.0, 100.0]] * 2)
+    z = np.array([[60.0, np.pi]])
+    births = measurement_births(z, sensor_of(2), POSE, bounds, 12.0, 500, np.random.default_rng(0))
+    assert births.totals[0] == 0.0
+
+
+def test_uniform_births_fill_the_environment():
+    bounds = np.array([[0.0, 10.0], [5.0, 6.0]])
+    particles, weights = uniform_births(bounds, 0.7, 5000, np.random.default_rng(0))
+    assert weights.sum() == pytest.approx(0.7)
+    np.testing.assert_allclose(particles.mean(axis=0), [5.0, 5.5], atol=0.1)
+
+
+def test_gaussian_births_stand_for_a_constant_intensity():
+    """Weights Y / (J p(x)) estimate Y times any volume, here that of a ball in the middle."""
+    bounds = np.array([[0.0, 100.0]] * 2)
+    centres = np.array([[40.0, 40.0], [60.0, 55.0]])
+    particles, weights = gaussian_births(
+        centres, 30.0 * np.eye(2), bounds, 2.0, 200_000, np.random.default_rng(0)
+    )
+    near = np.linalg.norm(particles - [50.0, 47.0], axis=1) < 5.0
+    assert weights[near].sum() == pytest.approx(2.0 / 1e4 * np.pi * 25.0, rel=0.05)
+    single, _ = gaussian_births(
+        centres[:1], 4.0 * np.eye(2), bounds, 2.0, 1000, np.random.default_rng(0)
+    )
+    np.testing.assert_allclose(np.cov(single.T), 4.0 * np.eye(2), atol=0.8)
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_noise_in_space_is_that_of_drawn_measurements(dimension):
+    sensor = sensor_of(dimension)
+    precise = Sensor.ranging('any', sensor.detection, 1e-4 * NOISE[dimension])
+    z = np.array([[25.0, 0.6, 0.3][:dimension]])
+    root = np.linalg.cholesky(precise.covariance)
+    drawn = z + np.random.default_rng(0).standard_normal((20_000, dimension)) @ root.T
+    places = precise.measurement.inverse(drawn, POSE)
+    expected = np.cov(places.T)
+    spread = noise_in_space(z, precise, POSE)
+    np.testing.assert_allclose(spread, expected, atol=0.05 * np.trace(expected))
+
+
+# Resampling.
+
+
+def test_copies_are_in_proportion_to_the_weights():
+    generator = np.random.default_rng(0)
+    weights = np.array([0.0, 1.0, 2.0, 0.0, 5.0, 2.0, 0.0])
+    counts = np.zeros(7)
+    for _ in range(400):
+        index = resample(weights, 50, generator)
+        assert (np.diff(index) >= 0).all()
+        counts += np.bincount(index, minlength=7)
+    np.testing.assert_array_equal(counts[weights == 0.0], 0.0)
+    np.testing.assert_allclose(counts / 400, 50 * weights / 10.0, rtol=0.05)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.floats(0.0, 1e3), min_size=1, max_size=60),
+    st.integers(1, 200),
+    st.integers(0, 1000),
+)
+def test_only_particles_with_weight_are_drawn(weights, number, seed):
+    weights = np.array(weights)
+    if not weights.sum() > 1e-200:
+        return
+    index = resample(weights, number, np.random.default_rng(seed))
+    assert index.shape == (number,)
+    # Of a weight that does not change the sum nothing can be told.
+    assert (weights[index] > 0.0).all()
+
+
+def test_first_copies_stay_and_further_ones_move_within_the_bounds():
+    particles = np.array([[0.0, 0.0], [9.95, 5.0]])
+    bounds = np.array([[0.0, 10.0]] * 2)
+    index = np.repeat([0, 1], 5000)
+    moved = jittered(particles, index, 0.1, bounds, np.random.default_rng(0))
+    np.testing.assert_array_equal(moved[[0, 5000]], particles)
+    assert ((moved >= 0.0) & (moved <= 10.0)).all()
+    assert moved[5001:, 1].std() == pytest.approx(0.1, rel=0.05)
+    assert len(np.unique(moved[5000:, 1])) == 5000
+
+
+# Clusters.
+
+
+def test_kmeans_separates_clouds_and_keeps_a_warm_start():
+    generator = np.random.default_rng(0)
+    centres = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
+    label = np.repeat(np.arange(3), 200)
+    particles = centres[label] + generator.normal(size=(600, 2))
+    weights = np.full(600, 3.0 / 600)
+    found, means = kmeans(particles, weights, 3, generator, centres)
+    np.testing.assert_array_equal(found, label)
+    _, cold_means = kmeans(particles, weights, 3, generator, np.empty((0, 2)))
+    np.testing.assert_allclose(np.sort(cold_means, axis=0), np.sort(means, axis=0), atol=0.1)
+    clusters = clusters_of(particles, weights, found, 3)
+    assert list(clusters) == [0, 1, 2]
+    for c, cluster in clusters.items():
+        member = particles[label == c]
+        assert cluster.mass == pytest.approx(1.0)
+        np.testing.assert_allclose(cluster.covariance, np.cov(member.T, bias=True), atol=1e-9)
+        assert cluster.radius == pytest.approx(np.sqrt(np.trace(np.cov(member.T, bias=True))))
+
+
+def test_kmeans_of_one_point_many_times_over_ends():
+    particles = np.ones((50, 3))
+    label, centres = kmeans(particles, np.ones(50), 4, np.random.default_rng(0), np.empty((0, 3)))
+    clusters = clusters_of(particles, np.ones(50), label, len(centres))
+    assert sum(cluster.mass for cluster in clusters.values()) == pytest.approx(50.0)
+
+
+# Found targets.
+
+
+def found_at(*positions):
+    return [
+        FoundTarget(number, np.array(position), np.eye(2), 'own', 0, 1.0)
+        for number, position in enumerate(positions, start=1)
+    ]
+
+
+def test_papers_remove_the_closest_and_003_every_detection():
+    centres = np.array([[1.0, 0.0], [0.5, 0.0], [8.0, 0.0], [10.2, 0.0]])
+    found = found_at([0.0, 0.0], [10.0, 0.0], [50.0, 0.0])
+    assert kept_measurements(centres, found, 5.0, False).tolist() == [True, False, True, False]
+    assert kept_measurements(centres, found, 5.0, True).tolist() == [False] * 4
+    assert kept_measurements(centres, [], 5.0, True).all()
+
+
+def test_targets_kept_over_a_restart_keep_their_ids_unless_taken():
+    known = FoundTargets(found_at([0.0, 0.0]))
+    same, other = found_at([0.1, 0.0], [40.0, 0.0])
+    assert known.keep([same]) == []
+    added = known.keep([other, FoundTarget(1, np.full(2, 80.0), np.eye(2), 'own', 0, 1.0)])
+    assert [target.id for target in added] == [2, 3]
+    assert known.next_id() == 4
