@@ -12,7 +12,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from maasi_filter import FilterSettings, SearchFilter
+from maasi_filter import FilterSettings, make_filter
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.conversions import MOST_DETECTIONS
 from maasi_filter.ros.executor import executor_of
@@ -35,7 +35,7 @@ NOISE = {'range': 0.01, 'bearing': 0.03}
 SETTINGS = FilterNodeSettings.model_validate(
     {
         'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
-        'filter': {'particles': 2000},
+        'filter': {'method': 'pmb'},
         'robots': {name: {'sensor': {'detection': BOX, 'noise': NOISE}} for name in ('a', 'b')},
         'batch_timeout': 0.3,
     }
@@ -319,7 +319,7 @@ def test_a_file_that_cannot_be_used_is_refused_with_the_reason(tmp_path, wrong):
     bounds = SETTINGS.environment.array()
     if wrong == 'elsewhere':
         bounds = bounds + 0.5
-    SearchFilter(FilterSettings(), bounds, np.random.default_rng(0)).save(file)
+    make_filter(FilterSettings(), bounds, np.random.default_rng(0)).save(file)
     if wrong == 'damaged':
         content = bytearray(file.read_bytes())
         content[len(content) // 2] ^= 1

@@ -93,6 +93,7 @@ def test_threads_change_no_bit():
 
 def test_weights_equal_stone_soups():
     from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
+    from stonesoup.types.angle import Bearing, Elevation
     from stonesoup.types.array import CovarianceMatrix, StateVector, StateVectors
     from stonesoup.types.detection import Detection
     from stonesoup.types.hypothesis import SingleHypothesis
@@ -104,10 +105,12 @@ def test_weights_equal_stone_soups():
     class Noiseless(CartesianToElevationBearingRange):
         """Release 1.9.1 adds random noise to what it predicts before it evaluates the density."""
 
-        def function(self, state, noise=False, **options):
-            return super().function(state, noise=False, **options)
+        def logpdf(self, state1, state2, **options):
+            return super().logpdf(state1, state2, noise=False)
 
-    _, pose, positions, weights, _, _ = case(3)
+    _, _, positions, weights, _, _ = case(3)
+    # From far below no elevations are a right angle apart, where Stone Soup wraps them.
+    pose = Pose([0.0, 0.0, -40.0])
     now = datetime.datetime(2024, 1, 1)
     clutter = 1e-3
     # Stone Soup has a constant probability of detection, and no heading of the sensor.
@@ -131,7 +134,11 @@ def test_weights_equal_stone_soups():
         [
             SingleHypothesis(
                 prediction,
-                Detection(StateVector([z[2], z[1], z[0]]), timestamp=now, measurement_model=model),
+                Detection(
+                    StateVector([Elevation(z[2]), Bearing(z[1]), z[0]]),
+                    timestamp=now,
+                    measurement_model=model,
+                ),
             )
             for z in values
         ]

@@ -157,8 +157,6 @@ def test_rates_and_timeouts_can_be_set_while_the_node_runs(make):
 
 def test_what_a_preset_resolves_to_can_be_read(make):
     flat = flatten(SETTINGS)
-    # It has a default, which `flatten` writes.
-    del flat['filter.particles']
     node = make(flat)
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     assert node.get_parameter('filter.particles').value == 5000

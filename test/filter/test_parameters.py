@@ -37,7 +37,7 @@ def test_every_field_is_a_parameter_with_a_description():
     assert set(flat) <= set(fields)
     assert all(item.description for item in fields.values())
     assert fields['filter.particles'].constraints == 'at least 1 and at most 5000000'
-    assert 'recommended' in fields['filter.preset'].constraints
+    assert 'paper_003' in fields['filter.preset'].constraints
     assert fields['filter.found_mass'].default is None
 
 

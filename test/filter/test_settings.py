@@ -8,8 +8,8 @@ from maasi_filter import (
     DetectionSettings,
     EnvironmentSettings,
     FilterSettings,
+    IcPhdFilter,
     NoiseSettings,
-    SearchFilter,
     SensorSettings,
 )
 from maasi_filter.settings import PRESETS
@@ -57,14 +57,14 @@ def test_presets_fill_in_what_is_not_given():
     settings = FilterSettings(preset='paper_001', found_mass=0.9).resolved()
     assert settings.particles == 5000
     assert settings.found_mass == 0.9
-    assert settings.extraction == 'kmeans'
+    assert settings.removal == 'closest'
     assert FilterSettings(preset='paper_001', particles=777).resolved().particles == 777
     assert FilterSettings().resolved().particles == 10_000
+    # The other filter derives its lengths from the sensor.
+    assert FilterSettings(method='pmb').resolved().found_radius is None
 
 
 def test_papers_differ_where_they_differ():
-    assert PRESETS['paper_002']['corrector'] == 'running'
-    assert PRESETS['paper_000']['corrector'] == 'running'
     assert PRESETS['paper_003']['removal'] == 'every'
     assert PRESETS['paper_001']['removal'] == 'closest'
     assert PRESETS['paper_003']['births'] == 'gaussian'
@@ -73,10 +73,10 @@ def test_papers_differ_where_they_differ():
 
 
 def test_lengths_follow_the_environment():
-    large = SearchFilter(FilterSettings(), [[0.0, 260.0]] * 3, np.random.default_rng(0))
-    small = SearchFilter(FilterSettings(), [[0.0, 2.6]] * 3, np.random.default_rng(0))
+    large = IcPhdFilter(FilterSettings(), [[0.0, 260.0]] * 3, np.random.default_rng(0))
+    small = IcPhdFilter(FilterSettings(), [[0.0, 2.6]] * 3, np.random.default_rng(0))
     assert large.exploration.values.shape == small.exploration.values.shape
-    own = SearchFilter(
+    own = IcPhdFilter(
         FilterSettings(exploration_spacing=26.0), [[0.0, 260.0]] * 3, np.random.default_rng(0)
     )
     assert own.exploration.values.shape == (11, 11, 11)

@@ -21,7 +21,8 @@ def method(request):
 @pytest.fixture
 def new_filter(method):
     """Return a function that makes a filter with the lengths of the floor."""
-    lengths = FLOOR_LENGTHS if method == 'ic_phd' else {}
+    # A target is not found at its first detection.
+    lengths = {**FLOOR_LENGTHS, 'found_radius': 0.01} if method == 'ic_phd' else {}
     settings = FilterSettings(method=method, **lengths)
     return lambda: make_filter(settings, FLOOR, np.random.default_rng(1))
 

@@ -74,6 +74,9 @@ class FoundTargets:
         best = int(np.argmin(apart)) if apart else -1
         return best if apart and apart[best] < SAME_TARGET else -1
 
+    def _is_older(self, f: int, time: float, robot: str) -> bool:
+        return (self.targets[f].time, self.targets[f].robot) <= (time, robot)
+
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> tuple[list, bool]:
         """Merge what another robot's filter has found; return those that are new, and any change.
 
@@ -87,8 +90,7 @@ class FoundTargets:
             f = indices.get((robot, target.id), -1)
             if f < 0:
                 f = self._nearest(target)
-                known = self.targets[f]
-                if f >= 0 and (known.time, known.robot) <= (target.time, robot):
+                if f >= 0 and self._is_older(f, target.time, robot):
                     continue
             number = self.targets[f].id if f >= 0 else self.next_id()
             taken = replace(target, id=number, robot=robot, origin=target.id)

@@ -55,7 +55,7 @@ _ARRAYS: dict[str, tuple[str, str]] = {
 _SIZES = {'HEAD': HEAD, 'TERM': TERM}
 _NOT_NEGATIVE = ('hits', 'pose_error', 'found_radius', 'cluster_masses', 'clutter_counts')
 # What may be without a number: no step yet, and a radius that is not limited.
-_UNDEFINED = ('last_time', 'found_radius')
+_UNDEFINED = ('last_time', 'found_radius', 'heads')
 
 
 def to_arrays(
