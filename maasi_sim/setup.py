@@ -6,7 +6,10 @@ setup(
     name='maasi_sim',
     version='0.1.0',
     packages=find_packages(),
-    package_data={'maasi_sim.run': ['discovery.xml']},
+    package_data={
+        'maasi_sim.experiments': ['published/*.yaml'],
+        'maasi_sim.run': ['discovery.xml'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/maasi_sim']),
         ('share/maasi_sim', ['package.xml']),

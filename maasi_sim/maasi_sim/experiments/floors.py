@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from maasi_sim.experiments.cases import Choice
 from maasi_sim.experiments.searches import NEVER_DONE, merged
 
 
@@ -14,43 +13,6 @@ def floor_filter(preset: str, **settings: Any) -> dict[str, Any]:
     return {'preset': preset, 'jitter_deviation': 0.0013, **settings}
 
 
-FLOOR_CHOICES = (
-    Choice(
-        'R = diag[0.016, 0.052]',
-        'deviations in m and rad',
-        'As variances they would be 0.13 m and 13 degrees in a field of view of 0.4 m.',
-    ),
-    Choice(
-        'a found target counts',
-        'within 0.075 m of a true one, or half the smallest distance of two targets',
-        'Half of the 0.15 m that two markers keep; the paper has an RMSE of 0.08 m.',
-    ),
-    Choice(
-        'control cost C',
-        'weight 0.01, torques only',
-        'With weight 1 the force that keeps the drone in the air outweighs T and E.',
-    ),
-    Choice(
-        'period of measurements',
-        '0.2 m at full speed: 0.5 s, of the ground robot 1 s',
-        'Not given. It is the way between two measurements of AS, as in the simulations of 000.',
-    ),
-    Choice(
-        'filter',
-        "the paper's preset, with its lengths for the floor",
-        'Births where measurements point, T_m = 0.5 and a jitter: as printed nothing is found; '
-        'docs/filter_presets.md has each with its reason.',
-    ),
-    Choice(
-        'a run ends',
-        'when all are found, or at the cap',
-        'As the figures do. A run that does not get there counts with the cap (restricted mean).',
-    ),
-)
-HARDWARE_NOTE = (
-    'Simulated hardware: rendered camera images, segmentation, drifting odometry and the '
-    "drivers' motion, in one process. The paper flew a real drone once."
-)
 # The control cost without the force that holds a drone up.
 MAMBO_MOTION = {'control_inputs': 'torques'}
 # 0.2 m between measurements at 0.4 m/s, and as much for the ground robot at 0.2 m/s.

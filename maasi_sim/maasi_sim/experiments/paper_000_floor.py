@@ -5,17 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from maasi_sim.experiments import figures
-from maasi_sim.experiments.cases import Case, Choice, Comparison, Published
+from maasi_sim.experiments.cases import Case, Comparison
 from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.floors import (
-    FLOOR_CHOICES,
-    HARDWARE_NOTE,
     MAMBO_MOTION,
     MAMBO_SENSOR,
     TURTLEBOT_SENSOR,
     floor,
     floor_filter,
 )
+from maasi_sim.experiments.printed import printed
 from maasi_sim.experiments.searches import (
     FALSE,
     FOUND,
@@ -32,9 +31,6 @@ if TYPE_CHECKING:
 
 _FLOOR_FILTER = floor_filter('paper_000', particles=10000, found_radius=0.02, removal_distance=0.05)
 _RECOMMENDED_FILTER = {'method': 'pmb'}
-_AS_CHOICE = Choice(
-    'weight of exploration in AS', '5', 'That of 001, where AS is from; 000 does not give it.'
-)
 
 
 def _asi(alpha: float, name: str) -> dict[str, Any]:
@@ -45,36 +41,6 @@ def _asi(alpha: float, name: str) -> dict[str, Any]:
         'beta': alpha,
         'control_weight': 0.01,
     }
-
-
-# Means of measurements on six maps of another seed (`--seed 2`), unless said otherwise.
-_TESTED_9 = (
-    'The paper has ASI before AS before the lawnmower, by measurements. Here ASI is before the '
-    'lawnmower, but AS needs the fewest measurements; by time ASI is first and AS last. As much '
-    'way between two measurements as AS has is not the cause, as the case above shows. On six maps '
-    'of another seed, where AS needs 95 measurements and ASI 105, these are not the cause either: '
-    'no control cost (105, not one decision differs); e of (22) before its own measurement (105, '
-    'likewise); 6 x 6 waypoints (116), and J per metre as well (102). The cause is unknown.'
-)
-_TESTED_13 = (
-    'The paper has MAASI before MAAS, by measurements. That MAASI does not find all here comes '
-    'from the printed grid of the drone, 3 x 3 at 0.6 m, which ends 0.75 m from the bounds: with '
-    'grids from which all places are in view it finds all, after about as many measurements as '
-    'MAAS and in less than half the time. On six maps of another seed MAASI needs 302 measurements '
-    'with the printed grids (2 of 6 complete), 144 with 3 x 3 at 1.1 m, and 123 with all places in '
-    'view; then 101 with e of (22) before its own measurement, 138 with more way between two '
-    'measurements, and 119 without control cost. Why it is not before MAAS in measurements is '
-    'unknown.'
-)
-_TESTED_15 = (
-    'The paper has MAASI before MAAS before the lawnmower, by measurements. That MAASI does not '
-    'find all here comes from the printed grids: the edges of the floor are never in view. With '
-    'grids from which all places are in view it finds all, in less than half the time of MAAS. '
-    'Part of its measurements come from the distance between them: with as much way between two '
-    'as MAAS has (0.2 m, periods of 0.75 s and 1.4 s) it needs 153 instead of 232. That is the '
-    'order of the paper, but ten maps do not show a difference from MAAS in measurements. (On six '
-    'maps of another seed 128 instead of 379.)'
-)
 
 
 def _fig9_cases(small: bool) -> list[Case]:
@@ -127,7 +93,6 @@ def fig9() -> Experiment:
         run=run_search,
         quantities=(MEASUREMENTS, TIME, FOUND, FALSE, RMSE),
         draw=draw,
-        published=(Published('ASI', RMSE.name, 0.08, runs=1, note='one flight'),),
         comparisons=(
             *(
                 Comparison('ASI', other, quantity.name)
@@ -137,20 +102,8 @@ def fig9() -> Experiment:
             Comparison('ASI, as far apart as AS', 'AS', MEASUREMENTS.name),
             Comparison('ASI, recommended', 'lawnmower', MEASUREMENTS.name),
         ),
-        choices=(
-            *FLOOR_CHOICES,
-            Choice(
-                'candidates: 3 x 3, spacing 0.6, from 0.1, "centred"',
-                'coordinates 0.1, 1, 1.9',
-                'From 0.1, 0.7, 1.3 the drone never sees the far edges; the recommended case '
-                'has 6 x 6, from which every place is seen.',
-            ),
-            Choice('waypoints of AS', 'the eight neighbours at 0.2 m', 'As on the floor of 001.'),
-            _AS_CHOICE,
-        ),
-        tested=_TESTED_9,
         seconds=3.0,
-        note=HARDWARE_NOTE,
+        **printed('000-fig9'),
     )
 
 
@@ -274,23 +227,8 @@ def fig13() -> Experiment:
             ),
             Comparison('MAASI, recommended', 'MAASI', MEASUREMENTS.name),
         ),
-        choices=(
-            *FLOOR_CHOICES,
-            Choice(
-                'obstacles', 'four circles of 0.06 to 0.12 m', 'Placed by hand in the paper too.'
-            ),
-            Choice(
-                'speeds and periods',
-                '0.4 m/s and 0.6 s, 0.2 m/s and 1.2 s',
-                'Not given: 0.24 m between measurements, nearly the 0.25 m of MAAS.',
-            ),
-            Choice('grids', 'centred', 'The paper gives sizes and spacings only.'),
-            _AS_CHOICE,
-        ),
-        tested=_TESTED_13,
         seconds=4.0,
-        note='Kept away from obstacles by steering around them, 0.12 m off, instead of the term of '
-        '001, (15).',
+        **printed('000-fig13'),
     )
 
 
@@ -376,17 +314,6 @@ def fig15() -> Experiment:
             ),
             Comparison('MAASI, recommended', 'lawnmower', MEASUREMENTS.name),
         ),
-        choices=(
-            *FLOOR_CHOICES,
-            Choice(
-                'when the drone ends',
-                'after 210 s',
-                'In the video it does so at 3 min 30 s; the TurtleBot goes on alone.',
-            ),
-            Choice('grids', 'centred', 'The paper gives sizes and spacings only.'),
-            _AS_CHOICE,
-        ),
-        tested=_TESTED_15,
         seconds=6.0,
-        note=HARDWARE_NOTE,
+        **printed('000-fig15'),
     )

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from maasi_sim.experiments import figures
-from maasi_sim.experiments.cases import Case, Choice, Comparison, Outcome, Published, Quantity
+from maasi_sim.experiments.cases import Case, Comparison, Outcome, Quantity
 from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.floors import (
-    FLOOR_CHOICES,
-    HARDWARE_NOTE,
     MAMBO_MOTION,
     MAMBO_SENSOR,
     floor,
     floor_filter,
 )
+from maasi_sim.experiments.printed import printed
 from maasi_sim.experiments.searches import (
     FALSE,
     FOUND,
@@ -39,7 +38,6 @@ EXPLORED = Quantity('explored', 'share explored in the end')
 CLEARANCE = Quantity('clearance', 'smallest distance to an obstacle', 'm')
 
 _LONG, _SHORT = 812, 330
-_MATLAB = 'MATLAB, Intel 1165G7'
 _NOISE = {
     'range': 1.9,
     'bearing': 0.25,
@@ -53,70 +51,6 @@ _RING = {'ring': 6, 'distance': 12.0}
 _GRID = {'grid': [3, 3, 3], 'spacing': 115.0, 'corner': [10.0, 10.0, 10.0]}
 _UNIFORM = {'count': 12, 'distribution': 'uniform'}
 _CLUSTERED = {'count': 12, 'distribution': 'clustered', 'clusters': 2}
-
-CUBE_CHOICES = (
-    Choice(
-        'R = diag[1.9, 0.25, 0.41]',
-        'variances in m^2 and deg^2',
-        'As in 000; neither reading gives the accuracy of the paper, whose RMSE is 3.14 m.',
-    ),
-    Choice(
-        'motion',
-        '12 m/s, straight',
-        'The planner only sees positions 12 m apart; the LQR of the paper plays no part in that.',
-    ),
-    Choice(
-        'filter',
-        'preset paper_001',
-        'Births where measurements point, T_m = 0.5 and a jitter: as printed nothing is found; '
-        'docs/filter_presets.md has each with its reason.',
-    ),
-    Choice(
-        'a found target counts',
-        'within T_z = 5 m of a true one, one to one',
-        'The paper does not say when a found target is right.',
-    ),
-    Choice(
-        'mutual information',
-        'of the Poisson set of the clusters, each with 7 points for its spread',
-        'The paper refers to Dames and Kumar. Planner and filter are two nodes here, and the '
-        'planner is told clusters, not particles.',
-    ),
-)
-_LENGTH_CHOICE = Choice(
-    'a run ends',
-    "when all are found, or after the paper's number of steps",
-    'What is not found by then counts with that number (restricted mean).',
-)
-_SUNG_CHOICE = Choice(
-    'adapted method of Sung and Tokekar',
-    'measures each 12 m on its way',
-    "The paper's own rule for a fair comparison.",
-)
-_LONG_TAIL = (
-    'pi = 0.98 exp(-d / 50 m) has a long tail: from anywhere in the cube something is seen, so '
-    'that methods without exploration stumble on most targets too.'
-)
-
-
-# Means of measurements on six maps of another seed (`--seed 2`).
-_TESTED_UNIFORM = (
-    'The paper has exploration before Sung and Tokekar before the lawnmower, and MI only does not '
-    'find all. The tail of pi = 0.98 exp(-d / 50 m) is one cause: with 0.98 exp(-d^2 / 1250 m^2), '
-    'which ends at about 75 m, the order is that of the paper. On six maps of another seed '
-    'exploration then needs 494 measurements and Sung and Tokekar 570 (5 of 6 complete), and MI '
-    'only finds 7.8 of 12. The other cause is alpha = 5, which outweighs mutual information of at '
-    'most log 2: with the printed pi exploration needs 174, with alpha = 0.5 142, as MI only (142) '
-    'and Sung and Tokekar (141).'
-)
-_TESTED_CLUSTERED = (
-    'The paper has exploration before all others. Here alpha = 5 is the cause that it is behind MI '
-    'only and Sung and Tokekar: it outweighs mutual information of at most log 2. On six maps of '
-    'another seed exploration needs 148 measurements, with alpha = 0.5 63, MI only 57, Sung and '
-    'Tokekar 64. With a pi that ends at about 75 m, 0.98 exp(-d^2 / 1250 m^2), MI only finds 3.0 '
-    'of 12, as in the paper, but Sung and Tokekar (253) stay before exploration (620, 5 of 6 '
-    'complete; with alpha = 0.5 444): why is unknown.'
-)
 
 
 def cube(
@@ -221,46 +155,20 @@ def _e1() -> Experiment:
         run=run_search,
         quantities=(FOUND, FALSE, MEASUREMENTS, PLANNING_TIME),
         draw=draw,
-        published=(
-            Published(names[0], PLANNING_TIME.name, 0.041, note=_MATLAB),
-            *(Published(name, FOUND.name, 12.0, note='figure 4') for name in names),
-        ),
         comparisons=tuple(
             Comparison(name, names[0], quantity.name)
             for name in names[1:]
             for quantity in (FOUND, MEASUREMENTS)
         ),
-        choices=(*CUBE_CHOICES, _LENGTH_CHOICE),
-        causes=_LONG_TAIL,
         seconds=3.0,
         maps='001, uniform',
-        note='The paper finds no significant difference of the three.',
+        **printed('001-e1'),
     )
 
 
 def _comparison_of(number: int) -> Experiment:
     clustered = number == 3
     targets = _CLUSTERED if clustered else _UNIFORM
-    times = {'lawnmower': 0.005, 'MI only': 0.012, 'Sung and Tokekar': 0.011, _OURS: 0.041}
-    published = [
-        Published(name, FOUND.name, 12.0, note='figure 7' if clustered else 'figure 5')
-        for name in ('lawnmower', 'Sung and Tokekar', _OURS)
-    ]
-    if clustered:
-        published.append(Published(_OURS, RMSE.name, 3.14, runs=1, note='one run'))
-    else:
-        published += [
-            Published(name, PLANNING_TIME.name, time, note=_MATLAB) for name, time in times.items()
-        ]
-    choices = [*CUBE_CHOICES, _SUNG_CHOICE, _LENGTH_CHOICE]
-    if clustered:
-        choices.append(
-            Choice(
-                'spread of a cluster',
-                'deviation of 17 m around a random centre',
-                'Not given; a fifteenth of the side, as much as the figure seems to show.',
-            )
-        )
 
     def draw(figure: Figure, results: Results) -> None:
         figures.curves_and_path(figure, results, _STYLES, _OURS)
@@ -274,7 +182,6 @@ def _comparison_of(number: int) -> Experiment:
         run=run_search,
         quantities=(MEASUREMENTS, TIME, FOUND, FALSE, RMSE, PLANNING_TIME),
         draw=draw,
-        published=tuple(published),
         comparisons=(
             *(
                 Comparison(_OURS, other, quantity.name)
@@ -288,10 +195,9 @@ def _comparison_of(number: int) -> Experiment:
             Comparison(f'{_OURS}, alpha 0.5', 'MI only', MEASUREMENTS.name),
             Comparison('ASI, recommended', _OURS, MEASUREMENTS.name),
         ),
-        choices=tuple(choices),
-        tested=_TESTED_CLUSTERED if clustered else _TESTED_UNIFORM,
         seconds=3.0,
         maps='001, clustered' if clustered else '001, uniform',
+        **printed(f'001-e{number}'),
     )
 
 
@@ -329,14 +235,9 @@ def _e4() -> Experiment:
             Comparison(_radius_name(2.4), _radius_name(0.5), RMSE.name),
             Comparison(_radius_name(2.4), _radius_name(0.5), MEASUREMENTS.name),
         ),
-        choices=(
-            *CUBE_CHOICES,
-            _LENGTH_CHOICE,
-            Choice('runs of each threshold', '10', 'Not given; as in the other experiments.'),
-        ),
         seconds=3.0,
         maps='001, uniform',
-        note='The paper has larger errors and fewer steps with a larger threshold.',
+        **printed('001-e4'),
     )
 
 
@@ -360,22 +261,13 @@ def _e5() -> Experiment:
         run=run_search,
         quantities=(FOUND, FALSE, MEASUREMENTS, PLANNING_TIME),
         draw=draw,
-        published=(
-            Published(_OURS, PLANNING_TIME.name, 0.041, note=_MATLAB),
-            Published(centres, PLANNING_TIME.name, 0.018, note=_MATLAB),
-            Published(_OURS, FOUND.name, 12.0, note='figure 9'),
-            Published(centres, FOUND.name, 12.0, note='figure 9'),
-        ),
         comparisons=(
             Comparison(centres, _OURS, FOUND.name),
             Comparison(centres, _OURS, MEASUREMENTS.name),
         ),
-        choices=(*CUBE_CHOICES, _LENGTH_CHOICE),
-        causes='T of the centres grows with the number of clusters and outweighs 5 e where a few '
-        'are near; mutual information is at most log 2.',
         seconds=2.0,
         maps='001, uniform',
-        note='The paper finds no significant difference in targets found.',
+        **printed('001-e5'),
     )
 
 
@@ -412,12 +304,10 @@ def _e6() -> Experiment:
         run=_run_exploring,
         quantities=(EXPLORED, FALSE),
         draw=draw,
-        choices=CUBE_CHOICES,
         runs=1,
         seconds=3.0,
         maps='001, uniform',
-        note='The paper shows a way like that of a lawnmower, of 600 steps. The share explored is '
-        'the mean of 1 - e over the cube in the end.',
+        **printed('001-e6'),
     )
 
 
@@ -485,36 +375,13 @@ def _e7() -> Experiment:
         run=_run_among_obstacles,
         quantities=(MEASUREMENTS, FOUND, CLEARANCE),
         draw=draw,
-        published=(
-            Published('no obstacles', MEASUREMENTS.name, 330.0, runs=1, note='"330 steps"'),
-            Published(
-                'term (15), outwards', MEASUREMENTS.name, 380.0, runs=1, note='"about 380 steps"'
-            ),
-        ),
         comparisons=(
             Comparison('steered around', 'no obstacles', MEASUREMENTS.name),
             Comparison('term (15), outwards', 'no obstacles', MEASUREMENTS.name),
         ),
-        choices=(
-            *CUBE_CHOICES,
-            Choice(
-                'obstacles',
-                'five spheres of 15 to 28 m',
-                'Placed by hand in the paper too, which gives neither places nor sizes.',
-            ),
-            Choice(
-                'term (15), u - k_obs',
-                'with the direction away from the obstacle, besides steering around it',
-                'As printed it takes the same off every input wherever the obstacle is; that is '
-                'the fourth case.',
-            ),
-            Choice('runs', '10', 'The paper has one; one says little about a difference of 50.'),
-        ),
-        causes=_LONG_TAIL,
         seconds=5.0,
         maps='001, obstacles',
-        note='Distances are those of straight ways from one measurement to the next. A target that '
-        'would lie inside an obstacle is drawn again: the maps without obstacles can differ.',
+        **printed('001-e7'),
     )
 
 
@@ -566,20 +433,8 @@ def _fig14() -> Experiment:
             Comparison(_OURS, 'MI only', FOUND.name),
             Comparison('ASI, recommended', _OURS, MEASUREMENTS.name),
         ),
-        choices=(
-            *FLOOR_CHOICES,
-            Choice(
-                'length',
-                'at most 400 measurements',
-                'The paper gives 100 s with 3.05 s for each 0.2 m, in which no method comes by '
-                'everywhere; the order of the methods is what can be compared.',
-            ),
-        ),
-        causes='T_z = 0.3 m removes detections of markers that are nearer than that to a found '
-        'one. With pi = 1 in the field of view e is 0 or 1, and where all neighbours are seen '
-        'already nothing leads the drone on.',
         seconds=4.0,
-        note=HARDWARE_NOTE,
+        **printed('001-fig14'),
     )
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from maasi_sim.experiments import figures
-from maasi_sim.experiments.cases import Case, Choice, Comparison, Published
+from maasi_sim.experiments.cases import Case, Comparison
 from maasi_sim.experiments.experiment import Experiment, Results
+from maasi_sim.experiments.printed import printed
 from maasi_sim.experiments.searches import (
     FALSE,
     FOUND,
@@ -37,44 +38,6 @@ _STYLES = {
     _CENTRALIZED: 'asi',
     'MAASI, recommended': 'recommended',
 }
-
-CHOICES = (
-    Choice(
-        'noise',
-        'deviations of 1.22 m and 0.42 degrees',
-        'Not given; those of 000 in two dimensions.',
-    ),
-    Choice('weight alpha of exploration', '5', 'Not given; that of 001.'),
-    Choice(
-        'explorations',
-        'one for each agent, of its own measurements, (12) and (16)',
-        'As printed. "One exploration" is lowered by the measurements of both agents.',
-    ),
-    Choice('motion', 'straight, one move in a step', 'The planner only sees positions.'),
-    Choice(
-        'filter',
-        'preset paper_002',
-        'Births where measurements point, T_m = 0.5, a jitter, and the running corrector of 000: '
-        'as printed nothing is found, or a target several times; '
-        'docs/filter_presets.md has each with its reason.',
-    ),
-    Choice(
-        'a found target counts',
-        'within T_z = 5 m of a true one, one to one',
-        'The paper does not say when a found target is right.',
-    ),
-    Choice(
-        'a run ends',
-        "when all are found, or after the paper's number of steps",
-        'Measurements are those of both agents: two in a step.',
-    ),
-)
-_LANES_CHOICE = Choice(
-    'lanes of the lawnmower',
-    '55 m apart, 27.5 m from the bounds',
-    'Not given; with these two agents of 8 m per step meet in the middle after 120 steps, as '
-    'the paper has it.',
-)
 
 
 def agent(
@@ -182,12 +145,6 @@ def _homogeneous(small: bool) -> list[Case]:
     ]
 
 
-_CAUSE = (
-    'pi = 0.98 exp(-d / 50 m), or 120 m, has a long tail: most targets are seen from afar, so that '
-    'all are found well before the number of steps that the paper shows.'
-)
-
-
 def _fig5() -> Experiment:
     def draw(figure: Figure, results: Results) -> None:
         figures.curves(figure.add_subplot(), results, _STYLES)
@@ -199,10 +156,6 @@ def _fig5() -> Experiment:
         run=run_search,
         quantities=(MEASUREMENTS, FOUND, FALSE, RMSE),
         draw=draw,
-        published=tuple(
-            Published(name, FOUND.name, 12.0, note='"they find all the targets", 120 steps')
-            for name in ('lawnmower', _INDEPENDENT, _CENTRALIZED)
-        ),
         comparisons=(
             Comparison(_CENTRALIZED, 'lawnmower', FOUND.name),
             Comparison(_CENTRALIZED, _INDEPENDENT, FOUND.name),
@@ -210,10 +163,9 @@ def _fig5() -> Experiment:
             Comparison(_CENTRALIZED, _SHARED, MEASUREMENTS.name),
             Comparison('MAASI, recommended', _CENTRALIZED, MEASUREMENTS.name),
         ),
-        choices=(*CHOICES, _LANES_CHOICE),
-        causes=_CAUSE,
         seconds=1.5,
         maps='002, equal agents',
+        **printed('002-fig5'),
     )
 
 
@@ -230,11 +182,10 @@ def _fig7() -> Experiment:
         run=run_search,
         quantities=(FOUND, FALSE, RMSE),
         draw=draw,
-        choices=(*CHOICES, _LANES_CHOICE),
         runs=1,
         seconds=1.5,
         maps='002, equal agents',
-        note='The map is the first of 002-fig5.',
+        **printed('002-fig7'),
     )
 
 
@@ -276,24 +227,10 @@ def _fig9() -> Experiment:
         run=run_search,
         quantities=(MEASUREMENTS, FOUND, FALSE, RMSE, STEP_TIME),
         draw=draw,
-        published=(
-            Published(_CENTRALIZED, FOUND.name, 12.0, runs=1, note='figure 9, 320 steps'),
-            Published(_CENTRALIZED, RMSE.name, 1.14, runs=1, note='one run'),
-            Published(_CENTRALIZED, STEP_TIME.name, 1.88, runs=1, note='UAV; ROV 3.02; MATLAB'),
-        ),
         comparisons=(Comparison('MAASI, recommended', _CENTRALIZED, MEASUREMENTS.name),),
-        choices=(
-            *CHOICES,
-            Choice(
-                'noise of the slow agent',
-                'half the deviations',
-                'The paper says that it is better, not by how much.',
-            ),
-            Choice('runs', '10', 'The paper shows one.'),
-        ),
-        causes=_CAUSE,
         seconds=1.5,
         maps='002, different agents',
+        **printed('002-fig9'),
     )
 
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from maasi_sim.experiments import figures
-from maasi_sim.experiments.cases import Case, Choice, Comparison, Outcome, Published
+from maasi_sim.experiments.cases import Case, Comparison, Outcome
 from maasi_sim.experiments.experiment import Experiment, Results
+from maasi_sim.experiments.printed import printed
 from maasi_sim.experiments.searches import (
     FALSE,
     FOUND,
@@ -21,7 +22,7 @@ from maasi_sim.experiments.searches import (
     run_search,
     search_case,
 )
-from maasi_sim.experiments.terrain import HURST, chunk, littered
+from maasi_sim.experiments.terrain import chunk, littered
 from maasi_sim.world.noise_streams import noise_stream
 
 if TYPE_CHECKING:
@@ -49,55 +50,6 @@ _STYLES = {
 # Three clusters of six, as figure 4 of the paper has them, by hand.
 _CLUSTERS = ([60.0, 200.0], [200.0, 190.0], [180.0, 50.0])
 _AROUND = ((0.0, 0.0), (14.0, 3.0), (-11.0, 8.0), (5.0, -13.0), (-7.0, -10.0), (9.0, 13.0))
-
-CHOICES = (
-    Choice(
-        'noise, sigma^2',
-        '0.3 m^2 and 0.3 deg^2',
-        'Not given, one number for both. T_W is then as many deviations of the range as in 000; '
-        'with 1 m^2 no cluster gets below T_W in passing, a lawnmower finds none.',
-    ),
-    Choice(
-        'weight alpha of exploration',
-        '0.5',
-        'Not given. Mutual information is at most log 2, so that both terms count; with the 5 of '
-        '001 exploration decides alone, and fewer are found (on other maps).',
-    ),
-    Choice(
-        'motion',
-        '9 m in a step, straight',
-        'The backstepping controller reaches each waypoint before the next is planned, so that '
-        'the planner only sees positions.',
-    ),
-    Choice(
-        'filter',
-        'preset paper_003, but births where each measurement points, as in 000',
-        'The printed Gaussian over all measurements together puts most of its particles between '
-        'the targets; it is run as a case of its own. T_m = 0.5 and a jitter: '
-        'docs/filter_presets.md has each with its reason.',
-    ),
-    Choice(
-        'mutual information',
-        'of the Poisson set of the clusters, each with 5 points for its spread',
-        'The paper refers to Dames and Kumar. Planner and filter are two nodes here, and the '
-        'planner is told clusters, not particles.',
-    ),
-    Choice(
-        'lanes of the lawnmower',
-        '43 m apart',
-        'Not given; the widest that cover the area within the 240 steps of figure 4.',
-    ),
-    Choice(
-        'expected targets N0 of births and of the recommended planner',
-        '18, the true number of 003-fig4',
-        'Not given; a number that a search does not know. N0 = 1 and 100 are run beside it.',
-    ),
-    Choice(
-        'a found target counts',
-        'within T_z = 4 m of a true one, one to one',
-        'The paper does not say when a found target is right.',
-    ),
-)
 
 
 def area(
@@ -191,10 +143,6 @@ def _fig4() -> Experiment:
         run=run_search,
         quantities=(MEASUREMENTS, FOUND, FALSE, RMSE),
         draw=draw,
-        published=(
-            Published(_OURS, FOUND.name, 18.0, runs=1, note='240 steps'),
-            Published('lawnmower', FOUND.name, 18.0, runs=1, note='240 steps'),
-        ),
         comparisons=(
             Comparison(_OURS, 'lawnmower', FOUND.name),
             Comparison(_PRINTED, _OURS, FOUND.name),
@@ -205,17 +153,8 @@ def _fig4() -> Experiment:
                 for quantity in (FOUND, MEASUREMENTS)
             ),
         ),
-        choices=(
-            *CHOICES,
-            Choice(
-                'targets', 'three clusters of six', 'Placed by hand in the paper too, not given.'
-            ),
-            Choice('runs', '10', 'The paper has one; each has its own noise, on the same map.'),
-        ),
-        causes='pi = 0.98 exp(-d^2 / 450 m^2) ends at about 40 m: what counts is how soon the '
-        'robot comes near a cluster. One step ahead the planner lingers where all neighbours are '
-        'explored, far from what is still unseen.',
         seconds=2.5,
+        **printed('003-fig4'),
     )
 
 
@@ -251,25 +190,9 @@ def _fig5() -> Experiment:
             Comparison(_OURS, 'MI only', FOUND.name),
             Comparison('ASI, recommended', _OURS, FOUND.name),
         ),
-        choices=(
-            *CHOICES,
-            Choice(
-                'terrain',
-                f'generated, self-affine with H = {HURST}, 12 km wide, 150 m deviation',
-                "The paper's six areas of a geographical data base are not named. Real terrain has "
-                'a fractal dimension of about 2.2, which is this H. Heights only say where the '
-                'targets are.',
-            ),
-            Choice(
-                'targets',
-                'seven around the lowest and seven around the highest place, 15 m deviation',
-                'Placed by hand in the paper, at low and at high elevations.',
-            ),
-        ),
-        causes='As in 003-fig4. 100 steps of 9 m are not enough to come by everywhere.',
         runs=6,
         seconds=1.0,
-        note='The terrain is not that of the paper, which is not to be had: it is generated.',
+        **printed('003-fig5'),
     )
 
 

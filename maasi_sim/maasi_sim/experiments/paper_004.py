@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from maasi_planner.buildings import (
-    CuboidSettings,
-    DynamicsSettings,
-    HazardSettings,
     Mission,
     plan_mission,
 )
-from maasi_sim.buildings.mission import CuboidMission, SearchRobot, summary
 from maasi_sim.buildings.picture import draw_mission, legend
-from maasi_sim.experiments.cases import Case, Choice, Comparison, Outcome, Published, Quantity
+from maasi_sim.experiments.building_runs import (
+    ACTIVE,
+    CENTRALIZED,
+    COLLISIONS,
+    COMPLETE,
+    COVERAGE,
+    CUBOIDS,
+    DISTRIBUTED,
+    LEAST,
+    RECHARGES,
+    SOLVE,
+    STEPS,
+    mission_settings,
+    run_mission,
+    run_timing,
+)
+from maasi_sim.experiments.cases import Case, Comparison
 from maasi_sim.experiments.experiment import Experiment, Results
+from maasi_sim.experiments.printed import printed
 from maasi_sim.experiments.results import Run
 from maasi_sim.experiments.statistics import array, mean_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LIMIT = 1000
 _SIZE = [60.0, 60.0, 60.0]
 _BUILDING = {'centre': [175.0, 130.0], 'size': _SIZE}
 _TWO = [_BUILDING, {'centre': [175.0, 320.0], 'size': _SIZE}]
@@ -43,161 +54,15 @@ _OBSTACLES_5 = [
     {'centre': [170.0, 215.0], 'size': [20.0, 120.0, 80.0]},
     {'centre': [400.0, 215.0], 'size': [20.0, 120.0, 30.0]},
 ]
-_FOR_EVER = 1e9
-
-STEPS = Quantity('steps', 'time until all cuboids are visited', 's', 'restricted')
-CUBOIDS = Quantity('cuboids', 'cuboids')
-COVERAGE = Quantity('coverage', 'share of the faces that is seen')
-COMPLETE = Quantity('complete', 'missions with all cuboids visited')
-COLLISIONS = Quantity('collisions', 'steps on which an object was cut')
-LEAST = Quantity('least_detection_probability', 'least p_d of a snapshot')
-ACTIVE = Quantity('active', 'robots that search, mean over the steps')
-RECHARGES = Quantity('recharges', 'batteries that failed')
-SOLVE = Quantity('solve_mean', 'time of a decision', 's')
 
 PAPER, OURS = 'as printed', 'recommended settings'
 _PRINTED: dict[str, Any] = {'discount': 1.0, 'assignment': 'printed'}
 _OURS: dict[str, Any] = {'discount': 0.95, 'assignment': 'predicted'}
 
-CHOICES = (
-    Choice(
-        'size of a cuboid',
-        'cubes of 10 m',
-        'The paper does not say. With 5 m a single robot takes far longer than its 75 steps.',
-    ),
-    Choice(
-        'cells of a face',
-        'round(L / r)',
-        '36, 16 and 4 cuboids only come out so; ceil gives 64, 36 and 16. Strips of the faces stay '
-        'unseen then; coverage says how much, and "strict" sees all.',
-    ),
-    Choice('centre of the objects', '(175, 130), and (175, 320) for the second', 'From 004, VI-B.'),
-    Choice(
-        'p_b of (3)',
-        'a hazard per step since the last recharge, in (11) to (13) too',
-        'As a probability that the battery has failed by t it would be drawn once, not each step.',
-    ),
-    Choice(
-        'condition of (13)',
-        'p_b(t + T) at most 0.5',
-        'As printed, robots with good batteries would never plan what another one plans, and drop '
-        'and take up the same cuboid together.',
-    ),
-    Choice(
-        'reward of a visit',
-        'both: as printed, and discounted by 0.95 a step, more where it is put off',
-        'As printed a visit is worth the same whenever it comes, and is put off while smoother '
-        'flight pays: for ever, in some missions.',
-    ),
-    Choice(
-        'distances of the assignment (10)',
-        'both: from where robots are, as printed, and from where their plans have them at tau* + 1',
-        'A robot alone is drawn to the cuboid nearest to the latter. From where they are, robots '
-        'are held back by cuboids that they are about to visit anyway.',
-    ),
-    Choice(
-        'where visits count',
-        '1 mm inside the cuboid in plans',
-        'An optimum touches the faces; rounding would decide whether it was a visit.',
-    ),
-    Choice(
-        'obstacles and the end of the horizon',
-        'kept away from between samples, and with room to brake',
-        'As printed (15k) lets robots cut corners, and the next problem may have no solution.',
-    ),
-)
-
-
-def _mission_settings(settings: dict[str, Any]) -> CuboidSettings:
-    return CuboidSettings.model_validate({'time_limit': _FOR_EVER, **settings['mission']})
-
 
 def _mission_of(run: Run, results: Results) -> Mission:
     settings = results.case(run.case).settings
-    return plan_mission(_mission_settings(settings), settings['area'])
-
-
-def _robots(settings: dict[str, Any], seed: int) -> dict[str, SearchRobot]:
-    """Return the robots of a case: at given places, or at random ones outside of objects."""
-    rng = np.random.default_rng(seed)
-    hazard = {'failures': False, **settings.get('hazard', {})}
-    dynamics = DynamicsSettings.model_validate(settings.get('dynamics', {}))
-    starts = settings.get('starts')
-    if starts is None:
-        box = np.array(settings.get('spawn', settings['area']), dtype=float)
-        mission = plan_mission(_mission_settings(settings), settings['area'])
-        starts = {}
-        while len(starts) < settings['agents']:
-            place = rng.uniform(box[:, 0], box[:, 1])
-            # A robot needs some air around it.
-            near = (mission.solids[:, :, 0] - 2.0 < place) & (place < mission.solids[:, :, 1] + 2.0)
-            if not near.all(axis=1).any():
-                starts[f'agent{len(starts) + 1:02d}'] = place.tolist()
-    robots = {}
-    for name in sorted(starts):
-        own = dict(hazard)
-        if 'alpha_range' in settings:
-            own['alpha'] = float(rng.uniform(*settings['alpha_range']))
-        robots[name] = SearchRobot(
-            np.array(starts[name], dtype=float), dynamics, HazardSettings.model_validate(own)
-        )
-    return robots
-
-
-def run_mission(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a mission of a case."""
-    mission = CuboidMission(
-        _mission_settings(settings),
-        settings['area'],
-        _robots(settings, seed),
-        seed=seed,
-        scheme=settings.get('scheme', 'distributed'),
-    )
-    record = mission.run(settings.get('limit', _LIMIT), tuple(settings.get('keep', ())))
-    facts = summary(record)
-    length = record.steps + 1
-    columns: dict[str, Any] = {
-        'step': np.arange(length),
-        'visited': record.visited,
-        'active': record.active,
-    }
-    for name, path in record.paths.items():
-        for axis, letter in enumerate('xyz'):
-            columns[f'{name}_{letter}'] = path[:, axis]
-    return Outcome(
-        {
-            'steps': record.steps if record.complete else None,
-            'limit': settings.get('limit', _LIMIT),
-            'complete': record.complete,
-            'cuboids': facts['cuboids'],
-            'visited': facts['visited'],
-            'coverage': record.mission.coverage,
-            'collisions': record.collisions,
-            'outside': record.outside,
-            'recharges': record.recharges,
-            'active': float(record.active.mean()),
-            'least_detection_probability': facts['least_detection_probability'],
-            'optimal': record.how.get('optimal', 0) / max(sum(record.how.values()), 1),
-        },
-        columns,
-        {
-            'snapshots': [
-                {
-                    'cuboid': shot.cuboid,
-                    'robot': shot.robot,
-                    'step': shot.step,
-                    'distance': shot.distance,
-                    'detection_probability': shot.detection_probability,
-                }
-                for shot in record.snapshots
-            ],
-            'plans': {
-                str(step): {name: plan.tolist() for name, plan in plans.items()}
-                for step, plans in record.plans.items()
-            },
-        },
-        {'solve_mean': float(record.solve_times.mean()) if len(record.solve_times) else 0.0},
-    )
+    return plan_mission(mission_settings(settings), settings['area'])
 
 
 def _paths(run: Run, until: int | None = None) -> dict[str, np.ndarray]:
@@ -482,31 +347,6 @@ def _draw_8(figure: Figure, results: Results) -> None:
 
 # ---- table I ---------------------------------------------------------------------------------
 
-CENTRALIZED = Quantity('centralized', 'time of a joint decision, P1', 's')
-DISTRIBUTED = Quantity('distributed', 'time of a decision of one robot, P2', 's')
-_STEPS_TIMED = 8
-
-
-def run_timing(settings: dict[str, Any], seed: int) -> Outcome:
-    """Time the decisions of both controllers at the first steps of a mission."""
-    spent = {}
-    visited = {}
-    for scheme in ('centralized', 'distributed'):
-        mission = CuboidMission(
-            _mission_settings(settings),
-            settings['area'],
-            _robots(settings, seed),
-            seed=seed,
-            scheme=scheme,  # type: ignore[arg-type]
-        )
-        begun = time.perf_counter()
-        record = mission.run(_STEPS_TIMED)
-        spent[scheme] = float(record.solve_times.mean())
-        spent[f'{scheme}_mission'] = time.perf_counter() - begun
-        visited[f'visited_{scheme}'] = int(record.visited[-1])
-    rows = {'step': np.arange(_STEPS_TIMED)}
-    return Outcome({'cuboids': len(mission.mission.cells), **visited}, rows, {}, spent)
-
 
 def _name_table(agents: int, horizon: int) -> str:
     return f'{agents} agents, T = {horizon}'
@@ -555,14 +395,6 @@ def _draw_table(figure: Figure, results: Results) -> None:
     axes.legend(fontsize=8, frameon=False)
 
 
-_TABLE = {
-    (3, 3): (0.8969, 0.0022),
-    (5, 3): (2.1220, 0.0025),
-    (3, 7): (11.5956, 0.0756),
-    (5, 7): (56.3984, 0.0787),
-}
-
-
 def experiments() -> list[Experiment]:
     """Return the experiments of 004."""
     common = (STEPS, COMPLETE, COLLISIONS, CUBOIDS)
@@ -574,17 +406,8 @@ def experiments() -> list[Experiment]:
             run_mission,
             (STEPS, CUBOIDS, COVERAGE, COMPLETE, COLLISIONS, LEAST, SOLVE),
             _draw_3,
-            published=(
-                Published(PAPER, 'steps', 75.0, runs=1, note='VI-A'),
-                Published(OURS, 'steps', 75.0, runs=1, note='VI-A'),
-                Published(PAPER, 'cuboids', 36.0, runs=1, note='VI-A'),
-                Published('p_d = 0.88', 'cuboids', 16.0, runs=1, note='VI-A'),
-                Published('p_d = 0.53', 'cuboids', 4.0, runs=1, note='VI-A'),
-            ),
-            choices=CHOICES,
             runs=1,
-            note='At p_d = 1 the cuboids stand at d_min: in their nearer half p_d is 0 by (4). '
-            'The paper counts every visit; the report gives p_d of each snapshot.',
+            **printed('004-fig3'),
         ),
         Experiment(
             '004-fig4',
@@ -593,13 +416,9 @@ def experiments() -> list[Experiment]:
             run_mission,
             (*common, LEAST, SOLVE),
             _draw_missions,
-            published=(
-                Published(PAPER, 'steps', 48.0, runs=1, note='VI-B, one run'),
-                Published(OURS, 'steps', 48.0, runs=1, note='VI-B, one run'),
-            ),
             comparisons=(Comparison(PAPER, OURS, 'steps'),),
-            choices=CHOICES,
             runs=20,
+            **printed('004-fig4'),
         ),
         Experiment(
             '004-fig5',
@@ -608,15 +427,8 @@ def experiments() -> list[Experiment]:
             run_mission,
             (*common, LEAST, SOLVE),
             _draw_missions,
-            choices=(
-                *CHOICES,
-                Choice(
-                    'places and widths of object and obstacles',
-                    'object at (285, 215), walls of 20 m by 120 m at x = 170 and 400',
-                    'Only their heights are given; these leave a gap as in the picture.',
-                ),
-            ),
             runs=5,
+            **printed('004-fig5'),
         ),
         Experiment(
             '004-fig6',
@@ -625,9 +437,8 @@ def experiments() -> list[Experiment]:
             run_mission,
             (*common, ACTIVE, RECHARGES, SOLVE),
             _draw_6,
-            choices=CHOICES,
             runs=50,
-            note='The paper gives curves without numbers.',
+            **printed('004-fig6'),
         ),
         Experiment(
             '004-fig7',
@@ -636,9 +447,8 @@ def experiments() -> list[Experiment]:
             run_mission,
             (*common, ACTIVE, RECHARGES, SOLVE),
             _draw_7,
-            choices=CHOICES,
             runs=10,
-            note='The paper shows one run of each; these are means.',
+            **printed('004-fig7'),
         ),
         Experiment(
             '004-fig8',
@@ -647,28 +457,12 @@ def experiments() -> list[Experiment]:
             run_mission,
             (*common, SOLVE),
             _draw_8,
-            published=(
-                Published('distributed, 3 agents', 'steps', 24.4, runs=50, note='VI-B'),
-                Published('distributed, 3 agents, as printed', 'steps', 24.4, runs=50, note='VI-B'),
-                Published('sequential, 3 agents', 'steps', 21.8, runs=50, note='VI-B'),
-                Published('centralized, 3 agents', 'steps', 20.9, runs=50, note='VI-B'),
-            ),
             comparisons=tuple(
                 Comparison('distributed, 3 agents', f'{scheme}, 3 agents', 'steps')
                 for scheme in _SCHEMES[1:]
             ),
-            choices=(
-                *CHOICES,
-                Choice(
-                    'where robots begin',
-                    'anywhere in the area, at rest, outside of the object',
-                    'Uniformly, says the paper; heights are part of the area.',
-                ),
-            ),
-            causes='Climbing: 35 N lift 3.35 kg by 0.64 m/s^2 at most, and air resistance '
-            'ends that at 3.2 m/s. Without gravity, or with 70 N, the same planner comes out at '
-            "the paper's times. As printed, the distances of the assignment cost more than that.",
             runs=50,
+            **printed('004-fig8'),
         ),
         Experiment(
             '004-table1',
@@ -677,20 +471,7 @@ def experiments() -> list[Experiment]:
             run_timing,
             (CENTRALIZED, DISTRIBUTED, CUBOIDS),
             _draw_table,
-            published=tuple(
-                Published(_name_table(*key), quantity, value, runs=20, note='Table I')
-                for key, values in _TABLE.items()
-                for quantity, value in zip(('centralized', 'distributed'), values)
-            ),
-            choices=(
-                *CHOICES,
-                Choice(
-                    'what a time is the mean of',
-                    f'the first {_STEPS_TIMED} decisions of a mission',
-                    'The paper does not say at which step it was taken. Theirs: Gurobi 9 on a dual '
-                    'core of 3.5 GHz.',
-                ),
-            ),
             runs=20,
+            **printed('004-table1'),
         ),
     ]
