@@ -58,6 +58,8 @@ FOUND_RADIUS_DEVIATIONS = 2.0
 SAME_PLACE = 6.0
 # Expected detections of a found target: one narrow detection alone is not enough.
 LEAST_HITS = 1.5
+# Detections of one scan that two components of one target do not cause together.
+SEEN_BOTH = 1.5
 # Existence of what the filter of another robot has found.
 CERTAIN = 0.999
 
@@ -289,16 +291,14 @@ class PmbFilter:
     def _is_known(self, i: int, caused: FloatArray) -> bool:
         """Return whether a component may be a found target that this scan has not seen elsewhere.
 
-        A target causes one detection of a scan at most, so a found target that surely caused
-        another one than this component is not it.
+        A target causes one detection of a scan at most, so two components that together caused
+        more than one are two targets.
         """
         density = self.components[i].density
         for f, other in enumerate(self.components):
             if other.target is None:
                 continue
-            both = caused[[i, f]]
-            apart = both.max(axis=1, initial=0.0) > 0.5
-            if apart.all() and both[0].argmax() != both[1].argmax():
+            if caused[[i, f]].sum() > SEEN_BOTH:
                 continue
             offset = density.mean - other.density.mean
             total = density.covariance + other.density.covariance
