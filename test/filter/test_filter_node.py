@@ -143,6 +143,20 @@ def test_a_target_seen_again_and_again_is_found(world):
     assert not node.dropped
 
 
+def test_the_node_runs_the_multi_bernoulli_filter():
+    changed = SETTINGS.filter.model_copy(update={'method': 'pmb'})
+    with running(filter=changed) as (node, team, until):
+        for number in range(1, 9):
+            team.measure(number, ['a', 'b'], {'a': [(0.3, 0.5)], 'b': [(0.3, 0.5)]})
+            until(lambda number=number: len(team.updates) == number)
+        until(lambda: team.found and len(team.found[-1].targets) == 1)
+        target = team.found[-1].targets[0]
+        assert target.position.x == pytest.approx(1.0 + 0.3 * math.cos(0.5), abs=0.02)
+        assert target.position.y == pytest.approx(1.0 + 0.3 * math.sin(0.5), abs=0.02)
+        assert not node.dropped
+        assert node.status()['found'] == 1
+
+
 def test_a_missing_robot_is_named_and_its_late_answer_is_a_batch_of_its_own(world):
     _, team, until = world
     team.measure(1, ['a', 'b'], {'a': []})
