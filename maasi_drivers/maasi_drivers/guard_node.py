@@ -6,14 +6,13 @@ from typing import Any
 
 from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import TwistStamped
-from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from maasi_drivers.agent.driver_settings import LOCKSTEP_LEASE, GuardSettings
 from maasi_drivers.links.command_publisher import CommandPublisher
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, run
+from maasi_filter.ros.qos import liveliness_reader
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1
@@ -56,13 +55,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
         self.create_wall_timer(_LOOK_PERIOD, self._publisher.refresh)
         lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
-        quality = QoSProfile(
-            depth=1,
-            # Liveliness without data comes with heartbeats, which only reliable readers get.
-            reliability=ReliabilityPolicy.RELIABLE,
-            liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
-            liveliness_lease_duration=Duration(seconds=lease),
-        )
+        quality = liveliness_reader(lease)
         # Of the messages only the last one matters, and that only when no other comes.
         self.create_subscription(
             AgentState,

@@ -78,7 +78,7 @@ def test_covariances_cover_jpeg(drone, rendered_score):
 def test_a_cut_marker_is_kept_with_more_covariance_or_dropped(drone):
     pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
     settings = drone(distortion=[])
-    edge = MarkerDetector(settings).camera.to_floor([[80.0, 0.5]], pose)[0]
+    edge = MarkerDetector(settings).camera.back_project([[80.0, 0.5]], pose)[0][0]
     image = one_image(settings, [edge.tolist(), [0.0, 0.0]], pose)
     kept = MarkerDetector(settings).detect(image, pose)
     assert kept.blobs.border_cut.tolist() == [True, False]
@@ -105,7 +105,9 @@ def test_the_edge_of_something_large_is_no_cut_marker(drone):
     view = MarkerDetector(settings).camera
     large = RenderSettings.ideal(marker_diameter=0.065)
     for row in (-0.5, -0.8, -1.2):
-        image = one_image(settings, [view.to_floor([[80.0, row]], pose)[0].tolist()], pose, large)
+        image = one_image(
+            settings, [view.back_project([[80.0, row]], pose)[0][0].tolist()], pose, large
+        )
         seen = MarkerDetector(settings).detect(image, pose)
         assert len(seen) == 0
         assert seen.dropped['size'] == 1

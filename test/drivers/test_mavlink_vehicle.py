@@ -17,8 +17,8 @@ from maasi_drivers.links.mavlink.frames import (
     swap_orientation,
     swap_yaw,
 )
+from maasi_drivers.links.mavlink.phase import Phase
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
-from maasi_drivers.links.mavlink.vehicle import Phase
 from maasi_filter.models.pose import Pose
 
 # What the robot may take until it has stopped [s], and what counts as that [m/s].
@@ -425,9 +425,8 @@ def test_targets_that_are_not_finite_are_refused(bad):
 
 def test_a_setpoint_that_is_not_finite_crashes_the_fake():
     play = Play().fly()
-    play.vehicle._sender.set_position_target_local_ned_send(
-        0, 1, 1, 1, 0x9F8, math.nan, *[0.0] * 10
-    )
+    sender = mavlink.MAVLink(play.to_autopilot, 240, 190)
+    sender.set_position_target_local_ned_send(0, 1, 1, 1, 0x9F8, math.nan, *[0.0] * 10)
     play.run(1.0)
     assert 'not finite' in play.autopilot.crashed
     assert 'floating point exception' in play.said

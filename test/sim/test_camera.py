@@ -63,7 +63,7 @@ def test_a_marker_appears_where_the_projection_says(changes, seed):
         np.array([*generator.uniform(-1, 1, 2), 1.0]), np.array([1.0, *tilt, generator.normal()])
     )
     pixel = generator.uniform(0.2, 0.8, 2) * [view.width, view.height]
-    centre = view.to_floor([pixel], pose)[0]
+    centre = view.back_project([pixel], pose)[0][0]
     image = renderer([disc(centre, 0.015, MARKER)], view=view).render(pose, 0, 0.0)
     assert_allclose(centroid(image), pixel, atol=0.08)
 
@@ -78,7 +78,7 @@ def test_a_marker_covers_its_area(focal):
 
 def test_a_marker_half_outside_is_drawn_to_the_border():
     view = camera()
-    edge = view.to_floor([[-0.5, 59.5]], DOWN)[0]
+    edge = view.back_project([[-0.5, 59.5]], DOWN)[0][0]
     image = renderer([disc(edge, 0.015, MARKER)]).render(DOWN, 0, 0.0)
     assert coverage(image)[59, 0] > 0.95
     seen = coverage(image)[coverage(image) > 0.02].sum()

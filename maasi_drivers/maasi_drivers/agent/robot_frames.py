@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.publisher import Publisher
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from maasi_drivers.agent.driver_settings import DriverSettings
@@ -25,11 +24,9 @@ from maasi_filter.ros.conversions import (
     stamp_to_ros,
 )
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
-from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, TRANSFORMS
 from maasi_filter.ros.stamps import stamp_problem
 
-# As tf2 reads and writes.
-_TF = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
 _NO_TYPE = (
     'the package tf2_msgs is not installed (sudo apt install ros-$ROS_DISTRO-tf2-msgs): nothing is '
     'published on tf and tf_static, and goals have to be in the frame '
@@ -116,12 +113,12 @@ class RobotFrames:
                 kind, node.team_topic('tf_static'), LATCHED
             )
             if settings.poses != 'tf':
-                self._publisher = node.create_publisher(kind, node.team_topic('tf'), _TF)
+                self._publisher = node.create_publisher(kind, node.team_topic('tf'), TRANSFORMS)
         for frame in sensor_frames(self._robot, settings):
             self._add_static(frame.parent, frame.name, frame.pose())
         self._publish_static()
         if not settings.lockstep:
-            node.create_subscription(kind, node.team_topic('tf'), self._on_moving, _TF)
+            node.create_subscription(kind, node.team_topic('tf'), self._on_moving, TRANSFORMS)
             node.create_subscription(
                 kind, node.team_topic('tf_static'), self._on_static, LATCHED_ALL
             )

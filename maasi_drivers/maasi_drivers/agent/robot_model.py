@@ -6,10 +6,8 @@ import math
 from dataclasses import dataclass
 from xml.etree import ElementTree
 
-import numpy as np
-
 from maasi_drivers.agent.driver_settings import DriverSettings
-from maasi_filter.models.pose import Pose, quaternion_product
+from maasi_filter.models.pose import Pose
 
 # From a camera (x forward) to its optical frame (x right, y down, z forward).
 _OPTICAL = (-0.5 * math.pi, 0.0, -0.5 * math.pi)
@@ -39,12 +37,7 @@ class FixedFrame:
 
     def pose(self) -> Pose:
         """Return the pose of the frame in its parent."""
-        turn = np.array([1.0, 0.0, 0.0, 0.0])
-        for axis, angle in enumerate(self.rpy):
-            part = np.zeros(4)
-            part[0], part[1 + axis] = math.cos(0.5 * angle), math.sin(0.5 * angle)
-            turn = quaternion_product(part, turn)
-        return Pose(np.array(self.position), turn)
+        return Pose.from_rpy(self.position, self.rpy)
 
 
 def base_frame(robot: str, settings: DriverSettings) -> str:

@@ -9,17 +9,14 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from maasi_drivers.agent.driver_settings import CommandType
-from maasi_filter.ros.qos import RELIABLE
+from maasi_filter.ros.qos import COMMANDS, RELIABLE
 
 _TYPES: dict[str, type] = {
     'geometry_msgs/msg/TwistStamped': TwistStamped,
     'geometry_msgs/msg/Twist': Twist,
 }
-# Commands that may wait for a link that is down: what is older is worth nothing.
-_DEPTH = 3
 
 
 class CommandPublisher:
@@ -42,11 +39,7 @@ class CommandPublisher:
 
     def __init__(self, node: Node, topic: str, kind: CommandType, lockstep: bool = False) -> None:
         self._node = node
-        self._quality = (
-            RELIABLE
-            if lockstep
-            else QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
-        )
+        self._quality = RELIABLE if lockstep else COMMANDS
         self.topic = node.resolve_topic_name(topic)
         self._publisher: Any = None
         self._kind: type = TwistStamped

@@ -9,7 +9,6 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_drivers.vision.camera_settings import CameraSettings
-from maasi_drivers.vision.projection import propagate
 from maasi_filter.models.pose import Pose
 
 Array = NDArray[np.float64]
@@ -34,7 +33,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 
 
 @njit(cache=True)
-def _distort(x, y, k):  # type: ignore[no-untyped-def]
+def _distort(x, y, k):
     """Plumb-bob model at a normalised point: distorted point, Jacobian xx, yy and xy = yx."""
     k1, k2, p1, p2, k3 = k[0], k[1], k[2], k[3], k[4]
     r2 = x * x + y * y
@@ -50,7 +49,7 @@ def _distort(x, y, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def project_points(points, centre, turn, matrix, k, largest_radius):  # type: ignore[no-untyped-def]
+def project_points(points, centre, turn, matrix, k, largest_radius):
     """Pixels (n, 2) of points (n, 3); turn (3, 3) from the optical frame to the map."""
     pixels = np.full((points.shape[0], 2), np.nan)
     for i in range(points.shape[0]):
@@ -69,7 +68,7 @@ def project_points(points, centre, turn, matrix, k, largest_radius):  # type: ig
 
 
 @njit(cache=True)
-def _undistort(pixels, matrix, k, largest_radius):  # type: ignore[no-untyped-def]
+def _undistort(pixels, matrix, k, largest_radius):
     """Normalised points (n, 2) of pixels, and their derivatives by the pixels (n, 2, 2)."""
     count = pixels.shape[0]
     points = np.full((count, 2), np.nan)
@@ -99,7 +98,7 @@ def _undistort(pixels, matrix, k, largest_radius):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _to_floor(points, by_pixel, centre, turn, origin, height):  # type: ignore[no-untyped-def]
+def _to_floor(points, by_pixel, centre, turn, origin, height):
     """
     Floor positions (n, 2) of ideal rays, derivatives by pixel (n, 2, 2) and by pose (n, 2, 6).
 
@@ -255,9 +254,11 @@ class Camera:
         )
         return points, jacobians
 
-    def to_floor(self, pixels: ArrayLike, pose: Pose, height: float = 0.0) -> Array:
+    def back_project(
+        self, pixels: ArrayLike, pose: Pose, height: float = 0.0
+    ) -> tuple[Array, Array, Array]:
         """
-        Back-project pixels to the horizontal plane z = height (001, eq. (17) with z_w known).
+        Back-project pixels to the plane z = height (001, eq. (17) with z_w known).
 
         Parameters
         ----------
@@ -270,22 +271,8 @@ class Camera:
 
         Returns
         -------
-        ndarray, shape (n, 2)
-            x, y in the map frame [m]; NaN where the ray does not meet the plane.
-
-        """
-        return self.back_project(pixels, pose, height)[0]
-
-    def back_project(
-        self, pixels: ArrayLike, pose: Pose, height: float = 0.0
-    ) -> tuple[Array, Array, Array]:
-        """
-        Back-project pixels (n, 2) to the plane z = height, as `to_floor`, with derivatives.
-
-        Returns
-        -------
         positions : ndarray, shape (n, 2)
-            In the map frame [m].
+            In the map frame [m]; NaN where the ray does not meet the plane.
         by_pixel : ndarray, shape (n, 2, 2)
             Derivatives by the pixel [m/px].
         by_pose : ndarray, shape (n, 2, 6)
@@ -303,43 +290,6 @@ class Camera:
             float(height),
         )
         return positions, jacobian_pixel, jacobian_pose
-
-    def floor_covariance(
-        self,
-        pixels: ArrayLike,
-        pixel_covariances: ArrayLike,
-        pose: Pose,
-        pose_covariance: ArrayLike | None = None,
-        height: float = 0.0,
-    ) -> tuple[Array, Array]:
-        """
-        Back-project pixels to the floor with their covariance.
-
-        Parameters
-        ----------
-        pixels : array_like, shape (n, 2)
-            (column, row) [px].
-        pixel_covariances : array_like, shape (n, 2, 2) or (2, 2)
-            Of the pixels [px^2].
-        pose : Pose
-            Of the robot in the map frame.
-        pose_covariance : array_like, shape (6, 6), optional
-            Of x, y, z [m] and of rotations about the map's x, y, z axes [rad], as in
-            ``geometry_msgs/PoseWithCovariance``. An error of the pose is common to all pixels of
-            an image; each covariance here holds for its pixel alone.
-        height : float
-            Of the floor in the map frame [m].
-
-        Returns
-        -------
-        positions : ndarray, shape (n, 2)
-            In the map frame [m].
-        covariances : ndarray, shape (n, 2, 2)
-            [m^2].
-
-        """
-        positions, by_pixel, by_pose = self.back_project(pixels, pose, height)
-        return positions, propagate(by_pixel, pixel_covariances, by_pose, pose_covariance)
 
     def sees(self, positions: ArrayLike, pose: Pose, radius: float = 0.0) -> NDArray[np.bool_]:
         """

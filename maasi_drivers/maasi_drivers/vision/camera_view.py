@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_drivers.vision.camera_model import RIM_POINTS, Camera
-from maasi_drivers.vision.projection import quaternion_from_rotation_vector
 from maasi_filter.models.pose import Pose
 
 
@@ -16,7 +15,6 @@ def box_view_margin(
     upper: ArrayLike,
     robot_height: float,
     marker_radius: float = 0.0,
-    tilt: float = 0.0,
 ) -> float:
     """
     Return how far inside the image a box field of view lies, markers at its rim included.
@@ -31,13 +29,11 @@ def box_view_margin(
         Height of the robot's origin over the floor [m].
     marker_radius : float
         Markers whose centre lies in the box must be seen as a whole [m].
-    tilt : float
-        Largest roll and pitch of the robot for which the box must still be seen [rad].
 
     Returns
     -------
     float
-        Smallest distance to the image's border, over the box and the tilts [px]; negative where a
+        Smallest distance of the box to the image's border [px]; negative where a
         part of the box is not seen, minus infinity where it lies behind the camera.
 
     Raises
@@ -62,26 +58,4 @@ def box_view_margin(
     circle = marker_radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     outline = (rim[:, None, :] + circle).reshape(-1, 2)
     outline = np.concatenate([outline, np.zeros((len(outline), 1))], axis=1)
-    tilts = [(0.0, 0.0)]
-    if tilt > 0:
-        directions = np.arange(8) * (np.pi / 4)
-        tilts += [(tilt * float(np.cos(a)), tilt * float(np.sin(a))) for a in directions]
-    margins = []
-    for roll, pitch in tilts:
-        pose = Pose(
-            np.array([0.0, 0.0, robot_height]), quaternion_from_rotation_vector(roll, pitch, 0.0)
-        )
-        margins.append(float(camera.margin(outline, pose).min()))
-    return min(margins)
-
-
-def box_in_view(
-    camera: Camera,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    robot_height: float,
-    marker_radius: float = 0.0,
-    tilt: float = 0.0,
-) -> bool:
-    """Say whether a box field of view lies inside what the camera sees; see `box_view_margin`."""
-    return box_view_margin(camera, lower, upper, robot_height, marker_radius, tilt) >= 0.0
+    return float(camera.margin(outline, Pose.from_yaw([0.0, 0.0, robot_height], 0.0)).min())

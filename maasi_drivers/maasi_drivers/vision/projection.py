@@ -15,12 +15,6 @@ Array = NDArray[np.float64]
 _BEARING_VARIANCE_LIMIT = np.pi**2 / 3.0
 
 
-def quaternion_from_rotation_vector(x: float, y: float, z: float) -> Array:
-    angle = float(np.sqrt(x * x + y * y + z * z))
-    sine = 0.5 * float(np.sinc(angle / (2.0 * np.pi)))
-    return np.array([np.cos(angle / 2.0), sine * x, sine * y, sine * z])
-
-
 def propagate(
     by_pixel: Array,
     pixel_covariances: ArrayLike,
@@ -103,9 +97,7 @@ def range_bearing(
 
 
 @njit(cache=True)
-def _range_bearing(  # type: ignore[no-untyped-def]
-    positions, covariances, origin, height, deviation, values, result
-):
+def _range_bearing(positions, covariances, origin, height, deviation, values, result):
     dimension = values.shape[1]
     for i in range(positions.shape[0]):
         dx, dy = positions[i, 0] - origin[0], positions[i, 1] - origin[1]

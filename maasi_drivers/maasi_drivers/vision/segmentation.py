@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -88,7 +89,7 @@ def check_image(image: NDArray[np.generic]) -> Image:
 
 
 @njit(cache=True)
-def _paper_mask(red, green, blue, limit, mask):  # type: ignore[no-untyped-def]
+def _paper_mask(red, green, blue, limit, mask):
     for row in range(mask.shape[0]):
         for column in range(mask.shape[1]):
             excess = (
@@ -117,7 +118,7 @@ def _planes(image: Image) -> list[Image]:
 
 
 @njit(cache=True)
-def _fill(marked, labels, members, starts, boxes):  # type: ignore[no-untyped-def]
+def _fill(marked, labels, members, starts, boxes):
     """See `_components`; returns their number."""
     height, width = labels.shape
     count = 0
@@ -149,17 +150,12 @@ def _fill(marked, labels, members, starts, boxes):  # type: ignore[no-untyped-de
     return count
 
 
-def _components(
-    mask: NDArray[np.uint8],
-) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+class _Components(NamedTuple):
     """
-    Find the 8-connected components of a mask (h, w), in the order of rows.
+    The 8-connected components of a mask (h, w), in the order of rows.
 
-    Markers are few pixels of an image: filling each from its first pixel beats the passes over the
-    whole image that a general algorithm takes.
-
-    Returns
-    -------
+    Attributes
+    ----------
     labels : ndarray, shape (h, w)
         Component from 0 on, or _BACKGROUND.
     members : ndarray
@@ -170,6 +166,20 @@ def _components(
         Left, top, width, height.
 
     """
+
+    labels: NDArray[np.int32]
+    members: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    boxes: NDArray[np.int64]
+
+
+def _components(mask: NDArray[np.uint8]) -> _Components:
+    """
+    Return the components of a mask.
+
+    Markers are few pixels of an image: filling each from its first pixel beats the passes over the
+    whole image that a general algorithm takes.
+    """
     marked = np.flatnonzero(mask.view(np.bool_))
     labels = np.full(mask.shape, _BACKGROUND, dtype=np.int32)
     labels.reshape(-1)[marked] = _UNLABELLED
@@ -177,7 +187,7 @@ def _components(
     starts = np.empty(len(marked) + 1, dtype=np.int64)
     boxes = np.empty((len(marked), 4), dtype=np.int64)
     count = _fill(marked, labels, members, starts, boxes)
-    return labels, members, starts[: count + 1], boxes[:count]
+    return _Components(labels, members, starts[: count + 1], boxes[:count])
 
 
 def _border_cut(boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -216,7 +226,7 @@ def segment_paper(image: Image, settings: SegmentationSettings) -> Blobs:
 
 
 @njit(cache=True)
-def _histogram_median(histogram):  # type: ignore[no-untyped-def]
+def _histogram_median(histogram):
     """Median of counted values, interpolated within its bin; bins are centred on whole numbers."""
     half = 0.5 * histogram.sum()
     below = 0.0
@@ -229,7 +239,7 @@ def _histogram_median(histogram):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _floor_statistics(image, samples):  # type: ignore[no-untyped-def]
+def _floor_statistics(image, samples):
     """White-balance gains (3,) from the floor; median and deviation of its blueness."""
     height, width = image.shape[0], image.shape[1]
     stride = max(1, int(np.sqrt(height * width / samples)))
@@ -263,7 +273,7 @@ def _floor_statistics(image, samples):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _blueness(image, row, column, gain_r, gain_g, gain_b):  # type: ignore[no-untyped-def]
+def _blueness(image, row, column, gain_r, gain_g, gain_b):
     red = gain_r * image[row, column, 0]
     green = gain_g * image[row, column, 1]
     blue = gain_b * image[row, column, 2]
@@ -271,7 +281,7 @@ def _blueness(image, row, column, gain_r, gain_g, gain_b):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def _robust_mask(red, green, blue, gains, threshold, mask):  # type: ignore[no-untyped-def]
+def _robust_mask(red, green, blue, gains, threshold, mask):
     """Set mask to 1 where the blueness exceeds the threshold (no division per pixel)."""
     red_gain, green_gain, blue_gain = (
         np.float32(gains[0]),
@@ -290,7 +300,7 @@ def _robust_mask(red, green, blue, gains, threshold, mask):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def _excess(image, row, column, gains):  # type: ignore[no-untyped-def]
+def _excess(image, row, column, gains):
     """Blue excess O_p of the white-balanced image: linear in how much of a pixel is marker."""
     return gains[2] * image[row, column, 2] - 0.5 * (
         gains[0] * image[row, column, 0] + gains[1] * image[row, column, 1]
@@ -298,91 +308,145 @@ def _excess(image, row, column, gains):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _measure_blobs(  # type: ignore[no-untyped-def]
-    image, labels, members, starts, boxes, gains, gates, keep, centroids, areas, variances
-):
+def _shape_of(image, components, blob, gains, values):
     """
-    Measure each blob, and keep those within the gates: least peak blueness, aspect, solidity.
+    Fill `values` with the excess of each pixel; return mean, axes and peak blueness of the mask.
 
-    centroids (n, 2) and areas (n,) are weighted by the part of each pixel that is marker;
-    variances (n, 2) of the centroids follow from the noise of the surroundings.
+    The lengths of the axes go as the roots of `long` and `short`, the principal second moments.
     """
+    width = components.labels.shape[1]
+    left, top = components.boxes[blob, 0], components.boxes[blob, 1]
+    first, last = components.starts[blob], components.starts[blob + 1]
+    count = last - first
+    sx = sy = sxx = syy = sxy = 0.0
+    peak = 0.0
+    for index in range(first, last):
+        member = components.members[index]
+        row, column = member // width, member % width
+        x, y = float(column - left), float(row - top)
+        sx += x
+        sy += y
+        sxx += x * x
+        syy += y * y
+        sxy += x * y
+        peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
+        values[index - first] = _excess(image, row, column, gains)
+    mx, my = sx / count, sy / count
+    # A pixel is a square: it has a second moment of 1/12 of its own.
+    vxx = sxx / count - mx * mx + 1.0 / 12.0
+    vyy = syy / count - my * my + 1.0 / 12.0
+    vxy = sxy / count - mx * my
+    middle = 0.5 * (vxx + vyy)
+    apart = np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
+    return mx, my, middle + apart, max(middle - apart, 1e-9), peak
+
+
+@njit(cache=True)
+def _surroundings(image, components, blob, gains):
+    """Mean excess and noise of the floor: the box's frame, three pixels wide, without blobs."""
+    labels = components.labels
     height, width = labels.shape
+    left, top = components.boxes[blob, 0], components.boxes[blob, 1]
+    right, bottom = left + components.boxes[blob, 2], top + components.boxes[blob, 3]
+    around = 0
+    square = total = 0.0
+    for row in range(max(top - 3, 0), min(bottom + 3, height)):
+        for column in range(max(left - 3, 0), min(right + 3, width)):
+            frame = row < top - 1 or row > bottom or column < left - 1 or column > right
+            if frame and labels[row, column] == _BACKGROUND:
+                value = _excess(image, row, column, gains)
+                around += 1
+                total += value
+                square += value * value
+    background = total / around if around > 0 else 0.0
+    noise = square / around - background * background if around > 1 else 0.0
+    return background, noise
+
+
+@njit(cache=True)
+def _weigh(image, components, blob, gains, background, contrast, mean):
+    """
+    Sums over the blob and the ring of one pixel around it, other blobs left out.
+
+    Returns the sum of the weights, their moments about the box's corner, and the pixels' second
+    moments about `mean`.
+    """
+    labels = components.labels
+    height, width = labels.shape
+    left, top = components.boxes[blob, 0], components.boxes[blob, 1]
+    right, bottom = left + components.boxes[blob, 2], top + components.boxes[blob, 3]
+    mx, my = mean
+    weight_sum = wx = wy = 0.0
+    spread_x = spread_y = 0.0
+    for row in range(max(top - 1, 0), min(bottom + 1, height)):
+        for column in range(max(left - 1, 0), min(right + 1, width)):
+            near = labels[row, column] == blob
+            if labels[row, column] == _BACKGROUND:
+                for r in range(max(row - 1, 0), min(row + 2, height)):
+                    for c in range(max(column - 1, 0), min(column + 2, width)):
+                        near |= labels[r, c] == blob
+            if near:
+                weight = (_excess(image, row, column, gains) - background) / contrast
+                x, y = float(column - left), float(row - top)
+                weight_sum += weight
+                wx += weight * x
+                wy += weight * y
+                spread_x += (x - mx) * (x - mx)
+                spread_y += (y - my) * (y - my)
+    return weight_sum, wx, wy, spread_x, spread_y
+
+
+class _Measures(NamedTuple):
+    """
+    Of each blob.
+
+    Attributes
+    ----------
+    keep : ndarray of bool, shape (n,)
+        Whether it is within the gates.
+    centroids, areas : ndarray, shapes (n, 2) and (n,)
+        Weighted by the part of each pixel that is marker.
+    variances : ndarray, shape (n, 2)
+        Of the centroids, from the noise of the surroundings.
+
+    """
+
+    keep: NDArray[np.bool_]
+    centroids: NDArray[np.float64]
+    areas: NDArray[np.float64]
+    variances: NDArray[np.float64]
+
+
+@njit(cache=True)
+def _measure_blobs(image, components, gains, gates, measures):
+    """Measure each blob; keep those within the gates: least peak blueness, aspect, solidity."""
+    boxes, starts = components.boxes, components.starts
     for blob in range(boxes.shape[0]):
-        left, top = boxes[blob, 0], boxes[blob, 1]
-        right, bottom = left + boxes[blob, 2], top + boxes[blob, 3]
-        first, last = starts[blob], starts[blob + 1]
-        count = last - first
-        keep[blob] = False
-        # Moments of the mask, for the shape, and the peak.
+        count = starts[blob + 1] - starts[blob]
+        measures.keep[blob] = False
         values = np.empty(count)
-        sx = sy = sxx = syy = sxy = 0.0
-        peak = 0.0
-        for index in range(first, last):
-            row, column = members[index] // width, members[index] % width
-            x, y = float(column - left), float(row - top)
-            sx += x
-            sy += y
-            sxx += x * x
-            syy += y * y
-            sxy += x * y
-            peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
-            values[index - first] = _excess(image, row, column, gains)
-        mx, my = sx / count, sy / count
-        # A pixel is a square: it has a second moment of 1/12 of its own.
-        vxx = sxx / count - mx * mx + 1.0 / 12.0
-        vyy = syy / count - my * my + 1.0 / 12.0
-        vxy = sxy / count - mx * my
-        middle = 0.5 * (vxx + vyy)
-        apart = np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
-        long, short = middle + apart, max(middle - apart, 1e-9)
-        # Lengths of the axes go as the roots of the moments; an ellipse has area 4 pi root(l s).
+        mx, my, long, short, peak = _shape_of(image, components, blob, gains, values)
+        # An ellipse has area 4 pi root(long short).
         if peak < gates[0] or long > gates[1] * gates[1] * short:
             continue
         if count < gates[2] * 4.0 * np.pi * np.sqrt(long * short):
             continue
         # The excess of a pixel that is all marker: the mean of the upper half inside the blob.
         upper = np.sort(values)[count // 2 :].mean()
-        # The floor around: the frame of the box widened by three pixels, other blobs left out.
-        around = 0
-        square = total = 0.0
-        for row in range(max(top - 3, 0), min(bottom + 3, height)):
-            for column in range(max(left - 3, 0), min(right + 3, width)):
-                frame = row < top - 1 or row > bottom or column < left - 1 or column > right
-                if frame and labels[row, column] == _BACKGROUND:
-                    value = _excess(image, row, column, gains)
-                    around += 1
-                    total += value
-                    square += value * value
-        background = total / around if around > 0 else 0.0
-        noise = square / around - background * background if around > 1 else 0.0
+        background, noise = _surroundings(image, components, blob, gains)
         contrast = max(upper - background, 1e-6)
-        # Weights in the blob and the ring of one pixel around it, other blobs left out.
-        weight_sum = wx = wy = 0.0
-        spread_x = spread_y = 0.0
-        for row in range(max(top - 1, 0), min(bottom + 1, height)):
-            for column in range(max(left - 1, 0), min(right + 1, width)):
-                near = labels[row, column] == blob
-                if labels[row, column] == _BACKGROUND:
-                    for r in range(max(row - 1, 0), min(row + 2, height)):
-                        for c in range(max(column - 1, 0), min(column + 2, width)):
-                            near |= labels[r, c] == blob
-                if near:
-                    weight = (_excess(image, row, column, gains) - background) / contrast
-                    x, y = float(column - left), float(row - top)
-                    weight_sum += weight
-                    wx += weight * x
-                    wy += weight * y
-                    spread_x += (x - mx) * (x - mx)
-                    spread_y += (y - my) * (y - my)
+        weight_sum, wx, wy, spread_x, spread_y = _weigh(
+            image, components, blob, gains, background, contrast, (mx, my)
+        )
         if weight_sum < 0.25 * count:
             continue
-        keep[blob] = True
-        areas[blob] = weight_sum
-        centroids[blob, 0] = left + wx / weight_sum
-        centroids[blob, 1] = top + wy / weight_sum
+        measures.keep[blob] = True
+        measures.areas[blob] = weight_sum
+        measures.centroids[blob, 0] = boxes[blob, 0] + wx / weight_sum
+        measures.centroids[blob, 1] = boxes[blob, 1] + wy / weight_sum
         scale = max(noise, 0.0) / (contrast * weight_sum) ** 2
-        variances[blob, 0], variances[blob, 1] = scale * spread_x, scale * spread_y
+        measures.variances[blob, 0] = scale * spread_x
+        measures.variances[blob, 1] = scale * spread_y
 
 
 def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
@@ -410,10 +474,11 @@ def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
     mask = np.empty(image.shape[:2], dtype=np.uint8)
     red, green, blue = _planes(image)
     _robust_mask(red, green, blue, gains, threshold, mask)
-    labels, members, starts, boxes = _components(mask)
-    count = len(boxes)
-    keep = np.zeros(count, dtype=np.bool_)
-    centroids, areas, variances = np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2))
+    components = _components(mask)
+    count = len(components.boxes)
+    measures = _Measures(
+        np.zeros(count, dtype=np.bool_), np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2))
+    )
     gates = np.array(
         [
             max(settings.peak_saturation, threshold),
@@ -421,19 +486,17 @@ def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
             settings.minimum_solidity,
         ]
     )
-    _measure_blobs(
-        image, labels, members, starts, boxes, gains, gates, keep, centroids, areas, variances
-    )
+    _measure_blobs(image, components, gains, gates, measures)
     covariances = np.zeros((count, 2, 2))
-    covariances[:, 0, 0], covariances[:, 1, 1] = variances[:, 0], variances[:, 1]
+    covariances[:, [0, 1], [0, 1]] = measures.variances
     blobs = Blobs(
-        centroids,
-        areas,
-        boxes[:, 2:].astype(np.float64),
-        _border_cut(boxes, mask.shape),
+        measures.centroids,
+        measures.areas,
+        components.boxes[:, 2:].astype(np.float64),
+        _border_cut(components.boxes, mask.shape),
         covariances,
     )
-    return blobs.select(keep)
+    return blobs.select(measures.keep)
 
 
 RULES: dict[str, Callable[[Image, SegmentationSettings], Blobs]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,6 +81,16 @@ class Pose:
         """Return a level pose that faces `yaw` radians, anticlockwise from the x axis."""
         half = 0.5 * float(yaw)
         return cls(np.asarray(position, dtype=float), np.array([np.cos(half), 0, 0, np.sin(half)]))
+
+    @classmethod
+    def from_rpy(cls, position: ArrayLike, rpy: Sequence[float]) -> Pose:
+        """Return a pose by roll, pitch and yaw about fixed axes of its parent [rad]."""
+        orientation = np.array([1.0, 0.0, 0.0, 0.0])
+        for axis, angle in enumerate(rpy):
+            turn = np.zeros(4)
+            turn[0], turn[1 + axis] = math.cos(0.5 * angle), math.sin(0.5 * angle)
+            orientation = quaternion_product(turn, orientation)
+        return cls(np.array(position, dtype=float), orientation)
 
     @property
     def yaw(self) -> float:

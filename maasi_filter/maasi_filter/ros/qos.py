@@ -52,9 +52,28 @@ LIVELY = QoSProfile(
 # How often it is asserted [s].
 LIVELINESS_PERIOD = 0.1
 
+# Commands to a robot: an old one is worth nothing on a link that was down.
+COMMANDS = QoSProfile(depth=3, reliability=ReliabilityPolicy.RELIABLE)
+
+# Transforms, as tf2 reads and writes them.
+TRANSFORMS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE
+)
+
 # What sensors publish: each message replaces the one before.
 SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 SENSOR_READER = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def liveliness_reader(lease: float) -> QoSProfile:
+    """Return how a guard reads states: for the loss of liveliness after `lease` seconds."""
+    return QoSProfile(
+        depth=1,
+        # Liveliness without data comes with heartbeats, which only reliable readers get.
+        reliability=ReliabilityPolicy.RELIABLE,
+        liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
+        liveliness_lease_duration=Duration(seconds=lease),
+    )
 
 
 def sensor_reader(lockstep: bool) -> QoSProfile:

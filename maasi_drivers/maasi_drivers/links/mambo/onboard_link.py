@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from maasi_drivers.agent import geofence
 from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission, offer_arm
 from maasi_drivers.agent.odometry import StampedPose
@@ -18,7 +16,7 @@ from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.links.waypoint_orders import OrderKind, OrderSender
 from maasi_drivers.vision.measurement_feed import FeedPeer, FeedPose, FeedState
-from maasi_filter.models.pose import Pose, compose, inverse, quaternion_product
+from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.lifecycle_node import SettingsError
 
 # Between two orders [s]; without them the program on board hovers, then lands.
@@ -166,7 +164,9 @@ class OnboardLink(RobotLink):
             return
         if pose.battery >= 0.0:
             driver.take_charge(pose.battery)
-        place = compose(self._origin, Pose(pose.position, _orientation(pose)))
+        place = compose(
+            self._origin, Pose.from_rpy(pose.position, (pose.roll, pose.pitch, pose.yaw))
+        )
         driver.judge(_FLIGHT, self._next_order(pose, place), 'flying: goals are accepted')
         placed = self._speed.place(stamp, place)
         driver.take_pose(replace(placed, covariance=self._mambo.pose_covariance()))
@@ -207,13 +207,3 @@ class OnboardLink(RobotLink):
         self._landed_for = self._landed_for or reason
         self._order = OrderKind.LAND
         return self._landed_for
-
-
-def _orientation(pose: FeedPose) -> np.ndarray:
-    """Return w, x, y, z of yaw, then pitch, then roll."""
-    turned = np.array([1.0, 0.0, 0.0, 0.0])
-    for axis, angle in ((3, pose.yaw), (2, pose.pitch), (1, pose.roll)):
-        turn = np.zeros(4)
-        turn[0], turn[axis] = np.cos(0.5 * angle), np.sin(0.5 * angle)
-        turned = quaternion_product(turned, turn)
-    return turned

@@ -1,4 +1,4 @@
-"""Commands to an autopilot: one at a time, said again until it is answered."""
+"""Commands to an autopilot: one at a time, sent again until it is answered."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from maasi_drivers.links.mavlink.protocol import mavlink
 
-# A command that is not answered is said again after so long, so often [s, 1].
+# A command that is not answered is sent again after so long, so often [s, 1].
 _ANSWER_PATIENCE, _TRIES = 0.5, 5
 
 
@@ -25,7 +25,7 @@ class _Command:
 
 class CommandQueue:
     """
-    COMMAND_LONG, in the order in which they were asked for.
+    COMMAND_LONG, in the order of the requests.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class CommandQueue:
             return
         self._commands.popleft().answer(int(message.result))
 
-    def say(self, now: float) -> None:
+    def send(self, now: float) -> None:
         """Send what is due."""
         if not self._commands:
             return

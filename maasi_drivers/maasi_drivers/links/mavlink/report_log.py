@@ -1,0 +1,38 @@
+"""What happened to a vehicle, for the driver's log, and the recent texts of its autopilot."""
+
+from __future__ import annotations
+
+from collections import deque
+
+# Of MAV_SEVERITY.
+ERROR, WARNING, INFO, DEBUG = 3, 4, 6, 7
+# Texts of the autopilot that are younger explain a refusal [s].
+_TEXT_AGE = 6.0
+
+
+class ReportLog:
+    """Reports until the driver takes them."""
+
+    def __init__(self) -> None:
+        self._reports: deque[tuple[int, str]] = deque(maxlen=200)
+        self._texts: deque[tuple[float, str]] = deque(maxlen=8)
+
+    def add(self, severity: int, text: str) -> None:
+        """Add a report; severity as in MAVLink."""
+        self._reports.append((severity, text))
+
+    def add_text(self, severity: int, text: str, now: float) -> None:
+        """Add a text of the autopilot, at `now` on the steady clock [s]."""
+        self._texts.append((now, text))
+        self.add(severity, f'autopilot: {text}')
+
+    def take(self) -> list[tuple[int, str]]:
+        """Return the reports since the last call: severity and text."""
+        reports = list(self._reports)
+        self._reports.clear()
+        return reports
+
+    def recent_text(self, now: float, most: int = 8) -> str:
+        """Return the last recent texts of the autopilot, each once."""
+        texts = list(dict.fromkeys(text for time, text in self._texts if now - time < _TEXT_AGE))
+        return '; '.join(texts[-most:])
