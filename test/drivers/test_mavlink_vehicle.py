@@ -482,11 +482,11 @@ def test_a_frozen_position_is_no_news():
 def test_a_position_that_is_not_finite_is_dropped():
     play = Play().fly()
     number = play.vehicle.telemetry.number
-    play.autopilot._frozen = (math.nan, *[0.0] * 5)
+    play.autopilot.reports.frozen = (math.nan, *[0.0] * 5)
     play.run(1.0)
     assert play.vehicle.telemetry.number - number <= 1
     assert play.vehicle.dropped['LOCAL_POSITION_NED that is not finite'] > 10
-    play.autopilot._frozen = None
+    play.autopilot.reports.frozen = None
 
 
 @firmwares

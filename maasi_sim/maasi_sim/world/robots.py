@@ -17,10 +17,12 @@ from maasi_filter.settings import Settings
 from maasi_planner.motion import Body, RobotState, make_motion
 from maasi_planner.motion.base import check_command
 from maasi_planner.settings import MotionSettings
-from maasi_sim.world.camera import CameraRenderer, RenderSettings, scene_of
+from maasi_sim.world.camera import CameraRenderer
+from maasi_sim.world.floor_scene import scene_of
 from maasi_sim.world.laser_scan import LaserScanner, LaserSettings
 from maasi_sim.world.odometry import OdometryModel, OdometryReading, OdometrySettings
 from maasi_sim.world.ranging_sensor import RangingSensor
+from maasi_sim.world.render_settings import RenderSettings
 from maasi_sim.world.world import World
 
 Array = NDArray[np.float64]

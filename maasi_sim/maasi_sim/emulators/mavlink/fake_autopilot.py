@@ -13,73 +13,38 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, Firmware
+from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER
 from maasi_drivers.links.mavlink.frames import (
     swap_enu_ned,
-    swap_flu_frd,
-    swap_orientation,
     swap_yaw,
 )
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.models.pose import Pose
+from maasi_sim.emulators.mavlink.autopilot_parameters import (
+    FIRMWARES,
+    PARAMETERS,
+    WHOLE_NUMBERS,
+)
+from maasi_sim.emulators.mavlink.autopilot_reports import AutopilotReports
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.emulators.mavlink.flight_model import FlightLimits, FlightModel
 
 Array = NDArray[np.float64]
 
-FIRMWARES: dict[str, Firmware] = {
-    'arducopter': ARDUCOPTER,
-    'ardusub': ARDUSUB,
-    'px4': PX4_COPTER,
-}
-# As they come, but set up as docs/robots_mavlink.md asks: a failsafe for the link, and the system
-# id of the driver as that of the ground station.
-PARAMETERS: dict[str, dict[str, float]] = {
-    'arducopter': {
-        'FS_GCS_ENABLE': 5,
-        'FS_GCS_TIMEOUT': 5,
-        'FS_THR_ENABLE': 1,
-        'FS_EKF_ACTION': 1,
-        'BATT_FS_LOW_ACT': 1,
-        'FENCE_ENABLE': 0,
-        'SYSID_MYGCS': 240,
-    },
-    'ardusub': {
-        'FS_GCS_ENABLE': 4,
-        'FS_GCS_TIMEOUT': 5,
-        'FS_EKF_ACTION': 0,
-        'FS_LEAK_ENABLE': 1,
-        'BATT_FS_LOW_ACT': 0,
-        'SYSID_MYGCS': 240,
-    },
-    'px4': {
-        'COM_OBL_RC_ACT': 4,
-        'COM_OF_LOSS_T': 1,
-        'NAV_DLL_ACT': 0,
-        'COM_LOW_BAT_ACT': 2,
-        'GF_ACTION': 2,
-    },
-}
-# PX4's parameters that are whole numbers, whose bytes go in the place of a float.
-_WHOLE = frozenset({'COM_OBL_RC_ACT', 'NAV_DLL_ACT', 'COM_LOW_BAT_ACT', 'GF_ACTION'})
 # ArduCopter disarms on the ground after so long [s].
 _DISARM_DELAY = 10.0
 # PX4 wants setpoints for so long, and not so long ago, before OFFBOARD [s].
 _OFFBOARD_STREAM, _OFFBOARD_AGE = 1.0, 0.5
-_HEARTBEAT_PERIOD, _STATUS_PERIOD = 1.0, 1.0
 _LANDING, _SURFACING = 0.5, 0.3
 # From the loss of GNSS to that of the position estimate [s].
 _DEAD_RECKONING = 8.0
-_EKF_GOOD = 1 | 2 | 4 | 8 | 16 | 32
-_EKF_START = 1 | 128
 _POSITION_IGNORED, _VELOCITY_IGNORED, _YAW_IGNORED = 0b111, 0b111 << 3, 1 << 10
-_COMMON_RATES = {'LOCAL_POSITION_NED': 4.0, 'ATTITUDE_QUATERNION': 4.0}
 
 
 @dataclass
@@ -87,21 +52,6 @@ class _Setpoint:
     position: Array
     velocity: Array | None = None
     yaw: float | None = None
-
-
-@dataclass
-class _Streams:
-    """When each message is due."""
-
-    periods: dict[str, float] = field(default_factory=dict)
-    last: dict[str, float] = field(default_factory=dict)
-
-    def due(self, name: str, now: float) -> bool:
-        period = self.periods.get(name, math.inf)
-        if math.isinf(period) or now - self.last.get(name, -math.inf) < period - 1e-6:
-            return False
-        self.last[name] = now
-        return True
 
 
 class FakeAutopilot:
@@ -125,6 +75,8 @@ class FakeAutopilot:
     ----------
     crashed : str
         Why it runs no more; empty while it does.
+    now : float
+        Time since its start [s].
 
     """
 
@@ -158,8 +110,7 @@ class FakeAutopilot:
             yaw,
         )
         self._sender = sender
-        self._generator = generator
-        self._now = 0.0
+        self.now = 0.0
         self._setpoint: _Setpoint | None = None
         # Since when setpoints come without a pause, and the last of them.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
@@ -172,28 +123,14 @@ class FakeAutopilot:
         self._station_at = math.inf
         self._failed: set[str] = set()
         self._reported_ready = False
-        self._frozen: tuple[float, ...] | None = None
-        self._streams = self._first_streams()
-
-    def _first_streams(self) -> _Streams:
-        """Return the messages that it sends unasked."""
-        periods = {
-            'HEARTBEAT': _HEARTBEAT_PERIOD,
-            'BATTERY_STATUS': _STATUS_PERIOD,
-            'EXTENDED_SYS_STATE': _STATUS_PERIOD,
-            'GPS_RAW_INT': _STATUS_PERIOD,
-            **{name: 1.0 / rate for name, rate in _COMMON_RATES.items()},
-        }
-        if self.firmware is not PX4_COPTER:
-            periods['EKF_STATUS_REPORT'] = _STATUS_PERIOD
-        return _Streams(periods)
+        self.reports = AutopilotReports(self, sender, generator)
 
     # ---- for those who play with it ----------------------------------------------------------
 
     @property
     def ready(self) -> bool:
         """Whether its position estimate is."""
-        return self._now >= self.settings.estimator_time
+        return self.now >= self.settings.estimator_time
 
     @property
     def mode_name(self) -> str:
@@ -211,34 +148,34 @@ class FakeAutopilot:
 
     def freeze(self) -> None:
         """Say the same position from now on, with new stamps."""
-        self._frozen = self._position_message()
+        self.reports.freeze()
 
     def lose_gnss(self) -> None:
         """Lose GNSS: the fix at once, the position estimate when dead reckoning ends."""
-        self._gnss_lost_at = self._now
+        self._gnss_lost_at = self.now
 
     def restart(self) -> None:
         """Start again, as after a brown-out: disarmed, with a clock and message rates anew."""
         self.armed = False
-        self._now = 0.0
+        self.now = 0.0
         self._hold()
         self.mode = self._first_mode
-        self._streams = self._first_streams()
+        self.reports.restart()
 
     # ---- the clock ---------------------------------------------------------------------------
 
     def advance(self, dt: float) -> None:
         """Go on for `dt` seconds: move, look after failsafes, say what is due."""
-        self._now += dt
+        self.now += dt
         if self.crashed:
             self.body.drift(dt)
             return
         if self.ready and not self._reported_ready:
             self._reported_ready = True
-            self._say(6, 'EKF3 IMU0 is using GPS')
+            self.reports.say(6, 'EKF3 IMU0 is using GPS')
         self._move(dt)
         self._look_after_failsafes(dt)
-        self._publish()
+        self.reports.publish()
 
     def _move(self, dt: float) -> None:
         body = self.body
@@ -248,7 +185,7 @@ class FakeAutopilot:
                 body.drift(dt)
             return
         if body.grounded and self._rising_to is None and not self._lifts_off():
-            if self._now - self._armed_at > _DISARM_DELAY:
+            if self.now - self._armed_at > _DISARM_DELAY:
                 self._disarm('Disarming motors')
             return
         firmware, setpoint = self.firmware, self._setpoint
@@ -288,7 +225,7 @@ class FakeAutopilot:
     def _disarm(self, text: str) -> None:
         self.armed = False
         self._rising_to = self._setpoint = None
-        self._say(6, text)
+        self.reports.say(6, text)
 
     def _hold(self) -> None:
         self._rising_to = None
@@ -301,7 +238,7 @@ class FakeAutopilot:
             self._failed.clear()
             return
         read = self.parameters.get
-        silence = self._now - self._station_at
+        silence = self.now - self._station_at
         if silence > read('FS_GCS_TIMEOUT', math.inf) and self._acts('link', 'FS_GCS_ENABLE'):
             action = int(self.parameters['FS_GCS_ENABLE'])
             if self.firmware is ARDUSUB and action in (1, 2):
@@ -313,9 +250,9 @@ class FakeAutopilot:
         elif (
             self.firmware is PX4_COPTER
             and self.mode == self.firmware.external
-            and self._now - self._streamed_at > read('COM_OF_LOSS_T', 1.0)
+            and self.now - self._streamed_at > read('COM_OF_LOSS_T', 1.0)
         ):
-            self._say(3, 'Failsafe: no offboard setpoints')
+            self.reports.say(3, 'Failsafe: no offboard setpoints')
             hold = self.parameters['COM_OBL_RC_ACT'] == 5
             self._fail_to(self.firmware.hold if hold else self.firmware.land)
         if self.charge < 0.05 and self._acts('battery', 'BATT_FS_LOW_ACT', 'COM_LOW_BAT_ACT'):
@@ -326,91 +263,39 @@ class FakeAutopilot:
         if kind in self._failed or not any(self.parameters.get(name, 0) for name in names):
             return False
         self._failed.add(kind)
-        self._say(3, f'{"GCS" if kind == "link" else "Battery"} Failsafe')
+        self.reports.say(3, f'{"GCS" if kind == "link" else "Battery"} Failsafe')
         return True
 
     def _fail_to(self, mode: int) -> None:
         self.mode = mode
         self._hold()
 
-    # ---- what it says ------------------------------------------------------------------------
-
-    def _publish(self) -> None:
-        for name, write in _MESSAGES.items():
-            if self._streams.due(name, self._now):
-                write(self)
+    @property
+    def estimating(self) -> bool:
+        """Whether its position estimate is good."""
+        return self.ready and not self._gnss_lost_for(_DEAD_RECKONING)
 
     @property
-    def _milliseconds(self) -> int:
-        return round(self._now * 1000.0)
+    def has_fix(self) -> bool:
+        """Whether it has a GNSS fix."""
+        return not self._gnss_lost_for(0.0)
 
-    def _say(self, severity: int, text: str) -> None:
-        self._sender.statustext_send(severity, text.encode()[:50])
+    def _gnss_lost_for(self, time: float) -> bool:
+        return self.now - self._gnss_lost_at >= time
 
-    def _say_heartbeat(self) -> None:
-        flags = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        if self.armed:
-            flags |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-        submarine = self.firmware.kind == 'submarine'
-        kind = mavlink.MAV_TYPE_SUBMARINE if submarine else mavlink.MAV_TYPE_QUADROTOR
-        state = mavlink.MAV_STATE_ACTIVE if self.armed else mavlink.MAV_STATE_STANDBY
-        self._sender.heartbeat_send(kind, self.firmware.autopilot, flags, self.mode, state)
-
-    def _position_message(self) -> tuple[float, ...]:
-        noise = self._generator.normal(0.0, self.settings.noise or 1e-9, 6)
-        believed = self.body.position + np.array([0.0, 0.0, self._height_error])
-        return (
-            *(swap_enu_ned(believed) + noise[:3]).tolist(),
-            *(swap_enu_ned(self.body.velocity) + noise[3:]).tolist(),
-        )
-
-    def _say_position(self) -> None:
-        # ArduPilot says nothing before the estimate is there.
-        if self.ready:
-            values = self._frozen or self._position_message()
-            self._sender.local_position_ned_send(self._milliseconds, *values)
-
-    def _say_attitude(self) -> None:
-        orientation = Pose.from_yaw(np.zeros(3), self.body.yaw).orientation
-        rates = swap_flu_frd([0.0, 0.0, self.body.yaw_rate])
-        self._sender.attitude_quaternion_send(
-            self._milliseconds, *swap_orientation(orientation).tolist(), *rates.tolist()
-        )
-
-    def _say_battery(self) -> None:
-        unknown = [0xFFFF] * 9
-        for number, charge in enumerate([self.charge, *self.settings.more_batteries]):
-            voltage = round(12_000 + 4_800 * charge)
-            self._sender.battery_status_send(
-                number, 0, 0, 0x7FFF, [voltage, *unknown], -1, -1, -1, round(100.0 * charge)
-            )
-
-    def _say_landed(self) -> None:
+    def landed_state(self) -> int:
+        """Return MAV_LANDED_STATE."""
         if self.body.grounded:
-            state = mavlink.MAV_LANDED_STATE_ON_GROUND
-        elif self.mode == self.firmware.land:
-            state = mavlink.MAV_LANDED_STATE_LANDING
-        elif self._rising_to is not None:
-            state = mavlink.MAV_LANDED_STATE_TAKEOFF
-        else:
-            state = mavlink.MAV_LANDED_STATE_IN_AIR
-        self._sender.extended_sys_state_send(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
+            return int(mavlink.MAV_LANDED_STATE_ON_GROUND)
+        if self.mode == self.firmware.land:
+            return int(mavlink.MAV_LANDED_STATE_LANDING)
+        if self._rising_to is not None:
+            return int(mavlink.MAV_LANDED_STATE_TAKEOFF)
+        return int(mavlink.MAV_LANDED_STATE_IN_AIR)
 
-    def _say_estimator(self) -> None:
-        good = self.ready and self._now - self._gnss_lost_at < _DEAD_RECKONING
-        self._sender.ekf_status_report_send(
-            _EKF_GOOD if good else _EKF_START, 0.1, 0.1, 0.1, 0.1, 0.0
-        )
-
-    def _say_gnss(self) -> None:
-        fix = (
-            mavlink.GPS_FIX_TYPE_NO_FIX
-            if self._now >= self._gnss_lost_at
-            else mavlink.GPS_FIX_TYPE_3D_FIX
-        )
-        self._sender.gps_raw_int_send(
-            self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12
-        )
+    def believed_position(self) -> Array:
+        """Return the position that it believes, ENU [m]."""
+        return self.body.position + np.array([0.0, 0.0, self._height_error])
 
     # ---- what it hears -----------------------------------------------------------------------
 
@@ -425,7 +310,7 @@ class FakeAutopilot:
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.get_srcSystem() == self.parameters.get('SYSID_MYGCS'):
-            self._station_at = self._now
+            self._station_at = self.now
 
     def _on_read(self, message: Any) -> None:
         name = message.param_id.rstrip('\0')
@@ -433,7 +318,7 @@ class FakeAutopilot:
         if value is None:
             return
         kind = mavlink.MAV_PARAM_TYPE_REAL32
-        if self.firmware is PX4_COPTER and name in _WHOLE:
+        if self.firmware is PX4_COPTER and name in WHOLE_NUMBERS:
             kind = mavlink.MAV_PARAM_TYPE_INT32
             value = struct.unpack('<f', struct.pack('<i', int(value)))[0]
         names = list(self.parameters)
@@ -449,11 +334,8 @@ class FakeAutopilot:
 
     def _set_interval(self, message: Any) -> int:
         name = mavlink.mavlink_map.get(int(message.param1))
-        if name is None or name.msgname not in _MESSAGES:
-            return int(mavlink.MAV_RESULT_UNSUPPORTED)
-        if message.param2 > 0.0:
-            self._streams.periods[name.msgname] = message.param2 * 1e-6
-        return int(mavlink.MAV_RESULT_ACCEPTED)
+        known = name is not None and self.reports.set_period(name.msgname, message.param2 * 1e-6)
+        return int(mavlink.MAV_RESULT_ACCEPTED if known else mavlink.MAV_RESULT_UNSUPPORTED)
 
     def _set_mode(self, message: Any) -> int:
         mode = int(message.param2)
@@ -465,12 +347,12 @@ class FakeAutopilot:
         if mode == self.firmware.external and not self.ready:
             refusal = 'requires position'
         elif mode == self.firmware.external and self.firmware.streams_first:
-            too_short = self._now - self._streaming_since < _OFFBOARD_STREAM
-            if too_short or self._now - self._streamed_at > _OFFBOARD_AGE:
+            too_short = self.now - self._streaming_since < _OFFBOARD_STREAM
+            if too_short or self.now - self._streamed_at > _OFFBOARD_AGE:
                 refusal = 'no offboard signal'
         if refusal:
             name = self.firmware.mode_name(mode)
-            self._say(4, f'Mode change to {name} failed: {refusal}')
+            self.reports.say(4, f'Mode change to {name} failed: {refusal}')
             return int(mavlink.MAV_RESULT_FAILED)
         if mode != self.mode:
             self.mode = mode
@@ -489,13 +371,13 @@ class FakeAutopilot:
         elif self.charge < 0.05:
             refusal = 'Battery below minimum arming capacity'
         if refusal:
-            self._say(2, f'PreArm: {refusal}')
+            self.reports.say(2, f'PreArm: {refusal}')
             return int(mavlink.MAV_RESULT_FAILED)
         if not self.armed:
-            self.armed, self._armed_at = True, self._now
+            self.armed, self._armed_at = True, self.now
             self._home = float(self.body.position[2])
-            self._station_at = min(self._station_at, self._now)
-            self._say(6, 'Arming motors')
+            self._station_at = min(self._station_at, self.now)
+            self.reports.say(6, 'Arming motors')
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _take_off(self, message: Any) -> int:
@@ -522,13 +404,13 @@ class FakeAutopilot:
         if not all(map(math.isfinite, used)):
             self.crashed = f'SET_POSITION_TARGET_LOCAL_NED: {used} is not finite'
             self.armed = False
-            self._say(0, 'floating point exception')
+            self.reports.say(0, 'floating point exception')
             return
         if message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
             return
-        if self._now - self._streamed_at > _OFFBOARD_AGE:
-            self._streaming_since = self._now
-        self._streamed_at = self._now
+        if self.now - self._streamed_at > _OFFBOARD_AGE:
+            self._streaming_since = self.now
+        self._streamed_at = self.now
         if self.mode != self.firmware.external or self._rising_to is not None:
             return
         if not (wants_position or wants_velocity):
@@ -540,15 +422,6 @@ class FakeAutopilot:
         )
 
 
-_MESSAGES: dict[str, Callable[[FakeAutopilot], None]] = {
-    'HEARTBEAT': FakeAutopilot._say_heartbeat,
-    'ATTITUDE_QUATERNION': FakeAutopilot._say_attitude,
-    'LOCAL_POSITION_NED': FakeAutopilot._say_position,
-    'BATTERY_STATUS': FakeAutopilot._say_battery,
-    'EXTENDED_SYS_STATE': FakeAutopilot._say_landed,
-    'EKF_STATUS_REPORT': FakeAutopilot._say_estimator,
-    'GPS_RAW_INT': FakeAutopilot._say_gnss,
-}
 _HANDLERS: dict[str, Callable[[FakeAutopilot, Any], None]] = {
     'HEARTBEAT': FakeAutopilot._on_heartbeat,
     'PARAM_REQUEST_READ': FakeAutopilot._on_read,

@@ -1,0 +1,127 @@
+"""What lies on the floor: markers, obstacles, and things that are mistaken for markers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from maasi_sim.world.noise_streams import noise_stream
+from maasi_sim.world.render_settings import RenderSettings
+from maasi_sim.world.world import World
+
+Array = NDArray[np.float64]
+Colour = Sequence[float]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """
+    Something flat on the floor.
+
+    Attributes
+    ----------
+    centre : (x, y)
+        Map frame [m].
+    half_size : (a, b)
+        Radius twice for a disc, half the sides for a rectangle [m].
+    colour : (r, g, b)
+        Reflectance, 0 to 1.
+    rectangle : bool
+        Else it is a disc.
+    angle : float
+        Of a rectangle's first side from the x axis [rad].
+
+    """
+
+    centre: tuple[float, float]
+    half_size: tuple[float, float]
+    colour: Colour
+    rectangle: bool = False
+    angle: float = 0.0
+
+
+def disc(centre: ArrayLike, radius: float, colour: Colour) -> Shape:
+    """Return a disc on the floor: centre [m, map], radius [m], reflectance."""
+    x, y = (float(value) for value in np.asarray(centre, dtype=float)[:2])
+    return Shape((x, y), (radius, radius), tuple(colour))
+
+
+def draw_distractors(
+    settings: RenderSettings, world: World, generator: np.random.Generator
+) -> list[Shape]:
+    """
+    Draw the distractors of a world.
+
+    None but sheets touches a marker: a marker half under something else is no fair target.
+    """
+    counts = settings.distractors
+    low, high = world.bounds[:2, 0], world.bounds[:2, 1]
+    radius = 0.5 * settings.marker_diameter
+    shapes: list[Shape] = []
+
+    def draw(reach: float, clear: bool) -> tuple[float, float] | None:
+        for _ in range(1000):
+            x, y = generator.uniform(low, high)
+            gaps = np.linalg.norm(world.targets[:, :2] - np.array([x, y]), axis=1)
+            if not clear or not gaps.size or gaps.min() > reach + 2.0 * radius:
+                return float(x), float(y)
+        return None
+
+    for _ in range(counts.sheets):
+        centre = draw(0.0, False)
+        sides = generator.uniform(0.05, 0.125, size=2)
+        colour = np.array([0.60, 0.68, 0.80]) * generator.uniform(0.85, 1.15)
+        if centre is not None:
+            angle = float(generator.uniform(0, np.pi))
+            sizes = (float(sides[0]), float(sides[1]))
+            shapes.append(Shape(centre, sizes, colour.tolist(), True, angle))
+    for _ in range(counts.lines):
+        half = float(generator.uniform(0.1, 0.4))
+        width = float(generator.uniform(0.0015, 0.004))
+        angle = float(generator.uniform(0, np.pi))
+        line = _clear_line(world, half, angle, radius, generator, low, high)
+        if line is not None:
+            shapes.append(Shape(line, (half, width), settings.marker_colour, True, angle))
+    for count, size, colours in (
+        (counts.purple, 1.0, [[0.42, 0.12, 0.50]]),
+        (counts.cyan, 1.0, [[0.35, 0.55, 0.62]]),
+        (counts.large, 3.0, [settings.marker_colour]),
+    ):
+        for _ in range(count):
+            centre = draw(size * radius, True)
+            if centre is not None:
+                shapes.append(disc(centre, size * radius, colours[0]))
+    return shapes
+
+
+def _clear_line(
+    world: World,
+    half: float,
+    angle: float,
+    radius: float,
+    generator: np.random.Generator,
+    low: Array,
+    high: Array,
+) -> tuple[float, float] | None:
+    along = np.array([np.cos(angle), np.sin(angle)])
+    for _ in range(1000):
+        centre = generator.uniform(low, high)
+        offsets = world.targets[:, :2] - centre
+        nearest = np.clip(offsets @ along, -half, half)[:, None] * along
+        if not len(offsets) or np.linalg.norm(offsets - nearest, axis=1).min() > 2.5 * radius:
+            return float(centre[0]), float(centre[1])
+    return None
+
+
+def scene_of(world: World, settings: RenderSettings, seed: int) -> list[Shape]:
+    """Return what lies on the floor, bottom first: distractors, obstacles, markers."""
+    shapes = draw_distractors(settings, world, noise_stream(seed, purpose='distractors'))
+    shapes += [
+        disc(centre, float(radius), (0.25, 0.24, 0.23))
+        for centre, radius in zip(world.obstacles.centres, world.obstacles.radii)
+    ]
+    radius = 0.5 * settings.marker_diameter
+    return shapes + [disc(target, radius, settings.marker_colour) for target in world.targets]
