@@ -58,7 +58,7 @@ class Run:
     measurements : int
         Taken in all.
     step : float
-        Mean CPU time of a filter step, seconds; wall time, on one thread.
+        Mean wall time of a filter step, seconds; on a busy machine it means little.
     """
 
     seed: int

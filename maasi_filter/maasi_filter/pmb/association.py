@@ -76,7 +76,7 @@ def _propagate(psi, missed, caused, new):  # type: ignore[no-untyped-def]  # pra
 def associate(odds: FloatArray, other: FloatArray) -> Marginals:
     """Return the marginal probabilities of which component caused which detection.
 
-    Exact for one component or one detection, else approximate (Williams and Lau 2014, fig. 5).
+    Exact for one component or one detection, else approximate (Williams and Lau 2014).
 
     Parameters
     ----------

@@ -80,7 +80,7 @@ def draw_births(
     number: int,
     generator: np.random.Generator,
 ) -> Births:
-    """Return births of a scan, before e is updated with it (Williams 2015, eq. (27), (34)).
+    """Return births of a scan, before e is updated with it (Williams 2015).
 
     Parameters
     ----------

@@ -134,7 +134,7 @@ class Component:
     ) -> bool:
         """Take a scan in, given marginal association probabilities; return whether f changed.
 
-        a_0 = p_miss r (1 - p_D) / (1 - r p_D), a_j = p_j, r = sum a (Williams 2015, eq. (31)).
+        a_0 = p_miss r (1 - p_D) / (1 - r p_D), a_j = p_j, r = sum a (Williams 2015, TOMB/P).
         """
         r, detected = self.existence, view.detected
         nothing = missed * r * (1.0 - detected) / (1.0 - r * detected)

@@ -267,7 +267,7 @@ class Density:
         return products, last
 
     def _temper(self, generator: np.random.Generator) -> None:
-        """Take the last factor in by parts, with moves after each (Chopin 2002, section 4)."""
+        """Take the last factor in by parts, with moves after each (Chopin 2002)."""
         products, last = self._logs(self.particles)
         number = len(self.weights)
         taken = 0.0

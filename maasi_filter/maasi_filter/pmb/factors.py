@@ -1,6 +1,6 @@
 """Factors of a component's density: what each scan tells about where its target is.
 
-The density is a product of factors, one for each scan since birth (Williams 2015, eq. (31) to (33),
+The density is a product of factors, one for each scan since birth (Williams 2015,
 with marginal association probabilities):
 
     f(x) = c_0 (1 - pi(x)) + pi(x) sum_j c_j g(z_j | x)
