@@ -67,6 +67,17 @@ def _add_squares(particles, weights, label, means, covariances):  # type: ignore
                 covariances[g, b, a] = covariances[g, a, b]
 
 
+@njit(cache=True, error_model='numpy')
+def _keep_least(particles, centre, least):  # type: ignore[no-untyped-def]
+    """Lower `least` (n,) to the squared distance from a centre where that is smaller."""
+    d = particles.shape[1]
+    for i in range(len(particles)):
+        x = particles[i, 0] - centre[0]
+        y = particles[i, 1] - centre[1]
+        z = particles[i, 2] - centre[2] if d == 3 else 0.0
+        least[i] = min(x * x + y * y + z * z, least[i])
+
+
 def _starting_centres(
     particles: FloatArray,
     weights: FloatArray,
@@ -78,7 +89,7 @@ def _starting_centres(
     centres = start[:number]
     least = np.full(len(particles), np.inf)
     for centre in centres:
-        least = np.minimum(least, ((particles - centre) ** 2).sum(axis=1))
+        _keep_least(particles, centre, least)
     while len(centres) < number:
         chance = np.cumsum(weights * least if len(centres) else weights)
         if not chance[-1] > 0.0:
@@ -86,7 +97,7 @@ def _starting_centres(
         draw = generator.random() * chance[-1]
         pick = particles[min(int(np.searchsorted(chance, draw, 'right')), len(particles) - 1)]
         centres = np.concatenate([centres, pick[None]])
-        least = np.minimum(least, ((particles - pick) ** 2).sum(axis=1))
+        _keep_least(particles, pick, least)
     return np.array(centres)
 
 
