@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -10,214 +9,41 @@ from functools import partial
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseArray, TwistStamped
-from nav_msgs.msg import Odometry
-from rclpy.node import Node
+from geometry_msgs.msg import TwistStamped
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
-from std_msgs.msg import Header
-from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import CameraSettings
-from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import (
-    colour,
-    point_to_ros,
-    pose_to_ros,
-    sphere_marker,
     stamp_from_ros,
     stamp_of_step,
     stamp_to_ros,
 )
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError, run
-from maasi_filter.ros.marker_board import MarkerBoard
-from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
-from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray, RangeMeasurement
+from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
+from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.emulators.linked_robots import LinkedRobot, linked_robot
+from maasi_sim.ros.ground_truth import publish_truth
+from maasi_sim.ros.robot_topics import RobotTopics
 from maasi_sim.scenario.layering import Key
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import (
     Scenario,
     ScenarioError,
-    steps_of,
 )
 from maasi_sim.sim_settings import SimNodeSettings
 from maasi_sim.world.external_robot import ExternalRobot
-from maasi_sim.world.laser_scan import LaserSettings
-from maasi_sim.world.robots import SimulatedRobot
 from maasi_sim.world.simulation import Simulation
 
 RECORDER = 'recorder'
 
-# Between two looks at who is there [s].
+# Period of the checks for nodes that are not ready yet [s].
 _LOOK_PERIOD = 0.02
-# After so long it says whom it waits for, and again for the same ones [s].
+# Delay of the first warning about missing nodes, and period of its repetition [s].
 _PATIENCE, _REMINDER = 3.0, 15.0
-# Longest wait for the subscriptions of a node that says that it is ready [s].
+# Longest wait for the subscriptions of a node that reports ready [s].
 _CONNECTION_PATIENCE = 5.0
-# Of simulated time, between two messages on a battery [s].
-_BATTERY_PERIOD = 1.0
-_LEAST_VARIANCE = 1e-12
-# At the end: how long robots with a link of their own are there for drivers that stop them [s].
+# At shutdown: how long linked robots stay reachable for drivers that stop them [s].
 _FAREWELL = 1.0
-
-
-class RobotTopics:
-    """
-    What one robot publishes; its messages are filled anew each time, as making them takes longer.
-
-    Parameters
-    ----------
-    node : Node
-        Whose publishers they are.
-    simulation : Simulation
-        Where the robot is.
-    name : str
-        Of the robot.
-    qos : QoSProfile
-        Of all topics.
-    """
-
-    def __init__(self, node: Node, simulation: Simulation, name: str, qos: QoSProfile) -> None:
-        self.name = name
-        self.simulation = simulation
-        self.robot: SimulatedRobot = simulation.robots[name]
-        self._battery_steps = steps_of(_BATTERY_PERIOD, simulation.scenario.step)
-        self.publishers: list[Publisher] = []
-
-        def publisher(kind: type, topic: str) -> Publisher:
-            made = node.create_publisher(kind, f'{name}/{topic}', qos)
-            self.publishers.append(made)
-            return made
-
-        equipment = self.robot.equipment
-        # One that is moved by something else says where it is by itself.
-        robot = simulation.scenario.robots[name]
-        self.linked = robot.link != 'topics' or robot.external
-        self._odometry_publisher = None if self.linked else publisher(Odometry, 'odom')
-        self._odometry = Odometry(child_frame_id=f'{name}/base_link')
-        self._odometry.header.frame_id = f'{name}/odom'
-        linear = max(equipment.odometry.velocity_noise**2, _LEAST_VARIANCE)
-        angular = max(equipment.odometry.heading_noise**2, _LEAST_VARIANCE)
-        self._odometry.twist.covariance[::7] = [linear] * 3 + [angular] * 3
-        self._battery_publisher = None if self.linked else publisher(BatteryState, 'battery_state')
-        self._battery = BatteryState(
-            **dict.fromkeys(('voltage', 'temperature', 'current', 'charge', 'capacity'), math.nan),
-            design_capacity=math.nan,
-            power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
-            present=True,
-        )
-        self._battery.header.frame_id = f'{name}/base_link'
-        #: Topic that a driver cannot do without, beside its odometry.
-        self.sensor_topic = ''
-        if equipment.camera is not None:
-            self._image_publisher = publisher(Image, 'camera/image_raw')
-            self._info_publisher = publisher(CameraInfo, 'camera/camera_info')
-            self._image, self._info = camera_messages(equipment.camera, f'{name}/camera_optical')
-            self.sensor_topic = self._image_publisher.topic_name
-        elif equipment.sensor is not None:
-            self._ranges_publisher = publisher(RangeArray, 'ranges')
-            self._ranges = RangeArray(header=Header(frame_id=f'{name}/base_link'))
-            self.sensor_topic = self._ranges_publisher.topic_name
-        # Who moves a robot on topics has its scan as well.
-        self._scans = equipment.laser is not None and robot.body == 'simulated'
-        if equipment.laser is not None and self._scans:
-            self._scan_publisher = publisher(LaserScan, 'scan')
-            self._scan = scan_message(equipment.laser, f'{name}/base_scan')
-
-    @property
-    def odometry_topic(self) -> str:
-        """Full name of its odometry's topic; empty where it has none."""
-        return '' if self._odometry_publisher is None else self._odometry_publisher.topic_name
-
-    def publish(self, stamp: Time) -> bool:
-        """Publish what is due; return whether camera or ranging sensor had something."""
-        simulation, robot, name = self.simulation, self.robot, self.name
-        if self._odometry_publisher is not None:
-            self._publish_odometry(stamp, self._odometry_publisher)
-        imaging = simulation.images_due(name)
-        if imaging and robot.camera is not None:
-            image = robot.image(simulation.step, simulation.time)
-            self._info.header.stamp = stamp
-            self._info_publisher.publish(self._info)
-            self._image.header.stamp = stamp
-            # An array is copied as a whole, numbers of an ndarray one by one.
-            self._image.data = array.array('B', image.tobytes())
-            self._image_publisher.publish(self._image)
-        elif imaging and robot.ranging is not None:
-            self._ranges.header.stamp = stamp
-            self._ranges.ranges = [
-                RangeMeasurement(
-                    range=values[0],
-                    bearing=values[1],
-                    elevation=values[2] if len(values) == 3 else 0.0,
-                )
-                for values in robot.ranges(simulation.step).tolist()
-            ]
-            self._ranges_publisher.publish(self._ranges)
-        if self._scans and simulation.scan_due(name):
-            self._scan.header.stamp = stamp
-            self._scan.ranges = array.array('f', simulation.scan(name).tobytes())
-            self._scan_publisher.publish(self._scan)
-        if self._battery_publisher is not None and simulation.step % self._battery_steps == 0:
-            self._battery.header.stamp = stamp
-            self._battery.percentage = robot.battery.charge
-            self._battery_publisher.publish(self._battery)
-        return imaging
-
-    def _publish_odometry(self, stamp: Time, publisher: Publisher) -> None:
-        reading, message = self.robot.odometry, self._odometry
-        message.header.stamp = stamp
-        place, turn = message.pose.pose.position, message.pose.pose.orientation
-        place.x, place.y, place.z = reading.pose.position.tolist()
-        turn.w, turn.x, turn.y, turn.z = reading.pose.orientation.tolist()
-        message.pose.covariance = reading.covariance.reshape(36)
-        linear, angular = message.twist.twist.linear, message.twist.twist.angular
-        linear.x, linear.y, linear.z = reading.velocity.tolist()
-        angular.x, angular.y, angular.z = reading.angular_velocity.tolist()
-        publisher.publish(message)
-
-
-def camera_messages(settings: CameraSettings, frame: str) -> tuple[Image, CameraInfo]:
-    """Return a camera's image without its data, and its calibration."""
-    image = Image(
-        height=settings.height,
-        width=settings.width,
-        encoding='rgb8',
-        is_bigendian=0,
-        step=3 * settings.width,
-    )
-    camera = Camera.from_settings(settings)
-    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    info = CameraInfo(
-        height=settings.height,
-        width=settings.width,
-        distortion_model='plumb_bob',
-        d=camera.distortion.tolist(),
-        k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-    )
-    image.header.frame_id = info.header.frame_id = frame
-    return image, info
-
-
-def scan_message(settings: LaserSettings, frame: str) -> LaserScan:
-    """Return a laser scan without its ranges: a turn in no time, from straight ahead."""
-    increment = 2.0 * math.pi / settings.beams
-    return LaserScan(
-        header=Header(frame_id=frame),
-        angle_min=0.0,
-        angle_max=increment * (settings.beams - 1),
-        angle_increment=increment,
-        time_increment=0.0,
-        scan_time=1.0 / settings.rate,
-        range_min=settings.minimum_range,
-        range_max=settings.maximum_range,
-    )
 
 
 class SimNode(LockstepLifecycleNode[SimNodeSettings]):
@@ -281,18 +107,18 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._period = self._length / settings.rate if settings.rate > 0.0 else 0.0
         self._entities: list[Any] = []
         self._stamp = 0
-        # Of the time at which it begins, and the last time of a clock that it follows [ns].
+        # First step, and last time of the followed clock [ns].
         self._first = 0
         self._followed: int | None = None
-        # Of the last step that was published anew.
+        # Stamp of the last step that was republished.
         self._repeated = -1
-        # Topics on which each expected node listens.
+        # Topics that each expected node subscribes to.
         self._expected: dict[str, list[str]] = {}
         self._ready: set[str] = set()
         self._endpoints: dict[tuple[str, str], set[bytes]] = {}
         self._returned: dict[str, float] = {}
         self._ready_since: float | None = None
-        # In lockstep: nodes that are not done, and topics of commands that have not come.
+        # In lockstep: nodes that are not done, and command topics without a message yet.
         self._waiting: set[str] = set()
         self._last_command: dict[str, int] = {}
         self._due = 0.0
@@ -351,7 +177,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
                 self._expected[self.team_topic(f'{namespace}/{node}'.strip('/'))] = step_topics
         if self.settings.recorder:
             self._expected[self.team_topic(RECORDER)] = step_topics
-        self._publish_truth()
+        truth = publish_truth(self, self.simulation.world, self.settings.frame)
+        self._entities += truth
         for name, topics in self._robots.items():
             if topics.linked:
                 robot = linked_robot(name, self.scenario.robots[name], self.settings.seed)
@@ -432,7 +259,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             'collisions': sum(robot.collisions for robot in self.simulation.robots.values()),
         }
 
-    # ---- who is there ------------------------------------------------------------------------
+    # ---- presence of nodes -------------------------------------------------------------------
 
     def _on_ready(self, message: LockstepDone) -> None:
         node = message.node
@@ -567,7 +394,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._publish(present)
 
     def _publish(self, robots: list[str]) -> None:
-        """Publish what some robots have at this step, the clock, and that the step is there.
+        """Publish the data of some robots, the clock, and the step.
 
         Where a step comes twice, images of the other robots have been taken the first time.
         """
@@ -592,7 +419,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
 
     def _on_done(self, message: LockstepDone) -> None:
         if message.step == self.step and message.node in self._waiting:
-            # One that was started again is awaited until it has got the step.
+            # A restarted node is awaited until it has received the step.
             if message.node in self._returned:
                 return
             self._waiting.discard(message.node)
@@ -624,12 +451,12 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             if stamp == self._stamp:
                 return True
             if stamp == self._repeated:
-                # The others answer a step that comes twice twice.
+                # Duplicate: the other nodes answer a republished step again.
                 return False
-            # Nothing moves while a step waits: those who stop a robot are right already.
+            # Nothing moves while a step waits: a stop command is already fulfilled.
             oldest = newest = self._stamp
         else:
-            # The last one may be of the step before; none at all means now.
+            # A command may be of the previous step; stamp 0 means now.
             stamp = stamp or self._stamp
             newest = self._stamp + round(self._length * 1e9)
             oldest = max(
@@ -686,39 +513,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._followed = stamp_from_ros(message.clock)
         while self.active and 0 <= self.step < self._step_at(self._followed):
             self._advance_freely()
-
-    # ---- the truth ---------------------------------------------------------------------------
-
-    def _publish_truth(self) -> None:
-        header = Header(frame_id=self.settings.frame)
-        world = self.simulation.world
-        targets = self.create_publisher(PoseArray, 'ground_truth/targets', LATCHED)
-        markers = self.create_publisher(MarkerArray, 'ground_truth/markers', LATCHED)
-        self._entities += [targets, markers]
-        targets.publish(
-            PoseArray(
-                header=header, poses=[pose_to_ros(Pose(target)) for target in world.targets_3d]
-            )
-        )
-        size = 0.01 * float((world.bounds[:, 1] - world.bounds[:, 0]).max())
-        shapes = [
-            sphere_marker(header, 'truth', number, target, size, colour(0.0, 0.3, 1.0, 0.7))
-            for number, target in enumerate(world.targets_3d, start=1)
-        ]
-        obstacles = world.obstacles
-        for number, (centre, radius, sphere) in enumerate(
-            zip(obstacles.centres, obstacles.radii, obstacles.spheres), start=1
-        ):
-            shape = sphere_marker(
-                header, 'obstacles', number, centre, 2.0 * float(radius), colour(0.3, 0.3, 0.3)
-            )
-            if not sphere:
-                shape.type = Marker.CYLINDER
-                low, high = world.bounds[2] if world.dimension == 3 else (0.0, float(radius))
-                shape.pose.position = point_to_ros([*centre[:2], 0.5 * (low + high)])
-                shape.scale.z = float(high - low)
-            shapes.append(shape)
-        markers.publish(MarkerBoard().replace(MarkerArray(markers=shapes)))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -180,7 +180,7 @@ def _bound(info: FieldInfo, *kinds: str) -> float | None:
 
 
 def _number(annotation: Any) -> type | None:
-    kinds = [item for item in _choices(annotation) if item is not type(None)]
+    kinds = [item for item in choices(annotation) if item is not type(None)]
     return kinds[0] if len(kinds) == 1 and kinds[0] in (int, float) else None
 
 
@@ -276,15 +276,16 @@ def _bare(annotation: Any) -> Any:
     return annotation
 
 
-def _choices(annotation: Any) -> list[Any]:
+def choices(annotation: Any) -> list[Any]:
+    """Return what a field's annotation allows: the members of a union, without metadata."""
     annotation = _bare(annotation)
     if get_origin(annotation) in (Union, types.UnionType):
-        return [_bare(item) for item in get_args(annotation)]
+        return [inner for item in get_args(annotation) for inner in choices(item)]
     return [annotation]
 
 
 def _element(annotation: Any) -> Any:
-    for choice in _choices(annotation):
+    for choice in choices(annotation):
         if get_origin(choice) is list:
             return _bare(get_args(choice)[0])
     return None
@@ -292,7 +293,7 @@ def _element(annotation: Any) -> Any:
 
 def _width(annotation: Any) -> int | None:
     """Return the length of the lists in a list, if it is always the same."""
-    for choice in _choices(annotation):
+    for choice in choices(annotation):
         if get_origin(choice) is list and get_origin(get_args(choice)[0]) is Annotated:
             element, *metadata = get_args(get_args(choice)[0])
             limits = [item for item in metadata if isinstance(item, FieldInfo)]
@@ -310,14 +311,14 @@ def _width(annotation: Any) -> int | None:
 
 
 def _nested(annotation: Any) -> type[BaseModel] | None:
-    for choice in _choices(annotation):
+    for choice in choices(annotation):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             return choice
     return None
 
 
 def _model_by_name(annotation: Any) -> type[BaseModel] | None:
-    for choice in _choices(annotation):
+    for choice in choices(annotation):
         if get_origin(choice) is dict:
             return _nested(get_args(choice)[1])
     return None

@@ -70,7 +70,7 @@ class BuildingMission:
 
     def figure(self, record: CuboidRecord) -> Figure:
         """See `Mission.figure`."""
-        # Matplotlib takes long to import: not before the run.
+        # Deferred: Matplotlib takes long to import.
         from maasi_sim.buildings.report_figure import plot_cuboid_report
 
         return plot_cuboid_report(record)

@@ -16,7 +16,7 @@ def plan_nodes(scenario: CuboidScenario, run: RunSettings) -> list[NodePlan]:
     plans = [sim_plan('cuboid_sim_node', scenario, run)]
     for name in scenario.names():
         plans.append(_planner_plan(name, scenario, common))
-        # It decides once a step, and its commands are for one step.
+        # It plans once per step, and a command is valid for one step.
         plans.append(guard_plan(name, common, scenario.step))
     return plans
 

@@ -1,4 +1,4 @@
-"""What a search of buildings has come to, from its messages: live, or from a recording."""
+"""Gathers what the report of a search of buildings needs from its messages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Moment:
 
 @dataclass
 class CuboidRecord(RunRecord):
-    """What a search of buildings has come to.
+    """The record of a search of buildings.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class CuboidObserver:
 
     @property
     def topics(self) -> list[str]:
-        """Topics that it wants."""
+        """Topics that it needs."""
         return [STEP, *self._decision_topics, *self._state_topics]
 
     @property
@@ -155,7 +155,7 @@ class CuboidObserver:
         return max(self._done.values()) if self.settled is not None else None
 
     def add(self, topic: str, data: bytes) -> None:
-        """Take a serialised message; what is not in `topics` is left alone."""
+        """Add a serialised message; one of another topic is ignored."""
         if topic in self._decision_topics:
             self._take(self._decision_topics[topic], self._team.decode(data, 'CuboidDecision'))
         elif topic in self._state_topics:
@@ -164,7 +164,7 @@ class CuboidObserver:
             self._team.note(self._team.decode(data, 'LockstepStep'))
 
     def settle(self) -> None:
-        """Do nothing: each message was taken as it came."""
+        """Do nothing: messages are evaluated in `add`."""
 
     def _take(self, name: str, decision: Any) -> None:
         self._decisions[name].append(decision)

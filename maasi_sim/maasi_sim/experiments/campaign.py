@@ -32,7 +32,7 @@ ONE_THREAD = {
     'MKL_NUM_THREADS': '1',
     'NUMBA_NUM_THREADS': '1',
 }
-# Runs handed out ahead of those that are made, for each worker.
+# Runs queued in advance for each worker.
 _AHEAD = 2
 
 
@@ -75,7 +75,7 @@ def execute(task: Task) -> tuple[str, str]:
 
 
 class Workers(Protocol):
-    """Who makes the runs."""
+    """Executes runs."""
 
     number: int
 
@@ -86,7 +86,7 @@ class Workers(Protocol):
         """Yield each task with what `execute` returned, as they are done."""
 
     def close(self) -> None:
-        """Let them go; what is not done stays undone."""
+        """Shut down; pending runs are abandoned."""
 
 
 class SerialExecutor:
@@ -108,7 +108,7 @@ class SerialExecutor:
 
 
 def _begin_worker() -> None:
-    # Ctrl-C is for the one that writes; it lets its workers go.
+    # The main process handles Ctrl-C and shuts down its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -126,11 +126,11 @@ class Processes:
         before = {name: os.environ.get(name) for name in ONE_THREAD}
         os.environ.update(ONE_THREAD)
         try:
-            # Spawned, so that they begin as a fresh interpreter does on every system.
+            # Spawned: a fresh interpreter on every system.
             self._pool = ProcessPoolExecutor(
                 number, multiprocessing.get_context('spawn'), initializer=_begin_worker
             )
-            # Started while the environment is as they need it.
+            # Started now, while the environment is set.
             list(self._pool.map(_nothing, range(number)))
         finally:
             for name, value in before.items():
@@ -214,7 +214,7 @@ class Cluster:
         """See `Workers.make`."""
         from distributed import as_completed
 
-        # Once more where a worker is lost; not pure: the same task twice is made twice.
+        # One retry if a worker is lost; not pure, so that equal tasks are not merged.
         futures = {
             self._client.submit(execute, task, pure=False, retries=1): task for task in tasks
         }
@@ -233,7 +233,7 @@ class Cluster:
 
 @dataclass
 class Plan:
-    """What is to be done for one experiment.
+    """Work plan of one experiment.
 
     Attributes
     ----------
@@ -267,7 +267,7 @@ class Plan:
 
 
 def plan(experiment: Experiment, out: Path, runs: int, seed: int = 1, small: bool = False) -> Plan:
-    """Look at what is there and return what is to be done.
+    """Compare the stored runs with the wanted ones, and return the work plan.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-# Between two calls for one robot, as the first may come before its driver is active [s].
+# Period of calls for one robot: the first may come before its driver is active [s].
 _PERIOD = 2.0
 
 

@@ -46,9 +46,9 @@ ImageFormat = Literal['jpeg', 'png', 'raw']
 
 # Encodings that are compressed, with their number of channels.
 _CHANNELS = {'bgr8': 3, 'rgb8': 3, 'mono8': 1, '8UC1': 1, '8UC3': 3}
-# Shortest wait for a message, so that a chunk that is due does not spin [s].
+# Shortest wait for a message, against busy waiting while a chunk is due [s].
 _LEAST_WAIT = 0.01
-# Time of what is no message, but a topic that was announced.
+# Marks the announcement of a topic instead of a message.
 _ANNOUNCED = -(2**63)
 _FOREVER = QosTime(9223372036, 854775807)
 
@@ -174,7 +174,7 @@ class BagWriter:
         self._thread.start()
 
     def add_topic(self, topic: str, type_name: str, qos: TopicQos | None = None) -> None:
-        """Announce a topic; it appears in the recording even if nothing comes.
+        """Announce a topic; it appears in the recording even without messages.
 
         Raises
         ------
@@ -184,8 +184,8 @@ class BagWriter:
         if type_name not in self._types.fielddefs:
             raise BagError(f'topic {topic}: unknown message type {type_name}')
         self._topics[topic] = (type_name, qos or TopicQos())
-        # To describe a topic takes a while: not when its first messages wait. Of images it is not
-        # known yet how they are stored.
+        # Announcing a topic takes a while: do it before its first message. The stored format of
+        # images is not known yet.
         if type_name != IMAGE_TYPE:
             self._queue.put((topic, _ANNOUNCED, b''))
 

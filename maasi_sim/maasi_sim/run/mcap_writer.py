@@ -22,7 +22,7 @@ from rosbags.rosbag2.storage_mcap import (
 from maasi_drivers.calibration.bag_reader import whole_length, write_end
 
 ROS_DISTRO = 'jazzy'
-# Wall time after which what was written is in the file, at the latest [s].
+# Latest time after which written messages are in the file [s of wall time].
 FLUSH_PERIOD = 0.5
 _FOREIGN_DISTRO, _OWN_DISTRO = 'ros_distro: rosbags', f'ros_distro: {ROS_DISTRO}'
 

@@ -61,19 +61,19 @@ class NodePlan:
     parameters : dict
         Flat, with dots.
     topics : tuple of str
-        That it publishes, and that the run cannot do without.
+        That it publishes and that the run needs.
     says_ready : bool
-        Whether it says so on `lockstep/ready`, and is waited for.
+        Whether it reports on `lockstep/ready`, and is awaited.
     says_done : bool
         Whether it takes part in lockstep.
     is_clock : bool
-        Whether the time is its.
+        Whether it publishes the time.
     drives : bool
         Whether it commands a robot, which is stopped when the node dies.
     remaps : dict
-        Names of topics that are called otherwise.
+        Remapped topic names.
     given : dict
-        Parameters that are not in its file: what must not be taken over with it to real robots.
+        Parameters passed on the command line, as the file must not start a search on real robots.
     """
 
     package: str
@@ -107,7 +107,7 @@ class NodePlan:
     def command(
         self, executable: Path, parameter_file: Path, log_level: str | None = None
     ) -> list[str]:
-        """Return the command line of its process; what it says goes to its standard output."""
+        """Return the command line of its process."""
         return [
             str(executable),
             '--ros-args',
@@ -133,7 +133,7 @@ class NodePlan:
 
 
 def in_team(plan: NodePlan, team: str) -> NodePlan:
-    """Return the plan of a node below the namespace of a team; the clock is everybody's."""
+    """Return the plan of a node in the namespace of a team; the clock is shared."""
     if not team:
         return plan
     return replace(
@@ -145,14 +145,14 @@ def in_team(plan: NodePlan, team: str) -> NodePlan:
 
 
 def with_followed_clock(plan: NodePlan) -> NodePlan:
-    """Return the plan of a node of a run whose clock is another one's."""
+    """Return the plan of a node of a run that follows the clock of another run."""
     if not plan.is_clock:
         return plan
     return replace(plan, parameters={**plan.parameters, **SIMULATED, 'follow_clock': True})
 
 
 def with_saved_state(plan: NodePlan, folder: Path) -> NodePlan:
-    """Return the plan of a node that goes on where it was when it is started again."""
+    """Return the plan of a node that resumes from its saved state after a restart."""
     if plan.executable != 'filter_node':
         return plan
     file = str(folder / f'{plan.file_name}.maasi')

@@ -1,4 +1,4 @@
-"""Which nodes of a run hang: their heartbeats do not come any more."""
+"""Detects nodes that hang, by missing heartbeats."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-# A heartbeat so soon after a start is the last one of the process before [s].
+# A heartbeat this soon after a restart is from the previous process [s].
 _LEAST_START = 0.5
-# Between two looks: with a longer gap it was the run itself that stood still [s].
+# A longer gap between two checks means that the run itself was suspended [s].
 _LONGEST_LOOK = 1.0
 
 
@@ -19,7 +19,7 @@ class _Node:
     pid: int | None
     started: float
     beat: float | None = None
-    # Time that it waited for a processor until its last heartbeat.
+    # Time spent waiting for a processor until the last heartbeat.
     waited: float = 0.0
 
 

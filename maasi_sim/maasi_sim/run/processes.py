@@ -21,13 +21,13 @@ from setproctitle import setproctitle
 
 from maasi_sim.run.shared_memory import LONGEST_CREATION, remove_dead_ports
 
-# Domains whose ports lie below those that Linux gives to others (from 32768).
+# Domains whose ports lie below the ephemeral ports of Linux (from 32768).
 DOMAINS = range(0, 102)
 _FIRST_PORT, _PORTS_PER_DOMAIN = 7400, 250
 _PR_SET_PDEATHSIG = 1
-# Where Fast DDS is told of profiles.
+# Environment variable of the profiles of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-# Loaded here: between fork and exec there is no safe place for it.
+# Loaded at import: loading between fork and exec is not safe.
 _libc = ctypes.CDLL(None)
 
 
@@ -63,7 +63,7 @@ class Domain:
         team: str = '',
         shared: bool = False,
     ) -> None:
-        # A run that was killed a moment ago, at its start, leaves some that are young.
+        # A run that was just killed while starting leaves recent ports.
         remove_dead_ports(patience=LONGEST_CREATION + 1.0)
         self._folder = folder or Path('/tmp/maasi_domains')
         self._folder.mkdir(mode=0o777, parents=True, exist_ok=True)
@@ -72,7 +72,7 @@ class Domain:
         if number is not None and number not in DOMAINS:
             raise ProcessError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
         for candidate in DOMAINS[1:] if number is None else [number]:
-            # One that was asked for may have other nodes in it: that may be why.
+            # A requested domain may be in use by other nodes.
             if number is None and _port_used(_FIRST_PORT + _PORTS_PER_DOMAIN * candidate):
                 continue
             problem = self._take(candidate, team, shared)
@@ -222,7 +222,7 @@ class ForkedProcess:
             try:
                 pid, status = os.waitpid(self.pid, os.WNOHANG)
             except ChildProcessError:
-                # Somebody else has asked for it.
+                # Another waitpid has reaped it.
                 self.returncode = 0
             else:
                 if pid:
@@ -267,7 +267,7 @@ def _run_and_exit(
         with contextlib.suppress(OSError):
             traceback.print_exc()
     finally:
-        # Where the disk is full, the copy must not go on as if it were the run.
+        # Even if the disk is full, the forked process must not continue as the run.
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()
@@ -330,7 +330,7 @@ class NodeProcess:
                     stdout=output,
                     stderr=subprocess.STDOUT,
                     env={**os.environ, **self.environment},
-                    # Not in the terminal's group: Ctrl-C reaches the run, which ends its nodes.
+                    # Own process group: Ctrl-C reaches only the run, which stops its nodes.
                     start_new_session=True,
                     preexec_fn=lambda: _die_with_parent(parent),
                 )
@@ -393,7 +393,7 @@ class NodeProcess:
         return '\n'.join(text.splitlines()[-lines:])
 
 
-# Signals of an ending and how long each may take [s].
+# Signals of a shutdown, and the timeout of each [s].
 ENDING = ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5.0))
 
 
@@ -401,7 +401,7 @@ def stop(
     processes: Sequence[NodeProcess],
     ending: Sequence[tuple[signal.Signals, float]] = ENDING,
 ) -> list[str]:
-    """End processes: ask, insist, kill; returns when all are gone.
+    """Stop processes with increasingly strong signals; return when all have ended.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ class Status:
 
 class ProgressDisplay:
     """
-    Show how a run goes on.
+    Show the progress of a run.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class ProgressDisplay:
         if self._live is None:
             self._live = _live(self._stream)
             self._live.start()
-        # Not as markup, and without colours for numbers.
+        # Without markup and without highlighting of numbers.
         self._live.update(_plain_text(status.text()), refresh=True)
 
     def close(self) -> None:

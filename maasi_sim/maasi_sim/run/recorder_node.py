@@ -1,4 +1,4 @@
-"""The recorder: sees all topics of a run, writes them down, and takes part in lockstep."""
+"""The recorder: subscribes to all topics of a run, records them, and takes part in lockstep."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ from maasi_sim.run.topics import CLOCK, STEP, within
 NAME = 'recorder'
 READY, DONE = '/lockstep/ready', '/lockstep/done'
 DIAGNOSTICS, ROSOUT = '/diagnostics', '/rosout'
-# What all teams of a domain share.
+# Topics shared by all teams of a domain.
 _SHARED = (CLOCK, DIAGNOSTICS, ROSOUT)
-# What is left out: of no use to who reads the recording.
+# Not recorded: of no use to readers of the recording.
 _SKIPPED = ('/parameter_events', READY)
 # A copy of the found targets for a restarted filter.
 _KEPT = '/found_targets/kept'
-# What is recorded while the nodes are ended.
+# Topics still recorded during shutdown.
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
 _WITH_STEP = (
     AgentState,
@@ -62,11 +62,11 @@ _WITH_STEP = (
     SearchLink,
     SearchLinkArray,
 )
-# A message may arrive before the time that it is stamped with: it is recorded when that time has
-# come, so that no stamp is ahead of its log time. Longest wait [s of wall time], and the lead above
-# which a stamp is taken for one of another clock [ns].
+# A message with a stamp in the future is held until that time, so that no stamp is later than its
+# log time. Longest hold [s of wall time], and the lead above which a stamp is assumed to come from
+# another clock [ns].
 _LONGEST_HOLD, _LARGEST_LEAD = 1.0, 60 * 10**9
-# Longest wait for robots to hear that they are to stop [s].
+# Longest wait for the acknowledgement of stop commands [s].
 _STOP_PATIENCE = 1.0
 _READY_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -141,7 +141,7 @@ class Recorder:
         self._begun: int | None = None
         self.step: int | None = None
         self.last_seen: dict[str, float] = {}
-        #: When each node was last heard of in the diagnostics [s of wall time].
+        #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
         self._held: list[tuple[str, bytes]] = []
         self._hold_began = 0.0
@@ -178,14 +178,14 @@ class Recorder:
         return topic if topic in _SHARED else within(self._team, topic)
 
     def _relative(self, topic: str) -> str | None:
-        """Return the name of a topic within the team; None for one of somebody else."""
+        """Return the name of a topic within the team; None for a topic of others."""
         if not self._team or topic in _SHARED:
             return topic
         inner = topic.removeprefix(f'/{self._team}')
         return None if inner == topic or inner[0] != '/' or inner in _SHARED else inner
 
     def discover(self) -> None:
-        """Subscribe to the topics that have come up since the last time."""
+        """Subscribe to the topics that have appeared since the last call."""
         for full, types in self.node.get_topic_names_and_types():
             topic = self._relative(full)
             if topic is None or topic in self._subscriptions or topic in self._refused:
@@ -239,17 +239,17 @@ class Recorder:
         return self.bag is not None or topic in self._wanted
 
     def take_ready(self) -> set[str]:
-        """Return the names of the nodes that have said that they are ready."""
+        """Return the names of the nodes that have reported ready."""
         for data in _take(self._ready_subscription):
             self.ready.add(deserialize_message(data, LockstepDone).node)
         return self.ready
 
     def publish_ready(self) -> None:
-        """Say that the recorder is ready."""
+        """Report that the recorder is ready."""
         self._ready_publisher.publish(LockstepDone(node=self.name, step=0))
 
     def publish_done(self, step: int) -> None:
-        """Say that the recorder is done with a step."""
+        """Report that the recorder is done with a step."""
         self._done_publisher.publish(LockstepDone(node=self.name, step=step))
 
     def wait(self, timeout: float) -> None:
@@ -274,9 +274,9 @@ class Recorder:
         limit : int, optional
             Simulated time after its start at which the run ends [ns].
         """
-        # Left where they are they would end each wait at once.
+        # Messages left in the queue would end each wait at once.
         self.take_ready()
-        # What belongs to an update was published before it: take updates first, read them last.
+        # What an update refers to is published before it: take updates first, add them last.
         updates = [
             (topic, data)
             for topic in self.observer.update_topics
@@ -341,7 +341,7 @@ class Recorder:
         return True
 
     def _record(self, taken: list[tuple[str, bytes]]) -> None:
-        # One that has failed ends the run: `bag.failed`.
+        # A failed bag ends the run: see `bag.failed`.
         if self.bag is None or self.bag.failed:
             return
         try:
@@ -352,7 +352,7 @@ class Recorder:
                 raise
 
     def _due(self, taken: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-        """Return what to record now; hold what is stamped with a time that has not come yet."""
+        """Return what to record now; hold messages with a stamp in the future."""
         now = time.monotonic()
         items = self._held + taken
         if not self._held:
@@ -366,7 +366,7 @@ class Recorder:
         early: set[str] = set()
         for topic, data in items:
             lead = _stamp(topic, self._subscriptions[topic].msg_type, data) - self.time
-            # A topic keeps its order.
+            # Keep the order within a topic.
             if topic in early or 0 < lead <= _LARGEST_LEAD:
                 early.add(topic)
                 self._held.append((topic, data))
@@ -375,13 +375,13 @@ class Recorder:
         return due
 
     def finish(self) -> None:
-        """Keep from now on only what belongs to the steps so far, and how all is stopped."""
+        """Keep from now on only messages of the steps so far, and of the shutdown."""
         self._finished = True
         if self._last_step < 0 and self.step is not None:
             self._last_step = self.step
 
     def _until(self, taken: list[tuple[str, bytes]], step: int) -> list[tuple[str, bytes]]:
-        """Return the messages up to a step, as far as they say to which they belong."""
+        """Return the messages up to a step; those without step or stamp are kept."""
         end = stamp_of_step(step, self._step_length)
         kept = []
         for topic, data in taken:
@@ -404,7 +404,7 @@ class Recorder:
         self.time = max(self.time, _time_at(data, offset))
 
     def done_steps(self) -> dict[str, int]:
-        """Return the last step that each node has said it is done with, of late."""
+        """Return the last step that each node recently reported done."""
         steps: dict[str, int] = {}
         for data in self._last_done:
             message = deserialize_message(data, LockstepDone)
@@ -439,7 +439,7 @@ class Recorder:
             self.node.destroy_publisher(publisher)
 
     def followers(self) -> list[str]:
-        """Return the namespaces of the runs whose time is the clock of this one."""
+        """Return the namespaces of the runs that follow this clock."""
         return sorted(
             info.node_namespace
             for info in self.node.get_subscriptions_info_by_topic(CLOCK)
@@ -469,7 +469,7 @@ def _stamp_offset(topic: str, kind: Any, data: bytes) -> int | None:
     first = next(iter(kind.get_fields_and_field_types()))
     if first in ('header', 'clock'):
         return 4
-    # Transforms are a sequence: its length comes first.
+    # Transforms are a sequence, which starts with its length.
     if topic.rpartition('/')[2] == 'tf' and first == 'transforms' and len(data) >= 16:
         return 8
     return None
@@ -496,4 +496,4 @@ def _message_class(name: str) -> type:
 
 
 def _never(_: bytes) -> None:
-    """Stand in for a callback: messages are taken by hand."""
+    """Do nothing: messages are taken without callbacks."""

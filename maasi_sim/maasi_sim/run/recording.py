@@ -1,4 +1,4 @@
-"""What a replay needs of a recording: the batches of measurements, and what came of them."""
+"""The part of a recording that a replay needs: batches of measurements and their updates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FILTER = 'filter_node'
 
 @dataclass
 class Batch:
-    """One recorded update: what went in, in which order, and what came out.
+    """One recorded update: its inputs in their order, and its output.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Batch:
     update : dict
         What the filter published.
     late : bool
-        Whether it is what one robot sent too late for its batch, or unasked.
+        Whether it is a measurement that came too late for its batch, or without a request.
     namespace : str
         Of the filter; empty for the root.
     """
@@ -93,7 +93,7 @@ def read_recording(path: Path) -> Recording:
         detections: dict[tuple[str, int], bytes] = {}
         for topic, kind, _, data in bag.raw(topics):
             message = bag.decode(data, kind)
-            # An index comes again only where a driver was started again: the first was used.
+            # Duplicate index: a restarted driver; the filter used the first.
             detections.setdefault((topics[topic], int(message.measurement)), data)
         for namespace in recording.namespaces:
             last = 0

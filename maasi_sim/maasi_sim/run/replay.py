@@ -17,10 +17,10 @@ from maasi_sim.run.run_folder import make_folder, write_text
 from maasi_sim.run.topics import within
 
 EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
-# Wall time that one update may take, and the start of the node, which may have to compile [s].
+# Timeouts of an update, and of the start of the node, which may have to compile [s].
 _PATIENCE = 60.0
 _START_PATIENCE = 180.0
-# There is no clock, no step and nobody late; nothing is loaded, and nothing saved.
+# Without clock, lockstep, batch timeout, loading or saving.
 REPLAYED = {
     'use_sim_time': False,
     'lockstep': False,
@@ -163,7 +163,7 @@ def _feed(
 
 
 def _same(update: dict[str, Any], recorded: dict[str, Any]) -> bool:
-    """Compare updates; who was missing then is not asked now."""
+    """Compare updates, except for missing robots, which are not requested in a replay."""
     return {**update, 'missing': []} == {**recorded, 'missing': []}
 
 

@@ -1,4 +1,4 @@
-"""Plays planner and drivers towards the filter node, from a recording."""
+"""Stands in for planner and drivers of the filter node, from a recording."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LATCHED = QoSProfile(
 
 class ReplayNode:
     """
-    The other end of the filter node, or of several.
+    The peer of one or several filter nodes.
 
     Publishes
     ---------
@@ -97,7 +97,7 @@ class ReplayNode:
         return not self._awaited and all(item.get_subscription_count() for item in publishers)
 
     def spin(self, timeout: float = 0.05) -> None:
-        """Take what comes within a time [s]."""
+        """Process the messages that arrive within a time [s]."""
         self._executor.spin_once(timeout_sec=timeout)
 
     def publish(self, batch: Batch) -> None:

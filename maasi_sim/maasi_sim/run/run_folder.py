@@ -11,7 +11,7 @@ from typing import Any
 
 from maasi_sim.scenario.layering import ScenarioError
 
-# The disk, or the user's share of it, is full; or a file is longer than allowed.
+# Disk full, quota exceeded, or file too large.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

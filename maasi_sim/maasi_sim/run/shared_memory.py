@@ -8,11 +8,11 @@ from pathlib import Path
 
 # First word of a segment that is ready (Boost.Interprocess).
 _READY = 2
-# The creator writes it within microseconds: one that has not by then is dead [s].
+# The creator writes it within microseconds; after this time it is dead [s].
 LONGEST_CREATION = 5.0
 
 
-# Between two looks at a port that is being created [s].
+# Period of checks of a port that is being created [s].
 _PERIOD = 0.02
 
 
@@ -55,7 +55,7 @@ def _unready_ports(folder: Path) -> tuple[list[Path], list[Path]]:
                     continue
             old = time.time() - path.stat().st_mtime > LONGEST_CREATION
         except OSError:
-            # Gone meanwhile, or another user's.
+            # Removed meanwhile, or owned by another user.
             continue
         (dead if old else young).append(path)
     return dead, young

@@ -5,15 +5,16 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
+
+from maasi_filter.ros.parameters import choices
 
 Key = tuple[str | int, ...]
 Model = TypeVar('Model', bound=BaseModel)
@@ -352,27 +353,16 @@ def _known_keys(model: type[BaseModel], key: Key) -> list[str]:
         annotations = [
             inner
             for annotation in annotations
-            for candidate in _unfold(annotation)
+            for candidate in choices(annotation)
             for inner in _inside(candidate, step)
         ]
     return [
         info.alias or name
         for annotation in annotations
-        for candidate in _unfold(annotation)
+        for candidate in choices(annotation)
         if isinstance(candidate, type) and issubclass(candidate, BaseModel)
         for name, info in candidate.model_fields.items()
     ]
-
-
-def _unfold(annotation: Any) -> Iterator[Any]:
-    origin = typing.get_origin(annotation)
-    if origin in (typing.Union, types.UnionType):
-        for argument in typing.get_args(annotation):
-            yield from _unfold(argument)
-    elif origin is typing.Annotated:
-        yield from _unfold(typing.get_args(annotation)[0])
-    else:
-        yield annotation
 
 
 def _inside(annotation: Any, step: str | int) -> list[Any]:

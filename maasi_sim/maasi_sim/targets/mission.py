@@ -79,7 +79,7 @@ class TargetMission:
 
     def figure(self, record: TargetRecord) -> Figure:
         """See `Mission.figure`."""
-        # Matplotlib takes long to import: not before the run.
+        # Deferred: Matplotlib takes long to import.
         from maasi_sim.targets.report_figure import plot_report
 
         return plot_report(record)

@@ -97,7 +97,7 @@ def _robot_plans(
             'driver',
             name,
             {**flatten(settings), **SIMULATED},
-            # Its batches are those of its own planner, if it has one.
+            # A robot with its own planner gets its batches from that one.
             remaps={BATCH: within(name, BATCH)} if own else {},
             topics=tuple(f'/{name}/{topic}' for topic in topics),
             drives=True,

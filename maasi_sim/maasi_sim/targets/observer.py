@@ -80,7 +80,7 @@ class TargetObserver:
 
     @property
     def topics(self) -> list[str]:
-        """Topics that it wants."""
+        """Topics that it needs."""
         return [*self.result_topics, STEP, *self._kept]
 
     @property
@@ -126,7 +126,7 @@ class TargetObserver:
         return max(self._explored.values(), default=0.0)
 
     def add(self, topic: str, data: bytes) -> None:
-        """Take a serialised message; what is not in `topics` is left alone."""
+        """Add a serialised message; one of another topic is ignored."""
         if topic in self._kept:
             self._kept[topic].append(data)
             if topic in self._decision_topics:
@@ -145,13 +145,13 @@ class TargetObserver:
             self._note_team(self._team.decode(data, 'LockstepStep'))
 
     def settle(self) -> None:
-        """Take stock after the messages added since the last time.
+        """Evaluate the messages added since the last call.
 
-        The filter publishes found targets before the update that they belong to, so both are there.
+        The filter publishes found targets before the update that they belong to.
         """
         updates, self._updates = self._updates, []
         for namespace, message in updates:
-            # Of several filters the others may still have to say what they found at that step.
+            # Updates of the same step from other filters may still arrive.
             if self.completed is not None and (
                 len(self._update_topics) == 1 or message.step > self.completed.step
             ):
@@ -179,14 +179,14 @@ class TargetObserver:
         return tally
 
     def _note_decision(self, topic: str, decision: Any) -> None:
-        """Note when a planner says that nothing is left to gain: a reason, and no robots."""
+        """Note a planner that is settled: its decision has a reason and no robots."""
         self._explored[topic] = float(decision.explored)
         if decision.reason and not decision.robots:
             self._settled.setdefault(topic, (int(decision.step), decision.reason))
             self._note_ending(int(decision.step))
 
     def _note_ending(self, step: int) -> None:
-        """Note the end of the search: of the planners with a robot, all see nothing left."""
+        """Note the end of the search: all planners that have a robot are settled."""
         if self._ending is not None:
             return
         searching = {
@@ -194,7 +194,7 @@ class TargetObserver:
             for topic, names in self._robots_of.items()
             if any(self._takes_part(name) for name in names)
         }
-        # When all robots are gone, nobody says any more that the rest of the search is in vain.
+        # Without any robot left, the planners that were settled decide.
         if self._settled.keys() >= (searching or self._robots_of.keys()):
             last, reason = max(self._settled.values())
             self._ending = max(step, last), reason
@@ -273,7 +273,7 @@ def _point(point: Any) -> tuple[float, float, float]:
 
 
 def _absences(name: str, states: list[Any]) -> list[dict[str, Any]]:
-    """Return when a robot said that it cannot go on, and when it could again."""
+    """Return the events of a robot that became unavailable and available again."""
     events: list[dict[str, Any]] = []
     away = False
     for state in states:

@@ -19,7 +19,7 @@ from maasi_sim.targets.target_record import TargetRecord
 
 FloatArray = NDArray[np.float64]
 
-# Told apart also by those who do not see all colours (Okabe and Ito).
+# Palette for colour-blind readers (Okabe and Ito).
 _COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')
 _TRUE, _FOUND, _FALSE, _PALE = '#222222', '#D62728', '#7B3294', '#9A9A9A'
 _SIGMAS = 3.0
@@ -151,7 +151,7 @@ def _plot_space(axes: Any, record: TargetRecord) -> None:
     axes.plot([], [], [], 'o', color=_PALE, ms=7, label='end')
     floor = bounds[2, 0]
     for point in record.truth:
-        # A line to the floor tells where in space a target is.
+        # A vertical line to the floor shows the position in depth.
         axes.plot([point[0]] * 2, [point[1]] * 2, [floor, point[2]], '-', color=_PALE, lw=0.6)
     if len(record.truth):
         axes.plot(*record.truth.T, 'D', mfc='none', mec=_TRUE, ms=9, mew=1.4, label='true target')

@@ -36,7 +36,7 @@ def matching_radius(removal_distance: float, truth: ArrayLike) -> float:
         raise ValueError(
             f'removal_distance: got {removal_distance}, allowed are finite numbers above 0'
         )
-    # Imported late: it takes longer than all else that a run imports.
+    # Deferred: it is the slowest import of a run.
     from scipy.spatial.distance import pdist
 
     positions = np.asarray(truth, dtype=float)

@@ -63,7 +63,7 @@ class Tally:
         self.completed: Progress | None = None
         self.expected_number = 0.0
         self._shared = len(scenario.namespaces()) > 1
-        # By the namespace of the filter.
+        # By namespace of the filter.
         self._found: dict[str, dict[int, Found]] = {name: {} for name in scenario.namespaces()}
         self._expected: dict[str, float] = {}
         self._last_scores: Scores | None = None
@@ -92,12 +92,12 @@ class Tally:
                 changed = True
         self._found[update.namespace] = before
         for member in message.members:
-            # A restarted filter publishes its last update again.
+            # A restarted filter republishes its last update; ignore duplicates.
             key = (update.namespace, member.robot, int(member.measurement))
             if key not in self._counted:
                 self._counted.add(key)
                 self.measurements[member.robot] = self.measurements.get(member.robot, 0) + 1
-        # All filters believe in the same targets.
+        # All filters estimate the same targets.
         self._expected[update.namespace] = float(message.expected_number)
         self.expected_number = max(self._expected.values())
         if self.world.walk > 0.0:

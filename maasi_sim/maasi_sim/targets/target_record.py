@@ -1,4 +1,4 @@
-"""All that the report of a search for targets needs."""
+"""The record of a search for targets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass
 class TargetRecord(RunRecord):
-    """What a search for targets has come to.
+    """The record of a search for targets.
 
     Attributes
     ----------

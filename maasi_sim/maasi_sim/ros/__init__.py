@@ -1,0 +1,1 @@
+"""What the simulation node publishes, beside time and steps."""

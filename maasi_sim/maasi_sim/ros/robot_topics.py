@@ -1,0 +1,181 @@
+"""The topics that one simulated robot publishes."""
+
+from __future__ import annotations
+
+import array
+import math
+
+from builtin_interfaces.msg import Time
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
+from std_msgs.msg import Header
+
+from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_msgs.msg import RangeArray, RangeMeasurement
+from maasi_sim.scenario.schema import steps_of
+from maasi_sim.world.laser_scan import LaserSettings
+from maasi_sim.world.robots import SimulatedRobot
+from maasi_sim.world.simulation import Simulation
+
+# Period of battery messages [s of simulated time].
+_BATTERY_PERIOD = 1.0
+_LEAST_VARIANCE = 1e-12
+
+
+class RobotTopics:
+    """
+    Publish the data of one robot; messages are reused, as creating them takes longer.
+
+    Parameters
+    ----------
+    node : Node
+        Whose publishers they are.
+    simulation : Simulation
+        Where the robot is.
+    name : str
+        Of the robot.
+    qos : QoSProfile
+        Of all topics.
+    """
+
+    def __init__(self, node: Node, simulation: Simulation, name: str, qos: QoSProfile) -> None:
+        self.name = name
+        self.simulation = simulation
+        self.robot: SimulatedRobot = simulation.robots[name]
+        self._battery_steps = steps_of(_BATTERY_PERIOD, simulation.scenario.step)
+        self.publishers: list[Publisher] = []
+
+        def publisher(kind: type, topic: str) -> Publisher:
+            made = node.create_publisher(kind, f'{name}/{topic}', qos)
+            self.publishers.append(made)
+            return made
+
+        equipment = self.robot.equipment
+        # A linked or external robot reports its own pose.
+        robot = simulation.scenario.robots[name]
+        self.linked = robot.link != 'topics' or robot.external
+        self._odometry_publisher = None if self.linked else publisher(Odometry, 'odom')
+        self._odometry = Odometry(child_frame_id=f'{name}/base_link')
+        self._odometry.header.frame_id = f'{name}/odom'
+        linear = max(equipment.odometry.velocity_noise**2, _LEAST_VARIANCE)
+        angular = max(equipment.odometry.heading_noise**2, _LEAST_VARIANCE)
+        self._odometry.twist.covariance[::7] = [linear] * 3 + [angular] * 3
+        self._battery_publisher = None if self.linked else publisher(BatteryState, 'battery_state')
+        self._battery = BatteryState(
+            **dict.fromkeys(('voltage', 'temperature', 'current', 'charge', 'capacity'), math.nan),
+            design_capacity=math.nan,
+            power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
+            present=True,
+        )
+        self._battery.header.frame_id = f'{name}/base_link'
+        #: Sensor topic that the driver needs besides odometry.
+        self.sensor_topic = ''
+        if equipment.camera is not None:
+            self._image_publisher = publisher(Image, 'camera/image_raw')
+            self._info_publisher = publisher(CameraInfo, 'camera/camera_info')
+            self._image, self._info = camera_messages(equipment.camera, f'{name}/camera_optical')
+            self.sensor_topic = self._image_publisher.topic_name
+        elif equipment.sensor is not None:
+            self._ranges_publisher = publisher(RangeArray, 'ranges')
+            self._ranges = RangeArray(header=Header(frame_id=f'{name}/base_link'))
+            self.sensor_topic = self._ranges_publisher.topic_name
+        # The program that moves an external robot also publishes its scan.
+        self._scans = equipment.laser is not None and robot.body == 'simulated'
+        if equipment.laser is not None and self._scans:
+            self._scan_publisher = publisher(LaserScan, 'scan')
+            self._scan = scan_message(equipment.laser, f'{name}/base_scan')
+
+    @property
+    def odometry_topic(self) -> str:
+        """Full name of its odometry's topic; empty where it has none."""
+        return '' if self._odometry_publisher is None else self._odometry_publisher.topic_name
+
+    def publish(self, stamp: Time) -> bool:
+        """Publish what is due; return whether camera or ranging sensor had something."""
+        simulation, robot, name = self.simulation, self.robot, self.name
+        if self._odometry_publisher is not None:
+            self._publish_odometry(stamp, self._odometry_publisher)
+        imaging = simulation.images_due(name)
+        if imaging and robot.camera is not None:
+            image = robot.image(simulation.step, simulation.time)
+            self._info.header.stamp = stamp
+            self._info_publisher.publish(self._info)
+            self._image.header.stamp = stamp
+            # array.array is copied as one block, an ndarray element by element.
+            self._image.data = array.array('B', image.tobytes())
+            self._image_publisher.publish(self._image)
+        elif imaging and robot.ranging is not None:
+            self._ranges.header.stamp = stamp
+            self._ranges.ranges = [
+                RangeMeasurement(
+                    range=values[0],
+                    bearing=values[1],
+                    elevation=values[2] if len(values) == 3 else 0.0,
+                )
+                for values in robot.ranges(simulation.step).tolist()
+            ]
+            self._ranges_publisher.publish(self._ranges)
+        if self._scans and simulation.scan_due(name):
+            self._scan.header.stamp = stamp
+            self._scan.ranges = array.array('f', simulation.scan(name).tobytes())
+            self._scan_publisher.publish(self._scan)
+        if self._battery_publisher is not None and simulation.step % self._battery_steps == 0:
+            self._battery.header.stamp = stamp
+            self._battery.percentage = robot.battery.charge
+            self._battery_publisher.publish(self._battery)
+        return imaging
+
+    def _publish_odometry(self, stamp: Time, publisher: Publisher) -> None:
+        reading, message = self.robot.odometry, self._odometry
+        message.header.stamp = stamp
+        place, turn = message.pose.pose.position, message.pose.pose.orientation
+        place.x, place.y, place.z = reading.pose.position.tolist()
+        turn.w, turn.x, turn.y, turn.z = reading.pose.orientation.tolist()
+        message.pose.covariance = reading.covariance.reshape(36)
+        linear, angular = message.twist.twist.linear, message.twist.twist.angular
+        linear.x, linear.y, linear.z = reading.velocity.tolist()
+        angular.x, angular.y, angular.z = reading.angular_velocity.tolist()
+        publisher.publish(message)
+
+
+def camera_messages(settings: CameraSettings, frame: str) -> tuple[Image, CameraInfo]:
+    """Return a camera's image without its data, and its calibration."""
+    image = Image(
+        height=settings.height,
+        width=settings.width,
+        encoding='rgb8',
+        is_bigendian=0,
+        step=3 * settings.width,
+    )
+    camera = Camera.from_settings(settings)
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    info = CameraInfo(
+        height=settings.height,
+        width=settings.width,
+        distortion_model='plumb_bob',
+        d=camera.distortion.tolist(),
+        k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
+    image.header.frame_id = info.header.frame_id = frame
+    return image, info
+
+
+def scan_message(settings: LaserSettings, frame: str) -> LaserScan:
+    """Return a laser scan without its ranges: a turn in no time, from straight ahead."""
+    increment = 2.0 * math.pi / settings.beams
+    return LaserScan(
+        header=Header(frame_id=frame),
+        angle_min=0.0,
+        angle_max=increment * (settings.beams - 1),
+        angle_increment=increment,
+        time_increment=0.0,
+        scan_time=1.0 / settings.rate,
+        range_min=settings.minimum_range,
+        range_max=settings.maximum_range,
+    )
