@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.calibration.bag_reader import BagError, BagReader
-from maasi_drivers.calibration.sensor_calibration import Look, SensorNoise, sensor_noise
+from maasi_drivers.calibration.sensor_calibration import Observation, SensorNoise, sensor_noise
 from maasi_drivers.vision.camera_settings import load_calibration
 from maasi_drivers.vision.image_encoding import decode_image, image_to_array
 from maasi_drivers.vision.marker_detector import MarkerDetector
@@ -79,7 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
         type=float,
         default=0.05,
         metavar='M',
-        help='looks from nearer are left out: the bearing means nothing there (default: 0.05)',
+        help='nearer observations are left out: the bearing means nothing there (default: 0.05)',
     )
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the result to a file too')
     return parser
@@ -234,7 +234,7 @@ class RecordedRobot:
                 # What comes before the damage is as good as ever.
                 self.recovered = f'{error}; what is before it is read'
 
-    def looks(self) -> list[Look]:
+    def observations(self) -> list[Observation]:
         """Return what it saw, each with where it was then."""
         if self.use == 'detections':
             return list(self._published())
@@ -244,7 +244,7 @@ class RecordedRobot:
             )
         return list(self._segmented())
 
-    def _published(self) -> Iterator[Look]:
+    def _published(self) -> Iterator[Observation]:
         dimension = self.settings.environment.dimension
         for _, message in self._messages(self._topic(_DETECTIONS)):
             values = [[item.range, item.bearing, item.elevation] for item in message.detections]
@@ -253,9 +253,9 @@ class RecordedRobot:
             if pose is None or not np.isfinite(array).all():
                 self.left_out += 1
             else:
-                yield Look(pose, array)
+                yield Observation(pose, array)
 
-    def _segmented(self) -> Iterator[Look]:
+    def _segmented(self) -> Iterator[Observation]:
         assert self.settings.camera is not None
         camera = self.settings.camera
         for _, message in self._messages(self._topic('camera/camera_info')):
@@ -291,7 +291,7 @@ class RecordedRobot:
             except ValueError:
                 self.left_out += 1
                 continue
-            yield Look(placed.pose, seen.values)
+            yield Observation(placed.pose, seen.values)
 
     def _history(self) -> PoseHistory:
         settings = self.settings
@@ -351,7 +351,7 @@ def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:
         clear = given and abs(bias) > _CLEAR * deviation / np.sqrt(noise.used)
         lines.append(
             f'{name}: deviation {deviation:.4f} {unit}, mean error {bias:+.4f} {unit}'
-            + (': look at mount, stamp_offset, start and target' if clear else '')
+            + (': check mount, stamp_offset, start and target' if clear else '')
         )
     correlation = noise.covariance / np.outer(noise.deviations, noise.deviations)
     lines.append(f'correlation of range and bearing: {correlation[0, 1]:+.2f}')
@@ -372,7 +372,7 @@ def main(arguments: list[str] | None = None) -> int:
         settings = read_parameters(options.parameters)
         recorded = RecordedRobot(options.bag, settings, options.robot, options.use, options.poses)
         sensor = settings.sensor.build(recorded.robot, settings.environment.dimension)
-        noise = sensor_noise(recorded.looks(), sensor, options.target, options.least_range)
+        noise = sensor_noise(recorded.observations(), sensor, options.target, options.least_range)
     except ValueError as error:
         if recorded is not None and recorded.recovered:
             print(f'warning: {recorded.recovered}', file=sys.stderr)

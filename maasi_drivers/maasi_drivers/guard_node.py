@@ -16,7 +16,7 @@ from maasi_filter.ros.qos import liveliness_reader
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1
-# Between two looks at who listens: zeros must not wait for a publisher to be discovered.
+# Between two checks of the subscriptions: zeros must not wait for the discovery of a publisher [s].
 _LOOK_PERIOD = 0.5
 
 
@@ -24,8 +24,8 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
     """
     Publishes zeros while no driver is alive, and nothing while one is.
 
-    Every robot that is commanded by a topic needs it: the last command goes on when nothing
-    follows. Where Nav2 drives, its goals are cancelled, or it would go on too.
+    Every robot that is commanded by a topic needs it: without a new one it continues
+    the last one. Where Nav2 drives, its goals are cancelled, or it would continue as well.
 
     Subscribes
     ----------
@@ -56,7 +56,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         self.create_wall_timer(_LOOK_PERIOD, self._publisher.refresh)
         lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
         quality = liveliness_reader(lease)
-        # Of the messages only the last one matters, and that only when no other comes.
+        # Of the messages only the last one is used, and only once no other comes.
         self.create_subscription(
             AgentState,
             'state',
@@ -72,7 +72,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         self._last = b''
 
     def halt(self) -> None:
-        """Leave the robot alone."""
+        """Stop publishing."""
         self._end_stop()
 
     def status(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Show what a robot says of itself, or send it to a waypoint: for trying a robot out by hand."""
+"""Show the state of a robot, or send it to a waypoint: for manual tests."""
 
 from __future__ import annotations
 

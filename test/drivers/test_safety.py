@@ -255,7 +255,7 @@ def test_it_is_said_that_nobody_listens(context, process, capfd):
         team.odometry.publish(team.odometry_message())
         team.executor_used.spin_once(timeout_sec=0.05)
         said += capfd.readouterr().err
-    assert 'nobody listens; the robot wants geometry_msgs/msg/Twist' in said
+    assert 'no subscription of this type; the robot wants geometry_msgs/msg/Twist' in said
     assert driver.poll() is None
     executor.shutdown()
     team.destroy_node()

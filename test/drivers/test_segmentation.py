@@ -95,7 +95,9 @@ def test_a_disc_is_one_blob_at_its_centre(rule, tolerance, x, y, radius):
     assert len(blobs) == 1
     assert_allclose(blobs.centroids[0], [x, y], atol=tolerance)
     assert not blobs.border_cut[0]
-    assert abs(blobs.areas[0] / (np.pi * radius**2) - 1) < 0.3
+    # The paper's rule counts pixels that are partly marker, up to half a pixel outside the disc.
+    largest = max(0.3, (1.0 + 0.5 / radius) ** 2 - 1.0)
+    assert abs(blobs.areas[0] / (np.pi * radius**2) - 1) < largest
 
 
 @pytest.mark.parametrize('rule', [PAPER, ROBUST])

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.calibrate_sensor import main
-from maasi_drivers.calibration.sensor_calibration import Look, sensor_noise
+from maasi_drivers.calibration.sensor_calibration import Observation, sensor_noise
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import SensorSettings
@@ -26,20 +26,22 @@ STEP = 0.05
 LEAST_RANGE = 0.05
 
 
-# ---- from looks to R -------------------------------------------------------------------------
+# ---- from observations to R ------------------------------------------------------------------
 
 
-def looks_at(target, deviations, number, seed, sensor, spread=0.2, height=0.0):
+def observations_of(target, deviations, number, seed, sensor, spread=0.2, height=0.0):
     generator = np.random.default_rng(seed)
-    looks = []
+    observations = []
     for _ in range(number):
         place = np.zeros(3)
         place[: len(target)] = target + generator.uniform(-spread, spread, len(target))
         place[2] += height
         pose = Pose.from_yaw(place, generator.uniform(-3.0, 3.0))
         exact = sensor.measurement.measure(np.atleast_2d(target), pose)
-        looks.append(Look(pose, exact + generator.normal(0.0, deviations, exact.shape)))
-    return looks
+        observations.append(
+            Observation(pose, exact + generator.normal(0.0, deviations, exact.shape))
+        )
+    return observations
 
 
 def sensor_of(dimension, **settings):
@@ -50,15 +52,15 @@ def sensor_of(dimension, **settings):
 def test_a_known_covariance_is_found_again_in_3d(given):
     target, deviations = np.array([9.0, 12.0, 7.0]), [1.5, 0.175, 0.295]
     sensor = sensor_of(3, detection={'size': [25.0, 25.0, 25.0]})
-    looks = looks_at(target, deviations, 2000, 3, sensor, spread=6.0)
+    observations = observations_of(target, deviations, 2000, 3, sensor, spread=6.0)
     if given:
-        noise = sensor_noise(looks, sensor, target)
+        noise = sensor_noise(observations, sensor, target)
         assert_allclose(noise.deviations, deviations, rtol=0.06)
         correlation = noise.covariance / np.outer(noise.deviations, noise.deviations)
         assert np.abs(correlation - np.eye(3)).max() < 0.08
         assert np.abs(noise.bias).max() < 0.1
     else:
-        noise = sensor_noise(looks, sensor)
+        noise = sensor_noise(observations, sensor)
         assert_allclose(noise.target, target, atol=0.3)
         assert_allclose(noise.deviations, deviations, rtol=0.1)
     assert noise.used == 2000
@@ -67,14 +69,16 @@ def test_a_known_covariance_is_found_again_in_3d(given):
 def test_misses_and_other_things_are_counted_and_not_part_of_r():
     sensor = sensor_of(2, detection={'kind': 'box', 'lower': [-1, -1], 'upper': [1, 1]})
     target = np.array([1.0, 2.0])
-    looks = looks_at(target, [0.01, 0.03], 400, 4, sensor, spread=0.5)
+    observations = observations_of(target, [0.01, 0.03], 400, 4, sensor, spread=0.5)
     generator = np.random.default_rng(5)
     for i in range(0, 400, 10):
-        looks[i] = Look(looks[i].pose, np.zeros((0, 2)))
+        observations[i] = Observation(observations[i].pose, np.zeros((0, 2)))
     for i in range(5, 400, 10):
         false = [[generator.uniform(0.5, 0.9), generator.uniform(-3, 3)]]
-        looks[i] = Look(looks[i].pose, np.concatenate([false, looks[i].values]))
-    noise = sensor_noise(looks, sensor)
+        observations[i] = Observation(
+            observations[i].pose, np.concatenate([false, observations[i].values])
+        )
+    noise = sensor_noise(observations, sensor)
     assert_allclose(noise.deviations, [0.01, 0.03], rtol=0.15)
     assert (noise.inside, noise.missed, noise.others) == (400, 40, 40)
     assert noise.probability == pytest.approx(0.9)
@@ -84,26 +88,26 @@ def test_misses_and_other_things_are_counted_and_not_part_of_r():
 def test_bearings_across_pi_have_small_errors():
     sensor = sensor_of(2)
     target = np.array([-1.0, 0.0])
-    looks = []
+    observations = []
     generator = np.random.default_rng(6)
     for _ in range(50):
         pose = Pose.from_yaw([0.0, generator.normal(0.0, 0.01), 0.0], 0.0)
         value = sensor.measurement.measure(target[None], pose)
         value[0, 1] += generator.normal(0.0, 0.01)
         value[0, 1] -= 2.0 * np.pi * (value[0, 1] > np.pi)
-        looks.append(Look(pose, value))
-    assert sensor_noise(looks, sensor, target).deviations[1] < 0.015
+        observations.append(Observation(pose, value))
+    assert sensor_noise(observations, sensor, target).deviations[1] < 0.015
 
 
 def test_too_few_looks_are_refused():
     sensor = sensor_of(2)
-    looks = looks_at(np.array([1.0, 2.0]), [0.01, 0.03], 9, 4, sensor)
+    observations = observations_of(np.array([1.0, 2.0]), [0.01, 0.03], 9, 4, sensor)
     with pytest.raises(ValueError, match=r'seen . times from .* allowed is at least 10'):
-        sensor_noise(looks, sensor)
+        sensor_noise(observations, sensor)
     with pytest.raises(ValueError, match='seen 0 times'):
         sensor_noise([], sensor)
     with pytest.raises(ValueError, match='target: got'):
-        sensor_noise(looks, sensor, [np.nan, 1.0])
+        sensor_noise(observations, sensor, [np.nan, 1.0])
 
 
 # ---- from a recording to R -------------------------------------------------------------------
@@ -257,7 +261,7 @@ def test_a_wrong_stamp_offset_shows(recording, capsys):
 def test_a_target_given_at_the_wrong_place_shows_as_a_bias(recording, capsys):
     folder, _ = recording
     calibrate(folder, '--target', '0.83', '0.9')
-    assert 'look at mount, stamp_offset, start and target' in capsys.readouterr().out
+    assert 'check mount, stamp_offset, start and target' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -302,22 +306,22 @@ def test_detections_of_a_driver_do_as_well(tmp_path, capsys):
     sensor = scenario.robots['mambo'].sensor.build('mambo', 2)
     types = load_types()
     made = types.types
-    looks = looks_at(np.array(TARGET), [0.011, 0.03], 300, 9, sensor, height=1.0)
+    observations = observations_of(np.array(TARGET), [0.011, 0.03], 300, 9, sensor, height=1.0)
     with BagWriter(tmp_path / 'bag', types) as writer:
         writer.add_topic('/mambo/detections', 'maasi_msgs/msg/DetectionArray')
         writer.add_topic('/mambo/state', 'maasi_msgs/msg/AgentState')
-        for number, look in enumerate(looks):
+        for number, observation in enumerate(observations):
             pose = made['geometry_msgs/msg/Pose'](
-                position=made['geometry_msgs/msg/Point'](*look.pose.position),
+                position=made['geometry_msgs/msg/Point'](*observation.pose.position),
                 orientation=made['geometry_msgs/msg/Quaternion'](
-                    *look.pose.orientation[1:], look.pose.orientation[0]
+                    *observation.pose.orientation[1:], observation.pose.orientation[0]
                 ),
             )
             detections = [
                 made['maasi_msgs/msg/Detection'](
                     range=value[0], bearing=value[1], elevation=0.0, covariance=np.zeros(0)
                 )
-                for value in look.values
+                for value in observation.values
             ]
             message = made['maasi_msgs/msg/DetectionArray'](
                 header=made['std_msgs/msg/Header'](

@@ -316,7 +316,7 @@ def test_nav2_drives_to_the_waypoints(driven):
         assert 'no odometry for' in reason
         handle = send(team, [0.7, 0.8, 0.0])
         reason = reason_of_abort(team, handle.get_result_async())
-    assert 'Nav2 has said nothing for' in reason or 'Nav2 is' in reason
+    assert 'no answer or feedback of Nav2 for' in reason or 'Nav2 is' in reason
 
 
 def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, context):

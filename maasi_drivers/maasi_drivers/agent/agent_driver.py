@@ -48,7 +48,7 @@ class AgentDriver(RobotNode):
 
     Services
     --------
-    `stop`, `release` (std_srvs/Trigger): it stops, and takes no goals until it is released
+    `stop`, `release` (std_srvs/Trigger): the robot stops, and takes no goals until `release`
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The permission to take off: asked for by a service, for one take-off, and for a while."""
+"""The permission to take off: given by a service, for one take-off and a limited time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-# What planner and clients read while a vehicle waits for it.
+# Reason in `state` while a vehicle waits for it.
 UNTIL_ARM = 'until the service arm is called'
 
 
@@ -19,7 +19,7 @@ class ArmPermission:
     Parameters
     ----------
     timeout : float
-        After which one that was not used ends [s].
+        After which an unused permission expires [s].
 
     """
 
@@ -41,7 +41,7 @@ class ArmPermission:
         return now < self._end
 
     def expired(self, now: float) -> bool:
-        """Return whether there was one that ran out, and end it then."""
+        """Return whether a permission has just expired."""
         return now >= self._end and self.end()
 
 
@@ -54,7 +54,7 @@ def offer_arm(node: Node, arm: Callable[[], str]) -> None:
     node : Node
         Of a robot that takes off.
     arm : callable
-        Gives the permission, and returns why it does not; empty where it does.
+        Gives the permission, or returns the reason of a refusal; empty where it is given.
 
     """
 

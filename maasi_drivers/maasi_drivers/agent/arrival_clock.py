@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-# Of what was seen of the node's time, for so long [s].
+# Length of the window of observations [s].
 _WINDOW = 2.0
 
 

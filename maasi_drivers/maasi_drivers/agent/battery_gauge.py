@@ -28,7 +28,7 @@ class BatteryGauge:
         self._per_cent = 0.0
 
     def charge(self, reading: float) -> float:
-        """Return the charge, 0 to 1, or -1 where the reading says nothing."""
+        """Return the charge, 0 to 1, or -1 for an invalid reading."""
         if not (math.isfinite(reading) and 0.0 <= reading <= 100.0):
             return -1.0
         settled = self._in_a_row >= _SETTLED and self._per_cent <= _NEARLY_EMPTY

@@ -16,8 +16,8 @@ from maasi_planner.settings import MotionSettings
 
 CommandType = Literal['auto', 'stamped', 'twist']
 LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink']
-# The same in lockstep, where robots stand still until their drivers answer: a busy machine may keep
-# a driver waiting, and zeros in between would make the run another one [s].
+# The same in lockstep, where robots wait for their drivers: a busy machine may delay
+# a driver, and zeros in between would change the run [s].
 LOCKSTEP_LEASE = 20.0
 
 
@@ -101,7 +101,7 @@ class DriverSettings(NodeSettings):
     )
     navigation: Literal['own', 'nav2'] = Field(
         default='own',
-        description="Who drives a ground robot to its waypoints: the driver, or Nav2's "
+        description="What drives a ground robot to its waypoints: the driver, or Nav2's "
         'NavigateToPose; not in lockstep',
     )
     nav2_timeout: float = Field(
@@ -125,7 +125,7 @@ class DriverSettings(NodeSettings):
     feed_address: str = Field(
         default='127.0.0.1',
         min_length=1,
-        description='Address of this host on which the measurement feed is heard; 0.0.0.0: all, '
+        description='Address of this host on which the measurement feed is received; 0.0.0.0: all, '
         'from a robot on the network',
     )
     image_transport: Literal['raw', 'compressed'] = Field(
@@ -149,7 +149,7 @@ class DriverSettings(NodeSettings):
     )
     odometry_origin: Literal['zero', 'first', 'map'] = Field(
         default='zero',
-        description='What the odometry shows at the start: zero, or what its first message says; '
+        description='What the odometry shows at the start: zero, or its first message; '
         'map: it is in the map already, and so is its header.frame_id',
     )
     pose_source: Literal['odometry', 'tf', 'pose'] | None = Field(
@@ -180,25 +180,25 @@ class DriverSettings(NodeSettings):
         default=1.0,
         ge=0.0,
         description='Time by the odometry for which its pose may be the same to the bit under a '
-        'command to move, before the robot is stopped; 0: not looked at; not in lockstep [s]',
+        'command to move, before the robot is stopped; 0: disabled; not in lockstep [s]',
     )
     sensor_timeout: float | None = Field(
         default=None,
         ge=0.0,
         description='Time by the odometry without a new image or sweep after which the robot is '
-        'stopped; none: three periods of the sensor, at least 1 s; 0: not looked at; not in '
+        'stopped; none: three periods of the sensor, at least 1 s; 0: disabled; not in '
         'lockstep [s]',
     )
     command_type: CommandType = Field(
         default='auto',
-        description='Type of cmd_vel: TwistStamped, Twist, or what the robot listens to; auto is '
-        'stamped in lockstep',
+        description='Type of cmd_vel: TwistStamped, Twist, or the type that it subscribes to; auto '
+        'is stamped in lockstep',
     )
     battery_minimum: float = Field(
         default=0.0,
         ge=0.0,
         lt=1.0,
-        description='Charge below which the robot goes nowhere any more; 0: not looked at [1]',
+        description='Charge below which the robot takes no goals; 0: disabled [1]',
     )
 
     @property
@@ -273,6 +273,6 @@ class GuardSettings(NodeSettings):
 
     command_type: CommandType = Field(
         default='auto',
-        description='Type of cmd_vel: TwistStamped, Twist, or what the robot listens to; auto is '
-        'stamped in lockstep',
+        description='Type of cmd_vel: TwistStamped, Twist, or the type that it subscribes to; auto '
+        'is stamped in lockstep',
     )

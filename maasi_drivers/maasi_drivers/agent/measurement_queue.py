@@ -42,7 +42,7 @@ class Frame(Generic[DataT]):
 
 class MeasurementQueue(Generic[DataT]):
     """
-    Brings together requests, images and poses, in whatever order they come.
+    Matches requests, images and poses, in any order of arrival.
 
     An image answers one request at most: it is one measurement.
 
@@ -78,7 +78,7 @@ class MeasurementQueue(Generic[DataT]):
         self.latest = frame.stamp
 
     def add_request(self, request: MeasurementRequest) -> list[MeasurementRequest]:
-        """Add a request, unless it waits already; return those that are given up for it."""
+        """Add a request, unless it waits already; return those that are dropped for it."""
         if request in self._requests:
             return []
         self._requests.append(request)
@@ -88,7 +88,7 @@ class MeasurementQueue(Generic[DataT]):
         return dropped
 
     def clear(self) -> None:
-        """Forget everything, as after a jump of the clock."""
+        """Discard everything, as after a jump of the clock."""
         self._frames.clear()
         self._requests.clear()
         self.latest = None
@@ -103,7 +103,7 @@ class MeasurementQueue(Generic[DataT]):
         latest = self.history.latest
         if not self._requests or latest is None:
             return None
-        # The earliest one, so that a request for a time to come holds up no other.
+        # The earliest one: a request for a later time must not block others.
         request = self._next = min(self._requests, key=lambda item: item.stamp)
         while self._frames:
             frame = self._frames[0]

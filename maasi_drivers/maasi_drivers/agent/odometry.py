@@ -112,7 +112,7 @@ class MapOdometry:
 
 def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedPose:
     """
-    Return the pose at a stamp between two others: position linear, orientation the short way round.
+    Return the pose at a stamp between two others: position linear, orientation by slerp.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedP
 
 class PoseHistory:
     """
-    A robot's latest poses, to look up where it was when an image was taken.
+    A robot's latest poses, to look up its pose when an image was taken.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ class PoseHistory:
         return True
 
     def clear(self) -> None:
-        """Forget everything, as after a jump of the clock."""
+        """Discard everything, as after a jump of the clock."""
         self._stamps.clear()
         self._poses.clear()
 

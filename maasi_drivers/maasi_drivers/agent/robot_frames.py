@@ -1,4 +1,4 @@
-"""A robot's frames on /tf and /tf_static, its description, and poses that others publish there."""
+"""A robot's frames on /tf and /tf_static, its description, and poses of other nodes there."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class RobotFrames:
             )
 
     def clear(self) -> None:
-        """Forget what moves, as after a jump of the clock."""
+        """Discard what moves, as after a jump of the clock."""
         self._buffer.clear()
         self._slot = self._taken = None
 
@@ -173,7 +173,7 @@ class RobotFrames:
         try:
             self._buffer.add(parent, child, pose, stamp or 0, static=stamp is None)
         except ValueError as error:
-            # As where somebody else has a frame of the same name above this one.
+            # For example a peer publishes a parent frame of the same name.
             self._node.drop('transform', f'frames of this robot: {error}')
 
     def _publish_static(self) -> None:
@@ -214,7 +214,7 @@ class RobotFrames:
                 )
 
     def _take_pose(self) -> None:
-        """Hand the robot's pose on if tf has a newer one that is not stale."""
+        """Take the robot's pose if tf has a newer one that is not stale."""
         settings = self._settings
         try:
             stamp = self._buffer.latest(settings.frame, self._base)
@@ -222,7 +222,7 @@ class RobotFrames:
                 return
             pose = self._buffer.pose(settings.frame, self._base, stamp)
         except TransformError:
-            # The driver says that it has no pose.
+            # The driver reports the missing pose.
             return
         self._taken = stamp
         age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)

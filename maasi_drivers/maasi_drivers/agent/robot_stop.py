@@ -1,4 +1,4 @@
-"""The services that stop one robot, whatever the planner does, and release it again."""
+"""The services that stop one robot independently of the planner, and release it again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-# What planner and clients read while it is latched.
+# Reason in `state` while it is latched.
 STOPPED = 'stopped by the service stop, until the service release is called'
 
 
@@ -20,12 +20,12 @@ class RobotStop:
     Parameters
     ----------
     on_stop, on_release : callable
-        What the driver does then.
+        Called after the service.
 
     Attributes
     ----------
     latched : bool
-        Whether the robot is to stand.
+        Whether the stop is in force.
 
     """
 

@@ -29,24 +29,24 @@ class GoalStatus(IntEnum):
 @dataclass(eq=False)
 class Goal:
     """
-    A waypoint that a robot was sent to.
+    A waypoint of a robot.
 
     Attributes
     ----------
     id : int
         Decision index plus one.
     step : int
-        At which it was decided; it acts from the next one on.
+        At which it was decided; it takes effect from the next one on.
     waypoint : ndarray, shape (3,)
         [m, map].
     tolerance : float
         Distance at which it counts as reached; 0: the robot's own [m].
     handle : object
-        Whose it is.
+        The handle of its client.
     status : GoalStatus
-        How it stands with it.
+        Its state.
     reason : str
-        Why it was given up.
+        Why it ended without success.
 
     """
 
@@ -61,10 +61,9 @@ class Goal:
 
 class WaypointFollower:
     """
-    Brings a robot to its waypoints and holds it there.
+    Steers a robot to its waypoints and holds it there.
 
-    A ground robot stands still where it has nothing to do, a flying one is kept by its controller
-    where it is to be.
+    Without a goal a ground robot stands still; the controller of a flying one holds its position.
 
     Parameters
     ----------
@@ -74,7 +73,7 @@ class WaypointFollower:
     Attributes
     ----------
     goal : Goal or None
-        The last one that acted.
+        The last one that took effect.
 
     """
 
@@ -116,7 +115,7 @@ class WaypointFollower:
         return goal
 
     def distance(self, position: FloatArray) -> float:
-        """Return the way left to the goal, as the crow flies [m]; 0 without one."""
+        """Return the straight distance to the goal [m]; 0 without one."""
         return 0.0 if self.goal is None else self._distance(position, self.goal.waypoint)
 
     def _distance(self, position: FloatArray, waypoint: FloatArray) -> float:
@@ -165,7 +164,7 @@ class WaypointFollower:
 
     @property
     def target(self) -> FloatArray | None:
-        """Where it goes, or stays [m, map]; None where it was not asked yet."""
+        """The position that it goes to or holds [m, map]; None before the first update."""
         if self.goal is not None and self.goal.status == GoalStatus.MOVING:
             return self.goal.waypoint
         return self._hold

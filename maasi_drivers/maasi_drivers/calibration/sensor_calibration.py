@@ -1,4 +1,4 @@
-"""A sensor's noise R from looks at one target, as in 000, section 5.2."""
+"""A sensor's noise R from observations at one target, as in 000, section 5.2."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from maasi_filter.models.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
 
-# Fewer looks say nothing of a covariance.
+# Fewer observations say nothing of a covariance.
 LEAST_LOOKS = 10
 # What is so many times farther from the target than the median is something else.
 _FAR = 8.0
@@ -23,7 +23,7 @@ _ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Look:
+class Observation:
     """
     What a sensor saw at one instant.
 
@@ -53,7 +53,7 @@ class SensorNoise:
     target : ndarray, shape (d,)
         Where the target is [m, map]: as given, or the mean of where it was seen.
     ranges : tuple of float
-        Smallest and largest range of the looks that were used [m].
+        Smallest and largest range of the observations that were used [m].
     used : int
         Looks from which R comes.
     near : int
@@ -83,12 +83,12 @@ class SensorNoise:
 
     @property
     def probability(self) -> float:
-        """Share of the looks with the target in the field of view that showed it."""
+        """Share of the observations with the target in the field of view that showed it."""
         return 1.0 - self.missed / self.inside if self.inside else float('nan')
 
 
 def sensor_noise(
-    looks: Sequence[Look],
+    observations: Sequence[Observation],
     sensor: Sensor,
     target: ArrayLike | None = None,
     least_range: float = 0.05,
@@ -96,12 +96,12 @@ def sensor_noise(
     """
     Return a sensor's noise.
 
-    In each look the detection nearest to the target counts, unless it is eight times as far as the
-    median.
+    In each observation the detection nearest to the target counts, unless it is eight times as far
+    as the median.
 
     Parameters
     ----------
-    looks : sequence of Look
+    observations : sequence of Observation
         At one target, from different places.
     sensor : Sensor
         Its measurement model, and the field of view in which misses are counted.
@@ -113,10 +113,10 @@ def sensor_noise(
     Raises
     ------
     ValueError
-        If fewer than ten looks show it, or the target is not finite.
+        If fewer than ten observations show it, or the target is not finite.
     """
     model = sensor.measurement
-    seen = [model.inverse(look.values, look.pose) for look in looks]
+    seen = [model.inverse(observation.values, observation.pose) for observation in observations]
     if target is not None:
         place = np.asarray(target, dtype=float)
         if place.shape != (model.dimension,) or not np.isfinite(place).all():
@@ -136,9 +136,9 @@ def sensor_noise(
         if target is None and chosen:
             place = np.mean(chosen, axis=0)
     errors, ranges, near, inside, missed = [], [], 0, 0, 0
-    for look, index in zip(looks, nearest):
-        expected = model.measure(place[None, :], look.pose)[0]
-        if sensor.detection.probability(place[None, :], look.pose)[0] > 0.0:
+    for observation, index in zip(observations, nearest):
+        expected = model.measure(place[None, :], observation.pose)[0]
+        if sensor.detection.probability(place[None, :], observation.pose)[0] > 0.0:
             inside += 1
             missed += index is None
         if index is None:
@@ -146,7 +146,7 @@ def sensor_noise(
         if expected[0] < least_range:
             near += 1
             continue
-        errors.append(model.residual(look.values[index], expected))
+        errors.append(model.residual(observation.values[index], expected))
         ranges.append(float(expected[0]))
     if len(errors) < LEAST_LOOKS:
         raise ValueError(
@@ -168,7 +168,7 @@ def sensor_noise(
 
 
 def _nearest(seen: Sequence[FloatArray], place: FloatArray) -> list[int | None]:
-    """Return for each look which of its detections is the target's; none: none is."""
+    """Return for each observation which of its detections is the target's; none: none is."""
     distances = [np.linalg.norm(spots - place, axis=1) for spots in seen]
     least = [float(item.min()) for item in distances if len(item)]
     limit = max(_FAR * float(np.median(least)), _ROUNDING) if least else 0.0

@@ -1,4 +1,4 @@
-"""Velocity commands on a topic, in the type that the robot listens to."""
+"""Velocity commands on a topic, in the type that the robot subscribes to."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class CommandPublisher:
     topic : str
         Relative name.
     kind : {'auto', 'stamped', 'twist'}
-        auto: found out from the graph, by `refresh`.
+        auto: determined from the graph, by `refresh`.
     lockstep : bool
         Whether no command may be lost; there, auto is stamped.
     """
@@ -56,7 +56,7 @@ class CommandPublisher:
         self._publisher = self._node.create_publisher(kind, self.topic, self._quality)
 
     def refresh(self) -> None:
-        """Look who listens, and for what type; to be called again and again."""
+        """Follow the type that is subscribed to; call it repeatedly."""
         if not self._auto or self.listeners():
             return
         for name in self.wanted():
@@ -81,29 +81,29 @@ class CommandPublisher:
         return 0 if self._publisher is None else self._publisher.get_subscription_count()
 
     def problem(self) -> str:
-        """Return why nobody hears a command; empty where somebody does."""
+        """Return why no command is received; empty where one is."""
         if self.listeners():
             return ''
         wanted = self.wanted()
         if not wanted:
-            return f'{self.topic}: nobody listens; is the robot there?'
+            return f'{self.topic}: no subscription; is the robot running?'
         return (
-            f'{self.topic}: nobody listens; the robot wants {", ".join(wanted)}, '
+            f'{self.topic}: no subscription of this type; the robot wants {", ".join(wanted)}, '
             'see the parameter command_type'
         )
 
     def publish(self, command: TwistStamped) -> None:
-        """Publish a command, without its header where that is what is listened to."""
+        """Publish a command, without its header where that is subscribed to."""
         if self._publisher is not None:
             self._publisher.publish(command if self._kind is TwistStamped else command.twist)
 
     def wait(self, seconds: float) -> None:
-        """Wait until what was published has arrived, for at most so long."""
+        """Wait until all commands have arrived, for at most so many seconds."""
         if self._publisher is not None:
             self._publisher.wait_for_all_acked(Duration(nanoseconds=round(seconds * 1e9)))
 
     def destroy(self) -> None:
-        """Leave the graph."""
+        """Destroy the publisher."""
         if self._publisher is not None:
             self._node.destroy_publisher(self._publisher)
             self._publisher = None

@@ -80,7 +80,7 @@ class Nav2Navigation:
             return 'Nav2 is gone'
         silence = self._silence.length
         if silence > self._timeout:
-            return f'Nav2 has said nothing for {silence:.1f} s'
+            return f'no answer or feedback of Nav2 for {silence:.1f} s'
         return None
 
     def go(self, goal: Goal, heading: float) -> None:
@@ -116,7 +116,7 @@ class Nav2Navigation:
             self._ended(goal, True, '')
             return
         ended = 'cancelled it' if answer.status == ActionStatus.STATUS_CANCELED else 'gave it up'
-        # Humble's result is empty, that of newer ones says more.
+        # Humble's result is empty, newer ones have code and text.
         code = getattr(answer.result, 'error_code', 0)
         text = getattr(answer.result, 'error_msg', '')
         reason = (

@@ -31,7 +31,7 @@ class TopicLink(RobotLink):
     Publishes
     ---------
     `cmd_vel` (geometry_msgs/TwistStamped or Twist, as the robot listens), with each pose, and
-    zeros when it cannot go on and at the end
+    zeros on a fault and at the end
     """
 
     def __init__(self, driver: RobotNode) -> None:

@@ -23,7 +23,7 @@ _FARTHEST = 1000.0
 
 
 class OrderError(ValueError):
-    """An order that cannot be; the text says field, what was read, what is allowed."""
+    """An invalid order; the text has field, value read, values allowed."""
 
 
 class OrderKind(IntEnum):
@@ -59,7 +59,7 @@ class Order:
 
 
 def encode(order: Order) -> bytes:
-    """Return an order as a datagram; `OrderError` if it holds numbers that are not allowed."""
+    """Return an order as a datagram; `OrderError` for numbers that are not allowed."""
     data = _ORDER.pack(
         MAGIC, VERSION, order.kind, 0, order.sequence % 2**32, *order.position, order.yaw
     )
@@ -75,7 +75,7 @@ def decode(data: bytes) -> Order:
     Raises
     ------
     OrderError
-        If it is none, or damaged, or of another version, or holds what cannot be.
+        If it is damaged, of another version, or holds values that are not allowed.
 
     """
     size = _ORDER.size + _CHECKSUM.size
@@ -109,7 +109,7 @@ class OrderSender:
     address : str
         Of the robot.
     port : int
-        UDP, on which it hears them.
+        UDP, on which it receives them.
 
     """
 
@@ -128,5 +128,5 @@ class OrderSender:
         return ''
 
     def close(self) -> None:
-        """Send no more."""
+        """Close the socket."""
         self._socket.close()

@@ -15,12 +15,12 @@ _LARGEST_IMAGE, _LARGEST_INTRINSIC, _LARGEST_DISTORTION = 32_768, 1e6, 1e4
 
 
 class SegmentationSettings(Settings):
-    """How marker pixels are told from the floor; see `maasi_drivers.vision.segmentation`."""
+    """How marker pixels are separated from the floor; see `maasi_drivers.vision.segmentation`."""
 
     rule: Literal['robust', 'paper'] = Field(
         default='robust',
         description="'paper': fixed blue excess (001, eq. (16)), blobs of any size from "
-        "minimum_area on; 'robust': adapts to light, and looks at size and shape",
+        "minimum_area on; 'robust': adapts to light, and gates on size and shape",
     )
     threshold: float = Field(
         default=35.0,
@@ -108,7 +108,7 @@ class MountSettings(Settings):
 
 class CameraSettings(Settings):
     """
-    A camera that looks at the floor.
+    A camera that sees the floor.
 
     The defaults are those of a drone at 1 m: 160 x 120 px, looking down, the image's width across
     the robot. With 260 px of focal length the papers' field of view of +-0.2 m lies in the image,
@@ -164,7 +164,7 @@ class CameraSettings(Settings):
         description='Blobs that the image border cuts: kept with more covariance, or dropped',
     )
     segmentation: SegmentationSettings = Field(
-        default_factory=SegmentationSettings, description='How markers are told apart'
+        default_factory=SegmentationSettings, description='How markers are segmented'
     )
 
     @model_validator(mode='after')

@@ -91,7 +91,7 @@ class MarkerDetector:
         Parameters
         ----------
         image : ndarray, shape (h, w, 3), uint8
-            R, G, B; of the size that the settings say.
+            R, G, B; of the size in the settings.
         pose : Pose
             Of the robot in the map frame when the image was taken.
         pose_covariance : array_like, shape (6, 6), optional

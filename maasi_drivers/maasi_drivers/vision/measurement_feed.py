@@ -31,23 +31,23 @@ _HEADER = struct.Struct('<4sBBHHHII')
 _POSE = struct.Struct('<7fI')
 _BLOB = struct.Struct('<8fI')
 _CHECKSUM = struct.Struct('<I')
-# Images older than that are of no use [s].
+# Images older than this are dropped [s].
 _OLDEST = 10.0
-# Farther from where it took off, or tilted by more, is no pose [m], [rad].
+# A pose farther from the take-off point, or with more tilt, is invalid [m, rad].
 _FARTHEST, _MOST_TILT = 1000.0, 1.5
-# A sequence number that is farther behind belongs to a sender that was started again.
+# A sequence number that is farther behind belongs to a restarted sender.
 _FAR_BEHIND = 1000
-# So does any, after so long a silence [s].
+# So does any, after a silence of this length [s].
 _SILENCE = 2.0
 _MOST_AT_ONCE = 64
 
 
 class FeedError(ValueError):
-    """A datagram that is not to be used; the text says field, what was read, what is allowed."""
+    """An invalid datagram; the text has field, value read, values allowed."""
 
 
 class FeedState(IntEnum):
-    """What a robot that sends its pose does."""
+    """State of flight of a robot that sends its pose."""
 
     GROUND = 0
     AIR = 1
@@ -57,7 +57,7 @@ class FeedState(IntEnum):
 @dataclass(frozen=True)
 class FeedPose:
     """
-    Where a robot was when the image was taken, as it believes.
+    The robot's own estimate of its pose when the image was taken.
 
     Attributes
     ----------
@@ -269,7 +269,7 @@ class FeedPeer:
 
 class FeedReceiver:
     """
-    Hears a feed; to be asked often.
+    Receives a feed; poll it often.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ class FeedReceiver:
     address : str
         Of this host, on which it listens.
     sender : str, optional
-        Address of the only one that is heard; none: anybody.
+        Address of the only sender that is used; none: any.
 
     Attributes
     ----------

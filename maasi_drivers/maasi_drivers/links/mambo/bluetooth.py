@@ -35,7 +35,7 @@ def ask_for_answer(connection: Any, tilt: float) -> None:
     connection : BLEConnection
         Of pyparrot.
     tilt : float
-        The largest, which it has been told before [rad].
+        The largest, as set before [rad].
     """
     content = struct.pack('<f', math.degrees(tilt))
     _write(connection, 'SEND_WITH_ACK', 'DATA_WITH_ACK', _MAX_TILT, content)

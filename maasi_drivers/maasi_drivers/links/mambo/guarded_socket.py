@@ -1,4 +1,4 @@
-"""The UDP socket on which pyparrot hears a Mambo, guarded against what others send. Without ROS.
+"""The UDP socket of pyparrot for a Mambo, guarded against other senders. Without ROS.
 
 pyparrot 1.5.20 (`pyparrot/networking/wifiConnection.py`) binds it to all interfaces, takes every
 datagram for one of the drone's, hands the last one out again after a timeout, and its listener
@@ -16,7 +16,7 @@ from typing import Any
 # Type, buffer, sequence, total size.
 _HEADER = struct.Struct('<BBBI')
 _TYPES = range(1, 5)
-# Longest wait for a datagram: then the listener looks whether it is to end [s].
+# Longest wait for a datagram: then the listener checks whether it has to end [s].
 _TIMEOUT = 0.3
 
 

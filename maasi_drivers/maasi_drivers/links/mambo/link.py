@@ -5,7 +5,7 @@ position event is the time since the one before. So an event counts as new only 
 acquisition stamps that come with it (of speed, altitude or orientation) has changed. Bluetooth
 delivers few of them, each notification once (pyparrot, docs/minidronecommands.rst: "more
 information via wifi than via BLE"): there each one counts, and so does the acknowledgement of a
-command, which is sent for that purpose when nothing else is heard.
+command, which is sent for that purpose when nothing else is received.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ AIRBORNE = ('takingoff', 'hovering', 'flying', 'landing')
 _STAMPS = ('DroneSpeed_ts', 'DroneAltitude_ts', 'DroneQuaternion_ts')
 # Between two rounds of the thread [s]; what is handed over wakes it.
 _ROUND = 0.05
-# Silence of its caller after which the drone is told to hover [s].
+# Silence of its caller after which the drone is commanded to hover [s].
 CALLER_TIMEOUT = 0.5
 # From one take-off or landing command to the next while the drone does not obey [s].
 _REPEAT = 0.7
@@ -49,13 +49,13 @@ _FARTHEST = 1000.0
 
 
 class MamboLinkError(RuntimeError):
-    """No way to the drone; the text says why and what can be done."""
+    """No connection to the drone; the text has cause and remedy."""
 
 
 @dataclass(frozen=True)
 class PositionEvent:
     """
-    Where the drone says that it is.
+    The drone's own estimate of its position.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class MamboLink:
 
     All calls return at once; a thread of its own talks to pyparrot, which sleeps in its commands. A
     piloting command is sent once. That thread is a dead man's switch too: once the caller has not
-    called `keep_alive` for `CALLER_TIMEOUT`, the drone is told to hover, and to land after
+    called `keep_alive` for `CALLER_TIMEOUT`, the drone is commanded to hover, and to land after
     `land_after` more.
 
     Parameters
@@ -89,13 +89,13 @@ class MamboLink:
     address : str
         IP address, or Bluetooth address.
     port : int
-        UDP port on which the drone's events are heard, on the address of this host that faces it.
+        UDP port on which the drone's events are received, on this host's address in its network.
     tilt : float
         Of 100 per cent roll or pitch [rad]; the drone takes 5 to 25 degrees.
     climb : float
         Of 100 per cent climb [m/s]; the drone takes 0.5 to 2.
     land_after : float
-        Time without its caller after which the drone is told to land, from when it hovers [s].
+        Time without its caller after which the drone is commanded to land, from when it hovers [s].
 
     """
 
@@ -114,13 +114,13 @@ class MamboLink:
         self.tilt = tilt
         self.climb = climb
         self.land_after = land_after
-        #: What is wrong with the link; while it is not connected it goes on trying.
+        #: Fault of the link; while it is not connected it keeps trying.
         self.error = ''
         #: Of the drone, as pyparrot calls it: landed, takingoff, hovering, flying, ...
         self.flying_state = ''
-        #: Charge, 0 to 1; negative: not heard yet.
+        #: Charge, 0 to 1; negative: not received yet.
         self.battery = -1.0
-        #: When something new, or an acknowledgement, was last heard from it, monotonic clock [s].
+        #: Time of the last new data or acknowledgement, monotonic clock [s].
         self.heard_at = -math.inf
         #: Position events that could not be used.
         self.bad_events = 0
@@ -168,7 +168,7 @@ class MamboLink:
 
     @property
     def airborne(self) -> bool:
-        """Whether the drone says that it is in the air, landing included."""
+        """Whether the drone reports that it is in the air, landing included."""
         return self.flying_state in AIRBORNE
 
     @property
@@ -183,11 +183,11 @@ class MamboLink:
         return self._position
 
     def take_off(self) -> None:
-        """Have it take off; said again until it does, or until something else is asked for."""
+        """Take off; repeated until it does, or until something else is requested."""
         self._want('take_off')
 
     def land(self) -> None:
-        """Have it land; said again until it does, also when nothing is heard from it."""
+        """Land; repeated until it does, also while nothing is received from it."""
         self._want('land')
 
     def steer(self, forward: float, left: float, up: float, turn: float) -> None:
@@ -211,7 +211,7 @@ class MamboLink:
         self._wake.set()
 
     def keep_alive(self) -> None:
-        """Note that the caller still looks after the drone; the first call arms the switch."""
+        """Note that the caller is alive; the first call arms the dead man's switch."""
         self._called_at = time.monotonic()
 
     def hover(self) -> None:
@@ -272,7 +272,7 @@ class MamboLink:
         link = self
 
         class Sensors(minidrone.MinidroneSensors):  # type: ignore[name-defined, misc]
-            """Those of pyparrot, which also say what has just come in."""
+            """Those of pyparrot, which also report each update."""
 
             def update(self, name: str, value: Any, sensor_enum: Any) -> None:
                 super().update(name, value, sensor_enum)
@@ -359,7 +359,7 @@ class MamboLink:
                 else state in ('landed', 'landing', 'emergency')
             )
             if wanted == 'land' and state != 'landed' and self._stale():
-                # What it said last may not be so any more.
+                # Its last reported state may be outdated.
                 obeyed = False
             if wanted == 'take_off' and obeyed:
                 # Once is enough: one that lands by itself stays down.
@@ -428,7 +428,7 @@ class MamboLink:
 
 
 def _check_port(port: int, drone: str) -> None:
-    """Raise where somebody has the port."""
+    """Raise where another program has the port."""
     try:
         DroneSocket(drone, port).close()
     except OSError as error:

@@ -1,4 +1,4 @@
-"""A Mambo's flight: what it is told, from take-off to landing. Without ROS."""
+"""A Mambo's flight: its commands from take-off to landing. Without ROS."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from maasi_planner.settings import MotionSettings
 
 FloatArray = NDArray[np.float64]
 
-# Acceleration for each m/s that the speed is wrong [1/s].
+# Acceleration per speed error [1/s].
 _SPEED_GAIN = 2.5
-# Acceleration of the speed that is wished for: little tilt, as images are taken meanwhile [m/s^2].
+# Acceleration of the desired speed: little tilt, as images are taken meanwhile [m/s^2].
 _RAMP = 0.4
-# A wish before this is forgotten [s].
+# A desired velocity older than this is discarded [s].
 _OLD_WISH = 0.5
 # Share of the largest acceleration that stops it before the geofence: the rest is for wind.
 _BRAKE_SHARE = 0.5
 # Most speed for each metre to the geofence, well below what the speed follows by [1/s].
 _NEAR_RATE = 1.0
-# Reckoned with until the speed at the largest tilt is measured; it does not fly by it [m/s].
+# Assumed until the speed at the largest tilt is measured; it does not fly by it [m/s].
 _UNKNOWN_SPEED = 1.0
 # How far from its altitude the drone counts as there after take-off [m].
 _ALTITUDE_TOLERANCE = 0.1
-# An event that says the same to the bit under a command faster than this is no new position [m/s].
+# Under a command faster than this, an event equal to the bit is no new position [m/s].
 _LEAST_SPEED = 0.05
 _STILL = np.zeros(4)
 
@@ -86,7 +86,7 @@ class Phase(Enum):
 
 class MamboPilot:
     """
-    Flies a Mambo from take-off to landing, and lands it when something is wrong.
+    Flies a Mambo from take-off to landing, and lands it on a fault.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class MamboPilot:
     settings : MamboSettings
         Limits and times.
     home : Pose
-        Where it hovers after take-off, in the map; it stands below that at the start.
+        Where it hovers after take-off, in the map; it starts on the ground below.
     fence : ndarray, shape (3, 2)
         Lowest and highest x, y, z [m, map].
 
@@ -130,17 +130,17 @@ class MamboPilot:
         speed = settings.full_speed or _UNKNOWN_SPEED
         model = TiltModel(link.tilt, speed, link.climb, settings.full_turn)
         self.reckoning = DeadReckoning(model, Pose.from_yaw(place, home.yaw), settings)
-        # When the pose of another system came.
+        # Time of the last pose of another system [s].
         self._other_at = -math.inf
         self._event: PositionEvent | None = None
-        # Since when the position is what it is; monotonic clock.
+        # Time of the last change of the position, monotonic clock [s].
         self._moved_at = -math.inf
         self._place: FloatArray | None = None
-        # Once it was the same in spite of commands, only another one is believed.
+        # Unchanged in spite of commands: only a changed position is accepted.
         self._stuck = False
         self._command = _STILL
         self._now = -math.inf
-        # When, and which velocity in the map was wished for last [m/s].
+        # Time [s] and value of the last desired velocity in the map [m/s].
         self._wish: tuple[float, FloatArray] = (-math.inf, np.zeros(2))
         self._since = -math.inf
         self._lost_since: float | None = None
@@ -178,11 +178,11 @@ class MamboPilot:
         self.reckoning.take(state, now)
 
     def _note_place(self, now: float, place: FloatArray) -> None:
-        told_to_move = float(np.abs(self._command[:3]).max()) > _LEAST_SPEED
+        commanded = float(np.abs(self._command[:3]).max()) > _LEAST_SPEED
         if self._place is None or not np.array_equal(place, self._place):
             self._stuck = False
             self._moved_at = now
-        elif not told_to_move and not self._stuck:
+        elif not commanded and not self._stuck:
             self._moved_at = now
         self._place = place
 
@@ -306,7 +306,7 @@ class MamboPilot:
     # ---- the flight --------------------------------------------------------------------------
 
     def update(self, now: float) -> None:
-        """Go on, at `now` of the monotonic clock [s]: call it at least ten times a second."""
+        """Advance to `now` on the monotonic clock [s]; at least ten times a second."""
         self._now = now
         self.reckoning.go_on(now, self.flying)
         event = self.link.position
@@ -315,10 +315,10 @@ class MamboPilot:
             if self.settings.pose == 'events':
                 self.reckoning.correct(event, self.flying)
                 self._note_place(event.received, event.position)
-        self.problem = self._go_on(now)
+        self.problem = self._advance(now)
 
-    def _go_on(self, now: float) -> str:
-        """Do what the phase asks for; return why it takes no goals, or nothing."""
+    def _advance(self, now: float) -> str:
+        """Do what the phase needs; return why it takes no goals, or nothing."""
         link = self.link
         if self.phase is Phase.CONNECTING:
             if not link.connected:
@@ -326,7 +326,7 @@ class MamboPilot:
             self.phase = Phase.GROUND
         if link.error:
             return self._give_up(link.error)
-        lost = self._see_to_pose(now)
+        lost = self._check_pose(now)
         if self.phase is Phase.GROUND:
             return self._stand(now)
         if self.phase is Phase.LANDING:
@@ -354,7 +354,7 @@ class MamboPilot:
             return f'{"in the air, not by this driver" if flies else "on the ground"}, {UNTIL_ARM}'
         if state != 'landed':
             if flies:
-                # Of a driver before this one.
+                # Started by an earlier driver.
                 self._begin(Phase.TAKING_OFF, now)
                 return Phase.TAKING_OFF.value
             return 'on the ground: nothing heard of its state yet'
@@ -436,7 +436,7 @@ class MamboPilot:
         self._steer(self.motion.command(ahead, above))
         return f'{Phase.CLIMBING.value}, {offset:+.2f} m from its altitude'
 
-    # ---- what can be wrong -------------------------------------------------------------------
+    # ---- faults -------------------------------------------------------------------
 
     @property
     def _battery_low(self) -> bool:
@@ -445,7 +445,7 @@ class MamboPilot:
     def _battery_text(self) -> str:
         return f'battery at {self.link.battery:.2f}, below {self.settings.battery_minimum:.2f}'
 
-    def _see_to_pose(self, now: float) -> float | None:
+    def _check_pose(self, now: float) -> float | None:
         """Return for how long link or position have been missing, beyond the timeout [s]."""
         timeout = self.settings.link_timeout
         self._stuck |= now - self._moved_at > timeout and now - self._positioned_at() <= timeout

@@ -60,15 +60,15 @@ class DeadReckoning:
         #: Time of flight since the last correction [s].
         self.age = 0.0
         self._turn = origin.rotation()
-        # Commands of late, and from when on each acts.
+        # Recent commands, and the time at which each takes effect.
         self._sent: deque[tuple[float, FloatArray]] = deque([(-math.inf, _STILL)])
         self._now: float | None = None
-        # Monotonic time, position and heading of late.
+        # Recent (time, position, yaw) samples, monotonic clock.
         self._past: deque[tuple[float, FloatArray, float]] = deque(maxlen=_HISTORY)
 
     @property
     def state(self) -> RobotState:
-        """Pose, velocity and angular velocity in the map; it is tilted as it was told."""
+        """Pose, velocity and angular velocity in the map; tilted as commanded."""
         course, shares = self.course, self._acting()
         state = np.zeros(12)
         state[:3] = course.position

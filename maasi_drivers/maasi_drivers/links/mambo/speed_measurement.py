@@ -23,25 +23,25 @@ FloatArray = NDArray[np.float64]
 
 # Rest before each leg: the first part for the firmware to stop it [s].
 _REST, _STOPPING = 3.0, 1.8
-# Beyond the planned way by this share it has not done what it was told.
+# Beyond the planned way by this share it has not followed the command.
 _EXCESS = 1.5
 # Longest silence, and longest waits for take-off and connection [s].
 _SILENCE, _PATIENCE = 1.5, 15.0
 _LEAST_BATTERY = 0.2
 # What a fit may leave [m], and how uncertain the speed may be [1].
 _MOST_MISFIT, _MOST_DOUBT = 0.05, 0.35
-# Drag [1/s] and delay [s] that are looked for.
+# Drag [1/s] and delay [s] that are searched.
 _LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)
 
 
 class MeasurementError(RuntimeError):
-    """It cannot be measured; the text says why."""
+    """The measurement failed; the text has the cause."""
 
 
 @dataclass(frozen=True)
 class MeasuredSpeed:
     """
-    What a measuring flight says.
+    Result of a measuring flight.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Leg:
     origin : float
         Where it rested, forward of the take-off point [m].
     tilts : list of (float, float)
-        Time since `begin` from which on it was told [s], share of the largest tilt forward [1].
+        Time of the command since `begin` [s], share of the largest tilt forward [1].
     events : list of (float, float)
         Time since `begin` [s], place forward of the take-off point [m].
 
@@ -90,7 +90,7 @@ class MeasuringLink(Link, Protocol):
     """What the flight needs of a `MamboLink`."""
 
     def keep_alive(self) -> None:
-        """Note that the caller still looks after the drone."""
+        """Note that the caller is alive."""
 
 
 class MeasuringFlight:

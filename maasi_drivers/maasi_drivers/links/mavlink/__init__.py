@@ -2,5 +2,5 @@
 
 import os
 
-# pymavlink looks at it when it is imported, and speaks MAVLink 1 without it.
+# pymavlink reads it when it is imported, and speaks MAVLink 1 without it.
 os.environ['MAVLINK20'] = '1'

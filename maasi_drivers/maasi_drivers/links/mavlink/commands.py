@@ -10,7 +10,7 @@ from typing import Any
 
 from maasi_drivers.links.mavlink.protocol import mavlink
 
-# A command that is not answered is sent again after so long, so often [s, 1].
+# Period and number of tries of a command that is not answered [s, 1].
 _ANSWER_PATIENCE, _TRIES = 0.5, 5
 
 
@@ -67,7 +67,7 @@ class CommandQueue:
         self._commands.append(_Command(number, parameters, answer))
 
     def clear(self) -> None:
-        """Forget what was not answered."""
+        """Discard what was not answered."""
         self._commands.clear()
 
     def take_answer(self, message: Any, now: float) -> None:

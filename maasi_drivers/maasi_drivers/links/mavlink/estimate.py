@@ -1,4 +1,4 @@
-"""What an autopilot tells of its vehicle: where it is, batteries, fix, whether it stands."""
+"""The state of a vehicle by its autopilot: pose, batteries, fix, landed or not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from maasi_drivers.links.mavlink.settings import MavlinkSettings
 
 FloatArray = NDArray[np.float64]
 
-# A clock further back than this is that of an autopilot that was started again [ms].
+# A time since boot that is smaller by more than this means a restart [ms].
 _RESTART = 1000
 # Of GPS_RAW_INT: the least fix with a height.
 _FIX_3D = 3
@@ -28,12 +28,12 @@ _EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
 @dataclass(frozen=True)
 class Telemetry:
     """
-    Where a vehicle was, in the local frame of its autopilot turned to ENU.
+    Pose of a vehicle, in the local frame of its autopilot turned to ENU.
 
     Attributes
     ----------
     number : int
-        Of the message; one that says nothing new does not count.
+        Of the message; one without new data does not count.
     arrival : float
         On the steady clock [s].
     position, velocity : ndarray, shape (3,)
@@ -55,14 +55,14 @@ class Telemetry:
 
 class Estimate:
     """
-    The newest of what an autopilot tells.
+    The newest data of an autopilot.
 
     Parameters
     ----------
     settings : MavlinkSettings
         Of the link.
     on_restart : callable
-        Called when the autopilot was started again; what it told before is forgotten.
+        Called when the autopilot was restarted; earlier data is discarded.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Estimate:
     origin : ndarray, shape (3,)
         Of the settings, in the local frame, ENU [m].
     heard_at : float
-        When position or attitude were heard last, on the steady clock [s].
+        When position or attitude were received last, on the steady clock [s].
     landed : int
         MAV_LANDED_STATE.
     charge_reports : int
@@ -87,10 +87,10 @@ class Estimate:
         self.dropped: Counter[str] = Counter()
         self._number = -1
         self.charge_reports = 0
-        self.forget()
+        self.clear()
 
-    def forget(self) -> None:
-        """Forget all."""
+    def clear(self) -> None:
+        """Discard all data."""
         self.telemetry: Telemetry | None = None
         self.heard_at = -math.inf
         self.origin = np.zeros(3)
@@ -155,9 +155,9 @@ class Estimate:
             self._good = bool(flags & _EKF_POSITION) and not flags & _EKF_ASSUMED
 
     def _note_time(self, milliseconds: int, now: float) -> None:
-        """Look at the time since the autopilot was started; its clock never goes back else."""
+        """Detect a restart by the time since boot, which never decreases otherwise."""
         if self._boot_time is not None and milliseconds < self._boot_time - _RESTART:
-            self.forget()
+            self.clear()
             self._on_restart()
         else:
             self.heard_at = now
@@ -171,11 +171,11 @@ class Estimate:
         self._note_time(message.time_boot_ms, now)
         before = self._position
         if before is not None and message.time_boot_ms <= before[0]:
-            # Heard again.
+            # A duplicate.
             return
         self._position = (message.time_boot_ms, values)
         if before is not None and before[1] == values and armed:
-            # An estimate that moves at all never says the same twice: it is frozen.
+            # An estimate that moves at all never repeats to the bit: it is frozen.
             self.dropped['LOCAL_POSITION_NED that is frozen'] += 1
             return
         if self.telemetry is None and self._settings.origin == 'here':

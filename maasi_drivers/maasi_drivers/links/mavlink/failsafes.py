@@ -11,9 +11,9 @@ from maasi_drivers.links.mavlink.firmware import Firmware
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 
-# A parameter that is not answered is asked for again after so long, so often [s, 1].
+# Period and number of requests for a parameter that is not answered [s, 1].
 _ANSWER_TIMEOUT, _TRIES = 0.5, 5
-# A heartbeat with our system id counts for so long [s].
+# A heartbeat with our system id counts for this time [s].
 _FOREIGN_AGE = 5.0
 _WARNING, _INFO = 4, 6
 
@@ -22,7 +22,7 @@ class FailsafeCheck:
     """
     Whether a vehicle stops by itself when the driver is gone.
 
-    ArduPilot's ground station failsafe looks at the system id of heartbeats alone
+    ArduPilot's ground station failsafe checks the system id of heartbeats alone
     (`GCS::sysid_is_gcs`): any program with the driver's id keeps it from acting.
 
     Parameters
@@ -41,7 +41,7 @@ class FailsafeCheck:
     values : dict
         Parameters as read; None where the autopilot does not have one.
     complete : bool
-        Whether all were answered, or asked for in vain.
+        Whether all were answered, or requested in vain.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class FailsafeCheck:
         self._foreign_at = now
 
     def read(self, now: float) -> None:
-        """Ask for what is missing; call it again and again."""
+        """Request what is missing; call it repeatedly."""
         if self.complete or now - self._asked_at < _ANSWER_TIMEOUT:
             return
         self._asked_at = now

@@ -15,7 +15,7 @@ COPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
 @dataclass(frozen=True)
 class Failsafe:
     """
-    A parameter of an autopilot that says what it does when something fails.
+    A parameter of an autopilot that defines its reaction to a fault.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class Failsafe:
     off : tuple of float
         Values with which it does nothing that helps.
     guards_link : bool
-        Whether it acts when the driver is not heard any more.
+        Whether it acts on the loss of the driver's heartbeats.
 
     """
 

@@ -12,7 +12,7 @@ from maasi_drivers.links.mavlink.protocol import mavlink, mavutil
 from maasi_drivers.links.mavlink.settings import Ending, MavlinkSettings
 from maasi_drivers.links.mavlink.vehicle import Vehicle
 
-# Longest time until the next look at what is due [s].
+# Longest time until the next check of what is due [s].
 _PERIOD = 0.02
 # Between two tries to open a device that is not there [s].
 _RETRY = 1.0
@@ -29,7 +29,7 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
     Raises
     ------
     LinkError
-        If it cannot be opened; the text says why.
+        If it cannot be opened; the text has the cause.
 
     """
     if mavlink.WIRE_PROTOCOL_VERSION != '2.0':
@@ -54,7 +54,7 @@ class VehicleLink:
     """
     A vehicle on a wire.
 
-    A wire that cannot be opened is tried again and again; `failure` says why meanwhile.
+    A wire that cannot be opened is retried; `failure` has the cause meanwhile.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class VehicleLink:
 
     def finish(self, ending: Ending, patience: float) -> bool:
         """
-        Have it hold or land; return whether it said within `patience` seconds that it does.
+        Have it hold or land; return whether it confirms within `patience` seconds.
 
         Where nothing flies there is nothing to wait for.
         """
@@ -110,7 +110,7 @@ class VehicleLink:
         return False
 
     def close(self) -> None:
-        """Say nothing any more, and close the wire."""
+        """Stop sending, and close the wire."""
         self._end.set()
         self._thread.join(timeout=2.0)
         self._shut()
