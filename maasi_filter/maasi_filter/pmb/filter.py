@@ -33,7 +33,7 @@ from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import LEAST_SUPPORT, Component, merge
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, MISS, SCALE, TERMS, Scan, make_scan
-from maasi_filter.pmb.found import SAME_TARGET, nearest, same_estimate
+from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest, same_estimate
 from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
@@ -56,10 +56,6 @@ LEAST_CLUSTER_MASS = 0.1
 FOUND_RADIUS_DEVIATIONS = 2.0
 # Squared normalised distance up to which components may be one target.
 SAME_PLACE = 6.0
-# Expected detections of a found target: one narrow detection alone is not enough.
-LEAST_HITS = 1.5
-# Detections of one scan that two components of one target do not cause together.
-SEEN_BOTH = 1.5
 # Existence of what the filter of another robot has found.
 CERTAIN = 0.999
 
@@ -212,7 +208,8 @@ class PmbFilter:
             if marginals.caused[i].sum() > 0.5 and not item.foreign:
                 item.pose_error = member.pose_error
                 item.found_radius = self._found_radius(member)
-            if self._can_be_found(item, moved) and not self._is_known(i, marginals.caused):
+            sure = moved and can_be_found(item, self._numbers.pmb.found_probability)
+            if sure and not is_known(i, self.components, marginals.caused):
                 newly_found.append(self._find(item, member, time))
                 changed = True
             else:
@@ -277,34 +274,6 @@ class PmbFilter:
                     self._found_radius(member),
                 )
             )
-
-    def _can_be_found(self, item: Component, moved: bool) -> bool:
-        """Return whether a component surely exists, and it is known well enough where."""
-        return (
-            moved
-            and item.target is None
-            and item.existence > self._numbers.pmb.found_probability
-            and item.hits >= LEAST_HITS
-            and item.density.radius <= item.found_radius
-        )
-
-    def _is_known(self, i: int, caused: FloatArray) -> bool:
-        """Return whether a component may be a found target that this scan has not seen elsewhere.
-
-        A target causes one detection of a scan at most, so two components that together caused
-        more than one are two targets.
-        """
-        density = self.components[i].density
-        for f, other in enumerate(self.components):
-            if other.target is None:
-                continue
-            if caused[[i, f]].sum() > SEEN_BOTH:
-                continue
-            offset = density.mean - other.density.mean
-            total = density.covariance + other.density.covariance
-            if float(offset @ np.linalg.solve(total, offset)) < SAME_TARGET:
-                return True
-        return False
 
     def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
         """Mark a component as found."""
