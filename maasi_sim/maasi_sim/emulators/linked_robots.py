@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Protocol
 
 from maasi_filter.models.pose import Pose
+from maasi_sim.emulators.mambo.fake_mambo import free_address, free_port
+from maasi_sim.emulators.mambo.linked_mambo import LinkedMambo
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.world.external_robot import ExternalRobot
 from maasi_sim.world.noise_streams import noise_stream
@@ -40,9 +42,8 @@ def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
     if robot.external:
         return ExternalRobot(Pose.from_yaw(robot.start, robot.yaw))
     if robot.link == 'mambo_wifi':
-        from maasi_sim.emulators.mambo.linked_mambo import LinkedMambo
-
         return LinkedMambo(name, robot, seed)
+    # Deferred: pymavlink takes long to import.
     from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import vehicle_of
 
     return vehicle_of(robot, noise_stream(seed, name, purpose='autopilot'))
@@ -62,8 +63,6 @@ def with_addresses(scenario: Scenario) -> Scenario:
     for name, robot in scenario.robots.items():
         mambo = robot.mambo
         if robot.link == 'mambo_wifi' and mambo and not mambo.address.startswith(_LOOPBACK):
-            from maasi_sim.emulators.mambo.fake_mambo import free_address, free_port
-
             mambo = mambo.model_copy(update={'address': free_address(), 'port': free_port()})
             robots[name] = robot.model_copy(update={'mambo': mambo})
     return scenario.model_copy(update={'robots': robots})

@@ -34,6 +34,8 @@ from maasi_sim.emulators.mambo.firmware import (
 )
 from maasi_sim.emulators.mambo.frames import ACK, DATA, DATA_WITH_ACK, Frame, FrameError, frames
 from maasi_sim.emulators.mambo.tilt_body import TiltBodySettings
+from maasi_sim.scenario.layering import ScenarioError
+from maasi_sim.scenario.loading import robot_type
 
 #: Where pyparrot looks for the handshake; it cannot be changed there.
 HANDSHAKE_PORT = 44444
@@ -410,9 +412,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a fake Mambo until it is interrupted."""
-    from maasi_sim.scenario.loading import robot_type
-    from maasi_sim.scenario.schema import ScenarioError
-
     options = build_parser().parse_args(arguments)
     try:
         if not 0.0 <= options.charge <= 1.0:
