@@ -39,6 +39,7 @@ from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
 from maasi_filter.ros.silence import Silence
 from maasi_filter.ros.stamps import batch_id_limit
 from maasi_filter.search_filter import SearchFilter
+from maasi_filter.settings import unsuitable_lengths
 from maasi_filter.state_file import StateFileError
 from maasi_msgs.msg import (
     BatchMember,
@@ -135,6 +136,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self.filter = make_filter(
             settings.filter, settings.environment.array(), np.random.default_rng(settings.seed)
         )
+        warning = unsuitable_lengths(settings.filter, settings.environment.array())
+        if warning:
+            self.get_logger().warning(warning)
         self._pending: dict[int, PendingBatch] = {}
         self._early: dict[tuple[int, str], DetectionArray] = {}
         # Of each robot's last detections: batch, measurement, stamp [ns].

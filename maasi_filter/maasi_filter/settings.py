@@ -348,6 +348,29 @@ class FilterSettings(Settings):
         return self.model_copy(update=values)
 
 
+# A found target that takes the detections of half the environment leaves none to find.
+LARGEST_REMOVAL = 0.5
+
+
+def unsuitable_lengths(settings: FilterSettings, bounds: FloatArray) -> str:
+    """Return a warning if the lengths of a preset are not those of an environment, else ''.
+
+    Parameters
+    ----------
+    bounds : (d, 2) array
+        Of the environment, metres.
+    """
+    distance = settings.resolved().removal_distance
+    side = float((bounds[:, 1] - bounds[:, 0]).min())
+    if settings.method != 'ic_phd' or distance is None or distance <= LARGEST_REMOVAL * side:
+        return ''
+    return (
+        f'filter.removal_distance: T_z is {distance:g} m, in an environment of {side:g} m: targets '
+        f'will be missed, as the lengths of {settings.preset} are those of a larger one; give '
+        'found_radius, removal_distance and jitter_deviation, or method: pmb'
+    )
+
+
 @dataclass(frozen=True)
 class IcPhdNumbers:
     """The settings of the PHD filter, none of them left open; see `FilterSettings`."""

@@ -12,7 +12,7 @@ from maasi_filter import (
     NoiseSettings,
     SensorSettings,
 )
-from maasi_filter.settings import PRESETS
+from maasi_filter.settings import PRESETS, unsuitable_lengths
 
 
 @pytest.mark.parametrize(
@@ -87,3 +87,11 @@ def test_three_dimensional_noise_needs_an_elevation():
     assert noise.covariance(2).shape == (2, 2)
     with pytest.raises(ValueError, match='elevation'):
         noise.covariance(3)
+
+
+def test_lengths_that_do_not_suit_an_environment_are_warned_of():
+    floor, cube = np.array([[0.0, 2.7]] * 2), np.array([[0.0, 260.0]] * 3)
+    assert 'T_z is 5 m, in an environment of 2.7 m' in unsuitable_lengths(FilterSettings(), floor)
+    assert unsuitable_lengths(FilterSettings(), cube) == ''
+    assert unsuitable_lengths(FilterSettings(method='pmb'), floor) == ''
+    assert unsuitable_lengths(FilterSettings(removal_distance=0.05), floor) == ''

@@ -24,6 +24,7 @@ def scenario(kind, start=(0.0, 0.0, 0.0)):
     values = {
         'version': 1,
         'environment': {'bounds': [[-0.2, 1.5], [-0.2, 1.5]]},
+        'filter': {'method': 'pmb'},
         'targets': {'count': 4, 'separation': 0.2, 'margin': 0.1},
         'robots': {'rover': robot},
         'limits': {'time': 400.0},

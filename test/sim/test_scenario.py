@@ -130,7 +130,7 @@ WRONG = [
     ([('filter.particels', 5)], 'filter.particels', ["did you mean 'particles'"]),
     ([('robots.mambo.motion.sped', 1.0)], 'robots.mambo.motion.sped', ["did you mean 'speed'"]),
     ([('robots.mambo.sensor.noise.unit', 1)], 'robots.mambo.sensor.noise.unit', ['as, angles']),
-    ([('filter.preset', 'recomended')], 'filter.preset', ["did you mean 'recommended'", 'paper_0']),
+    ([('filter.preset', 'papr_000')], 'filter.preset', ["did you mean 'paper_000'", 'paper_0']),
     ([('planner.name', 'lawnmover')], 'planner.name', ["did you mean 'lawnmower'"]),
     ([('robots.mambo.type', 'manbo')], 'robots.mambo.type', ["did you mean 'mambo'", 'turtlebot3']),
     ([('robots.mambo.driver', 'driver')], 'robots.mambo.driver', ['mambo_driver']),

@@ -37,7 +37,7 @@ SCENARIO = {
             'candidates': {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
         }
     },
-    'filter': {'preset': 'recommended', 'particles': 500},
+    'filter': {'method': 'pmb'},
     'limits': {'time': 300.0},
 }
 # Little enough that the report is larger.

@@ -89,7 +89,7 @@ def scenario(path, **changes):
                 'candidates': {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
             }
         },
-        'filter': {'preset': 'recommended', 'particles': 2000},
+        'filter': {'method': 'pmb'},
         'limits': {'time': 60.0},
         **changes,
     }

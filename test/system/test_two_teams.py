@@ -34,7 +34,7 @@ def scenario(path, start, target, **limits):
                 'candidates': {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
             }
         },
-        'filter': {'preset': 'recommended', 'particles': 2000},
+        'filter': {'method': 'pmb'},
         'limits': {'time': 120.0, **limits},
     }
     path.write_text(yaml.safe_dump(content))

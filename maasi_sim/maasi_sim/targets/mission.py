@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
 
+from maasi_filter.settings import unsuitable_lengths
 from maasi_sim.emulators.linked_robots import with_addresses
 from maasi_sim.run.node_plan import NodePlan, RunSettings
 from maasi_sim.scenario.schema import Scenario
@@ -63,7 +64,8 @@ class TargetMission:
 
     def warning(self) -> str:
         """See `Mission.warning`."""
-        return never_seen(self.scenario)
+        lengths = unsuitable_lengths(self.scenario.filter, self.scenario.environment.array())
+        return '\n'.join(filter(None, (never_seen(self.scenario), lengths)))
 
     def observer(self, types: Typestore) -> TargetObserver:
         """See `Mission.observer`."""
