@@ -1,4 +1,4 @@
-"""The whole search in one process, without ROS: the very filter, planner and drivers' library."""
+"""The search in one process, without ROS, with the filter, planner and library of the nodes."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Found:
 
 @dataclass
 class SearchResult:
-    """What a search has come to.
+    """Result of a search.
 
     Attributes
     ----------
@@ -210,7 +210,7 @@ class _Group:
         robots: Mapping[str, _Robot],
         taken: Sequence[tuple[FloatArray, float]],
     ) -> tuple[dict[str, PresentRobot], Decision | None]:
-        """Decide where the robots go that are free, and send them there."""
+        """Plan for the free robots, and send them to their waypoints."""
         coordinator = self.coordinator
         present = {
             name: PresentRobot(

@@ -138,7 +138,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         return []
 
     def on_new_step(self) -> None:
-        """Note that the simulation has come to another step."""
+        """Handle a new step of the simulation."""
 
     # ---- life cycle --------------------------------------------------------------------------
 
@@ -232,7 +232,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._close_links()
 
     def destroy_node(self) -> None:
-        """Leave, once robots with a link of their own have been told to stop."""
+        """Shut down, once linked robots have been told to stop."""
         until = time.monotonic() + _FAREWELL
         while any(robot.obeys for robot in self._linked.values()) and time.monotonic() < until:
             time.sleep(_LOOK_PERIOD)
@@ -358,7 +358,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
                 self._endpoints[node, topic] = self._listeners(node, topic)
 
     def _watch(self) -> None:
-        """Say whom a step waits for when it takes long."""
+        """Warn about the nodes that a step waits for, when it takes long."""
         now = time.monotonic()
         if self._waiting and self.active and now - self._wall_step > _PATIENCE:
             waiting = ', '.join(sorted(self._waiting))
@@ -379,7 +379,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             self._waiting.add(f'{robot}/cmd_vel')
 
     def _begin_step(self) -> None:
-        """Publish the step that the simulation has come to."""
+        """Publish the current step of the simulation."""
         self.step = self._first + self.simulation.step
         self._stamp = stamp_of_step(self.step, self._length)
         self._wall_step = time.monotonic()
@@ -504,12 +504,12 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._begin_step()
 
     def _step_at(self, time_: int) -> int:
-        """Return the last step that has come at a time [ns]."""
+        """Return the last step at or before a time [ns]."""
         step = math.floor(time_ * 1e-9 / self._length)
         return step + 1 if stamp_of_step(step + 1, self._length) <= time_ else step
 
     def _on_clock(self, message: Clock) -> None:
-        """Follow a clock; time that comes again, as its publisher was started anew, stands."""
+        """Follow a clock; the simulation pauses if a restarted publisher repeats time."""
         self._followed = stamp_from_ros(message.clock)
         while self.active and 0 <= self.step < self._step_at(self._followed):
             self._advance_freely()

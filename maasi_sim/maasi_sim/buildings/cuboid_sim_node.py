@@ -18,7 +18,7 @@ from maasi_sim.buildings.simulation import CuboidSimulation
 from maasi_sim.scenario.layering import Key
 from maasi_sim.sim_node import SimNode
 
-# Share of a step after which the link passes on what it has, though some said nothing.
+# Share of a step after which the link delivers, even if some robots sent nothing.
 _PATIENCE = 0.1
 
 
@@ -92,13 +92,13 @@ class CuboidSimNode(SimNode):
             )
             return
         self._sent[name] = message
-        # One that was started again hears what the others said at this step.
+        # A restarted robot receives the messages of this step again.
         self._served.discard(name)
         if all(robot in self._sent for robot in self.simulation.present):
             self._pass_on()
 
     def _pass_on(self) -> None:
-        """Give each robot that has sent what it hears."""
+        """Deliver to each robot that has sent the messages in its range."""
         self._link_timer.cancel()
         senders = sorted(name for name, message in self._sent.items() if not message.silent)
         heard = self.simulation.heard_by(senders)

@@ -102,7 +102,7 @@ class MissionRecord:
 def within_range(
     positions: Mapping[str, FloatArray], communication_range: float
 ) -> dict[str, list[str]]:
-    """Return whom each robot hears, in name order: those at most C_R [m] away (III-B)."""
+    """Return the robots in range of each robot, in name order: at most C_R [m] away (III-B)."""
     names = sorted(positions)
     return {
         name: [
@@ -252,7 +252,7 @@ class CuboidMission:
         return times
 
     def heard(self, broadcasts: dict[str, Broadcast]) -> dict[str, list[Broadcast]]:
-        """Return what each robot hears; one that recharges hears nothing."""
+        """Return the messages that each robot receives; none while it recharges."""
         places = {name: message.position for name, message in broadcasts.items()}
         reach = within_range(places, self.settings.communication_range)
         return {name: [broadcasts[other] for other in reach.get(name, [])] for name in self.agents}

@@ -12,7 +12,7 @@ from maasi_planner.buildings import Mission
 
 FloatArray = NDArray[np.float64]
 
-# Told apart also by those who do not see all colours (Okabe and Ito).
+# Palette for colour-blind readers (Okabe and Ito).
 COLOURS = ('#CC79A7', '#D62728', '#009E73', '#0072B2', '#E69F00', '#56B4E9', '#8C564B')
 _OBJECT, _OBSTACLE, _OPEN, _VISITED = '#B9B9C9', '#8A8478', '#D55E00', '#56B4E9'
 _SIDES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))

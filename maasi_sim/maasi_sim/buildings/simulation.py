@@ -172,7 +172,7 @@ class CuboidSimulation:
         return False
 
     def heard_by(self, senders: list[str]) -> dict[str, list[str]]:
-        """Return which of the senders each of them hears: those within C_R (III-B)."""
+        """Return the senders within C_R of each sender (III-B)."""
         places = {name: self.robots[name].state.pose.position for name in senders}
         return within_range(places, self.scenario.planner.communication_range)
 

@@ -20,7 +20,7 @@ class LinkedRobot(Leader, Protocol):
 
     @property
     def obeys(self) -> bool:
-        """Whether it moves as its driver says."""
+        """Whether it executes the commands of its driver."""
 
     def cut(self, cut: bool = True) -> None:
         """Cut the link, or mend it."""

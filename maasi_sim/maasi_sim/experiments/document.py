@@ -201,7 +201,7 @@ def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) ->
             results[name] = found
     for name, found in results.items():
         image = file.parent / 'reproduction' / f'{name}.png'
-        # One with all cases says more than one with some of them.
+        # Keep a figure of all cases rather than one of some.
         if len(found.names()) == len(found.cases) or not image.exists():
             write_file(image, picture(found, _PICTURE_DPI))
     earlier = earlier_sections(file.read_text()) if file.exists() else {}

@@ -175,7 +175,7 @@ def markdown(results: Results) -> str:
         if row.note:
             paper += f' ({row.note})'
         name = row.case if row.preset == 'paper' else f'{row.case} (recommended)'
-        # Where no run got there, the mean restricted to what was tried says nothing else.
+        # If no run finished, the restricted mean is just the limit.
         ours = shown(row.ours) if row.finished else f'more than {number(row.ours.mean)}'
         if row.quantity.kind == 'restricted' and row.runs > 2 and math.isfinite(row.median):
             ours += f' (median {number(row.median)})'

@@ -1,4 +1,4 @@
-"""YAML files in layers: read, merged and checked, with errors that say file, line and key."""
+"""YAML files in layers: read, merged and checked, with errors that name file, line and key."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Model = TypeVar('Model', bound=BaseModel)
 
 
 class ScenarioError(ValueError):
-    """Wrong input: says file, key, what was read and what is allowed."""
+    """Invalid input: names file, key, value and what is allowed."""
 
 
 # Compiled, where PyYAML was built so: writing takes a third of a second without it.
@@ -70,7 +70,7 @@ class Layer:
         return ''
 
     def part(self, key: Key) -> Layer:
-        """Return what stands under a key, an empty mapping if there is nothing."""
+        """Return the subtree of a key, an empty mapping if there is none."""
         data = self.data
         for step in key:
             data = data.get(step) if isinstance(data, dict) else None

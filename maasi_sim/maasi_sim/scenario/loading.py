@@ -136,7 +136,7 @@ def check_scenario(layer: Layer) -> Scenario:
 
 
 def _lay_types_under(layer: Layer, path: Path) -> None:
-    """Put the layers of each robot's type under what the scenario says of it."""
+    """Merge each robot's settings over the layers of its type."""
     robots = layer.data.get('robots')
     if isinstance(robots, dict):
         for name in robots:

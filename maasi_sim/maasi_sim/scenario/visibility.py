@@ -20,13 +20,13 @@ def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> 
 
 
 def never_seen(scenario: Scenario) -> str:
-    """Return a warning that says which parts can never be seen from the candidates, or ''."""
+    """Return a warning about parts that can never be seen from the candidates, or ''."""
     if any(robot.candidates.ring is not None for robot in scenario.robots.values()):
         # Waypoints that move with the robot lead anywhere.
         return ''
     bounds = scenario.environment.array()
     margin = scenario.targets.margin if scenario.targets.positions is None else 0.0
-    # What is seen from the waypoints alone needs no look at the ways between them.
+    # What is seen from the waypoints need not be checked on the paths between them.
     standing = {name: _viewer(scenario, name, _FAR) for name in scenario.names()}
     steady = {name: viewer for name, viewer in standing.items() if viewer.yaw is not None}
     if steady and not unseen_parts(bounds, steady, margin):

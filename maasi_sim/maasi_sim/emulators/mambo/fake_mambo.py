@@ -37,9 +37,9 @@ from maasi_sim.emulators.mambo.tilt_body import TiltBodySettings
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import robot_type
 
-#: Where pyparrot looks for the handshake; it cannot be changed there.
+#: Port of the handshake, fixed in pyparrot.
 HANDSHAKE_PORT = 44444
-#: Where the drone hears commands, as it says in the handshake.
+#: Port of commands, announced in the handshake.
 COMMAND_PORT = 6000
 
 PING, PONG, COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 0, 1, 10, 11, 12
@@ -79,7 +79,7 @@ def free_address() -> str:
 
 
 def free_port() -> int:
-    """Return a UDP port that nobody has, on which a driver can hear its drone."""
+    """Return a free UDP port, on which a driver can receive from its drone."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as test:
         test.bind(('0.0.0.0', 0))
         return int(test.getsockname()[1])
@@ -119,7 +119,7 @@ class FakeMambo:
         self.position_sent = 'true'
         self.cut_up = self.cut_down = False
         self.refused = 0
-        #: What was heard from the controller: (project, class, id) to how often.
+        #: Number of received commands by (project, class, id).
         self.heard: dict[tuple[int, int, int], int] = {}
         self._lock = threading.RLock()
         self._closing = threading.Event()
@@ -218,12 +218,12 @@ class FakeMambo:
             firmware = self.firmware
             return firmware.state, firmware.flying_state, firmware.charge.charge
 
-    # ---- what it says ------------------------------------------------------------------------
+    # ---- sending -----------------------------------------------------------------------------
 
     def _transmit(self, frame: Frame) -> None:
         if self._controller is None or self.cut_down:
             return
-        # A controller that is gone is nothing to the drone.
+        # A lost controller is not an error for the drone.
         with contextlib.suppress(OSError):
             self._air.sendto(frame.encode(), self._controller)
 
@@ -281,7 +281,7 @@ class FakeMambo:
         # Its stamp is the time since the one before, unlike that of the others.
         self._event((2, 18, 0), struct.pack('<ffhhh', x, y, round(z), psi, round(1000.0 * elapsed)))
 
-    # ---- what it hears -----------------------------------------------------------------------
+    # ---- receiving ---------------------------------------------------------------------------
 
     def _answer_door(self) -> None:
         while not self._closing.is_set():

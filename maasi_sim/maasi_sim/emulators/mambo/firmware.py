@@ -184,7 +184,7 @@ class MamboFirmware:
         self._body = TiltBody(self.settings.body, self.start)
         self._odometry = OdometryModel(self.odometry, self.start, self.seed, self.name)
         self._readings = 0
-        # Piloting commands, and when they begin to act.
+        # Piloting commands, and the time at which they take effect.
         self._piloted: deque[tuple[float, Piloting]] = deque([(-math.inf, Piloting())])
         self._heard_at = -math.inf
         self._percent = self.percent
@@ -204,7 +204,7 @@ class MamboFirmware:
         """Above the floor [m]."""
         return float(self._body.position[2]) - self.floor
 
-    # ---- what a controller says --------------------------------------------------------------
+    # ---- commands ----------------------------------------------------------------------------
 
     def hear(self) -> None:
         """Note that something came from the controller."""

@@ -14,7 +14,7 @@ from maasi_sim.emulators.mambo.firmware import (
 )
 from maasi_sim.scenario.schema import RobotSettings
 
-# A Mambo hovers lower than where it starts to search, and climbs from there [1].
+# Hover height after take-off relative to the height at which the search starts [1].
 _TAKE_OFF_SHARE = 0.8
 
 

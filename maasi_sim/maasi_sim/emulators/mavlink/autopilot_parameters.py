@@ -9,7 +9,7 @@ FIRMWARES: dict[str, Firmware] = {
     'ardusub': ARDUSUB,
     'px4': PX4_COPTER,
 }
-# As they come, but set up as docs/robots_mavlink.md asks: a failsafe for the link, and the system
+# Defaults, but set up as docs/robots_mavlink.md asks: a failsafe for the link, and the system
 # id of the driver as that of the ground station.
 PARAMETERS: dict[str, dict[str, float]] = {
     'arducopter': {
@@ -37,5 +37,5 @@ PARAMETERS: dict[str, dict[str, float]] = {
         'GF_ACTION': 2,
     },
 }
-# PX4's parameters that are whole numbers, whose bytes go in the place of a float.
+# Integer parameters of PX4, whose bytes are sent in place of a float.
 WHOLE_NUMBERS = frozenset({'COM_OBL_RC_ACT', 'NAV_DLL_ACT', 'COM_LOW_BAT_ACT', 'GF_ACTION'})

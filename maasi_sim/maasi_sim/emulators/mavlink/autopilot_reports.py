@@ -23,7 +23,7 @@ _EKF_START = 1 | 128
 
 
 class AutopilotState(Protocol):
-    """What the messages say of an autopilot."""
+    """State of an autopilot that the messages report."""
 
     now: float
     settings: AutopilotSettings
@@ -78,7 +78,7 @@ class AutopilotReports:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew with the messages that are sent unasked."""
+        """Reset to the messages that are sent by default."""
         self._last: dict[str, float] = {}
         self._periods = {
             'HEARTBEAT': _HEARTBEAT_PERIOD,
@@ -139,7 +139,7 @@ class AutopilotReports:
         self._sender.heartbeat_send(kind, pilot.firmware.autopilot, flags, pilot.mode, state)
 
     def _send_position(self) -> None:
-        # ArduPilot sends none before the estimate is there.
+        # ArduPilot sends no position before it has an estimate.
         if self._pilot.ready:
             values = self.frozen or self._position()
             self._sender.local_position_ned_send(self._milliseconds, *values)

@@ -12,7 +12,7 @@ FirmwareName = Literal['arducopter', 'ardusub', 'px4']
 
 
 class AutopilotSettings(Settings):
-    """What a fake autopilot is like, or that there is another one: `external`."""
+    """Settings of a fake autopilot; `external`: another program is the autopilot."""
 
     external: bool = Field(
         default=False,

@@ -112,7 +112,7 @@ class FakeAutopilot:
         self._sender = sender
         self.now = 0.0
         self._setpoint: _Setpoint | None = None
-        # Since when setpoints come without a pause, and the last of them.
+        # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
         self._rising_to: float | None = None
         # True height at arming, and how far off the height is that it believes [m].
@@ -125,7 +125,7 @@ class FakeAutopilot:
         self._reported_ready = False
         self.reports = AutopilotReports(self, sender, generator)
 
-    # ---- for those who play with it ----------------------------------------------------------
+    # ---- for tests and demonstrations --------------------------------------------------------
 
     @property
     def ready(self) -> bool:
@@ -147,7 +147,7 @@ class FakeAutopilot:
         self._hold()
 
     def freeze(self) -> None:
-        """Say the same position from now on, with new stamps."""
+        """Send the same position from now on, with new stamps."""
         self.reports.freeze()
 
     def lose_gnss(self) -> None:
@@ -155,7 +155,7 @@ class FakeAutopilot:
         self._gnss_lost_at = self.now
 
     def restart(self) -> None:
-        """Start again, as after a brown-out: disarmed, with a clock and message rates anew."""
+        """Restart, as after a brown-out: disarmed, with clock and message rates reset."""
         self.armed = False
         self.now = 0.0
         self._hold()
@@ -165,7 +165,7 @@ class FakeAutopilot:
     # ---- the clock ---------------------------------------------------------------------------
 
     def advance(self, dt: float) -> None:
-        """Go on for `dt` seconds: move, look after failsafes, say what is due."""
+        """Advance by `dt` seconds: move, check failsafes, send due messages."""
         self.now += dt
         if self.crashed:
             self.body.drift(dt)
@@ -297,7 +297,7 @@ class FakeAutopilot:
         """Return the position that it believes, ENU [m]."""
         return self.body.position + np.array([0.0, 0.0, self._height_error])
 
-    # ---- what it hears -----------------------------------------------------------------------
+    # ---- receiving ---------------------------------------------------------------------------
 
     def handle(self, message: Any) -> None:
         """Take a message."""

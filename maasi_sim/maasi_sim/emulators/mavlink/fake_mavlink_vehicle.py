@@ -1,4 +1,4 @@
-"""A fake vehicle on a real wire, in real time: what a driver talks to where there is none."""
+"""A simulated MAVLink vehicle on a real link, in real time."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ class FakeVehicle:
 
     @property
     def obeys(self) -> bool:
-        """Whether it is armed, and goes where the driver says."""
+        """Whether it is armed and executes the commands of its driver."""
         with self._lock:
             autopilot = self.autopilot
             return autopilot.armed and autopilot.mode == autopilot.firmware.external
 
     def cut(self, cut: bool = True) -> None:
-        """Cut the link, so that nothing goes out or comes in, or mend it."""
+        """Cut the link in both directions, or restore it."""
         self._gate.shut = cut
 
     @property
