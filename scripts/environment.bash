@@ -61,18 +61,20 @@ maasi_make_venv() {
   echo "$key" > "$maasi_venv/.maasi_key"
 }
 
-# What only the tests and benchmarks need.
-maasi_install_tests() {
-  local key log="$maasi_workspace/setup_tests.log"
-  key="$(maasi_hash < "$maasi_root/requirements-test.txt")"
-  [ "$(cat "$maasi_venv/.maasi_tests_key" 2> /dev/null)" != "$key" ] || return 0
-  echo "Setting up: what the tests need ..." >&2
+# What only the tests and benchmarks (tests), or the API reference (docs) need.
+maasi_install() {
+  local what="$1" requirements="$maasi_root/requirements-test.txt" key
+  local log="$maasi_workspace/setup_$what.log"
+  [ "$what" = tests ] || requirements="$maasi_root/requirements-$what.txt"
+  key="$(maasi_hash < "$requirements")"
+  [ "$(cat "$maasi_venv/.maasi_${what}_key" 2> /dev/null)" != "$key" ] || return 0
+  echo "Setting up: what the $what need ..." >&2
   if ! "$maasi_venv/bin/python" -m pip install --disable-pip-version-check \
-      -r "$maasi_root/requirements-test.txt" -c "$maasi_root/requirements.txt" > "$log" 2>&1; then
+      -r "$requirements" -c "$maasi_root/requirements.txt" > "$log" 2>&1; then
     tail -n 15 "$log" >&2
-    maasi_fail "installing the test requirements failed; the whole log: $log"
+    maasi_fail "installing the $what requirements failed; the whole log: $log"
   fi
-  echo "$key" > "$maasi_venv/.maasi_tests_key"
+  echo "$key" > "$maasi_venv/.maasi_${what}_key"
 }
 
 # The wheels have no tf2_msgs; one that is installed is used as it is.
@@ -122,7 +124,7 @@ maasi_compile() {
   key="$(cd "$maasi_root" && grep -rl --include='*.py' njit maasi_*/maasi_* | sort \
     | xargs cat | maasi_hash)"
   export NUMBA_CACHE_DIR="$maasi_workspace/numba/${key:0:16}"
-  [ ! -e "$NUMBA_CACHE_DIR/complete" ] || return 0
+  [ ! -e "$NUMBA_CACHE_DIR/complete" ] && [ -z "${NUMBA_DISABLE_JIT:-}" ] || return 0
   echo "Compiling (a few minutes, once) ..." >&2
   if ! python "$maasi_root/scripts/compile_kernels.py" > "$maasi_workspace/compile.log" 2>&1; then
     tail -n 15 "$maasi_workspace/compile.log" >&2

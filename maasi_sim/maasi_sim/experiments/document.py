@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from maasi_sim.experiments.results import RunFolder, write_file
 from maasi_sim.experiments.tables import markdown
 
 _PICTURE_DPI = 65
+_COLUMNS = 118
 
 _PAPERS = {
     '000': 'Yousuf, Herzal, Lendek, Buşoniu: Multi-agent active multi-target search with '
@@ -163,11 +165,29 @@ def page(results: dict[str, Results], earlier: dict[str, Earlier] | None = None)
             paper = experiment.paper
             parts.append(f'## Paper {paper}\n\n{_PAPERS.get(paper, "")}\n')
         parts.append(
-            f'### {name}\n\n{experiment.title}. Rests on {section.rests}.{section.duration}\n'
+            f'### {name}\n\n{experiment.title}.\nRests on {section.rests}.{section.duration}\n'
         )
         parts.append(f'![{experiment.title}](reproduction/{name}.png)\n')
         parts.append(described(experiment, section.tables))
     return '\n'.join(parts)
+
+
+def wrapped(text: str) -> str:
+    """Return Markdown with long lines of paragraphs and lists wrapped; tables stay."""
+    lines = []
+    for line in text.split('\n'):
+        if len(line) <= _COLUMNS or line.startswith(('|', '#', '!', '    ')):
+            lines.append(line)
+            continue
+        indent = '  ' if line.startswith('- ') else ''
+        lines += textwrap.wrap(
+            line,
+            _COLUMNS,
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    return '\n'.join(lines)
 
 
 def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) -> list[str]:
@@ -205,5 +225,5 @@ def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) ->
         if len(found.names()) == len(found.cases) or not image.exists():
             write_file(image, picture(found, _PICTURE_DPI))
     earlier = earlier_sections(file.read_text()) if file.exists() else {}
-    write_file(file, page(results, earlier))
+    write_file(file, wrapped(page(results, earlier)))
     return list(results)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 EARLIER = 'from an earlier campaign'
 EARLIER_ROW = '(earlier)'
 _SECTION = re.compile(r'^### (\S+)$', re.MULTILINE)
-_RESTS = re.compile(r'Rests on (.+?)\.( A run takes about .+?\.)?$', re.MULTILINE)
+_RESTS = re.compile(r'Rests on (.+?)\.( A run takes about .+?\.)?$')
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def earlier_sections(text: str) -> dict[str, Earlier]:
     parts = _SECTION.split(text)
     found = {}
     for name, body in zip(parts[1::2], parts[2::2]):
-        rests = _RESTS.search(body)
+        rests = _RESTS.search(' '.join(body.strip().partition('\n\n')[0].split()))
         lines = body[: body.find('\n## ')] if '\n## ' in body else body
         tables = _tables(lines)
         if rests is None or not tables:

@@ -105,7 +105,7 @@ class TeamLog:
         return before != self.robots
 
     def trajectory(self, states: Iterable[Any]) -> FloatArray:
-        """Return time [s], x, y, z [m] of the `AgentState`s of a robot, (n, 4)."""
+        """Return time [s], x, y, z [m] of a robot's `AgentState` messages, (n, 4)."""
         places = [(self.time(state.header.stamp), state.pose.pose.position) for state in states]
         return rows([(time, place.x, place.y, place.z) for time, place in places], 4)
 
