@@ -47,9 +47,7 @@ def add_settings(
     lines.append('')
 
 
-def plain_words(
-    app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]
-) -> None:
+def plain_words(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
     """Keep types in words from becoming links, and |x| from becoming a substitution."""
     for number, line in enumerate(lines):
         field = re.fullmatch(r'(\s*:(?:type|vartype|rtype)[^:]*:) ([^`]+)', line)

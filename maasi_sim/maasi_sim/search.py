@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_drivers.agent.odometry import MapOdometry, StampedPose
+from maasi_drivers.agent.sensor_reading import SensorReading
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_drivers.vision.marker_reading import read_markers
@@ -165,18 +166,11 @@ class _Robot:
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
         """Return what the robot sees at a step."""
         if self.detector is None:
-            values = self.body.ranges(step)
-            return AgentMeasurement(
-                self.name,
-                self.pose.pose,
-                self.sensor,
-                values,
-                None,
-                index,
-                self.pose.covariance[:3, :3],
-            )
-        image = self.body.image(step, time)
-        reading = read_markers(image, self.pose, self.detector, self.sensor)
+            ranges = self.body.ranges(step)
+            reading = SensorReading.of_ranges(ranges, self.sensor, self.pose.pose)
+        else:
+            image = self.body.image(step, time)
+            reading = read_markers(image, self.pose, self.detector, self.sensor)
         return AgentMeasurement(
             self.name,
             self.pose.pose,

@@ -56,9 +56,7 @@ class RangingInput(SensorInput[FloatArray]):
     def detect(self, data: FloatArray, pose: StampedPose) -> SensorReading:
         """Return the measurements of one sweep, relative to the robot's position in the map."""
         sensor = self.driver.sensor
-        if self._mount is not None:
-            reading = SensorReading(*self._mount.measurements(data, pose), {})
-        else:
-            positions = sensor.measurement.inverse(data, pose.pose)
-            reading = SensorReading(data, None, positions, {})
+        if self._mount is None:
+            return SensorReading.of_ranges(data, sensor, pose.pose)
+        reading = SensorReading(*self._mount.measurements(data, pose), {})
         return reading.in_field_of_view(sensor, pose.pose)

@@ -36,6 +36,24 @@ class SensorReading:
     positions: FloatArray
     dropped: dict[str, int]
 
+    @classmethod
+    def of_ranges(cls, values: FloatArray, sensor: Sensor, pose: Pose) -> SensorReading:
+        """
+        Return the detections of a ranging sensor that are in its field of view.
+
+        Parameters
+        ----------
+        values : ndarray, shape (m, d)
+            Range [m], bearing and, in 3D, elevation [rad], from the robot on the map's axes.
+        sensor : Sensor
+            Of the robot.
+        pose : Pose
+            Of the robot in the map.
+
+        """
+        positions = sensor.measurement.inverse(values, pose)
+        return cls(values, None, positions, {}).in_field_of_view(sensor, pose)
+
     def in_field_of_view(self, sensor: Sensor, pose: Pose) -> SensorReading:
         """
         Return the detections with pi(x, q) > 0 and within the maximum range; the rest is counted.
