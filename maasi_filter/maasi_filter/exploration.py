@@ -48,9 +48,7 @@ def interpolate(
 def interpolate_at(
     values: FloatArray, lower: FloatArray, step: FloatArray, x: float, y: float, z: float
 ) -> float:
-    """Return the same as `interpolate` for a position given by its coordinates; z plays no part
-    in 2D.
-    """
+    """Return the same as `interpolate` for a position x, y, z; z plays no part in 2D."""
     u = min(max((x - lower[0]) / step[0], 0.0), values.shape[0] - 1.0)
     i = min(np.int64(u), values.shape[0] - 2)
     u -= i
@@ -219,7 +217,7 @@ class Exploration:
 
     @property
     def values(self) -> FloatArray:
-        """e at the nodes; a view, write through `values[...] =`."""
+        """Value of e at the nodes; a view, write through `values[...] =`."""
         return self._values if self.dimension == 3 else self._values[:, :, 0]
 
     def axes(self) -> list[FloatArray]:

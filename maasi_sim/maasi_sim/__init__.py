@@ -1,0 +1,1 @@
+"""Simulation, runs of scenarios, and the experiments of the papers."""

@@ -366,7 +366,7 @@ def _surroundings(image, components, blob, gains):
 @njit(cache=True)
 def _weigh(image, components, blob, gains, background, contrast, mean):
     """
-    Sums over the blob and the ring of one pixel around it, other blobs left out.
+    Return sums over the blob and the ring of one pixel around it, other blobs left out.
 
     Returns the sum of the weights, their moments about the box's corner, and the pixels' second
     moments about `mean`.

@@ -122,17 +122,20 @@ class RangeBearing(MeasurementModel):
     names = ('range', 'bearing')
 
     def measure(self, positions: ArrayLike, pose: Pose) -> FloatArray:
+        """Return range and bearing of positions, (n, 2)."""
         offset = self._array('positions', positions) - pose.position[:2]
         return np.stack(
             [np.hypot(offset[:, 0], offset[:, 1]), np.arctan2(offset[:, 1], offset[:, 0])], axis=1
         )
 
     def inverse(self, z: ArrayLike, pose: Pose) -> FloatArray:
+        """Return where measurements point, (n, 2)."""
         values = self._array('z', z)
         direction = np.stack([np.cos(values[:, 1]), np.sin(values[:, 1])], axis=1)
         return np.asarray(pose.position[:2] + values[:, :1] * direction)
 
     def jacobian(self, positions: ArrayLike, pose: Pose) -> FloatArray:
+        """Return dg/dx at positions, (n, 2, 2)."""
         offset = self._array('positions', positions) - pose.position[:2]
         distance = np.hypot(offset[:, 0], offset[:, 1])
         safe = np.where(distance > 0.0, distance, np.inf)
@@ -150,6 +153,7 @@ class RangeBearingElevation(MeasurementModel):
     names = ('range', 'bearing', 'elevation')
 
     def measure(self, positions: ArrayLike, pose: Pose) -> FloatArray:
+        """Return range, bearing and elevation of positions, (n, 3)."""
         offset = self._array('positions', positions) - pose.position
         level = np.hypot(offset[:, 0], offset[:, 1])
         # atan2 is the arcsin of (9), and keeps its digits next to the vertical.
@@ -163,6 +167,7 @@ class RangeBearingElevation(MeasurementModel):
         )
 
     def inverse(self, z: ArrayLike, pose: Pose) -> FloatArray:
+        """Return where measurements point, (n, 3)."""
         values = self._array('z', z)
         level = np.cos(values[:, 2])
         direction = np.stack(
@@ -172,6 +177,7 @@ class RangeBearingElevation(MeasurementModel):
         return np.asarray(pose.position + values[:, :1] * direction)
 
     def jacobian(self, positions: ArrayLike, pose: Pose) -> FloatArray:
+        """Return dg/dx at positions, (n, 3, 3)."""
         offset = self._array('positions', positions) - pose.position
         level = np.hypot(offset[:, 0], offset[:, 1])
         distance = np.hypot(level, offset[:, 2])

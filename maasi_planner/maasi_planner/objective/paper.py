@@ -33,6 +33,7 @@ def centre_sum(
     parameters: FloatArray,
     out: FloatArray,
 ) -> None:
+    """Write T of each candidate into `out`: the sum of pi at cluster centres (000, (19), (31))."""
     together = is_vectorised(kind)
     room = np.empty((ROOM_ROWS, places.shape[1] * centres.shape[0]))
     for w in range(places.shape[0]):

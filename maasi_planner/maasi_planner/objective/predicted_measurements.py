@@ -200,12 +200,14 @@ def starts_of(counts: IntArray) -> IntArray:
 
 
 def joined(parts: list, dtype: type) -> NDArray:
+    """Return arrays as one, of `dtype`."""
     if len(parts) == 1:
         return np.ascontiguousarray(parts[0], dtype)
     return np.concatenate(parts).astype(dtype, copy=False) if parts else np.zeros(0, dtype)
 
 
 def stacked(parts: list, width: int) -> FloatArray:
+    """Return the rows of arrays as one array, (0, width) without any."""
     if len(parts) == 1:
         return np.ascontiguousarray(parts[0])
     return np.concatenate(parts) if parts else np.zeros((0, width))

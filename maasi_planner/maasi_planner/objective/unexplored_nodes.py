@@ -26,8 +26,9 @@ ROOM_ROWS = 4
 
 @njit(cache=True)
 def is_vectorised(kind: int) -> bool:
-    """Return whether pi does not depend on the heading and is nowhere 0, so that many at a time
-    are quicker than one by one with an early end.
+    """Return whether many pi at a time are quicker than one by one with an early end.
+
+    That is where pi does not depend on the heading and is nowhere 0.
     """
     return kind != BOX
 
@@ -432,6 +433,7 @@ def miss_at_nodes(
 
 @njit(cache=True)
 def block_sums(values: FloatArray, volumes: FloatArray, stride: int, out: FloatArray) -> None:
+    """Add values times volumes, summed over blocks of `stride` nodes on each axis, to `out`."""
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             for k in range(values.shape[2]):

@@ -36,6 +36,7 @@ _STEPS_TIMED = 8
 
 
 def mission_settings(settings: dict[str, Any]) -> CuboidSettings:
+    """Return the settings of the planner of a case."""
     return CuboidSettings.model_validate({'time_limit': _FOR_EVER, **settings['mission']})
 
 

@@ -90,7 +90,7 @@ class Workers(Protocol):
 
 
 class SerialExecutor:
-    """This process."""
+    """Runs in this process."""
 
     number = 1
 

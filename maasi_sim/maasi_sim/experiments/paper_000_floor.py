@@ -81,6 +81,7 @@ def _fig9_cases(small: bool) -> list[Case]:
 
 
 def fig9() -> Experiment:
+    """Figure 9 of 000."""
     styles = {'lawnmower': 'lawnmower', 'AS': 'as', 'ASI': 'asi', 'ASI, recommended': 'recommended'}
 
     def draw(figure: Figure, results: Results) -> None:
@@ -205,6 +206,7 @@ def _fig13_cases(small: bool) -> list[Case]:
 
 
 def fig13() -> Experiment:
+    """Figure 13 of 000."""
     styles = {'MAAS': 'as', 'MAASI': 'asi', 'MAASI, recommended': 'recommended'}
 
     def draw(figure: Figure, results: Results) -> None:
@@ -286,6 +288,7 @@ def _fig15_cases(small: bool) -> list[Case]:
 
 
 def fig15() -> Experiment:
+    """Figure 15 of 000."""
     styles = {
         'lawnmower': 'lawnmower',
         'MAAS': 'as',

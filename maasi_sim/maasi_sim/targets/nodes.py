@@ -34,7 +34,6 @@ def _team_plans(
     namespace: str, names: list[str], scenario: Scenario, common: dict[str, Any]
 ) -> list[NodePlan]:
     """Return filter and planner of robots that share them."""
-
     others = [name for name in scenario.names() if name not in names]
     filter_settings = FilterNodeSettings.model_validate(
         {
@@ -70,7 +69,6 @@ def _robot_plans(
     name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
 ) -> list[NodePlan]:
     """Return a robot's driver, and its guard if it has one."""
-
     settings = DriverSettings.model_validate(
         {
             **common,

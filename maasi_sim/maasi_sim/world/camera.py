@@ -37,7 +37,7 @@ _NOISE_TABLE_SIZE = 1 << 16
 
 
 def _noise_table() -> NDArray[np.float32]:
-    """Normal numbers that every camera's noise is read from, at offsets drawn for each row."""
+    """Return normal numbers for the noise of all cameras, read at offsets drawn for each row."""
     generator = np.random.Generator(np.random.PCG64(20240601))
     return generator.standard_normal(_NOISE_TABLE_SIZE, dtype=np.float32)
 
