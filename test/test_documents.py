@@ -86,6 +86,11 @@ def dead_paths(text: str) -> list[str]:
 
 
 @documents
+def test_lines_are_short(document: Path) -> None:
+    assert long_lines(document.read_text()) == []
+
+
+@documents
 def test_links_and_paths_exist(document: Path) -> None:
     text = document.read_text()
     assert dead_links(text, document.parent) == []
