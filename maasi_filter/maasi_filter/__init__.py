@@ -1,4 +1,4 @@
-"""What the team believes: sensors, exploration, filters and found targets."""
+"""State estimation of the team: sensors, exploration, filters and found targets."""
 
 from maasi_filter.exploration import Exploration
 from maasi_filter.ic_phd.filter import IcPhdFilter

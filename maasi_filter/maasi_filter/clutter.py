@@ -1,4 +1,4 @@
-"""False detections: the volume in which they fall, and how many there are at least."""
+"""Clutter: the volume of its density, and a lower bound of its intensity."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from maasi_filter.models.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
 
-# No sensor is without: false detections of a scan that are expected at least.
+# Lower bound of the expected number of false detections in a scan: no sensor is without clutter.
 LEAST_PER_SCAN = 0.05
 
 
@@ -27,15 +27,15 @@ def measurement_space(sensor: Sensor, bounds: FloatArray) -> float:
     if isinstance(sensor.detection, BoxDetection):
         corner = np.maximum(np.abs(sensor.detection.lower), np.abs(sensor.detection.upper))
         corner = corner[: len(bounds)] + sensor.detection.edge
-        # A box of a floor's two axes has any height.
+        # A box in two axes does not limit the height.
         if len(corner) == len(bounds):
             reach = min(reach, math.sqrt(float((corner * corner).sum())))
     return reach * 2.0 * math.pi * (math.pi if len(bounds) == 3 else 1.0)
 
 
 def least_clutter(sensor: Sensor, bounds: FloatArray) -> float:
-    """Return the smallest intensity of false detections, per unit of measurement space.
+    """Return the lower bound of the clutter intensity, per unit of measurement space.
 
-    Without it a few stray particles explain a false detection, which is then found.
+    Without it, a few stray particles suffice to explain a false detection as a target.
     """
     return LEAST_PER_SCAN / measurement_space(sensor, bounds)

@@ -1,4 +1,4 @@
-"""A filter and its place in a run, in a file that survives the death of the process."""
+"""A filter and its progress in a run, in a file that survives the death of the process."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from maasi_filter.make_filter import filter_from_state
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.state_file import StateFileError, read_state, text, untext, write_state
 
-# Of the arrays in the file: what the filter itself does not know.
+# Names of the arrays that are not part of the state of the filter.
 _PROGRESS, _UPDATE = 'progress', 'update'
 
 
 @dataclass
 class Progress:
-    """Where a run stood after a batch.
+    """Progress of a run after a batch.
 
     Attributes
     ----------
@@ -32,11 +32,11 @@ class Progress:
     step : int
         Of the last batch.
     settled_by : dict
-        Id of the batch that settled each found target, by the id of the target.
+        Id of the batch that completed each found target, by the id of the target.
     heard : dict
         Batch, measurement and stamp [ns] of the last detections, by robot.
     update : bytes
-        The last update as it is published, serialised; it may not have been sent yet.
+        The last update, as published and serialised; it may not have been sent yet.
     """
 
     batch: int
@@ -48,9 +48,9 @@ class Progress:
 
 
 class FilterMemory:
-    """Keeps a filter with its progress in a file, replaced in one piece after each batch.
+    """Keeps a filter with its progress in a file, replaced atomically after each batch.
 
-    The file outlives the process, not a power failure: it is not forced to the disk.
+    The file survives the death of the process, not a power failure: it is not forced to the disk.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class FilterMemory:
         Raises
         ------
         OSError
-            If the file cannot be written; the old one is still there.
+            If the file cannot be written; the old one is kept.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         values = asdict(progress)
@@ -78,7 +78,7 @@ class FilterMemory:
         write_state(self.path, state, durable=False)
 
     def load(self) -> tuple[SearchFilter, Progress] | None:
-        """Return what was saved, or None where nothing was.
+        """Return the saved filter and progress, or None without a file.
 
         Raises
         ------
@@ -97,13 +97,13 @@ class FilterMemory:
             raise StateFileError(f'{self.path}: does not hold a progress: {error}') from None
 
     def set_aside(self) -> Path:
-        """Rename a file that cannot be used, so that it can be looked at; return its new name."""
+        """Rename a file that cannot be used, to keep it for inspection; return its new name."""
         aside = self.path.with_name(f'{self.path.name}.refused')
         self.path.replace(aside)
         return aside
 
     def forget(self) -> None:
-        """Remove the file: what is in it belongs to a search that has ended."""
+        """Remove the file of a search that has ended."""
         self.path.unlink(missing_ok=True)
 
 

@@ -51,19 +51,19 @@ from maasi_msgs.msg import (
 )
 
 _TIMEOUT_PERIOD = 0.05
-# How much later than its batch a measurement may be stamped [ns].
+# Largest lead of the stamp of a measurement over that of its batch [ns].
 _STAMP_AHEAD = 60_000_000_000
-# Detections that are kept until their batch comes.
+# Capacity of the buffer of detections that arrive before their batch.
 _MOST_EARLY = 64
-# Prediction over more steps than this is that over so many: a day at 10 steps a second.
+# Upper bound on predicted steps: a day at 10 steps per second.
 _MOST_STEPS = 864_000
-# Longest wait until the filters of other robots have what was found [s].
+# Longest wait for other filters to acknowledge found targets [s].
 _SHARING_PATIENCE = 0.5
 
 
 @dataclass
 class PendingBatch:
-    """A batch whose measurements are not all there yet."""
+    """A batch whose measurements have not all arrived."""
 
     id: int
     step: int
@@ -75,27 +75,27 @@ class PendingBatch:
 
     @property
     def missing(self) -> list[str]:
-        """Names of the members whose measurements are not there."""
+        """Names of the members whose measurements have not arrived."""
         return [item.robot for item in self.members if item.robot not in self.measurements]
 
     @property
     def complete(self) -> bool:
-        """Whether nobody is waited for."""
+        """Whether no measurement is missing."""
         return all(name in self.failed for name in self.missing)
 
 
 class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     """The filter of the team: particle PHD (000, sections 3.1 to 3.3) or Poisson multi-Bernoulli.
 
-    In the namespace of its only robot it is that robot's own: beside others of the kind that tell
-    each other what they have found (002, section 4, independent planner). What another one found
-    counts for the batches with a later stamp.
+    In the namespace of its only robot it is the filter of that robot alone, and exchanges found
+    targets with the filters of the other robots (002, section 4, independent planner). Received
+    found targets take effect for batches with a later stamp.
 
     Subscribes
     ----------
-    `measurement_batch` (maasi_msgs/MeasurementBatch): who measures;
-    `<robot>/detections` (maasi_msgs/DetectionArray): what they see;
-    `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): what was found before a restart;
+    `measurement_batch` (maasi_msgs/MeasurementBatch): which robots measure;
+    `<robot>/detections` (maasi_msgs/DetectionArray): their measurements;
+    `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): targets found before a restart;
     `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with filters of their own
 
     Publishes
@@ -109,7 +109,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         super().__init__('filter_node', FilterNodeSettings, **options)
 
     def prepare(self) -> None:
-        """Make the filter, or load it."""
+        """Create the filter, or load it from its file."""
         settings = self.settings
         self._dimension = settings.environment.dimension
         self._sensors = {
@@ -141,7 +141,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             self.get_logger().warning(warning)
         self._pending: dict[int, PendingBatch] = {}
         self._early: dict[tuple[int, str], DetectionArray] = {}
-        # Of each robot's last detections: batch, measurement, stamp [ns].
+        # Last detections of each robot: batch, measurement, stamp [ns].
         self._last_heard: dict[str, tuple[int, int, int]] = {}
         self._last_batch = 0
         self._last_batch_stamp = -1
@@ -156,13 +156,13 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._latency = 0.0
 
     def _restore(self, memory: FilterMemory) -> None:
-        """Go on after the last batch of a process that died."""
+        """Resume after the last batch of a process that died."""
         try:
             saved = memory.load()
             if saved is not None:
                 self._check_bounds(saved[0])
         except (StateFileError, SettingsError) as error:
-            # The rest of the team goes on meanwhile, so this node does, too.
+            # The rest of the team continues, so this node starts without the saved state.
             self.get_logger().error(f'{error}; set aside as {memory.set_aside()}')
             return
         if saved is None:
@@ -179,7 +179,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         )
 
     def _load(self) -> None:
-        """Go on where the saved search was.
+        """Resume the saved search.
 
         Raises
         ------
@@ -239,7 +239,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 )
             )
             self.expect_publisher(topic)
-        # The filters of the others, and the planner that keeps them.
+        # Subscribers: the filters of the others, and the planner that keeps the found targets.
         self.expect_subscribers(self._found_publisher, len(self._shared) + 1 if self._shared else 0)
         if not settings.lockstep:
             self.create_wall_timer(_TIMEOUT_PERIOD, self._look_at_waiting)
@@ -247,14 +247,14 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             self.create_wall_timer(settings.save_period, self._save)
 
     def start(self) -> None:
-        """Publish what was restored: what the dead process had latched is gone with it."""
+        """Republish the restored state: the latched messages of the dead process are lost."""
         self._kept.begin(time.monotonic())
         if not self._restored:
             return
         update = deserialize_message(self._restored, FilterUpdate)
         self._restored = b''
         self._publish_found(update.header, self._last_batch)
-        # Its sender may have died before it was sent; who has it already drops it.
+        # The process may have died before it sent this update; receivers ignore a duplicate.
         self._update_publisher.publish(update)
 
     def halt(self) -> None:
@@ -298,7 +298,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         known = {key: item.stamp for key, item in self._pending.items()}
         known[self._last_batch] = self._last_batch_stamp
         if known.get(number) == stamp:
-            # A planner says again what may have been missed.
+            # Duplicate batch: the planner republishes batches that may have been missed.
             return
         if number <= self._last_batch or (number in self._pending and not self.settings.lockstep):
             self.drop('old batch', f'measurement_batch.id: read {number}, allowed is a new one')
@@ -327,13 +327,13 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             silence=Silence(self),
         )
         if self.settings.lockstep:
-            # A planner waits for what it asks for: these are of one that is gone.
+            # A planner waits for each batch: older pending ones are from a planner that is gone.
             for item in self._pending.values():
                 item.failed.update(item.missing)
         self._pending[number] = pending
         for member in pending.members:
             early = self._early.pop((number, member.robot), None)
-            # One before the batch answered another planner's of that number.
+            # Stamped before the batch: it answered an earlier planner's batch with that number.
             if (
                 early is not None
                 and 0 <= stamp_from_ros(early.header.stamp) - stamp <= _STAMP_AHEAD
@@ -357,14 +357,14 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             return
         key = (number, int(message.measurement), stamp_from_ros(message.header.stamp))
         if self._last_heard.get(name) == key:
-            # A driver too.
+            # Duplicate: drivers also republish.
             return
         self._last_heard[name] = key
         if pending is not None and expected:
             self._take(pending, message)
             self._process_complete()
         elif number > self._last_batch and pending is None:
-            # Its batch has not come yet.
+            # Its batch has not arrived yet.
             self._early[(number, name)] = message
             if len(self._early) > _MOST_EARLY:
                 oldest = next(iter(self._early))
@@ -374,7 +374,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             self._take_late(name, message)
 
     def _problem(self, name: str, message: DetectionArray) -> str | None:
-        """Return what is wrong with a whole message, if anything."""
+        """Return why a whole message is refused, or None."""
         if message.robot != name:
             return f'robot: read {message.robot!r}, allowed on this topic is {name!r}'
         if message.header.frame_id != self.settings.frame:
@@ -396,7 +396,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     def _stamp_problem(
         self, name: str, message: DetectionArray, expected: PendingBatch | None
     ) -> str | None:
-        """Return what is wrong with the stamp of detections, if anything.
+        """Return why the stamp of detections is refused, or None.
 
         Parameters
         ----------
@@ -405,15 +405,15 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         message : DetectionArray
             From it.
         expected : PendingBatch, optional
-            That it answers.
+            The batch that it answers.
         """
         stamp = stamp_from_ros(message.header.stamp)
         last = self._last_heard[name][2] if name in self._last_heard else 0
         if expected is not None:
-            # One stamp from the future does not make those that follow late.
+            # After one stamp from the future, later messages with valid stamps are not late.
             earliest, latest = min(last, expected.stamp), expected.stamp + _STAMP_AHEAD
         elif message.batch_id > self._last_batch:
-            # Its batch may still come.
+            # Its batch may still arrive.
             return None
         else:
             earliest, latest = last, max(self._last_batch_stamp, last) + _STAMP_AHEAD
@@ -446,7 +446,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             pending.measurements[message.robot] = measurement
 
     def _take_late(self, name: str, message: DetectionArray) -> None:
-        """Process what came after its batch, or was not asked for, as a batch of its own."""
+        """Process a late or unrequested measurement as a batch of its own."""
         measurement = self._measurement(message)
         if measurement is None:
             return
@@ -475,9 +475,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._shared[name].append(message)
 
     def _take_over(self, stamp: int) -> bool:
-        """Take over what others found before a batch; return whether anything changed."""
+        """Merge targets found by others before a batch; return whether anything changed."""
         for subscription in self._sharing:
-            # The others go on once this has come, which does not mean that it has been read.
+            # Lockstep only guarantees that the messages have arrived, not that they were read.
             while (taken := subscription.handle.take_message(FoundTargetArray, False)) is not None:
                 subscription.callback(taken[0])
         changed = False
@@ -487,7 +487,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 last = waiting.popleft()
             if last is None:
                 continue
-            # What it took over itself comes from whoever found it.
+            # Targets that it received itself arrive from the filter that found them.
             targets = [item for item in last.targets if item.robot == name]
             try:
                 changed |= self.filter.take_over(
@@ -513,7 +513,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def _process_complete(self) -> None:
         """Process the batches that are complete, in the order of their ids."""
-        # New ids must not be those of targets that were found before a restart.
+        # New ids must differ from those of targets that were found before a restart.
         if self._pending and self._kept.is_awaited(
             self.count_publishers(self._kept_topic), time.monotonic()
         ):
@@ -542,7 +542,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 [batch.measurements[item.robot] for item in members], steps, now
             )
         except ValueError as error:
-            # What the filter refuses leaves it as it was.
+            # A refused measurement leaves the filter unchanged.
             self.drop('refused measurement', f'batch {batch.id}: {error}')
             for item in members:
                 del batch.measurements[item.robot]
@@ -566,13 +566,13 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             clusters=clusters,
         )
         if self._memory is not None:
-            # Before anybody hears of it: what was published is not lost with this process.
+            # Save before publishing, so that no published result is lost with this process.
             self._remember(self._memory, update)
-        # Found targets first, so that they are there for whoever hears of the update.
+        # Found targets first, so that subscribers have them when the update arrives.
         if changed or result.found_changed or not self._found_published:
             self._publish_found(header, batch.id)
             if self._shared:
-                # With everybody before the step ends, so that it counts from the next one on.
+                # Delivered before the step ends, so that it takes effect from the next one.
                 self._found_publisher.wait_for_all_acked(Duration(seconds=_SHARING_PATIENCE))
         self._update_publisher.publish(update)
         for target in result.newly_found:
@@ -615,7 +615,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             self.warn_throttled('state', f'{memory.path}: state not saved: {error.strerror}')
 
     def _on_kept(self, message: FoundTargetArray) -> None:
-        """Take over what was found before a restart of this node without its state."""
+        """Restore targets found before a restart of this node without its state."""
         if not self.active or not self._kept.take():
             return
         try:
@@ -641,7 +641,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._process_complete()
 
     def _publish_views(self, header: Header, now: float) -> None:
-        """Publish what is for the eye, seldom enough."""
+        """Publish visualization at a limited rate."""
         settings = self.settings
         if settings.particles_rate > 0.0 and abs(now - self._particles_at) >= (
             1.0 / settings.particles_rate

@@ -1,4 +1,4 @@
-"""Found targets that another node keeps for a filter that is restarted without its state."""
+"""Found targets that another node keeps for a filter restarted without its state."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from maasi_filter.models.sensor import is_covariance
 from maasi_filter.records import FoundTarget
 
-# Longest wait for a message that its publisher has latched [s].
+# Longest wait for a latched message [s].
 _PATIENCE = 5.0
 
 
 class KeptFoundTargets:
-    """Whether the kept targets have been taken, once in the life of a process.
+    """Takes the kept targets once in the life of a process.
 
-    The first message counts: later ones hold what this filter has found itself.
+    Only the first message is used: later ones contain the targets that this filter found itself.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class KeptFoundTargets:
         Parameters
         ----------
         publishers : int
-            Of the topic; a team without one keeps nothing.
+            Number of publishers of the topic; without any there is nothing to wait for.
         now : float
             Wall time [s].
         """

@@ -39,7 +39,7 @@ def make_filter(
 
 
 def load_filter(path: str | os.PathLike[str]) -> SearchFilter:
-    """Return the filter that was saved; it continues to the bit as the saved one would have.
+    """Return the saved filter; it continues bit for bit as the saved one would have.
 
     Raises
     ------

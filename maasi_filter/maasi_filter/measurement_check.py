@@ -17,7 +17,8 @@ from maasi_filter.settings import FilterSettings
 
 FloatArray = NDArray[np.float64]
 
-# A box's edge is as uncertain as the robot's position: at least this share of its half size.
+# Default position error of a robot with a box-shaped field of view, as a share of its half size:
+# the position error blurs the edge.
 POSE_ERROR_OF_BOX = 0.05
 
 
@@ -30,7 +31,8 @@ class CheckedMeasurement:
     own : bool
         Whether the covariances are the detections' own.
     pose_error : float
-        Deviation of the error of the robot's position, per axis, as far as it is not in them [m].
+        Standard deviation of the robot's position error per axis, as far as the covariances do not
+        include it [m].
     """
 
     robot: str
@@ -60,7 +62,7 @@ def check_measurements(
     ------
     ValueError
         If anything is not finite, a covariance is not positive definite, shapes or dimensions do
-        not fit, or a robot is there twice.
+        not fit, or a robot appears twice.
     """
     if isinstance(steps, bool) or int(steps) != steps or steps < 0:
         raise ValueError(f'steps: got {steps!r}, allowed are whole numbers from 0')
@@ -75,7 +77,7 @@ def check_measurements(
 
 
 def pose_error_of(sensor: Sensor, settings: FilterSettings, dimension: int) -> float:
-    """Return the error of a robot's position, where it does not say more of it [m]."""
+    """Return the default position error of a robot that reports none [m]."""
     if settings.pose_error is not None:
         return settings.pose_error
     if isinstance(sensor.detection, BoxDetection):
@@ -105,7 +107,7 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
         reported = _reported_error(name, measurement.position_covariance, d)
         if settings.pose_error is None and not own:
             pose_error = max(pose_error, reported)
-    # The order in which a sensor lists its detections means nothing, so it decides nothing.
+    # Sort, so that the result does not depend on the order in which a sensor lists detections.
     order = np.lexsort(values.T[::-1])
     return CheckedMeasurement(
         name,
@@ -147,7 +149,7 @@ def _reported_error(name: str, reported: FloatArray, d: int) -> float:
 
 
 def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> None:
-    """Refuse targets with numbers that are not finite, or of another dimension.
+    """Refuse targets with non-finite numbers or of another dimension.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How good an estimate of a set of targets is, and how long a search took."""
+"""Metrics of the estimate of a set of targets, and of search times."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def _distances(estimates: ArrayLike, truth: ArrayLike) -> FloatArray:
 
 
 def _assign(cost: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the pairs whose costs add up to the least."""
-    # Imported late: it takes longer than all else that a node imports, and no node needs it.
+    """Return rows and columns of the assignment with the least total cost."""
+    # Deferred: the slowest import, which no node needs.
     from scipy.optimize import linear_sum_assignment
 
     rows, columns = linear_sum_assignment(cost)
@@ -106,7 +106,8 @@ def gospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 
 def ospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 2.0) -> float:
     """Return the OSPA metric between two sets of points (Schuhmacher, Vo and Vo, 2008).
 
-    Arguments as for `gospa`. Two empty sets are 0 apart; an empty and another one `cutoff`.
+    Arguments as for `gospa`. The distance of two empty sets is 0, that of an empty and a non-empty
+    set `cutoff`.
     """
     _positive('cutoff', cutoff)
     _positive('power', power, 1.0)
@@ -129,7 +130,7 @@ class Match:
     pairs : list of (int, int)
         Index of the found, and of the true target.
     true_found, missed, false_found : int
-        Numbers of pairs, of true targets without, and of found ones without.
+        Numbers of pairs, of unmatched true targets, and of unmatched found targets.
     rmse : float
         Root mean square distance of the pairs, metres; nan without pairs.
     """
@@ -148,7 +149,7 @@ def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Matc
     """
     _positive('radius', radius)
     apart = _distances(estimates, truth)
-    # One more pair outweighs any distances.
+    # One more pair outweighs any sum of distances.
     worth = (min(apart.shape) + 1.0) * radius**2 if apart.size else 0.0
     cost = np.where(apart <= radius, apart**2 - worth, 0.0)
     rows, columns = _assign(cost)
@@ -180,7 +181,7 @@ def normalised_error(error: ArrayLike, covariance: ArrayLike) -> float:
 
 @dataclass(frozen=True)
 class RestrictedMean:
-    """Mean time up to a cap, of runs that may not have finished.
+    """Restricted mean time of runs of which some are censored.
 
     Parameters
     ----------
@@ -206,12 +207,11 @@ def restricted_mean(
     Parameters
     ----------
     times : sequence of float or None
-        When each run found all; None for one that did not.
+        Time at which each run had found all targets; None if it did not.
     cap : float
         Upper end of the mean.
     ended : sequence of float, optional
-        When each run ended without having found all; the cap if not given. Runs that were cut
-        short count up to then.
+        Censoring time of each run that did not find all targets; the cap if not given.
 
     Raises
     ------

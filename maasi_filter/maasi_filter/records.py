@@ -1,4 +1,4 @@
-"""What a search filter takes and gives: measurements, clusters, found targets, results."""
+"""Input and output of a search filter: measurements, clusters, found targets, results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass
 class AgentMeasurement:
-    """What one robot measured at one step; an empty one counts too.
+    """Measurement of one robot at one step; one without detections is information too.
 
     Parameters
     ----------
@@ -24,16 +24,16 @@ class AgentMeasurement:
     pose : Pose
         Of the sensor at the time of the measurement.
     sensor : Sensor
-        What it measured with.
+        The sensor that measured.
     values : (m, d) array
         Detections: range, bearing and, in 3D, elevation; m, rad, rad.
     covariances : (m, d, d) array, optional
-        Of each detection, in place of the sensor's; not used by the PHD filter.
+        Covariance of each detection, instead of the sensor's; not used by the PHD filter.
     index : int
         That robot's measurement index.
     position_covariance : (3, 3) array, optional
-        What the robot says of the error of its own position, square metres. Covariances of
-        detections are taken to have it in them already.
+        Covariance of the robot's position error as it reports it, square metres. Covariances of
+        detections are assumed to include it.
     """
 
     robot: str
@@ -80,14 +80,13 @@ class FoundTarget:
     covariance : (d, d) array
         Of the error of `position`, square metres.
     robot : str
-        Whose measurement completed it.
+        Robot whose measurement completed it.
     measurement : int
         That robot's measurement index then.
     time : float
         Seconds.
     origin : int
-        Its number in the filter of another robot that it was taken over from; 0 for the filter's
-        own.
+        Its id in the filter of another robot that found it; 0 if this filter found it.
     """
 
     id: int
@@ -101,12 +100,12 @@ class FoundTarget:
 
 @dataclass
 class FilterResult:
-    """What a step brought.
+    """Result of a step.
 
     Parameters
     ----------
     clusters : list of Cluster
-        Potential targets after the step, found ones not among them.
+        Potential targets after the step, without found targets.
     newly_found : list of FoundTarget
         Targets found in this step.
     found_changed : bool

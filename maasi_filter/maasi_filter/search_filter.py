@@ -1,4 +1,4 @@
-"""What a search filter is to those that use it: nodes, planners and searches in one process."""
+"""Interface of a search filter for nodes, planners and searches in one process."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ class SearchFilter(Protocol):
         """Return the found targets that this filter found itself."""
 
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Take over what the filter of another robot has found; return whether anything changed."""
+        """Merge targets found by the filter of another robot; return whether anything changed."""
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets found before this filter was made; return those that are new."""
+        """Add targets found before this filter was created; return those that are new."""
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the whole state, random generator included, to one file."""

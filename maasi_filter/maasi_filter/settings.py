@@ -91,7 +91,7 @@ class DetectionSettings(Settings):
 
 
 class NoiseSettings(Settings):
-    """Noise of a measurement; nothing about the meaning of the numbers is left to guess."""
+    """Noise of a measurement; the meaning of each number is explicit."""
 
     range: float = Field(
         default=1.5, gt=0.0, description='Noise of the range [m, or m^2 as variance]'
@@ -168,7 +168,7 @@ class SensorSettings(Settings):
 
 
 class Obstacle(Settings):
-    """A cylinder (2D: a disc) or, with three coordinates, a sphere to keep away from."""
+    """Obstacle: a cylinder (2D: a disc) or, with three coordinates, a sphere."""
 
     centre: list[Finite] = Field(min_length=2, max_length=3, description='Centre [m, map]')
     radius: float = Field(gt=0.0, description='Radius [m]')
@@ -221,7 +221,7 @@ _PAPER_000: dict[str, Any] = {
     'pose_error': 0.0,
 }
 
-# What each preset fills in; `docs/filter_presets.md` says where the numbers are from.
+# Values of each preset; their sources are in `docs/filter_presets.md`.
 PRESETS: dict[str, dict[str, Any]] = {
     'paper_000': _PAPER_000,
     'paper_001': {**_PAPER_000, 'particles': 5000, 'particles_per_target': 500},
@@ -241,8 +241,8 @@ _PMB: dict[str, Any] = {'use_detection_covariances': True}
 class FilterSettings(Settings):
     """Numbers of the search filter.
 
-    What is left None takes, with `method: ic_phd`, the value of the preset; with `method: pmb` it
-    is derived at each step from the sensor and the environment, or not used.
+    With `method: ic_phd`, None means the value of the preset; with `method: pmb` it is derived at
+    each step from the sensor and the environment, or not used.
     """
 
     method: Literal['ic_phd', 'pmb'] = Field(
@@ -342,13 +342,13 @@ class FilterSettings(Settings):
     )
 
     def resolved(self) -> FilterSettings:
-        """Return a copy in which what was not given has the value of the method or preset."""
+        """Return a copy with None replaced by the value of the method or preset."""
         filled = PRESETS[self.preset] if self.method == 'ic_phd' else _PMB
         values = {name: value for name, value in filled.items() if getattr(self, name) is None}
         return self.model_copy(update=values)
 
 
-# A found target that takes the detections of half the environment leaves none to find.
+# Upper bound: a found target must not remove the detections of half the environment.
 LARGEST_REMOVAL = 0.5
 
 
@@ -373,7 +373,7 @@ def unsuitable_lengths(settings: FilterSettings, bounds: FloatArray) -> str:
 
 @dataclass(frozen=True)
 class IcPhdNumbers:
-    """The settings of the PHD filter, none of them left open; see `FilterSettings`."""
+    """Resolved settings of the PHD filter; see `FilterSettings`."""
 
     expected_targets: float
     found_radius: float

@@ -1,6 +1,6 @@
-"""Checks of a saved filter state, and what the states of all filters have in common.
+"""Checks of a saved filter state, and the part common to the states of all filters.
 
-A checksum tells that a file is as it was written, not that it was written by a filter.
+A checksum proves that a file is as it was written, not that a filter wrote it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from maasi_filter.state_file import (
 
 Arrays = Mapping[str, NDArray[Any]]
 
-# By name: kind of dtype, and the shape; letters are sizes that have to agree.
+# By name: kind of dtype, and shape; equal letters are equal sizes.
 COMMON = {
     'bounds': ('f', 'd 2'),
     'spacing': ('f', ''),
@@ -46,7 +46,7 @@ COMMON = {
 
 @contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn what is wrong with a state into a StateFileError that names its file."""
+    """Convert errors of a state to a StateFileError that names its file."""
     try:
         yield
     except KeyError as error:
@@ -69,7 +69,7 @@ def common_arrays(
 
 
 def construction(state: Arrays) -> tuple[FilterSettings, NDArray[Any], np.random.Generator]:
-    """Return the arguments with which the filter of a state is made."""
+    """Return the constructor arguments of the filter of a state."""
     return (
         FilterSettings.model_validate_json(untext(state['settings'])),
         state['bounds'],
@@ -91,7 +91,7 @@ def exploration_of(state: Arrays) -> Exploration:
         raise ValueError(
             f'exploration: got shape {values.shape} of {values.dtype}, allowed is {shape} of floats'
         )
-    # Written so that it holds for NaN, too.
+    # Negated, so that NaN is refused too.
     if not ((values >= 0.0) & (values <= 1.0)).all():
         raise ValueError('exploration: got a number that is not from 0 to 1')
     exploration.values[...] = values
@@ -171,11 +171,11 @@ def check_arrays(
     state : mapping of str to array
         As it was read.
     arrays : mapping
-        What is allowed, as in COMMON.
+        Allowed kinds and shapes, as in COMMON.
     sizes : dict
-        Known sizes by letter; those that are learnt are added.
+        Known sizes by letter; new ones are added.
     undefined : sequence of str
-        Arrays whose numbers may be not finite.
+        Arrays that may contain non-finite numbers.
 
     Raises
     ------
@@ -210,6 +210,6 @@ def check_not_negative(state: Arrays, names: Sequence[str]) -> None:
 
 
 def check_ids(ids: NDArray[Any]) -> None:
-    """Refuse numbers of found targets that are not different ones from 1."""
+    """Refuse ids of found targets that are not unique and positive."""
     if (ids < 1).any() or len(np.unique(ids)) != len(ids):
         raise ValueError(f'found_ids: got {ids.tolist()}, allowed are different numbers from 1')

@@ -1,4 +1,4 @@
-"""The whole state of a search filter in one file: versioned, checksummed, written in one piece.
+"""The whole state of a search filter in one file: versioned, checksummed, written atomically.
 
 The file is one line of JSON (format, version, length and SHA-256 of the rest) and a NumPy archive.
 """
@@ -29,17 +29,17 @@ class StateFileError(ValueError):
 def write_state(
     path: str | os.PathLike[str], values: dict[str, NDArray[Any]], *, durable: bool = True
 ) -> None:
-    """Write arrays to `path`, replacing the file in one piece.
+    """Write arrays to `path`, replacing the file atomically.
 
     Parameters
     ----------
     path : path
         The file.
     values : dict of str to array
-        What is written.
+        The arrays.
     durable : bool
-        Whether everything is on the disk before the old file is replaced: it then survives a power
-        failure as well.
+        Whether to force the data to the disk (fsync) before replacing the old file, so that it
+        also survives a power failure.
     """
     target = Path(path)
     buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Compiles what the filter uses before it is used."""
+"""Compiles the kernels of the filter before their first use."""
 
 from __future__ import annotations
 

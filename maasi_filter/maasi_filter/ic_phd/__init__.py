@@ -1,1 +1,1 @@
-"""The particle PHD filter with an iterated corrector, and what it adds to find targets."""
+"""Particle PHD filter with an iterated corrector, and removal of found targets."""

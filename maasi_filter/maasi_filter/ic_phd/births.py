@@ -1,4 +1,4 @@
-"""Births: particles for targets that nothing represents yet (000, section 3.2; 001, (A1); 003)."""
+"""Births: particles for targets without particles yet (000, section 3.2; 001, (A1); 003)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class MeasurementBirths:
     Parameters
     ----------
     particles : (m J, d) array
-        Metres; those of a measurement lie together.
+        Metres; grouped by measurement.
     intensity : (m, J) array
         b, the birth intensity times psi_z over the density of the draw, divided by J, per unit of
         measurement space. b / C(z) is the posterior weight.
@@ -34,7 +34,7 @@ class MeasurementBirths:
 
     @property
     def totals(self) -> FloatArray:
-        """<psi_z, Y>, what births add to C(z), (m,)."""
+        """<psi_z, Y>, the contribution of births to C(z), (m,)."""
         return np.asarray(self.intensity.sum(axis=1))
 
 
@@ -48,10 +48,10 @@ def measurement_births(
     generator: np.random.Generator,
     before: Sequence[tuple[DetectionModel, Pose]] = (),
 ) -> MeasurementBirths:
-    """Draw births where each measurement points: x = g^-1(z + N(0, R)), inside E.
+    """Draw births at each measurement: x = g^-1(z + N(0, R)), inside E.
 
-    Their intensity is N0 / V; with the density of the draw divided out, and those left that the
-    robots before have missed, b = (N0 / V) pi(x, q) |dx/dz| prod(1 - pi_before) / J, where
+    Their intensity is N0 / V. Divided by the density of the draw and multiplied by the probability
+    that earlier robots missed them, b = (N0 / V) pi(x, q) |dx/dz| prod(1 - pi_before) / J, where
     |dx/dz| = r in 2D and r^2 cos(elevation) in 3D. A birth counts for its own measurement only.
 
     Parameters
@@ -63,13 +63,13 @@ def measurement_births(
     number : int
         J.
     before : sequence of (DetectionModel, Pose)
-        Of the robots that are processed before in the same step, (9).
+        Robots that were processed earlier in the same step, (9).
     """
     count, d = values.shape
     noise = generator.standard_normal((count, number, d)) @ np.linalg.cholesky(sensor.covariance).T
     z = (values[:, None, :] + noise).reshape(-1, d)
     particles = sensor.measurement.inverse(z, pose)
-    # Negative ranges, and elevations beyond straight up, are no measurements.
+    # Exclude draws with negative range, or elevation beyond +-90 degrees.
     level = z[:, 0] * (np.cos(z[:, 2]) if d == 3 else 1.0)
     jacobian = level * z[:, 0] if d == 3 else level
     inside = ((particles >= bounds[:, 0]) & (particles <= bounds[:, 1])).all(axis=1)
@@ -85,7 +85,7 @@ def measurement_births(
 def uniform_births(
     bounds: FloatArray, expected: float, number: int, generator: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return births anywhere: particles (J, d) and weights Y V / J (001, (A1)).
+    """Return uniform births: particles (J, d) and weights Y V / J (001, (A1)).
 
     Parameters
     ----------
@@ -114,8 +114,8 @@ def gaussian_births(
     centres : (m, d) array
         g^-1(z), metres.
     spread : (d, d) array
-        Covariance of the noise at the measurements, added to the empirical one, which is singular
-        for few measurements: a deviation from the paper.
+        Noise covariance at the measurements, added to the empirical one, which is singular for few
+        measurements. A deviation from the paper.
     expected : float
         Y V, targets expected to appear in the whole environment.
     """
@@ -131,7 +131,7 @@ def gaussian_births(
         - np.log(np.diagonal(root)).sum()
     )
     volume = float(np.prod(bounds[:, 1] - bounds[:, 0]))
-    # Far out in the tails one draw may not stand for more than everything that is born.
+    # Bound the weight of a draw far out in the tails by the total birth mass.
     weights = np.minimum(expected / volume / number * np.exp(-log_density), expected)
     inside = ((particles >= bounds[:, 0]) & (particles <= bounds[:, 1])).all(axis=1)
     return particles[inside], weights[inside]

@@ -1,4 +1,4 @@
-"""The papers' filter: a particle PHD filter with an iterated corrector (000, sections 3.2, 3.3)."""
+"""Particle PHD filter with an iterated corrector, as in the papers (000, sections 3.2, 3.3)."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ from maasi_filter.state_file import write_state
 
 FloatArray = NDArray[np.float64]
 
-# Threads only pay off for sets of this size.
+# Particle sets below this size are faster on one thread.
 PARALLEL_PARTICLES = 65_536
-# Particles of a birth when there are more detections than there are particles for.
+# Fewest particles of a birth, when many detections share the particle budget.
 LEAST_BIRTHS = 20
 
 
@@ -54,7 +54,7 @@ class IcPhdFilter:
     Parameters
     ----------
     settings : FilterSettings
-        What is left None comes from the preset.
+        None means the value of the preset.
     bounds : (d, 2) array
         Of the environment E, metres; d = 2 or 3.
     generator : numpy.random.Generator
@@ -113,13 +113,13 @@ class IcPhdFilter:
         steps : int
             Control steps since the last batch, from 0.
         time : float
-            Seconds, kept with what is found.
+            Time of newly found targets, seconds.
 
         Raises
         ------
         ValueError
-            If anything is not finite, shapes or dimensions do not fit, or a robot is there twice.
-            Nothing has changed then.
+            If anything is not finite, shapes or dimensions do not fit, or a robot appears twice.
+            The filter is then unchanged.
         """
         dropped: dict[str, int] = {}
         members = check_measurements(measurements, steps, time, self._settings, self.dimension)
@@ -162,7 +162,7 @@ class IcPhdFilter:
     def _births(
         self, member: CheckedMeasurement, before: Sequence[CheckedMeasurement]
     ) -> MeasurementBirths:
-        """Return births at the detections of a robot, none with the other kinds of births."""
+        """Return births at the detections of a robot; none with other kinds of births."""
         numbers = self._numbers
         count = len(member.values)
         if numbers.births != 'measurement' or not count:
@@ -182,7 +182,7 @@ class IcPhdFilter:
     def _born_anywhere(
         self, members: Sequence[CheckedMeasurement]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return births that belong to no measurement: anywhere (001), or 003's Gaussian."""
+        """Return births independent of single measurements: uniform (001), or Gaussian (003)."""
         numbers = self._numbers
         expected, number = numbers.birth_targets, numbers.birth_particles
         if numbers.births == 'uniform' and members:
@@ -218,8 +218,8 @@ class IcPhdFilter:
         """Find clusters by K-means, and mark the narrow ones as found (000, section 3.3).
 
         k is the rounded expected number. A cluster with a radius of at most T_r and a mass of at
-        least T_m is a found target, and its particles go; so do those of a narrow cluster that may
-        be a target found before.
+        least T_m is a found target, and its particles are removed, as are those of a narrow cluster
+        that matches an earlier found target.
         """
         numbers = self._numbers
         if not members or not self.expected_number > 0.0:
@@ -262,7 +262,7 @@ class IcPhdFilter:
     def _without_found(
         self, member: CheckedMeasurement, dropped: dict[str, int]
     ) -> CheckedMeasurement:
-        """Return a measurement without detections of found targets, and those from too far."""
+        """Return a measurement without detections of found targets and beyond maximum range."""
         reach = member.values[:, 0] <= member.sensor.maximum_range
         _count(dropped, 'range', int((~reach).sum()))
         member = member.only(reach)
@@ -279,7 +279,7 @@ class IcPhdFilter:
     def _count_unexplained(
         self, member: CheckedMeasurement, unexplained: NDArray[np.bool_], dropped: dict[str, int]
     ) -> None:
-        """Count detections that no particle and no birth explains, by the reason."""
+        """Count detections that no particle and no birth explains, by reason."""
         centres = member.sensor.measurement.inverse(member.values[unexplained], member.pose)
         inside = ((centres >= self.bounds[:, 0]) & (centres <= self.bounds[:, 1])).all(axis=1)
         _count(dropped, 'outside', int((~inside).sum()))
@@ -293,28 +293,28 @@ class IcPhdFilter:
             self._pool = ThreadPoolExecutor(threads)
         return self._pool
 
-    # What other filters have found.
+    # Found targets of other filters.
 
     def own_found_targets(self) -> list[FoundTarget]:
         """Return the found targets that this filter found itself."""
         return self._found.own()
 
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Take over what the filter of another robot has found; return whether anything changed.
+        """Merge targets found by the filter of another robot; return whether anything changed.
 
-        The independent robots of 002, section 4, share their found targets.
+        Independent robots share their found targets (002, section 4).
 
         Parameters
         ----------
         robot : str
-            Whose filter.
+            Robot of that filter.
         targets : sequence of FoundTarget
-            All that its filter found itself, as they stand there; taken before `step`.
+            All targets that its filter found itself; call before `step`.
 
         Raises
         ------
         ValueError
-            If a number is not finite, or dimensions do not fit. Nothing has changed then.
+            If a number is not finite, or dimensions do not fit. The filter is then unchanged.
         """
         check_taken(robot, targets, self.dimension)
         added, changed = self._found.take_over(robot, targets)
@@ -322,10 +322,9 @@ class IcPhdFilter:
         return changed
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before this filter was made; return those that are new.
+        """Add targets that were found before this filter was created; return the new ones.
 
-        They keep their ids. Where another target has such an id already, the next free one is
-        used.
+        They keep their ids, except that an id in use is replaced by the next free one.
 
         Parameters
         ----------
@@ -343,12 +342,12 @@ class IcPhdFilter:
             keep = (offset * offset).sum(axis=1) > self._numbers.removal_distance**2
             self.particles, self.weights = self.particles[keep], self.weights[keep]
 
-    # The state in a file.
+    # Saved state.
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the whole state, random generator included, to one file.
 
-        The file is replaced in one piece: a crash leaves the old one or the new one.
+        The file is replaced atomically: a crash leaves the old one or the new one.
         """
         write_state(path, self.state())
 
@@ -367,7 +366,7 @@ class IcPhdFilter:
     def from_state(
         cls, state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
     ) -> IcPhdFilter:
-        """Return the filter of a state; it continues to the bit as the saved one would have.
+        """Return the filter of a state; it continues bit for bit as the saved one would have.
 
         Raises
         ------
@@ -388,7 +387,7 @@ class IcPhdFilter:
 def _nearest_member(
     position: FloatArray, members: Sequence[CheckedMeasurement]
 ) -> CheckedMeasurement:
-    """Return the robot whose detection is nearest to a place, the last one where none has any."""
+    """Return the robot with the detection nearest to a position; the last one if there is none."""
     apart = []
     for member in members:
         centres = member.sensor.measurement.inverse(member.values, member.pose)

@@ -1,4 +1,4 @@
-"""Found targets: they take their measurements with them (000, section 3.3)."""
+"""Found targets: they remove their measurements from later corrections (000, section 3.3)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from maasi_filter.records import FoundTarget
 
 FloatArray = NDArray[np.float64]
 
-# Two estimates whose squared normalised difference is below this may be one target.
+# Gate on the squared normalised distance of two estimates of the same target.
 SAME_TARGET = 16.0
 
 
@@ -25,7 +25,7 @@ def distance(position: FloatArray, covariance: FloatArray, target: FoundTarget) 
 def kept_measurements(
     centres: FloatArray, targets: Sequence[FoundTarget], limit: float, every: bool
 ) -> NDArray[np.bool_]:
-    """Return which of m detections stay once found targets took theirs.
+    """Return which of m detections remain after removing those of found targets.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ def kept_measurements(
     limit : float
         T_z, metres.
     every : bool
-        Whether all detections within T_z of a found target go (003, algorithm 1), or only the
-        closest one to each found target (000, section 3.3; 001, algorithm 1).
+        Whether to remove all detections within T_z of a found target (003, algorithm 1), or only
+        the closest one to each (000, section 3.3; 001, algorithm 1).
     """
     keep = np.ones(len(centres), np.bool_)
     for target in targets:
@@ -49,7 +49,7 @@ def kept_measurements(
 
 
 class FoundTargets:
-    """The found targets of a filter: its own, and those of other robots' filters.
+    """Found targets of a filter: its own, and those of the filters of other robots.
 
     Attributes
     ----------
@@ -61,15 +61,15 @@ class FoundTargets:
         self.targets = list(targets)
 
     def next_id(self) -> int:
-        """Return the number of the next one."""
+        """Return the id of the next found target."""
         return 1 + max((target.id for target in self.targets), default=0)
 
     def own(self) -> list[FoundTarget]:
-        """Return those that this filter found itself."""
+        """Return the targets that this filter found itself."""
         return [target for target in self.targets if not target.origin]
 
     def _nearest(self, target: FoundTarget) -> int:
-        """Return the index of the nearest one that may be the same target, or -1."""
+        """Return the index of the nearest found target within the gate, or -1."""
         apart = [distance(target.position, target.covariance, known) for known in self.targets]
         best = int(np.argmin(apart)) if apart else -1
         return best if apart and apart[best] < SAME_TARGET else -1
@@ -78,10 +78,10 @@ class FoundTargets:
         return (self.targets[f].time, self.targets[f].robot) <= (time, robot)
 
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> tuple[list, bool]:
-        """Merge what another robot's filter has found; return those that are new, and any change.
+        """Merge targets found by another filter; return the new ones, and whether any changed.
 
-        A target that two robots found belongs to the one that was first, at the same time to the
-        first by name, and follows that one's estimate (002, section 4).
+        A target that two robots found belongs to the robot that found it first (ties: first by
+        name), and follows the estimate of that robot (002, section 4).
         """
         added: list[FoundTarget] = []
         changed = False
@@ -105,10 +105,9 @@ class FoundTargets:
         return added, changed
 
     def keep(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before a restart; return those that are new.
+        """Add targets that were found before a restart; return the new ones.
 
-        They keep their ids. Where another target has such an id already, the next free one is
-        used.
+        They keep their ids, except that an id in use is replaced by the next free one.
         """
         own = {target.id: target for target in self.targets}
         kept = {target.id for target in targets}

@@ -35,7 +35,7 @@ def check(state: Arrays) -> None:
     check_not_negative(state, _NOT_NEGATIVE)
     check_ids(state['found_ids'])
     for number, covariance in zip(state['found_ids'].tolist(), state['found_covariances']):
-        # A cluster of equal particles has none, so zeros are allowed.
+        # A cluster of equal particles has zero covariance.
         if not np.allclose(covariance, covariance.T) or (np.diagonal(covariance) < 0.0).any():
             raise ValueError(
                 f'found_covariances: of target {number}: got {covariance.tolist()}, allowed is a '

@@ -30,7 +30,7 @@ def finite_vector(name: str, value: ArrayLike, length: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a body is and how it is turned.
+    """Position and orientation of a body.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Pose:
         norm = float(np.sqrt((orientation * orientation).sum()))
         if norm < 1e-9:
             raise ValueError('orientation: got a zero quaternion, allowed are unit quaternions')
-        # A unit quaternion stays as it is, to the bit, so that copies of a pose are equal.
+        # Keep unit quaternions bit for bit, so that copies of a pose are equal.
         if abs(norm - 1.0) > 1e-12:
             orientation = orientation / norm
         position.flags.writeable = False
@@ -84,7 +84,7 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position: ArrayLike, rpy: Sequence[float]) -> Pose:
-        """Return a pose by roll, pitch and yaw about fixed axes of its parent [rad]."""
+        """Return a pose from roll, pitch and yaw about fixed axes of its parent [rad]."""
         orientation = np.array([1.0, 0.0, 0.0, 0.0])
         for axis, angle in enumerate(rpy):
             turn = np.zeros(4)

@@ -1,4 +1,4 @@
-"""A robot's sensor: what it detects, and how badly it measures."""
+"""A robot's sensor: probability of detection, and measurement noise."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def check_covariance(name: str, covariance: FloatArray, dimension: int) -> None:
 
 
 def is_covariance(covariance: FloatArray) -> bool:
-    """Return whether a finite square matrix is symmetric positive definite, well above rounding."""
+    """Return whether a finite square matrix is symmetric positive definite despite rounding."""
     scale = np.sqrt(np.abs(np.diagonal(covariance)))
     if not (np.isfinite(covariance).all() and (scale > 0.0).all()):
         return False
@@ -49,7 +49,7 @@ def is_covariance(covariance: FloatArray) -> bool:
 
 @dataclass
 class Sensor:
-    """What a robot measures targets with.
+    """Sensor of a robot.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Sensor:
     clutter : float
         Intensity of false detections, per unit of measurement space (m rad in 2D, m rad^2 in 3D).
     period : float
-        Seconds between possible measurements; 0 where there is no limit.
+        Seconds between possible measurements; 0 means no limit.
     maximum_range : float
         Detections from farther away are dropped and counted, metres.
 

@@ -1,18 +1,18 @@
-"""How many false detections a robot's sensor gives, learnt from what no target explains."""
+"""Clutter rates of the robots' sensors, estimated from detections that no target explains."""
 
 from __future__ import annotations
 
 from maasi_filter.clutter import LEAST_PER_SCAN
 
-# Scans that the prior is worth.
+# Weight of the prior, in scans.
 PRIOR_SCANS = 10.0
 
 
 class ClutterEstimate:
     """Mean number of false detections in a scan, with a gamma prior, for each robot.
 
-    The prior's mean is what the sensor is said to have, at least LEAST_PER_SCAN; it is worth
-    PRIOR_SCANS scans.
+    The mean of the prior is the configured rate of the sensor, at least LEAST_PER_SCAN; its weight
+    is PRIOR_SCANS scans.
 
     Attributes
     ----------
@@ -25,12 +25,12 @@ class ClutterEstimate:
         self.counts: dict[str, float] = {}
 
     def per_scan(self, robot: str, told: float) -> float:
-        """Return the posterior mean for a robot whose sensor is said to have `told` in a scan."""
+        """Return the posterior mean for a robot with a configured rate of `told` per scan."""
         prior = max(told, LEAST_PER_SCAN)
         count = PRIOR_SCANS * prior + self.counts.get(robot, 0.0)
         return count / (PRIOR_SCANS + self.scans.get(robot, 0))
 
     def count(self, robot: str, false_detections: float) -> None:
-        """Count a scan with an expected number of false detections."""
+        """Add a scan with an expected number of false detections."""
         self.scans[robot] = self.scans.get(robot, 0) + 1
         self.counts[robot] = self.counts.get(robot, 0.0) + false_detections

@@ -1,4 +1,4 @@
-"""Bernoulli components: a potential target, with the probability that it exists."""
+"""Bernoulli components: potential targets with existence probabilities."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from maasi_filter.records import FoundTarget
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# A detection may be a component's within so many deviations and root mean square radii.
+# Gate of a detection, in standard deviations and root mean square radii.
 GATE = 6.0
-# Fewer effective particles than this do not tell a likelihood; draws from the detection may.
+# Fewest effective particles for a likelihood; below it, draws from the detection are used.
 LEAST_SUPPORT = 10.0
-# Squared normalised distance up to which such draws are tried.
+# Largest squared normalised distance for such draws.
 SUPPORT_DISTANCE = 36.0
 SUPPORT_DRAWS = 100
-# Associations and changes of the log density that are not worth a term or a factor.
+# Association probabilities and changes of the log density below these are neglected.
 LEAST_SHARE = 1e-4
 LEAST_CHANGE = 1e-3
-# Factors after which a density is condensed to a normal one: found, or not.
+# Number of factors above which a density is condensed to a normal one: found, or not.
 MOST_FACTORS_FOUND = 60
 MOST_FACTORS = 150
 
 
 @dataclass
 class View:
-    """A component as one scan sees it.
+    """Likelihoods of a component in one scan.
 
     Parameters
     ----------
@@ -48,13 +48,13 @@ class View:
     detected : float
         p_D = sum w pi.
     gated : (g,) int array
-        Detections that may be its own.
+        Detections within its gate.
     seen : (g, n) array
         pi g_j at its particles.
     likelihood : (g,) array
         L_j = int f pi g_j dx.
     drawn : dict
-        Weights of the detection's draws, by the place in `gated`, where particles do not reach.
+        Weights of draws from detections with too few particles, by index in `gated`.
     """
 
     probability: FloatArray
@@ -76,15 +76,15 @@ class Component:
     density : Density
         f.
     hits : float
-        Expected number of its detections, if it exists.
+        Expected number of its detections, given that it exists.
     scan : int
         Number of the scan it was born in.
     pose_error : float
-        Of the robot that detected it last, metres.
+        Position error of the robot that detected it last, metres.
     found_radius : float
-        T_r of that robot's sensor, metres.
+        T_r of the sensor of that robot, metres.
     target : FoundTarget, optional
-        What is reported, where it is found.
+        The reported target, if it is found.
     """
 
     existence: float
@@ -97,11 +97,11 @@ class Component:
 
     @property
     def foreign(self) -> bool:
-        """Whether the filter of another robot found it, and follows it."""
+        """Whether the filter of another robot found it, and provides its estimate."""
         return self.target is not None and self.target.origin != 0
 
     def view(self, scan: Scan, births: Births) -> View:
-        """Return how a scan sees this component."""
+        """Return the likelihoods of this component in a scan."""
         density = self.density
         gated = self._gated(scan)
         probability = np.empty(len(density.weights))
@@ -132,7 +132,7 @@ class Component:
         births: Births,
         generator: np.random.Generator,
     ) -> bool:
-        """Take a scan in, given marginal association probabilities; return whether f changed.
+        """Update with a scan, given marginal association probabilities; return whether f changed.
 
         a_0 = p_miss r (1 - p_D) / (1 - r p_D), a_j = p_j, r = sum a (Williams 2015, TOMB/P).
         """
@@ -173,7 +173,7 @@ class Component:
         return np.flatnonzero(near)
 
     def _support(self, view: View, k: int, births: Births) -> None:
-        """Take a likelihood from the detection's draws where particles are too sparse for it."""
+        """Estimate a likelihood from draws of the detection if particles are too sparse."""
         shares = view.seen[k] * self.density.weights
         total = view.likelihood[k]
         if total > 0.0 and total * total >= LEAST_SUPPORT * float(shares @ shares):
@@ -201,7 +201,7 @@ class Component:
         births: Births,
         generator: np.random.Generator,
     ) -> None:
-        """Draw the posterior from particles and, for some detections, from their own draws."""
+        """Draw the posterior from particles and, for some detections, from draws of these."""
         density = self.density
         for k in drawn:
             factor = factor - share[k] / view.likelihood[k] * view.seen[k]
@@ -216,8 +216,8 @@ class Component:
 def same_place(one: Component, other: Component, distance: float) -> bool:
     """Return whether two components may be one target, within a squared normalised distance.
 
-    Not those of one scan, as a target causes one detection of it at most, nor those which together
-    are more than one target.
+    Not if they were born in one scan, as a target causes at most one detection per scan, nor if
+    their existence probabilities sum to more than one target.
     """
     if one.scan == other.scan or one.existence + other.existence > 1.0:
         return False
@@ -227,9 +227,9 @@ def same_place(one: Component, other: Component, distance: float) -> bool:
 
 
 def merge(components: list[Component], distance: float) -> list[Component]:
-    """Merge components of one place: the heavier one's density, both existences.
+    """Merge components of one target: the density of the heavier one, the sum of existences.
 
-    One of the two is a target at most: the events exclude each other, and their probabilities add.
+    At most one of the two is a target: the events exclude each other, so their probabilities add.
     """
     if len(components) < 2:
         return components

@@ -1,8 +1,8 @@
-"""Poisson multi-Bernoulli filter of targets that stand still, or walk a little.
+"""Poisson multi-Bernoulli filter for static targets, or targets in a slow random walk.
 
-Targets not detected yet are a Poisson process of intensity (N0 / V) e(x); every detection that
-may be of one of them makes a Bernoulli component (Williams 2015, TOMB/P). `docs/filter_pmb.md`
-has the equations.
+Undetected targets are a Poisson process of intensity (N0 / V) e(x); each detection that may
+originate from one of them creates a Bernoulli component (Williams 2015, TOMB/P). The equations are
+in `docs/filter_pmb.md`.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from maasi_filter.state_file import write_state
 FloatArray = NDArray[np.float64]
 
 LEAST_EXISTENCE = 1e-4
-# Of a potential target that planners hear of.
+# Least existence probability of a cluster that is published.
 LEAST_CLUSTER_MASS = 0.1
-# T_r where it is not given, in deviations of the range.
+# Default of T_r, in standard deviations of the range.
 FOUND_RADIUS_DEVIATIONS = 2.0
-# Squared normalised distance up to which components may be one target.
+# Gate on the squared normalised distance for merging components.
 SAME_PLACE = 6.0
-# Existence of what the filter of another robot has found.
+# Existence probability of targets that other filters found.
 CERTAIN = 0.999
 
 
@@ -66,7 +66,7 @@ class PmbFilter:
     Parameters
     ----------
     settings : FilterSettings
-        What is left None is derived from the sensor that measures.
+        None means derived from the measuring sensor.
     bounds : (d, 2) array
         Of the environment E, metres; d = 2 or 3.
     generator : numpy.random.Generator
@@ -75,11 +75,11 @@ class PmbFilter:
     Attributes
     ----------
     components : list of Component
-        Potential targets, those found among them.
+        Potential targets, including found ones.
     found_targets : list of FoundTarget
         In the order of being found.
     clusters : list of Cluster
-        Potential targets that are not found, most probable first; their mass is r.
+        Potential targets that are not found, most probable first, with mass r.
     exploration : Exploration
         e, updated with every measurement.
     """
@@ -115,7 +115,7 @@ class PmbFilter:
 
     @property
     def expected_number(self) -> float:
-        """Expected number of targets detected but not found: the sum of their r."""
+        """Expected number of detected but not found targets: the sum of their r."""
         return math.fsum(item.existence for item in self.components if item.target is None)
 
     @property
@@ -144,15 +144,15 @@ class PmbFilter:
         measurements : sequence of AgentMeasurement
             M_k, in any order; they are processed in the order of the robots' names. May be empty.
         steps : int
-            Control steps since the last batch, from 0; targets that stand still do not care.
+            Control steps since the last batch, from 0; irrelevant for static targets.
         time : float
-            Seconds, kept with what is found.
+            Time of newly found targets, seconds.
 
         Raises
         ------
         ValueError
             If anything is not finite, a covariance is not positive definite, shapes or dimensions
-            do not fit, or a robot is there twice. Nothing has changed then.
+            do not fit, or a robot appears twice. The filter is then unchanged.
         """
         members = check_measurements(measurements, steps, time, self._numbers, self.dimension)
         dropped: dict[str, int] = {}
@@ -183,7 +183,7 @@ class PmbFilter:
         space = measurement_space(member.sensor, self.bounds)
         # kappa: clutter per unit of measurement space.
         kappa = self._clutter.per_scan(member.robot, member.sensor.clutter * space) / space
-        # lambda_j = (N0 / V) int e pi g_j dx, by draws from the detections.
+        # lambda_j = (N0 / V) int e pi g_j dx, by importance sampling from the detections.
         births = draw_births(
             scan,
             self.exploration,
@@ -196,7 +196,7 @@ class PmbFilter:
         odds = np.zeros((len(views), len(scan.terms)))
         for i, (item, view) in enumerate(zip(self.components, views)):
             odds[i, view.gated] = item.odds(view)
-        # Who caused what: r L_j / (1 - r p_D) against kappa + lambda_j.
+        # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         marginals = associate(odds, kappa + births.intensity)
         self._count_unexplained(scan, births, odds, dropped)
         changed = False
@@ -223,14 +223,14 @@ class PmbFilter:
         return changed
 
     def _scan(self, member: CheckedMeasurement, dropped: dict[str, int]) -> Scan:
-        """Return a member's scan without what is out of its sensor's range."""
+        """Return the scan of a member without detections beyond the range of its sensor."""
         if math.isfinite(member.sensor.maximum_range):
             reach = member.values[:, 0] <= member.sensor.maximum_range
             _count(dropped, 'range', int((~reach).sum()))
             member = member.only(reach)
         detection = member.sensor.detection
         if isinstance(detection, BoxDetection):
-            # A box's edge is as uncertain as the robot's position.
+            # The position error of the robot blurs the edge of a box-shaped field of view.
             detection = detection.softened(2.0 * member.pose_error)
         prepared = prepare_measurements(
             member.values,
@@ -244,9 +244,9 @@ class PmbFilter:
     def _bear(
         self, member: CheckedMeasurement, scan: Scan, births: Births, existence: FloatArray
     ) -> None:
-        """Add a component for each detection that may be of a target not seen before."""
+        """Add a component for each detection that may originate from a new target."""
         grid: FloatArray | None = None
-        # A detection that points out of the environment has few draws inside.
+        # A detection near or beyond the bounds has few draws inside the environment.
         total, squares = births.weights.sum(axis=1), np.square(births.weights).sum(axis=1)
         supported = np.square(total) > LEAST_SUPPORT * squares
         for j in np.flatnonzero(supported & (existence >= LEAST_EXISTENCE)).tolist():
@@ -284,7 +284,7 @@ class PmbFilter:
         return item.target
 
     def _report(self, item: Component, moved: bool) -> bool:
-        """Report where a found component is now, or withdraw it; return whether it changed."""
+        """Update the estimate of a found component, or withdraw it; return whether it changed."""
         target = item.target
         if target is None:
             return False
@@ -299,7 +299,7 @@ class PmbFilter:
         return moved
 
     def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
-        """Return a target where its particles are, with the robot's position error."""
+        """Return a target with the moments of its particles and the position error of the robot."""
         error = item.pose_error**2 * np.eye(self.dimension)
         return replace(
             target,
@@ -308,7 +308,7 @@ class PmbFilter:
         )
 
     def _predict(self, time: float) -> bool:
-        """Let targets walk since the last step; return whether they did."""
+        """Predict the random walk since the last step; return whether a found target changed."""
         walk = self._numbers.pmb.walk
         last = time if self._last_time is None else self._last_time
         self._last_time = max(time, last)
@@ -325,7 +325,7 @@ class PmbFilter:
         return any(item.target is not None for item in self.components)
 
     def _reduce(self) -> None:
-        """Delete components that hardly exist, and merge those of one place."""
+        """Prune components with low existence probability, and merge those of one target."""
         found = [item for item in self.components if item.target is not None]
         others = [
             item
@@ -359,36 +359,36 @@ class PmbFilter:
     def _count_unexplained(
         self, scan: Scan, births: Births, odds: FloatArray, dropped: dict[str, int]
     ) -> None:
-        """Count detections that nothing but clutter explains."""
+        """Count detections that only clutter explains."""
         alone = (births.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
         centres = scan.measurements.centres[alone]
         inside = ((centres >= self.bounds[:, 0]) & (centres <= self.bounds[:, 1])).all(axis=1)
         _count(dropped, 'outside', int((~inside).sum()))
         _count(dropped, 'unseen', int(inside.sum()))
 
-    # What others have found.
+    # Found targets of other filters.
 
     def own_found_targets(self) -> list[FoundTarget]:
         """Return the found targets that this filter found itself."""
         return [target for target in self.found_targets if not target.origin]
 
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Take over what the filter of another robot has found; return whether anything changed.
+        """Merge targets found by the filter of another robot; return whether anything changed.
 
-        A target that two robots found belongs to the one that was first, at the same time to the
-        first by name, and follows that one's estimate.
+        A target that two robots found belongs to the robot that found it first (ties: first by
+        name), and follows the estimate of that robot.
 
         Parameters
         ----------
         robot : str
-            Whose filter.
+            Robot of that filter.
         targets : sequence of FoundTarget
-            All that its filter found itself, as they stand there; taken before `step`.
+            All targets that its filter found itself; call before `step`.
 
         Raises
         ------
         ValueError
-            If a number is not finite, or dimensions do not fit. Nothing has changed then.
+            If a number is not finite, or dimensions do not fit. The filter is then unchanged.
         """
         check_taken(robot, targets, self.dimension)
         changed = False
@@ -419,10 +419,9 @@ class PmbFilter:
         return changed
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before this filter was made; return those that are new.
+        """Add targets that were found before this filter was created; return the new ones.
 
-        They keep their ids. Where another target has such an id already, the next free one is
-        used.
+        They keep their ids, except that an id in use is replaced by the next free one.
 
         Parameters
         ----------
@@ -446,7 +445,7 @@ class PmbFilter:
         return new
 
     def _place(self, target: FoundTarget, item: Component | None) -> None:
-        """Let a component, or a new one, be a found target."""
+        """Mark a component, or a new one, as a found target."""
         density = Density.normal(
             target.position,
             target.covariance,
@@ -464,12 +463,12 @@ class PmbFilter:
         self._last_id += 1
         return self._last_id
 
-    # The state in a file.
+    # Saved state.
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the whole state, random generator included, to one file.
 
-        The file is replaced in one piece: a crash leaves the old one or the new one.
+        The file is replaced atomically: a crash leaves the old one or the new one.
         """
         write_state(path, self.state())
 
@@ -489,7 +488,7 @@ class PmbFilter:
     def from_state(
         cls, state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
     ) -> PmbFilter:
-        """Return the filter of a state; it continues to the bit as the saved one would have.
+        """Return the filter of a state; it continues bit for bit as the saved one would have.
 
         Raises
         ------

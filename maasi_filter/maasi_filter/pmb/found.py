@@ -1,4 +1,4 @@
-"""Which components are found targets, and which of them a target from elsewhere may be."""
+"""Criteria for found targets, and matching of components and found targets."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from maasi_filter.pmb.component import Component
 from maasi_filter.records import FoundTarget
 
-# Two estimates whose squared normalised difference is below this may be one target.
+# Gate on the squared normalised distance of two estimates of the same target.
 SAME_TARGET = 16.0
-# Expected detections of a found target: one narrow detection alone is not enough.
+# Least expected number of detections of a found target: one precise detection is not enough.
 LEAST_HITS = 1.5
-# Detections of one scan that two components of one target do not cause together.
+# Expected joint detections in a scan from which two components are different targets.
 SEEN_BOTH = 1.5
 
 
 def can_be_found(item: Component, probability: float) -> bool:
-    """Return whether a component surely exists, and it is known well enough where.
+    """Return whether a component almost surely exists, at a precisely known position.
 
     Parameters
     ----------
     probability : float
-        Existence probability that is enough.
+        Least existence probability.
     """
     return (
         item.target is None
@@ -35,10 +35,10 @@ def can_be_found(item: Component, probability: float) -> bool:
 
 
 def is_known(i: int, components: Sequence[Component], caused: NDArray[np.float64]) -> bool:
-    """Return whether component i may be a found target that this scan has not seen beside it.
+    """Return whether component i may be the same target as a found component.
 
-    A target causes one detection of a scan at most, so two components that together caused more
-    than one are two targets.
+    A target causes at most one detection per scan, so two components that together caused more than
+    one are two targets.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def is_known(i: int, components: Sequence[Component], caused: NDArray[np.float64
 
 
 def nearest(target: FoundTarget, components: Sequence[Component]) -> Component | None:
-    """Return the nearest component that may be a target, or None."""
+    """Return the nearest component within the gate of a target, or None."""
     best, least = None, SAME_TARGET
     for item in components:
         position, covariance = item.density.mean, item.density.covariance
@@ -71,7 +71,7 @@ def nearest(target: FoundTarget, components: Sequence[Component]) -> Component |
 
 
 def same_estimate(one: FoundTarget, other: FoundTarget) -> bool:
-    """Return whether nothing of an estimate has changed."""
+    """Return whether two estimates are identical."""
     return (
         one.origin == other.origin
         and one.robot == other.robot

@@ -1,4 +1,4 @@
-"""Settings of the Poisson multi-Bernoulli filter that the PHD filter does not have."""
+"""Settings specific to the Poisson multi-Bernoulli filter."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class PmbSettings(BaseModel):
-    """Numbers of the Poisson multi-Bernoulli filter."""
+    """Settings of the Poisson multi-Bernoulli filter."""
 
     model_config = ConfigDict(
         extra='forbid', populate_by_name=True, validate_assignment=True, allow_inf_nan=False

@@ -26,7 +26,7 @@ from maasi_filter.state_check import (
 )
 from maasi_filter.state_file import text
 
-# By name: kinds of dtype, and the shape; letters are sizes that have to agree.
+# By name: kinds of dtype, and shape; equal letters are equal sizes.
 _ARRAYS: dict[str, tuple[str, str]] = {
     **{name: item for name, item in COMMON.items() if not name.startswith('found_')},
     'counters': ('i', '2'),
@@ -54,7 +54,7 @@ _ARRAYS: dict[str, tuple[str, str]] = {
 }
 _SIZES = {'HEAD': HEAD, 'TERM': TERM}
 _NOT_NEGATIVE = ('hits', 'pose_error', 'found_radius', 'cluster_masses', 'clutter_counts')
-# What may be without a number: no step yet, and a radius that is not limited.
+# Arrays that may contain non-finite numbers: no step yet, unlimited radius.
 _UNDEFINED = ('last_time', 'found_radius', 'heads')
 
 
@@ -78,7 +78,7 @@ def to_arrays(
     grids: list[NDArray[Any]] = []
     numbers: dict[int, int] = {}
     for density in densities:
-        # Components of one scan share it.
+        # Components of one scan share the grid.
         if density.grid.size and id(density.grid) not in numbers:
             numbers[id(density.grid)] = len(grids)
             grids.append(density.grid)
@@ -126,7 +126,7 @@ def components_of(
             f'{particles}'
         )
     targets = found_of(state)
-    # Of one scan's components it is the same array, as before.
+    # Share one array between the components of one scan, as before saving.
     shared = list(grids)
     empty = np.empty((0, 0, 0))
     heads = np.split(state['heads'], np.cumsum(state['head_counts'])[:-1])
@@ -162,7 +162,7 @@ def clutter_of(state: Arrays) -> ClutterEstimate:
     Raises
     ------
     ValueError
-        If the robots' names are not those of the numbers.
+        If names and counts of robots do not match.
     """
     clutter = ClutterEstimate()
     robots = names_of(state, 'clutter_robots', len(state['clutter_scans']))
@@ -172,7 +172,7 @@ def clutter_of(state: Arrays) -> ClutterEstimate:
 
 
 def check(state: Arrays) -> None:
-    """Refuse a state that a filter cannot go on from.
+    """Refuse a state that a filter cannot continue from.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Targets that walk at random: prediction of densities and of e."""
+"""Prediction of densities and of e for targets in a random walk."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from maasi_filter.pmb.density import Density
 def diffuse(density: Density, variance: float, generator: np.random.Generator) -> None:
     """Convolve a density with a normal one of `variance` [m^2] on each axis.
 
-    Particles are moved, so they stay a sample of the true density. Its product of factors becomes
-    a normal density with their moments, which only Metropolis moves use from then on.
+    Particles are moved, so they remain a sample of the true density. Its product of factors is
+    replaced by a normal density with their moments, which only Metropolis moves use afterwards.
     """
     d = density.particles.shape[1]
     noise = generator.standard_normal(density.particles.shape)
@@ -29,11 +29,11 @@ def diffuse(density: Density, variance: float, generator: np.random.Generator) -
 
 
 def diffuse_unexplored(exploration: Exploration, variance: float) -> None:
-    """Spread e as targets do that walk: the diffusion equation, with walls at the bounds."""
+    """Diffuse e as for targets in a random walk, with reflecting bounds."""
     values = exploration.values
     for axis in range(exploration.dimension):
         rate = 0.5 * variance / float(exploration.step[axis]) ** 2
-        # The explicit scheme is stable and positive up to 1/2.
+        # The explicit scheme is stable and positive up to a ratio of 1/2.
         parts = max(1, math.ceil(rate / 0.25))
         for _ in range(parts):
             flow = rate / parts * np.diff(values, axis=axis)

@@ -1,1 +1,1 @@
-"""The runtime that all nodes share: life cycle, lockstep, parameters, QoS, conversions."""
+"""Runtime shared by all nodes: life cycle, lockstep, parameters, QoS, conversions."""

@@ -1,4 +1,4 @@
-"""Requests to the services that rclpy makes for each node, of which some make it raise."""
+"""Guards against requests to the built-in services of a node on which rclpy raises."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
-# Errors of bad requests, by the package of the service's type.
+# Exceptions of rclpy on bad requests, by package of the service type.
 _ERRORS: dict[str, tuple[type[Exception], ...]] = {
     'rcl_interfaces': (TypeError, ValueError, AttributeError, KeyError, AssertionError),
     'lifecycle_msgs': (rclpy_implementation.RCLError,),
@@ -17,15 +17,15 @@ _ERRORS: dict[str, tuple[type[Exception], ...]] = {
 
 
 def survive_bad_requests(node: Node, drop: Callable[[str, str], None]) -> None:
-    """Answer requests that rclpy cannot work off with an empty response, instead of ending.
+    """Answer requests on which rclpy raises with an empty response, instead of ending the node.
 
     rclpy raises on the type of an undeclared parameter, on values of an unknown type, and on a
-    transition that the present state does not have.
+    transition that is not defined in the present state.
 
     Parameters
     ----------
     node : Node
-        Whose services there are now.
+        Node whose present services are wrapped.
     drop : callable
         Counts and logs a request: reason, text.
     """

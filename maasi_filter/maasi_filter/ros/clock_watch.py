@@ -10,19 +10,19 @@ from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-# Without /clock for so long the node warns [s].
+# Time without /clock before a warning [s].
 _PATIENCE = 3.0
-# With several publishers of /clock: a jump counts if time stays back for so long [s].
+# With several publishers of /clock: a jump counts if time stays back this long [s].
 _CONFIRMATION = 1.0
 _LEAST_BACKWARD, _LEAST_FORWARD = 1_000_000, 200_000_000
 
 
 class ClockWatch:
-    """Tells a node that its time starts again.
+    """Informs a node that its time starts again.
 
-    A looped recording or a restarted simulation has one publisher of `/clock`: a backward jump is
-    taken at once. With several publishers the time may only alternate between theirs: then a jump
-    counts once the time has stayed back.
+    A looped recording or a restarted simulation has one publisher of `/clock`: a backward jump
+    counts at once. With several publishers the time may alternate between theirs: then a jump
+    counts only after the time has stayed back.
 
     Parameters
     ----------
@@ -43,11 +43,11 @@ class ClockWatch:
         self._node = node
         self._warn = warn
         self._on_restart = on_restart
-        # Of a jump to be confirmed: time before it [ns], and when it was (steady) [s].
+        # Unconfirmed jump: time before it [ns], and steady time at which it happened [s].
         self._pending: tuple[int, float] | None = None
         self._silent_since: float | None = None
         self._patience = _PATIENCE
-        # rclpy keeps a borrowed pointer only: without this reference a jump is a segfault.
+        # rclpy only borrows the pointer: without this reference a jump segfaults.
         self._handle: Any = node.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=Duration(nanoseconds=_LEAST_FORWARD),
@@ -84,7 +84,7 @@ class ClockWatch:
             self._pending = (now - delta, time.monotonic())
 
     def look(self) -> None:
-        """Judge what needs time; to be called about each second."""
+        """Confirm pending jumps and check for silence; call about once per second."""
         now, time_now = time.monotonic(), self._node.get_clock().now().nanoseconds
         if self._pending is not None and now - self._pending[1] >= _CONFIRMATION:
             before, self._pending = self._pending[0], None
@@ -101,14 +101,14 @@ class ClockWatch:
             self._silent_since = now
         waited = now - self._silent_since
         if waited >= self._patience:
-            # Less and less often.
+            # Exponential back-off.
             self._patience = 2.0 * waited
             self._node.get_logger().warning(
                 f'no publisher of /clock for {waited:.0f} s (use_sim_time is true): waiting'
             )
 
     def stop(self) -> None:
-        """Let go of the clock."""
+        """Remove the callback from the clock."""
         if self._handle is not None:
             self._handle.unregister()
             self._handle = None

@@ -1,4 +1,4 @@
-"""Between messages and the library's records, in pairs."""
+"""Conversions between messages and records of the library, in pairs."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from maasi_msgs.msg import FoundTarget as FoundTargetMessage
 
 FloatArray = NDArray[np.float64]
 
-#: Detections of one message that are used at most, the first ones. A step's time grows with their
-#: number; no sensor of a search sees so many targets at once.
+#: Largest number of detections used of one message, against unbounded computation times; no sensor
+#: of a search sees so many targets at once.
 MOST_DETECTIONS = 200
 
-#: Coordinates beyond this are no place [m]: the circumference of the Earth.
+#: Largest accepted coordinate [m]: the circumference of the Earth.
 FARTHEST = 4e7
-#: Speeds beyond this are none of a robot [m/s, rad/s].
+#: Largest accepted speed [m/s, rad/s].
 FASTEST = 1e5
 
-# Relative, for what is called symmetric and positive.
+# Relative tolerance of symmetry and positive definiteness.
 _ROUNDING = 1e-9
 
 
@@ -55,14 +55,14 @@ def stamp_of_step(step: int, duration: float) -> int:
 
 
 def bounded(name: str, values: Iterable[float], limit: float) -> None:
-    """Refuse numbers that are not finite or so large that the arithmetic with them fails.
+    """Refuse non-finite numbers, and numbers that would overflow in later arithmetic.
 
     Raises
     ------
     ValueError
         The message names `name`.
     """
-    # Not so for NaN either.
+    # Also false for NaN.
     if not all(abs(value) <= limit for value in values):
         raise ValueError(
             f'{name}: got {list(values)}, allowed are finite numbers up to {limit:g} in magnitude'
@@ -150,7 +150,7 @@ def cluster_from_ros(message: ClusterMessage, dimension: int) -> Cluster:
 
 
 def found_target_to_ros(target: FoundTarget, batch: int) -> FoundTargetMessage:
-    """Return a found target and the batch that settled it."""
+    """Return a found target and the batch that completed it."""
     return FoundTargetMessage(
         id=target.id,
         position=point_to_ros(target.position),
@@ -182,7 +182,7 @@ def detections_to_ros(values: FloatArray, covariances: FloatArray | None) -> lis
     values : (m, d) array
         Range, bearing and, in 3D, elevation [m, rad].
     covariances : (m, d, d) array, optional
-        Of the values.
+        Covariances of the values.
     """
     messages = []
     for index, value in enumerate(values):
@@ -200,7 +200,7 @@ def detections_to_ros(values: FloatArray, covariances: FloatArray | None) -> lis
 
 
 def detection_problem(detection: Detection, dimension: int) -> str | None:
-    """Return what is wrong with a detection: field, what was read, what is allowed."""
+    """Return the error of a detection: field, what was read, what is allowed."""
     if not (math.isfinite(detection.range) and detection.range >= 0.0):
         return f'range: read {detection.range}, allowed are finite numbers from 0 [m]'
     for name, limit in (('bearing', math.pi), ('elevation', 0.5 * math.pi)):
@@ -226,7 +226,7 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
 def _usable(
     detections: Sequence[Detection], dimension: int
 ) -> tuple[list[Detection], dict[str, Counter[str]]]:
-    """Return the detections that are used; of the others reasons, texts and how many."""
+    """Return usable detections, and reasons, texts and numbers of the others."""
     kept: list[Detection] = []
     problems: dict[str, Counter[str]] = {}
 
@@ -261,10 +261,10 @@ def _usable(
 def measurement_from_ros(
     message: DetectionArray, sensor: Sensor, dimension: int
 ) -> tuple[AgentMeasurement, dict[str, Counter[str]]]:
-    """Return what a robot measured, and what is wrong with the detections left out.
+    """Return the measurement of a robot, and why detections were left out.
 
-    Detections that cannot be used, those that are equal to one before, and those beyond
-    `MOST_DETECTIONS` are left out: reason to texts and their numbers.
+    Invalid detections, duplicates, and those beyond `MOST_DETECTIONS` are left out: reason to texts
+    and their numbers.
 
     Raises
     ------
@@ -297,7 +297,7 @@ def measurement_from_ros(
             values=values,
             covariances=covariances,
             index=int(message.measurement),
-            # A negative variance stands for an error that is not known.
+            # A negative variance means that the error is unknown.
             position_covariance=(
                 position_covariance if np.diagonal(position_covariance).min() >= 0.0 else None
             ),
@@ -341,7 +341,7 @@ def sphere_marker(
     diameter: float,
     tint: ColorRGBA,
 ) -> Marker:
-    """Return a sphere; namespace and number stay the same for the same thing."""
+    """Return a sphere; namespace and number identify the object between messages."""
     marker = Marker(header=header, ns=namespace, id=number, type=Marker.SPHERE, action=Marker.ADD)
     marker.pose.position = point_to_ros(position)
     marker.pose.orientation.w = 1.0
@@ -356,7 +356,7 @@ def filter_markers(
     found: Iterable[FoundTarget],
     size: float,
 ) -> MarkerArray:
-    """Return markers of clusters (orange, as large as they are wide) and found targets (red).
+    """Return markers of clusters (orange, scaled by their width) and found targets (red).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The executor that a node spins in."""
+"""Choice of the executor of a node."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from rclpy.node import Node
 def executor_of(node: Node, context: Context | None = None) -> Executor:
     """Return an executor that runs one node.
 
-    It is rclpy's events executor, where this version of rclpy has it: the single-threaded one
-    builds its wait set anew for each callback, which takes two to four times the CPU time. In both,
-    a callback that raises ends the spin. Neither may spin after its `shutdown`.
+    rclpy's events executor if this version has it: the single-threaded one rebuilds its wait set
+    for each callback, which takes two to four times the CPU time. In both, an exception in a
+    callback ends the spin, and neither may spin after its `shutdown`.
     """
     try:
         from rclpy.experimental.events_executor import EventsExecutor

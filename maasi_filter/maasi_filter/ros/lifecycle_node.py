@@ -1,4 +1,4 @@
-"""What all nodes of a search share: parameters, life cycle, readiness, lockstep, diagnostics."""
+"""Base of all nodes of a search: parameters, life cycle, readiness, lockstep, diagnostics."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from maasi_msgs.msg import LockstepDone, LockstepStep
 
 __all__ = ['LockstepLifecycleNode', 'SettingsError', 'run']
 
-# Between two looks at whether the peers are there [s].
+# Period of the check for peers [s].
 _PEERS_PERIOD = 0.02
 _DIAGNOSTICS_PERIOD = 1.0
 _WARNING_PERIOD = 2.0
-# Longest time until a signal is noticed [s].
+# Period of the check for signals [s].
 _SIGNAL_PERIOD = 0.1
 
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
-# Between the discovery of a subscription and its connection [s].
+# Longest time from the discovery of a subscription to its connection [s].
 _CONNECTION_PATIENCE = 5.0
 
 
@@ -68,12 +68,12 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     settings : type
         Its settings; each becomes a parameter.
     in_robot : bool
-        Whether its namespace is that of a robot: what concerns the team is one level up.
+        Whether its namespace is that of a robot: topics of the team are one level up.
     lockstep_member : bool
         Whether it takes part in lockstep.
     """
 
-    #: Read in *configure*, and kept until the next one.
+    #: Read in *configure*, and valid until the next one.
     settings: SettingsT
 
     def __init__(
@@ -90,7 +90,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._lockstep_member = lockstep_member
         self._parameters_read = NodeParameters(self, settings)
         self._entities_made = NodeEntities(self)
-        #: Why it could not be configured; empty where it could.
+        #: Why *configure* failed; empty if it succeeded.
         self.problem = ''
         self.dropped: Counter[str] = Counter()
         self._prepared = False
@@ -109,7 +109,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         survive_bad_requests(self, self.drop)
 
     def destroy_node(self) -> None:
-        """Leave the graph."""
+        """Destroy the entities of the node."""
         self._clock_watch.stop()
         self._entities_made.clear()
         super().destroy_node()
@@ -126,27 +126,27 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     # ---- life cycle --------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Make what the settings describe, before `set_up`. In *configure*.
+        """Create the objects that the settings describe, before `set_up`. In *configure*.
 
         Raises
         ------
         SettingsError
-            If a setting is not allowed after all.
+            If a setting is invalid in combination with others.
         """
 
     def set_up(self) -> None:
         """Create publishers and subscriptions, compile and warm up. In *configure*."""
 
     def start(self) -> None:
-        """Begin to work, in *activate*."""
+        """Start operation, in *activate*."""
 
     def halt(self) -> None:
-        """Stop what moves, in *deactivate* and at the end. May be called more than once."""
+        """Stop all motion, in *deactivate* and at shutdown. May be called more than once."""
 
     def tear_down(self) -> None:
-        """Undo `prepare` and `set_up`, in *cleanup*: all but ROS entities, which go by themselves.
+        """Undo `prepare` and `set_up`, in *cleanup*; the base class destroys ROS entities.
 
-        After a *configure* that failed it is called as well.
+        Also called after a failed *configure*.
         """
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -170,7 +170,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def _configure(self) -> None:
         self.settings = self._parameters_read.read()
         robots = getattr(self.settings, 'robots', None)
-        # One that works for a single robot, in its namespace, belongs to that robot.
+        # A node of a single robot, in the namespace of that robot, belongs to it.
         alone = robots is not None and list(robots) == [self.get_namespace().rpartition('/')[2]]
         self._in_robot = self._always_in_robot or alone
         self.step = -1
@@ -190,14 +190,14 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.set_up()
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to work."""
+        """Start operation."""
         self.active = True
         self.start()
         self._peer_timer = self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop what moves."""
+        """Stop all motion."""
         self._stop()
         return super().on_deactivate(state)
 
@@ -207,12 +207,12 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop what moves, for good."""
+        """Stop all motion before shutdown."""
         self._stop()
         return TransitionCallbackReturn.SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop what moves after an error in a transition, and undo *configure*."""
+        """Stop all motion after an error in a transition, and undo *configure*."""
         self.get_logger().error('a transition failed: the node stops')
         try:
             self._stop()
@@ -239,7 +239,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             try:
                 self.tear_down()
             except Exception:
-                # The rest is undone all the same.
+                # Continue with the rest.
                 self.get_logger().error(traceback.format_exc())
         self.configured = False
         self._peers.clear()
@@ -251,7 +251,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     # ---- readiness and lockstep --------------------------------------------------------------
 
     def expect(self, condition: Callable[[], bool]) -> None:
-        """Count as ready only where this holds."""
+        """Add a condition for being ready."""
         self._peers.append(condition)
 
     def expect_subscribers(
@@ -260,14 +260,14 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         number: int = 1,
         names: Collection[str] = (),
     ) -> None:
-        """Count as ready only when a message would reach all who are known to listen.
+        """Be ready only when a message would reach all expected subscribers.
 
         Parameters
         ----------
         publisher : Publisher, or a function that returns the present one
-            Of the message.
+            Publisher of the message.
         number : int
-            How many have to listen; those who only look on do not count.
+            How many subscribers are expected; mere observers do not count.
         names : collection of str
             Nodes that have to be among them, without namespace.
         """
@@ -287,7 +287,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             if not set(names) <= set(known) or sum(map(_takes_part, known)) < number:
                 return False
             known_since.append(time.monotonic())
-            # Somebody who looks on with another quality of service is never connected.
+            # An observer with an incompatible quality of service never connects.
             late = known_since[-1] - known_since[0] > _CONNECTION_PATIENCE
             del known_since[1:]
             return late or present.get_subscription_count() >= len(known)
@@ -295,7 +295,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.expect(heard)
 
     def expect_publisher(self, topic: str) -> None:
-        """Count as ready only with a publisher of a topic."""
+        """Be ready only with a publisher of a topic."""
         self.expect(lambda: self.count_publishers(topic) > 0)
 
     def _look_for_peers(self) -> None:
@@ -307,7 +307,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
 
     def on_ready(self) -> None:
-        """Note that all peers are there."""
+        """Handle that all peers are present."""
 
     def _hear_step(self, message: LockstepStep) -> None:
         if not self.active:
@@ -321,11 +321,11 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.on_step(message)
 
     def on_step(self, message: LockstepStep) -> None:
-        """Do what this node does at a step in lockstep, and say `done` when it is."""
+        """Process a step in lockstep, and call `done` when finished."""
         self.done(message.step)
 
     def done(self, step: int) -> None:
-        """Say that the node has done what it does at a step."""
+        """Report that the node has finished a step."""
         if self._done_publisher is not None:
             self._done_publisher.publish(
                 LockstepDone(node=self.get_fully_qualified_name(), step=step)
@@ -334,14 +334,14 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     # ---- time --------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Forget what belongs to a time that will not come again: the clock jumped back."""
+        """Discard state with times after a backward jump of the clock."""
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], None], *others: Any, **options: Any
     ) -> Any:
-        """Return a timer that is not called any more once it was destroyed.
+        """Return a timer that is never called after its destruction.
 
-        The executor may have found it due before.
+        The executor may already have queued it.
         """
 
         def call() -> None:
@@ -358,7 +358,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def _on_restart(self, jump: float) -> None:
         text = f'the clock jumped back by {jump:.3f} s'
         if not self.active or self.settings.lockstep:
-            # In lockstep the steps are the time.
+            # In lockstep the steps define the time.
             self.warn_throttled('clock', text)
             return
         self.get_logger().warning(f'{text}: the search starts again')
@@ -369,13 +369,13 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription that drops messages whose stamp is no time."""
+        """Return a subscription that drops messages with an invalid stamp."""
         if not options.get('raw'):
             callback = partial(self.check_stamp, topic, callback)
         return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
 
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
-        """Call back unless the stamp of a message is no time."""
+        """Call back unless the stamp of a message is invalid."""
         problem = stamp_problem(message)
         if problem is None:
             callback(message)
@@ -385,12 +385,12 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     # ---- diagnostics -------------------------------------------------------------------------
 
     def drop(self, reason: str, text: str, number: int = 1) -> None:
-        """Count something that is not used, and say so, throttled.
+        """Count discarded data, and warn, throttled.
 
         Parameters
         ----------
         reason : str
-            Short; what is counted in the diagnostics.
+            Short; key of the count in the diagnostics.
         text : str
             Topic and field, what was read, what is allowed.
         number : int
@@ -407,15 +407,15 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             self.get_logger().warning(text)
 
     def status(self) -> dict[str, Any]:
-        """Return what the diagnostics show beside the counts."""
+        """Return further values for the diagnostics."""
         return {}
 
     def fault(self) -> str:
-        """Return what keeps the node from its work, for the diagnostics; empty where it works."""
+        """Return the present error for the diagnostics; empty if there is none."""
         return ''
 
     def warnings(self) -> list[str]:
-        """Return what is wrong now, for the diagnostics."""
+        """Return the present fault for the diagnostics."""
         return []
 
     def _publish_diagnostics(self) -> None:
@@ -448,7 +448,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
 
 
 def _takes_part(name: str) -> bool:
-    """Return whether a node that listens is one that something depends on."""
+    """Return whether a subscribing node is a peer, not a mere observer."""
     return name not in ('recorder', 'guard', 'rosbag2_recorder') and not name.startswith('_')
 
 
@@ -467,12 +467,12 @@ def _activate(node: LockstepLifecycleNode[Any]) -> bool:
 def run(
     make_node: Callable[[], LockstepLifecycleNode[Any]], arguments: list[str] | None = None
 ) -> int:
-    """Run a node until it is told to end; return the exit code.
+    """Run a node until it is asked to end; return the exit code.
 
-    SIGINT and SIGTERM stop what moves before the node leaves the graph.
+    SIGINT and SIGTERM stop all motion before the node is destroyed.
     """
-    # A signal is only noted: an exception in the middle of a call into rclpy's C++ comes out as
-    # another one. A second signal does not wait.
+    # The handler only sets a flag: an exception raised inside a call into rclpy's C++ surfaces as
+    # a different one. A second signal raises at once.
     asked = False
 
     def interrupt(number: int, frame: Any) -> None:
@@ -493,7 +493,7 @@ def run(
                 return 2 if node.problem else 1
             if not asked and not _activate(node):
                 return 1
-        # What was made so far stays: the collector need not look at it in every round.
+        # Objects created so far are permanent: exclude them from garbage collection.
         gc.collect()
         gc.freeze()
         while rclpy.ok() and not asked:
@@ -508,6 +508,6 @@ def run(
                 node.halt()
             node.destroy_node()
         rclpy.try_shutdown()
-        # Not left to the end of the process, which may be a copy of another one.
+        # Explicit: a forked process ends with `os._exit`, without clean-up by the interpreter.
         get_default_context(shutting_down=True).destroy()
     return 0

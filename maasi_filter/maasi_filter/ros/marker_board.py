@@ -1,4 +1,4 @@
-"""Markers that a viewer shows, without stale ones."""
+"""Marker arrays without stale markers."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 class MarkerBoard:
     """
-    Makes each array of markers replace the one before.
+    Makes each array of markers replace the previous one.
 
-    The first array deletes whatever a viewer still shows of a node before this one; later arrays
-    delete the markers that are no longer there. Nodes that publish on the same topic lose theirs
-    with the first array too, until they publish again.
+    The first array deletes all markers that a viewer still shows of an earlier process; later
+    arrays delete those that are no longer present. Other nodes on the same topic also lose their
+    markers with the first array, until they publish again.
 
     """
 

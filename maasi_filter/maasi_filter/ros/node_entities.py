@@ -1,4 +1,4 @@
-"""What a node creates in *configure*, so that *cleanup* can destroy all of it."""
+"""Records the entities of a node created in *configure*, so that *cleanup* can destroy them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class NodeEntities:
     Parameters
     ----------
     node : Node
-        That makes them.
+        Owner of the entities.
     """
 
     def __init__(self, node: Node) -> None:
@@ -22,16 +22,16 @@ class NodeEntities:
         self._kept: list[Any] | None = None
 
     def mark(self) -> None:
-        """Keep what there is now: `clear` destroys only what comes after."""
+        """Mark the present entities as kept: `clear` destroys only later ones."""
         self._kept = self._all()
 
     def clear(self) -> None:
-        """Destroy what was made since `mark`; without a mark nothing."""
+        """Destroy the entities created since `mark`; nothing without a mark."""
         if self._kept is None:
             return
         kept, self._kept = {id(item) for item in self._kept}, None
         node = self._node
-        # Servers and clients of actions are waitables; event handlers go with their owners.
+        # Action servers and clients are waitables; owners destroy their event handlers.
         for waitable in list(node.waitables):
             if id(waitable) not in kept and not isinstance(waitable, EventHandler):
                 waitable.destroy()  # type: ignore[attr-defined]

@@ -33,20 +33,20 @@ _MOST = 2**63 - 1
 
 
 class SettingsError(Exception):
-    """Parameters that are not allowed; the text says which and why."""
+    """Invalid parameters; the text says which and why."""
 
 
 class NodeParameters(Generic[SettingsT]):
     """Declares the parameters of a node, and reads its settings from them.
 
-    Values that nobody gave are those of the settings: once the node is configured they are the
-    resolved ones (of a preset, for example), and they change with what was given.
+    Parameters that were not set have the defaults of the settings: once the node is configured,
+    the resolved ones (of a preset, for example), which depend on the parameters that were set.
 
     Parameters
     ----------
     node : Node
-        Whose parameters they are. It has to allow undeclared ones: what is optional is declared
-        only where it has a value, as a file of `ros2 param dump` cannot hold nothing.
+        Owner of the parameters. It has to allow undeclared ones: optional parameters are declared
+        only if they have a value, as a file of `ros2 param dump` cannot represent None.
     model : type
         The settings; each becomes a parameter.
     """
@@ -54,10 +54,10 @@ class NodeParameters(Generic[SettingsT]):
     def __init__(self, node: Node, model: type[SettingsT]) -> None:
         self._node = node
         self._model = model
-        # Those in use, until `release`.
+        # Settings in use, until `release`.
         self._settings: SettingsT | None = None
         self._own_change = False
-        # rclpy's own, as use_sim_time and start_type_description_service.
+        # Parameters of rclpy, such as use_sim_time and start_type_description_service.
         self._foreign = set(node.list_parameters([], 0).names)
         given = {
             name: item.value
@@ -65,7 +65,7 @@ class NodeParameters(Generic[SettingsT]):
             if not self._is_foreign(name) and item.value is not None
         }
         known = {item.name for item in parameter_fields(model, given)}
-        #: Names of those that were given, by a file or at run time.
+        #: Names of parameters that were set, by a file or at run time.
         self._given = set(given) & known
         self._declare(given)
         for name in sorted(set(given) - known):
@@ -75,15 +75,15 @@ class NodeParameters(Generic[SettingsT]):
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._note)
 
-    # ---- what the node reads -----------------------------------------------------------------
+    # ---- reading by the node -----------------------------------------------------------------
 
     def read(self) -> SettingsT:
-        """Return the settings; from now on they are in use, until `release`.
+        """Return the settings, and lock them until `release`.
 
         Raises
         ------
         SettingsError
-            If some are not allowed: each with its name, what was read and what is allowed.
+            If some are invalid: each with its name, what was read and what is allowed.
         """
         settings, problems = check(self._model, self._values())
         if settings is None:
@@ -93,15 +93,15 @@ class NodeParameters(Generic[SettingsT]):
         return settings
 
     def release(self) -> None:
-        """Let all of them be set again."""
+        """Unlock all parameters."""
         self._settings = None
 
     def _values(self) -> dict[str, Any]:
-        """Return what was given."""
+        """Return the parameters that were set."""
         return {name: self._node.get_parameter(name).value for name in sorted(self._given)}
 
     def _show(self, settings: SettingsT) -> None:
-        """Set what was not given to what it is resolved to."""
+        """Set the other parameters to their resolved values."""
         changes = []
         for name, value in flatten(settings.resolved()).items():
             if name in self._given:
@@ -115,13 +115,13 @@ class NodeParameters(Generic[SettingsT]):
             finally:
                 self._own_change = False
 
-    # ---- what others set ---------------------------------------------------------------------
+    # ---- setting by clients ------------------------------------------------------------------
 
     def _is_foreign(self, name: str) -> bool:
         return name in self._foreign or name.startswith('qos_overrides.')
 
     def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Return whether parameters may be set, and why not."""
+        """Return whether parameters may be set, and if not, why."""
         own = [item for item in parameters if not self._is_foreign(item.name)]
         if self._own_change or not own:
             return SetParametersResult(successful=True)
@@ -140,7 +140,7 @@ class NodeParameters(Generic[SettingsT]):
                     f'parameter {item.name}: is read in configure; set it while the node is '
                     'unconfigured (deactivate and cleanup before)'
                 )
-            # What is wrong with another one, or with several together, may still be put right.
+            # Errors of other parameters, or of several together, may still be corrected.
             wrong = [item.name] if self._settings is None else list(problems)
             for name in wrong:
                 if name in problems and item.value is not None:
@@ -148,7 +148,7 @@ class NodeParameters(Generic[SettingsT]):
         return SetParametersResult(successful=True)
 
     def _note(self, parameters: list[Parameter]) -> None:
-        """Note and use what was given, and declare what it brings with it, as a robot more."""
+        """Apply what was set, and declare dependent parameters, such as those of a new robot."""
         if self._own_change:
             return
         for item in parameters:
@@ -168,7 +168,7 @@ class NodeParameters(Generic[SettingsT]):
             self._own_change = False
 
     def _use(self, names: Collection[str]) -> None:
-        """Change settings that are in use, where they stand."""
+        """Change settings in use in place."""
         changed, _ = check(self._model, self._values())
         for name in names:
             source: Any = changed
@@ -184,7 +184,7 @@ class NodeParameters(Generic[SettingsT]):
         for item in parameter_fields(self._model, given):
             present = self._node.has_parameter(item.name)
             if not present and (item.default is not None or item.name in given):
-                # rclpy would not let a value out of range be read, to say what is wrong with it.
+                # With a range, rclpy would refuse the value before this class can report the error.
                 ranged = item.name not in problems
                 self._node.declare_parameter(item.name, item.default, _descriptor(item, ranged))
 
@@ -192,7 +192,7 @@ class NodeParameters(Generic[SettingsT]):
 def check(
     model: type[SettingsT], values: Mapping[str, Any]
 ) -> tuple[SettingsT | None, dict[str, str]]:
-    """Return the settings of flat parameters, or None and by name what is wrong.
+    """Return the settings of flat parameters, or None and the errors by name.
 
     Parameters
     ----------

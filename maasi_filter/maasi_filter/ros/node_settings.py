@@ -9,12 +9,12 @@ from typing_extensions import Self
 
 from maasi_filter.settings import EnvironmentSettings, FilterSettings, SensorSettings, Settings
 
-# A commanding node that has not asserted its liveliness for so long is dead to its guard [s].
+# Time without asserted liveliness after which a guard considers its driver dead [s].
 LIVELINESS_LEASE = 0.5
 
 
 class NodeSettings(Settings):
-    """What every node of a search needs to know."""
+    """Settings common to all nodes of a search."""
 
     #: Parameters that can be set while the node runs.
     live: ClassVar[frozenset[str]] = frozenset()
@@ -30,12 +30,12 @@ class NodeSettings(Settings):
     )
 
     def resolved(self) -> Self:
-        """Return a copy in which what is derived from other settings has its value."""
+        """Return a copy with derived settings filled in."""
         return self
 
 
 class SensorOfRobot(Settings):
-    """What the filter knows of a robot."""
+    """Settings of a robot for the filter."""
 
     sensor: SensorSettings = Field(
         default_factory=SensorSettings, description='Its sensor, as the filter believes'

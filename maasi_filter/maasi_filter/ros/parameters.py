@@ -1,8 +1,9 @@
-"""Settings as flat ROS parameters, and back. No ROS in here.
+"""Conversion between settings and flat ROS parameters. Without ROS.
 
-Nested settings become names with dots, and `None` is left out. Lists of lists of one length become
-one list, `bounds: [-0.3, 2.4, -0.3, 2.4]`; other lists of lists, and of small settings, become
-lists of strings of numbers, `obstacles: ['0.8 1.2 0.1']`, which are read for the former as well.
+Nested settings become names with dots, and `None` is omitted. Lists of lists of fixed length
+become one list, `bounds: [-0.3, 2.4, -0.3, 2.4]`; other lists of lists, and of small settings,
+become lists of strings of numbers, `obstacles: ['0.8 1.2 0.1']`, a form that is also accepted for
+the former.
 Settings by name, `robots`, become the list `robots` and `robot.<name>.<key>`.
 """
 
@@ -28,15 +29,15 @@ class ParameterField:
     name : str
         With dots.
     default : bool, int, float, str, list or None
-        None: it has none.
+        None: no default.
     description : str
         Meaning and unit.
     constraints : str
         What is allowed, in words.
     number : type or None
-        float or int where it is a single number.
+        float or int for a single number.
     lowest, highest : float or None
-        Its bounds; whether they are allowed themselves is in `constraints`.
+        Its bounds; `constraints` says whether they are included.
     """
 
     name: str
@@ -99,8 +100,7 @@ def parameter_fields(
     model : type
         The settings.
     given : mapping
-        Flat parameters that are set; they say which robots there are, and which of the optional
-        parts.
+        Flat parameters that are set; they determine which robots and optional parts exist.
     prefix : str
         Of all names.
     """
@@ -129,14 +129,14 @@ def parameter_fields(
 
 
 def parameter_name(model: type[BaseModel], location: Iterable[int | str]) -> str:
-    """Return the parameter that a place in nested values belongs to.
+    """Return the parameter of a location in nested values.
 
     Parameters
     ----------
     model : type
         The settings.
     location : iterable of str or int
-        Keys and indices on the way to the place, as pydantic has them.
+        Keys and indices of the location, as in errors of pydantic.
     """
     parts: list[str] = []
     current: type[BaseModel] | None = model
@@ -149,7 +149,7 @@ def parameter_name(model: type[BaseModel], location: Iterable[int | str]) -> str
                 None,
             )
         if info is None:
-            # An index, or a part of what is one parameter.
+            # An index, or a part of a single parameter.
             break
         by_name = _model_by_name(info.annotation)
         if by_name is None:
@@ -241,7 +241,7 @@ def _from_list(key: str, value: Sequence[Any], annotation: Any) -> list[Any]:
 
 
 def _as_text(item: Any) -> Any:
-    """Return an item of a list; one that is a list or settings as its numbers in a string."""
+    """Return an item of a list; a list or settings become a string of numbers."""
     if isinstance(item, BaseModel):
         numbers: list[float] = []
         for name in type(item).model_fields:
@@ -264,7 +264,7 @@ def _from_text(key: str, item: Any, annotation: Any) -> Any:
     except ValueError as error:
         raise ValueError(f'{key}: got {item!r}, allowed are numbers with spaces between') from error
     if isinstance(element, type) and issubclass(element, BaseModel):
-        # All but the last number belong to the list, as the centre of an obstacle.
+        # All but the last number belong to the list, such as the centre of an obstacle.
         names = list(element.model_fields)
         return {names[0]: numbers[:-1], names[1]: numbers[-1] if numbers else None}
     return numbers
@@ -277,7 +277,7 @@ def _bare(annotation: Any) -> Any:
 
 
 def choices(annotation: Any) -> list[Any]:
-    """Return what a field's annotation allows: the members of a union, without metadata."""
+    """Return the types of an annotation: the members of a union, without metadata."""
     annotation = _bare(annotation)
     if get_origin(annotation) in (Union, types.UnionType):
         return [inner for item in get_args(annotation) for inner in choices(item)]
@@ -292,7 +292,7 @@ def _element(annotation: Any) -> Any:
 
 
 def _width(annotation: Any) -> int | None:
-    """Return the length of the lists in a list, if it is always the same."""
+    """Return the length of the lists in a list, if it is fixed."""
     for choice in choices(annotation):
         if get_origin(choice) is list and get_origin(get_args(choice)[0]) is Annotated:
             element, *metadata = get_args(get_args(choice)[0])

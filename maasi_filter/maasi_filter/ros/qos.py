@@ -1,4 +1,4 @@
-"""Quality of service, by what a topic is for."""
+"""Quality of service by purpose of a topic."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from rclpy.qos import (
 
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 
-# What nobody may miss: batches, detections, updates, states, decisions, lockstep.
+# Lossless topics: batches, detections, updates, states, decisions, lockstep.
 RELIABLE = QoSProfile(
     history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
 )
 
-# What one who comes later needs as well: found targets, the truth, the last update.
+# For late joiners: found targets, the truth, the last update.
 LATCHED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
-# Updates of the filter: reliable, and a planner that is started again hears of the last ones.
+# Updates of the filter: reliable, and a restarted planner receives the last ones.
 UPDATES = QoSProfile(
     depth=100,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
-# As LATCHED, for a reader of several writers.
+# As LATCHED, for a reader of several publishers.
 LATCHED_ALL = QoSProfile(
     history=HistoryPolicy.KEEP_ALL,
     depth=1,
@@ -41,7 +41,7 @@ LATCHED_ALL = QoSProfile(
 )
 
 # States of robots. Liveliness is asserted by the executor thread: a process whose executor hangs
-# loses it, though its middleware goes on.
+# loses it, although the threads of its middleware still run.
 LIVELY = QoSProfile(
     history=HistoryPolicy.KEEP_ALL,
     depth=1,
@@ -49,27 +49,27 @@ LIVELY = QoSProfile(
     liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
     liveliness_lease_duration=Duration(seconds=LIVELINESS_LEASE),
 )
-# How often it is asserted [s].
+# Period of assertion [s].
 LIVELINESS_PERIOD = 0.1
 
-# Commands to a robot: an old one is worth nothing on a link that was down.
+# Commands to a robot: a short queue, as old commands are useless after a link failure.
 COMMANDS = QoSProfile(depth=3, reliability=ReliabilityPolicy.RELIABLE)
 
-# Transforms, as tf2 reads and writes them.
+# Transforms, as in tf2.
 TRANSFORMS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE
 )
 
-# What sensors publish: each message replaces the one before.
+# Sensor data: each message replaces the previous one.
 SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 SENSOR_READER = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def liveliness_reader(lease: float) -> QoSProfile:
-    """Return how a guard reads states: for the loss of liveliness after `lease` seconds."""
+    """Return the QoS of a guard for states: liveliness is lost after `lease` seconds."""
     return QoSProfile(
         depth=1,
-        # Liveliness without data comes with heartbeats, which only reliable readers get.
+        # Without data, liveliness is asserted by heartbeats, which only reliable readers get.
         reliability=ReliabilityPolicy.RELIABLE,
         liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
         liveliness_lease_duration=Duration(seconds=lease),
@@ -77,10 +77,10 @@ def liveliness_reader(lease: float) -> QoSProfile:
 
 
 def sensor_reader(lockstep: bool) -> QoSProfile:
-    """Return how sensor data is read: best effort, or in lockstep all of it."""
+    """Return the QoS of readers of sensor data: best effort, in lockstep lossless."""
     return RELIABLE if lockstep else SENSOR_READER
 
 
 def sensor_writer(lockstep: bool) -> QoSProfile:
-    """Return how sensor data is written."""
+    """Return the QoS of publishers of sensor data."""
     return RELIABLE if lockstep else SENSOR

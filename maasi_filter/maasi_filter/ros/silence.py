@@ -1,4 +1,4 @@
-"""How long something has been silent, in the time that timeouts of a node count in."""
+"""Duration of silence of a source, in the clock that timeouts of a node use."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from rclpy.node import Node
 
 
 class Silence:
-    """The time since something was heard: simulated where the node uses simulated time.
+    """Time since the last message of a source: simulated if the node uses simulated time.
 
-    A busy machine slows simulated time down with everything else; timeouts of wall time would
-    expire although nothing is late. Else the clock is the steady one.
+    On a busy machine simulated time slows down with everything else, while timeouts of wall time
+    would expire without a fault. Otherwise the clock is the steady one.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class Silence:
         self.end()
 
     def end(self) -> None:
-        """Note that something was heard."""
+        """Note that a message was received."""
         self._wall = time.monotonic()
         self._simulated = self._time()
 
@@ -42,7 +42,7 @@ class Silence:
 
     @property
     def length(self) -> float:
-        """Time since then [s]; 0 from a simulated time that had not begun, or has jumped back."""
+        """Time since then [s]; 0 if simulated time had not begun then, or has jumped back."""
         now = self._time()
         if now is None:
             return self.wall

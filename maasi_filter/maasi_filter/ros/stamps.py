@@ -6,24 +6,24 @@ from typing import Any
 
 _NANOSECONDS = 1_000_000_000
 
-#: Steps back or forward in a stream of stamps from here on are jumps [ns].
+#: Smallest difference of consecutive stamps that counts as a jump [ns].
 JUMP = _NANOSECONDS
 
-#: Stamps are below this [s].
+#: Largest valid stamp [s].
 LAST_STAMP = 2**31 - 1
 
-# Batch ids that a node accepts at first, and how far they may be ahead of those that it knows.
+# Limit of the first batch id, and of the lead of later ids over the last one.
 _FIRST_IDS = 2**62
 _IDS_AHEAD = 10**6
 
 
 def stamp_problem(message: Any) -> str | None:
-    """Return what is wrong with the stamp of a message: field, what was read, what is allowed.
+    """Return the error of the stamp of a message: field, what was read, what is allowed.
 
     Parameters
     ----------
     message : object
-        With `header.stamp`, `stamp`, or neither: then nothing is wrong.
+        With `header.stamp`, `stamp`, or neither, which is no error.
     """
     name, owner = 'header.stamp', getattr(message, 'header', None)
     if owner is None:
@@ -41,15 +41,15 @@ def stamp_problem(message: Any) -> str | None:
 def batch_id_limit(last: int) -> int:
     """Return the highest batch id that is accepted after `last`.
 
-    Ids rise without end, and a uint64 does not. A node that accepted an absurd id could not go on
-    from it. Ids below the limit are followed, so that filter and planner agree again.
+    Ids increase, and uint64 is bounded: a node that accepted an id near the bound could not
+    continue from it. Ids below the limit are accepted, so that filter and planner agree again.
     """
     return max(last, _FIRST_IDS) + _IDS_AHEAD
 
 
 class StampGate:
     """
-    Tells a jump of a stream of stamps from a single message with a wrong one.
+    Distinguishes a jump of a stream of stamps from a single wrong stamp.
 
     A stamp that jumps is refused; if the next one follows it, the stream has really jumped (its
     source was restarted, messages were lost), and is accepted from there.
@@ -57,7 +57,7 @@ class StampGate:
     Parameters
     ----------
     jump : int
-        Largest difference of two stamps that is not a jump. In the unit of the stamps.
+        Largest difference of two stamps that is not a jump, in the unit of the stamps.
 
     """
 
@@ -67,7 +67,7 @@ class StampGate:
         self._suspect: int | None = None
 
     def accepts(self, stamp: int) -> bool:
-        """Return whether a stamp is to be believed."""
+        """Return whether a stamp is accepted."""
         last, suspect = self._last, self._suspect
         self._suspect = None
         if last is not None and abs(stamp - last) > self.jump:
@@ -75,11 +75,11 @@ class StampGate:
                 self._suspect = stamp
                 return False
         elif last is not None and stamp < last:
-            # Late, not a jump: the stream does not go back for it.
+            # A late message, not a jump: the reference stays at the last stamp.
             return True
         self._last = stamp
         return True
 
     def clear(self) -> None:
-        """Forget everything: the next stamp is believed."""
+        """Reset: the next stamp is accepted."""
         self._last = self._suspect = None
