@@ -7,7 +7,7 @@ from launch_ros.actions import LifecycleNode
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the planner node; it configures and activates itself unless told otherwise."""
+    """Return the planner node; it configures and activates itself by default (`autostart`)."""
     return LaunchDescription(
         [
             DeclareLaunchArgument('params_file', description='Parameters of the node (YAML)'),

@@ -1,4 +1,4 @@
-"""Where each robot goes: motion models, objective and planners. No ROS in here."""
+"""Planning of waypoints and measurements: motion models, objective and planners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Between messages and the planner's records."""
+"""Conversions between messages and records of the planner."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from maasi_planner.team import Decision, RobotDecision
 
 FloatArray = NDArray[np.float64]
 
-# J of a candidate that is not allowed; a message holds finite numbers only.
+# J of an inadmissible candidate; messages contain finite numbers only.
 NOT_ALLOWED = -1e30
 
 
@@ -44,7 +44,7 @@ def robot_state_from_ros(message: AgentState) -> RobotState:
 
 
 def robot_decision_to_ros(name: str, index: int, decision: RobotDecision) -> RobotDecisionMessage:
-    """Return a robot's decision with all its candidates."""
+    """Return the decision of a robot with all its candidates."""
     objective = decision.objective.tolist()
     rows = zip(
         decision.candidates.tolist(),
@@ -88,7 +88,7 @@ def decision_to_ros(
     Parameters
     ----------
     decision : Decision
-        What was decided.
+        Decision of the planner.
     indices : dict
         Decision index of each robot.
     planner : str
@@ -119,7 +119,7 @@ def decision_to_ros(
 
 
 def path_to_ros(positions: FloatArray, header: Header, most: int = 50) -> Path:
-    """Return a trajectory, thinned to at most so many poses."""
+    """Return a trajectory, thinned to a maximum number of poses."""
     count = len(positions)
     chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
     poses = []
@@ -150,7 +150,7 @@ def exploration_to_ros(exploration: Exploration, header: Header) -> OccupancyGri
 def planner_markers(
     robots: dict[str, tuple[FloatArray, FloatArray, FloatArray]], header: Header, size: float
 ) -> MarkerArray:
-    """Return markers of robots (blue), waypoints (pink) and planned ways (green).
+    """Return markers of robots (blue), waypoints (pink) and planned paths (green).
 
     Parameters
     ----------

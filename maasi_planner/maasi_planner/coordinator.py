@@ -1,6 +1,6 @@
-"""The team's planning from step to step: who plans, who measures, what is explored.
+"""Planning of the team step by step: which robots plan and measure, what is explored.
 
-The planner node and the in-process search both run on this (000, algorithms 1 and 2).
+Used by the planner node and the in-process search (000, algorithms 1 and 2).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class PresentRobot:
     Attributes
     ----------
     state : RobotState
-        Where it is.
+        Present state.
     free : bool
         Whether it has no goal, or its goal has ended.
     """
@@ -53,7 +53,7 @@ class Member:
 
 @dataclass
 class _Plan:
-    """A robot with its present plan."""
+    """Present plan of a robot."""
 
     motion: MotionModel
     sensor: Sensor
@@ -85,7 +85,7 @@ class Coordinator:
     clusters : list of Cluster
         Potential targets after the last measurements.
     finished : str or None
-        Why nothing is left to gain, once that is so.
+        Why no gain is left; None before.
     """
 
     def __init__(self, settings: PlannerNodeSettings) -> None:
@@ -133,27 +133,27 @@ class Coordinator:
         return self._plans[name].positions
 
     def destination(self, name: str, state: RobotState) -> FloatArray:
-        """Return where a robot at `state` will stand when its plan is done, (3,) [m]."""
+        """Return the final position of the plan of a robot at `state`, (3,) [m]."""
         plan = self._plans[name]
         if plan.staying or not len(plan.positions):
             return np.array(state.pose.position)
         return plan.positions[-1].copy()
 
     def is_idle(self, name: str) -> bool:
-        """Return whether a robot has no goal of its plan: it never had one, or was told to stay."""
+        """Return whether a robot has no goal: it never had one, or is commanded to stay."""
         return self._plans[name].staying
 
     def refuse(self, name: str) -> None:
-        """Take note that a robot refused its goal; it plans anew at its next measurement."""
+        """Note that a robot refused its goal; it replans at its next measurement."""
         self._plans[name].staying = True
 
     def skip_measurements(self, name: str, index: int) -> None:
-        """Let a robot's measurement indices go on from `index`, as after a restart."""
+        """Continue the measurement indices of a robot from `index`, for example after a restart."""
         plan = self._plans[name]
         plan.measurements = max(plan.measurements, index)
 
     def leave(self, name: str) -> None:
-        """Take note that a robot does not take part: it has no plan any more."""
+        """Note that a robot does not take part; discard its plan."""
         plan = self._plans[name]
         plan.decided_at = None
         plan.positions = np.zeros((0, 3))
@@ -167,16 +167,16 @@ class Coordinator:
         return plan.decided_at is None or not plan.staying or len(plan.positions) > 0
 
     def lend(self, name: str, step: int) -> None:
-        """Take note that a robot follows a goal of another client: it measures without a plan."""
+        """Note that a robot follows a goal of another client: it measures without a plan."""
         plan = self._plans[name]
         began = step if plan.decided_at is None else plan.decided_at
         self.leave(name)
         plan.decided_at = began
-        # Measurements have the index of a decision, which is not negative.
+        # Measurements need a decision index, which is not negative.
         plan.decision = max(plan.decision, 0)
 
     def begin_again(self) -> None:
-        """Begin a new search with nothing explored; indices of decisions go on."""
+        """Begin a new search with nothing explored; decision indices continue."""
         self.exploration.values[...] = 1.0
         self.finished = None
         self.planner = make_planner(self.settings.planner.name, self.settings.planner)
@@ -185,7 +185,7 @@ class Coordinator:
             self.leave(name)
 
     def next_number(self, name: str) -> int:
-        """Return the number of a goal that no decision of the planner led to."""
+        """Return the number of a goal without a decision of the planner."""
         plan = self._plans[name]
         plan.decision += 1
         return plan.decision + 1
@@ -193,8 +193,8 @@ class Coordinator:
     def planning(self, step: int, robots: Mapping[str, PresentRobot]) -> list[str]:
         """Return P_k, the robots that plan at a step, in order of their names.
 
-        A robot plans when it has arrived; one that was told to stay, again at its next possible
-        measurement.
+        A robot plans when it has arrived; one that was commanded to stay replans at its next
+        possible measurement.
         """
         if self.finished is not None:
             return []
@@ -214,7 +214,7 @@ class Coordinator:
         robots: Mapping[str, PresentRobot],
         taken: Sequence[tuple[FloatArray, float]] = (),
     ) -> Decision | None:
-        """Return the joint decision of the robots that plan at a step, None where nobody does.
+        """Return the joint decision of the robots that plan at a step, None without any.
 
         Parameters
         ----------
@@ -223,7 +223,7 @@ class Coordinator:
         robots : mapping
             The robots that take part, by name.
         taken : sequence of (3,) array and float
-            Where robots that others plan for will stand [m], and their radii.
+            Final positions of robots of other planners [m], and their radii.
         """
         planning = self.planning(step, robots)
         if not planning:
@@ -308,8 +308,7 @@ class Coordinator:
         robots : mapping
             The robots that take part, by name.
         able : collection of str, optional
-            Robots whose sensor has data now; another one's measurement waits until it has. None:
-            all.
+            Robots whose sensor has data now; measurements of the others are postponed. None: all.
         """
         members = []
         for name in sorted(robots):
@@ -317,7 +316,7 @@ class Coordinator:
             if plan.decided_at is None:
                 continue
             gone = step - plan.decided_at
-            # The decision itself is taken at the last waypoint.
+            # At index 0 the robot is still at its last waypoint.
             if gone == 0 or (self.planner.measures_underway and gone % plan.period == 0):
                 plan.due = plan.due or self.trigger.measures(
                     name,
@@ -334,14 +333,14 @@ class Coordinator:
         return members
 
     def absorb(self, poses: Mapping[str, Pose], clusters: list[Cluster]) -> None:
-        """Take in a batch after the filter has processed it.
+        """Update with a batch that the filter has processed.
 
         Parameters
         ----------
         poses : mapping
-            Where the members measured, by name (000, eq. (20), (30); 002, eq. (12)).
+            Poses of the measurements of the members, by name (000, eq. (20), (30); 002, eq. (12)).
         clusters : list of Cluster
-            After the batch.
+            Potential targets after the batch.
         """
         for name in sorted(poses):
             plan = self._plans[name]

@@ -1,18 +1,18 @@
-"""Whether the filter still answers, for a planner that runs freely."""
+"""Supervision of the filter by a free-running planner."""
 
 from __future__ import annotations
 
 
 class FilterWatch:
-    """Judges a filter by its heartbeat and by the oldest batch without an update.
+    """Detects a silent filter by its heartbeat and by the oldest batch without an update.
 
-    Both count only once there was something to wait for: a filter that was never heard of, while
+    Both count only if there was something to wait for: a filter that never sent a heartbeat, while
     no batch is open, is no fault.
 
     Parameters
     ----------
     timeout : float
-        Longest silence [s of wall time]; 0: it is not watched.
+        Longest silence [s of wall time]; 0 disables the supervision.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -21,7 +21,7 @@ class FilterWatch:
         self._open: dict[int, float] = {}
 
     def beat(self, now: float) -> None:
-        """Note a heartbeat: the executor of the filter runs."""
+        """Note a heartbeat of the executor of the filter."""
         self._beat = now
 
     def asked(self, batch: int, now: float) -> None:
@@ -29,17 +29,17 @@ class FilterWatch:
         self._open[batch] = now
 
     def answered(self, batch: int) -> None:
-        """Note the update of a batch: those before will not come any more."""
+        """Note the update of a batch: updates of earlier ones will not arrive any more."""
         self._open = {number: since for number, since in self._open.items() if number > batch}
 
     def stalled(self, seconds: float) -> None:
-        """Note that the planner itself has stood still: what was sent meanwhile is not read yet."""
+        """Note that the planner itself was suspended: messages of that time are not read yet."""
         if self._beat is not None:
             self._beat += seconds
         self._open = {number: since + seconds for number, since in self._open.items()}
 
     def problem(self, now: float) -> str:
-        """Return why the filter counts as absent, empty where it does not."""
+        """Return why the filter counts as absent; empty if it does not."""
         if not self.timeout:
             return ''
         if self._beat is not None and now - self._beat > self.timeout:

@@ -1,4 +1,4 @@
-"""Keeps the found targets for a filter that is restarted without its state."""
+"""Keeps found targets for a filter that is restarted without its state."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from maasi_msgs.msg import FoundTarget, FoundTargetArray
 
 
 class FoundKeeper:
-    """Republishes found targets, latched: a latched message is gone with its publisher.
+    """Republishes found targets, latched: a latched message is lost with its publisher.
 
-    A target that was kept once stays, also where the filter does not have it any more.
+    Targets are never removed, even if the filter no longer has them.
 
     Subscribes
     ----------
@@ -44,6 +44,6 @@ class FoundKeeper:
         )
 
     def forget(self) -> None:
-        """Keep nothing: another search begins."""
+        """Remove all targets for a new search."""
         self._targets.clear()
         self._publisher.publish(FoundTargetArray())

@@ -1,4 +1,4 @@
-"""When to measure: periodically, or only when it is expected to be worth it (000, (24), (33))."""
+"""Measurement trigger: periodic, or by expected information (000, (24), (33))."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def expected_use(
     sensor : Sensor
         Of the robot.
     pose : Pose
-        Where it would measure.
+        Pose of the measurement.
     clusters : sequence of Cluster
         After the last measurement.
     exploration : Exploration
@@ -46,8 +46,8 @@ def expected_use(
 class MeasurementTrigger:
     """Decides at each possible measurement of a robot whether it measures.
 
-    At its decision (index 0) a robot always measures. `relative` compares with the mean of the
-    same quantity along the predicted trajectory, as known at the decision.
+    A robot always measures at its decision (index 0). `relative` compares with the mean of the same
+    quantity along the predicted trajectory, evaluated at the decision.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class MeasurementTrigger:
         self._means: dict[str, float] = {}
 
     def reset(self) -> None:
-        """Forget all trajectories."""
+        """Discard all trajectories."""
         self._means.clear()
 
     def begin(
@@ -73,7 +73,7 @@ class MeasurementTrigger:
         clusters: Sequence[Cluster],
         exploration: Exploration,
     ) -> None:
-        """Take note of a new trajectory; call it at each decision of the robot.
+        """Store a new trajectory; call at each decision of the robot.
 
         Parameters
         ----------
@@ -86,7 +86,7 @@ class MeasurementTrigger:
         period_steps : int
             Steps between possible measurements.
         clusters, exploration
-            As known at the decision.
+            Values at the decision.
         """
         if self.settings.measurement == 'periodic' or self.settings.trigger == 'absolute':
             return
@@ -118,9 +118,9 @@ class MeasurementTrigger:
         index : int
             m, of this possible measurement since the robot's decision, which is 0.
         sensor, pose
-            The robot's sensor and where it is.
+            Sensor of the robot, and its present pose.
         clusters, exploration
-            After the last measurement of anybody.
+            Values after the last measurement of any robot.
         """
         settings = self.settings
         if settings.measurement == 'periodic' or index == 0:

@@ -14,7 +14,7 @@ from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSet
 
 
 class PlannedRobotSettings(Settings):
-    """What the planner knows of a robot."""
+    """Settings of a robot for the planner."""
 
     candidates: CandidateSettings = Field(description='Waypoints to choose from')
     motion: MotionSettings = Field(default_factory=MotionSettings, description='How it moves')
@@ -29,7 +29,7 @@ class PlannedRobotSettings(Settings):
 
 
 class OtherRobotSettings(Settings):
-    """What the planner knows of a robot that plans for itself."""
+    """Settings of a robot with its own planner."""
 
     radius: float = Field(default=0.1, ge=0.0, description='Of a circle around the robot [m]')
     start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(

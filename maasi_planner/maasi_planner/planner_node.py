@@ -1,4 +1,4 @@
-"""The planner node: where each robot goes, and when it measures."""
+"""The planner node: waypoints and measurements of each robot."""
 
 from __future__ import annotations
 
@@ -65,22 +65,22 @@ from maasi_planner.search_control.team_goals import Course, HeardState, TeamGoal
 FloatArray = NDArray[np.float64]
 
 _LOOK_PERIOD = 0.1
-# With a longer gap it was the planner itself that stood still [s].
+# A longer gap between two checks means that the planner itself was suspended [s].
 _LONGEST_LOOK = 1.0
-# At the end: rounds in which results are sent.
+# At shutdown: executor rounds for sending results.
 _LAST_TASKS = 5
-# In lockstep: longest wait for an update until its batch is published once more [s].
+# Period of republishing a batch without an update [s].
 _ANSWER_PATIENCE = 1.0
-# Poses of measurements that are kept for updates that come late.
+# Capacity of the buffer of measurement poses for late updates.
 _POSES_KEPT = 1000
 
 
 class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
-    """Plans for the whole team (000, algorithms 1 and 2), or for one robot of several by itself.
+    """Plans for the whole team (000, algorithms 1 and 2), or independently for one robot.
 
-    In the namespace of its only robot it is that robot's own (002, section 4, independent
-    planner): beside others of the kind that tell each other where their robots go. Who comes
-    later by name knows where those before go at the same step.
+    In the namespace of its only robot it plans for that robot alone (002, section 4, independent
+    planner), and exchanges destinations with the planners of the other robots. At each step they
+    plan in the order of names, each with the destinations of the earlier ones.
 
     Subscribes
     ----------
@@ -115,7 +115,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._size = 0.02 * float((bounds[:, 1] - bounds[:, 0]).max())
         self._dimension = self.settings.environment.dimension
         self.modes = SearchModes(self.settings.robots)
-        # Steps between two states of a robot from which on one of them is not believed.
+        # Smallest difference of steps between states of a robot that counts as a jump.
         longest = max(1.0, 2.0 * self.settings.state_timeout)
         self._jump = round(longest / self.settings.step)
         self._begin_anew()
@@ -127,15 +127,15 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._away: set[str] = set(self.coordinator.names)
         self._poses: dict[tuple[str, int], Pose] = {}
         self._poses_order: deque[tuple[str, int]] = deque()
-        # Measurements whose updates were taken in.
+        # Measurements whose updates have been processed.
         self._used: set[tuple[str, int]] = set()
         self._used_order: deque[tuple[str, int]] = deque()
         self._updates: deque[tuple[FilterUpdate, list[Cluster], Silence]] = deque()
         self._taken_step = -1
         self._expected: LockstepStep | None = None
-        # Robots that follow a goal of another client, and its number.
+        # Robots that follow a goal of another client, with its number.
         self._lent: dict[str, int] = {}
-        # Robots that are on their way to their start, and the number of that goal; 0: there.
+        # Robots on their way to their start, with the number of that goal; 0: arrived.
         self._homing: dict[str, int] = {}
         self._waiting_batch = 0
         self._batch_message = MeasurementBatch()
@@ -147,7 +147,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._expected_number = 0.0
         self._measurements = 0
         self._decisions = 0
-        # Free running: why no robot is sent anywhere, empty where they are.
+        # Free running: why the robots are held; empty if they are not.
         self._held = ''
         self._filter_watch = FilterWatch(self.settings.filter_timeout)
         self._filter_names: set[str] = set()
@@ -157,7 +157,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._board = MarkerBoard()
         self._planning_time = 0.0
         others = self.settings.others
-        # Where they will stand, by step: the last two that were heard of.
+        # Destinations of robots with their own planner, by step: the last two received.
         self._destinations: dict[str, dict[int, FloatArray]] = {
             name: {-1: np.array(others[name].start)} for name in sorted(others)
         }
@@ -170,7 +170,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         """Compile and connect."""
         warm_up()
         names = self.coordinator.names
-        # Before the batches, so that a filter that hears these knows that targets are kept.
+        # Before the publisher of batches: a filter with batches must discover the kept targets.
         self._keeper = FoundKeeper(self)
         self._batch_publisher = self.create_publisher(
             MeasurementBatch, 'measurement_batch', RELIABLE
@@ -232,7 +232,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self.create_wall_timer(_LOOK_PERIOD, self._look_around)
 
     def start(self) -> None:
-        """Start the search, unless it waits for a command."""
+        """Start the search, unless it has to wait for a command."""
         if self.settings.search_on_start:
             self.modes.command('start')
 
@@ -247,13 +247,13 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._stop_robots(self.coordinator.names)
 
     def _stop_robots(self, names: Iterable[str]) -> None:
-        """Cancel the goals of robots, which have no plan any more."""
+        """Cancel the goals of robots, and discard their plans."""
         for name in names:
             self._goals.cancel(name)
             self.coordinator.leave(name)
 
     def destroy_node(self) -> None:
-        """Let a client know how its search ended, and leave."""
+        """Send the result of the search to its client, and shut down."""
         self.active = False
         if self.configured and self.executor is not None:
             for _ in range(_LAST_TASKS):
@@ -273,7 +273,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         return f'robots are held: {self._held}' if self._held else ''
 
     def _command(self, word: str, names: list[str] | None) -> tuple[bool, str]:
-        """Follow a command for robots (None: all); return whether, and an answer in words."""
+        """Execute a command for robots (None: all); return acceptance and an answer as text."""
         if not self.active:
             return False, 'the planner is not active'
         asked = self.coordinator.names if names is None else names
@@ -319,18 +319,18 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         }
 
     def warnings(self) -> list[str]:
-        """Return which robots follow goals of other clients."""
+        """Return the robots that follow goals of other clients."""
         return [
             f'{name} follows goal {goal} of another client'
             for name, goal in sorted(self._lent.items())
         ]
 
-    # ---- what comes in -----------------------------------------------------------------------
+    # ---- input -------------------------------------------------------------------------------
 
     def on_step(self, message: LockstepStep) -> None:
-        """Plan when the states of this step are all there.
+        """Plan when all states of this step have arrived.
 
-        A step comes again when a node was started anew: what it may have missed is said again.
+        A step is republished for a restarted node: resend the messages that it may have missed.
         """
         before = self._expected
         if before is None and message.step == self._taken_step:
@@ -342,21 +342,21 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._try_step()
 
     def _ask_again(self) -> None:
-        """Publish the batch that is waited for once more; who has it already does nothing."""
+        """Republish the pending batch; receivers ignore duplicates."""
         if self._waiting_batch:
             self._batch_at = time.monotonic()
             self._batch_publisher.publish(self._batch_message)
 
     def _repeat_step(self) -> None:
         self._ask_again()
-        # One that answers after all is sent elsewhere.
+        # If such a robot does answer later, it gets a new goal.
         for name, _ in sorted(self._goals.waiting):
             self._refuse(name)
         self._goals.waiting.clear()
         self._try_done()
 
     def _in_frame(self, reason: str, topic: str, header: Header) -> bool:
-        """Return whether a message is in the frame of the map; drop it otherwise."""
+        """Return whether a message is in the frame `map`; drop it otherwise."""
         if header.frame_id == self.settings.frame:
             return True
         self.drop(
@@ -465,9 +465,10 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._try_step()
 
     def _unheard(self, step: int, robots: list[str]) -> bool:
-        """Return whether another planner has still to say where its robot goes.
+        """Return whether destinations of other planners are missing.
 
-        One with a name before says so for this step first, one after for the step before.
+        Needed are those of this step from planners earlier by name, and of the previous step from
+        later ones.
         """
         own = self.coordinator.names[0]
         for name, known in self._destinations.items():
@@ -481,7 +482,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         return False
 
     def _taken(self, step: int, robots: list[str] | None) -> list[tuple[FloatArray, float]]:
-        """Return where robots that plan for themselves will stand, as far as it is known."""
+        """Return the known destinations of robots with their own planner, and their radii."""
         own = self.coordinator.names[0]
         taken = []
         for name, known in self._destinations.items():
@@ -516,7 +517,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if int(message.batch_id) > self._batch:
             self._batch = self._batch_before = int(message.batch_id)
         if int(message.batch_id) <= self._batch_before:
-            # Of a planner before this one: go on after its batches.
+            # An update of an earlier planner process: continue after its indices.
             for member in message.members:
                 self.coordinator.skip_measurements(member.robot, int(member.measurement) + 1)
             return
@@ -525,7 +526,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._take_updates()
 
     def _check_numbers(self, message: FilterUpdate) -> None:
-        """Refuse numbers from which the planner could not go on."""
+        """Refuse ids and indices so large that the planner could not continue from them."""
         limit = batch_id_limit(self._batch)
         if message.batch_id > limit:
             raise ValueError(f'batch_id: read {message.batch_id}, allowed is up to {limit}')
@@ -538,19 +539,19 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 )
 
     def _take_updates(self) -> None:
-        """Take in the updates whose measurements have been heard as well, in their order."""
+        """Process in order the updates whose detections have arrived as well."""
         while self._updates:
             update, clusters, silence = self._updates[0]
             keys = [(member.robot, int(member.measurement)) for member in update.members]
             if keys and all(key in self._used for key in keys):
-                # A restarted filter publishes its last update again.
+                # Duplicate: a restarted filter republishes its last update.
                 self._updates.popleft()
                 continue
             unknown = [key for key in keys if key not in self._poses]
             if unknown:
                 if self.settings.lockstep or silence.length < self.settings.state_timeout:
                     return
-                # It must not hold up those that follow.
+                # It must not block later updates.
                 self._updates.popleft()
                 self.drop(
                     'bad update',
@@ -574,7 +575,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 self._waiting_batch = 0
                 self._try_done()
 
-    # ---- who is there ------------------------------------------------------------------------
+    # ---- availability of robots and filter ---------------------------------------------------
 
     def _join_or_leave(self, name: str, status: int, reason: str) -> None:
         if status == AgentState.UNAVAILABLE:
@@ -595,7 +596,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self.get_logger().warning(f'{name} does not take part any more: {reason}')
 
     def _look_around(self) -> None:
-        """Plan without robots that have fallen silent; look after the action."""
+        """Remove silent robots from planning; check filter and action."""
         if not self.active:
             return
         if not self.settings.lockstep:
@@ -616,7 +617,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._filter_watch.beat(time.monotonic())
 
     def _watch_filter(self, now: float) -> None:
-        """Hold the robots while the filter does not answer."""
+        """Hold the robots while the filter is silent."""
         since, self._looked_at = now - self._looked_at, now
         if since > _LONGEST_LOOK:
             self._filter_watch.stalled(since)
@@ -646,7 +647,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     # ---- a step ------------------------------------------------------------------------------
 
     def _try_step(self) -> None:
-        """In lockstep: plan once the states of all robots that take part are there."""
+        """In lockstep: plan once the states of all participating robots have arrived."""
         expected = self._expected
         if expected is None:
             return
@@ -672,7 +673,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._try_done()
 
     def _try_free_step(self) -> None:
-        """Free running: plan once all robots that take part have come to a new step."""
+        """Free running: plan once all participating robots have reached a new step."""
         present = [name for name in self.coordinator.names if name not in self._away]
         if not present:
             return
@@ -738,7 +739,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 publisher.publish(PointStamped(header=header, point=point))
 
     def _announce(self, decision: Any, header: Header) -> None:
-        """Publish a decision and send the robots on their way."""
+        """Publish a decision and send the goals."""
         self._decisions += 1
         indices = {name: self.coordinator.decision_index(name) for name in decision.robots}
         self._decision_publisher.publish(
@@ -769,7 +770,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._goals.send(name, goal)
 
     def _is_free(self, name: str, heard: HeardState, step: int) -> bool:
-        """Return whether a robot can take a goal: none is under way, of any client."""
+        """Return whether a robot can take a goal: it has none, from any client."""
         coordinator = self.coordinator
         if not coordinator.is_idle(name):
             number = coordinator.decision_index(name) + 1
@@ -855,7 +856,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             )
         )
 
-    # ---- views -------------------------------------------------------------------------------
+    # ---- visualization -----------------------------------------------------------------------
 
     def _publish_views(self, header: Header, now: float, robots: dict[str, PresentRobot]) -> None:
         rate = self.settings.views_rate

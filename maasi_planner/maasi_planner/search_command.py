@@ -14,10 +14,10 @@ from std_srvs.srv import Trigger
 from maasi_planner.search_control.search_modes import COMMANDS
 
 DONE, REFUSED, ABSENT = 0, 1, 2
-# Commands of drivers alone.
+# Commands that only drivers have.
 _OF_DRIVERS = ('release', 'arm')
 _TRIGGER = 'std_srvs/srv/Trigger'
-# Services that come up later than this after the last one are not waited for [s].
+# Discovery ends this long after the last new service [s].
 _SETTLED = 1.0
 
 
@@ -40,10 +40,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def wanted(services: dict[str, list[str]], command: str, robot: str, namespace: str) -> set[str]:
-    """Return the services that a command calls, of those that there are."""
+    """Return the services that a command calls, among the available ones."""
     top = '/'.join(['', *[part for part in namespace.split('/') if part]])
     known = {name for name, types in services.items() if _TRIGGER in types}
-    # A driver has both; a robot is one level below its team.
+    # A driver has both services; its robot is one level below the team.
     drivers = {
         name.removesuffix('/release')
         for name in known
@@ -71,7 +71,7 @@ def wanted(services: dict[str, list[str]], command: str, robot: str, namespace: 
 
 
 def call_all(node: Node, options: argparse.Namespace) -> dict[str, Any]:
-    """Call each service as soon as it is found; return the answers, None where there is none."""
+    """Call each service as soon as it is found; return the answers, None without an answer."""
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     calls: dict[str, Any] = {}
@@ -85,7 +85,7 @@ def call_all(node: Node, options: argparse.Namespace) -> dict[str, Any]:
             options.robot or '',
             options.namespace,
         )
-        # Without the planner of the team, those of single robots may be only a part of it.
+        # Without the planner of the team, the services found may cover only a part of the robots.
         for name in sorted(found - set(clients)):
             clients[name] = node.create_client(Trigger, name)
             changed = time.monotonic()

@@ -132,7 +132,7 @@ class MotionSettings(Settings):
 
 
 class PlannerSettings(Settings):
-    """Which planner decides, and its numbers. What is left None takes the objective's value."""
+    """Choice of planner, and its parameters. None means the default of the objective."""
 
     name: Literal[
         'maasi', 'asi', 'maas', 'as', 'mutual_information', 'nearest_widest', 'lawnmower'

@@ -1,4 +1,4 @@
-"""What a planner sees of the team, and what it decides."""
+"""Input and output of a planner: view of the team, and decision."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass
 class RobotView:
-    """One robot, as the planner sees it at a step.
+    """View of one robot at a step.
 
     Parameters
     ----------
@@ -41,15 +41,15 @@ class RobotView:
     planning : bool
         Whether the robot is in P_k: it chooses a waypoint now.
     tail : (n, 3) array, optional
-        Rest of the trajectory of a robot that is not planning: positions at steps now, now + 1
-        and so on. None: it stands at its present position.
+        Remaining trajectory of a robot that is not planning: positions at steps now, now + 1 and
+        so on. None: it stands at its present position.
     tail_yaws : (n,) array, optional
         Headings along the tail, radians. None: the present one.
     phase : int
         Steps from now to the next possible measurement of a robot that is not planning. (One
         that plans measures now.)
     radius : float
-        Of a circle around the robot, metres; keeps waypoints apart.
+        Radius of a circle around the robot, metres; separates waypoints of different robots.
     exploration : Exploration, optional
         e after the robot's own measurements only, iota of 002, eq. (12). None: that of the team.
     """
@@ -69,7 +69,7 @@ class RobotView:
 
 @dataclass
 class TeamView:
-    """The whole team at one step.
+    """View of the whole team at one step.
 
     Parameters
     ----------
@@ -78,19 +78,19 @@ class TeamView:
     step_time : float
         Seconds per step.
     robots : dict
-        By name; taken in the order of names, however they were put in.
+        By name; always processed in the order of names.
     clusters : list of Cluster
         Potential targets now.
     exploration : Exploration
         e after the last measurements.
     found_targets : sequence
-        Not used by the objective; for planners that want to stay away from them.
+        Not used by the objective; for planners that avoid them.
     obstacles : Obstacles, optional
-        In their own size, not inflated.
+        In true size, not inflated.
     particles, weights : (n, d), (n,) arrays, optional
-        The intensity, for mutual information; without them the clusters stand for it.
+        Intensity function, for mutual information; approximated by the clusters if None.
     taken : sequence of (3,) array and float
-        Where robots stand or will stand that are none of this team's, metres, and their radii.
+        Present or final positions of robots of other planners, metres, and their radii.
     """
 
     step: int
@@ -125,26 +125,27 @@ class TeamView:
 
 @dataclass
 class RobotDecision:
-    """What one robot is to do, and what it could have done.
+    """Decision for one robot, with all compared candidates.
 
     Attributes
     ----------
     chosen : int
         Index into `candidates`; -1 means stay where it is (see `reason`).
     waypoint : (3,) array
-        Where to go, metres, frame `map`; the present position when it stays.
+        Chosen waypoint, metres, frame `map`; the present position when it stays.
     positions, yaws : (K + 1, 3), (K + 1,) arrays
         Predicted trajectory, from the present state.
     candidates : (W, 3) array
         Waypoints that were compared, after moving them out of obstacles.
     control_cost, target_refinement, exploration, objective : (W,) arrays
-        C, T, E and J of each, given what the other robots do; J is -inf for what is not allowed.
-        With the objective `information`, T and E of the chosen ones sum to those of the team.
-        In very large teams T, E and J of those not chosen are without the other planning robots.
+        C, T, E and J of each, given the choices of the other robots; J is -inf for inadmissible
+        candidates. With the objective `information`, T and E of the chosen ones sum to those of
+        the team. In very large teams T, E and J of other candidates neglect the other planning
+        robots.
     lengths, measurements : (W,) integer arrays
         Steps K and measurements M of each predicted trajectory.
     reason : str
-        Why this one, in words.
+        Explanation of the choice.
     """
 
     chosen: int
@@ -162,7 +163,7 @@ class RobotDecision:
 
     @property
     def stays(self) -> bool:
-        """Whether the robot is to stay where it is."""
+        """Whether the robot stays at its present position."""
         return self.chosen < 0
 
     @property
@@ -173,7 +174,7 @@ class RobotDecision:
 
 @dataclass
 class Decision:
-    """One decision of a planner, for all robots that planned."""
+    """Joint decision of a planner for all robots that plan."""
 
     step: int
     robots: dict[str, RobotDecision] = field(default_factory=dict)
@@ -186,18 +187,18 @@ class Decision:
 def single_choice(
     points: FloatArray, prediction: Trajectories, chosen: int, reason: str
 ) -> RobotDecision:
-    """Return a decision without terms, for planners that do not compare by J.
+    """Return a decision without the terms of J, for planners that do not use it.
 
     Parameters
     ----------
     points : (W, 3) array
         Waypoints, metres.
     prediction : Trajectories
-        To them.
+        Trajectories to the waypoints.
     chosen : int
-        Which.
+        Index of the chosen waypoint.
     reason : str
-        Why.
+        Explanation of the choice.
     """
     length = int(prediction.lengths[chosen])
     return RobotDecision(
@@ -217,7 +218,7 @@ def single_choice(
 
 
 def stay(view: RobotView, reason: str) -> RobotDecision:
-    """Return the decision to stay, which is safe whatever is wrong with the candidates."""
+    """Return the decision to stay, the safe fallback without usable candidates."""
     empty = np.zeros(0)
     return RobotDecision(
         chosen=-1,

@@ -21,7 +21,7 @@ Model = Literal['constant_speed', 'mambo', 'unicycle', 'quadrotor']
 
 
 def _decide(team: TeamView) -> None:
-    """Let every planner decide for all robots together, and for the first one alone."""
+    """Run every planner for all robots together, and for the first one alone."""
     for settings in (
         PlannerSettings(objective='paper'),
         PlannerSettings(objective='information'),
@@ -42,7 +42,7 @@ def _decide(team: TeamView) -> None:
 
 
 def warm_up() -> None:
-    """Run small decisions of every kind, so that the first real one is not the slow one."""
+    """Run small decisions of every kind, so that the first real one does not compile."""
     obstacles = Obstacles(np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.array([False]))
     pairs: tuple[tuple[int, tuple[Model, Model]], ...] = (
         (2, ('mambo', 'unicycle')),

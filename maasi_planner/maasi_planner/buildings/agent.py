@@ -1,4 +1,4 @@
-"""One robot of the distributed search of 004: what it knows, hears, decides and photographs."""
+"""One robot of the distributed search of 004: knowledge, messages, decisions and snapshots."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
 
-# A robot this close to its station, and this slow, has arrived [m, m/s].
+# Tolerances of arrival at the station [m, m/s].
 _ARRIVED, _ARRIVED_SPEED = 2.0, 2.0
-# How far the state may be from what the last plan said, for that plan to be flown on [m, m/s].
+# Largest deviation from the last plan for which that plan may be continued [m, m/s].
 _SAME_STATE = 0.5
-# Plans go this far into a cuboid: on its face, rounding would decide whether it is visited [m].
+# Depth of planned visits: on a face, rounding would decide whether a cuboid is visited [m].
 _INTO = 1e-3
 
 
 class Activity(Enum):
-    """What a robot is at."""
+    """Activity of a robot."""
 
     SEARCHING = 0
     RETURNING = 1
@@ -40,7 +40,7 @@ class Activity(Enum):
 
 @dataclass(frozen=True)
 class Broadcast:
-    """What a robot tells those in range at a step (V-B).
+    """Message of a robot to those in range at a step (V-B).
 
     Attributes
     ----------
@@ -51,17 +51,17 @@ class Broadcast:
     position, velocity : (3,) arrays
         [m, m/s].
     searching : bool
-        Whether it takes part; a robot on its way home still passes on what it knows.
+        Whether it takes part; a robot on its way home still shares its search map.
     visited : (N,) array of bool
         V, its search map.
     flight_steps : int
         t_Fl, since its last recharge.
     plan : mapping
-        Steps from now until the visit by cuboid, of its plan of the step before.
+        Steps from now until the visit, by cuboid, of its previous plan.
     hazard : Hazard
         Of its battery.
     predicted : (3,) array
-        Where its plan of the step before has it at t + tau* + 1 [m].
+        Position at t + tau* + 1 in its previous plan [m].
     """
 
     robot: str
@@ -78,20 +78,20 @@ class Broadcast:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A picture of a cell.
+    """Snapshot of a cell.
 
     Attributes
     ----------
     robot : str
-        Who took it.
+        Name of the robot.
     step : int
-        When.
+        Time step.
     cuboid : int
-        The cell's.
+        Index of the cuboid of the cell.
     position : (3,) array
         Of the robot [m].
     direction : (3,) array
-        Of the optical axis: against the normal of the face.
+        Optical axis, opposite to the normal of the face.
     distance : float
         From the face [m].
     detection_probability : float
@@ -109,23 +109,23 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Choice:
-    """What a robot does at a step.
+    """Decision of a robot at a step.
 
     Attributes
     ----------
     control : (3,) array
         Force until the next step [N].
     velocity : (3,) array
-        What it leads to at the next step [m/s].
+        Resulting velocity at the next step [m/s].
     plan : Plan
-        That it belongs to.
+        Plan of the decision.
     how : str
-        optimal; best_so_far: a limit ended the solve; shifted: there was no solution, it flies
-        the plan before; brake: not even that.
+        optimal; best_so_far: a limit ended the solve; shifted: no solution, it continues the
+        previous plan; brake: no valid previous plan either.
     target : (3,) array
         x* [m].
     activity : Activity
-        What it is at.
+        Present activity.
     """
 
     control: FloatArray
@@ -160,14 +160,15 @@ def inflated(boxes: FloatArray, clearance: float) -> FloatArray:
 
 
 class SearchAgent:
-    """A robot that plans for itself.
+    """A robot with its own planner.
 
-    At each step: `observe` its state, send what that returns, and `decide` with what was heard.
+    At each step: `observe` its state, send the returned message, and `decide` with the messages
+    received.
 
     Parameters
     ----------
     name : str
-        Of the robot.
+        Name of the robot.
     settings : CuboidSettings
         Of the search.
     mission : Mission
@@ -247,11 +248,11 @@ class SearchAgent:
 
     @property
     def done(self) -> bool:
-        """Whether it knows that all cuboids are visited."""
+        """Whether all cuboids are visited, as far as it knows."""
         return bool(self.visited.all())
 
     def observe(self, step: int, position: ArrayLike, velocity: ArrayLike) -> Broadcast | None:
-        """Take in its own state; return what it tells the others, None while it recharges.
+        """Update its own state; return the message to the others, None while it recharges.
 
         Raises
         ------
@@ -265,7 +266,7 @@ class SearchAgent:
                 f'{self.name}: state: got {place}, {speed}, allowed are finite numbers'
             )
         if self.plan is not None and step != self.step + 1:
-            # It was away, or a step was missed: the plan is not of the step before.
+            # After a recharge or a missed step the plan is not that of the previous step.
             self.plan = None
         self.step = step
         self.position, self.velocity = place, speed
@@ -316,16 +317,16 @@ class SearchAgent:
         rng: np.random.Generator,
         wanted: BoolArray | None = None,
     ) -> Choice:
-        """Decide on the step that was observed last.
+        """Decide for the step that was observed last.
 
         Parameters
         ----------
         heard : sequence of Broadcast
-            From those in range, of the same step.
+            Messages from robots in range, of the same step.
         rng : numpy.random.Generator
-            For this robot and step: battery, recharge and rewards.
+            Generator of this robot and step, for battery, recharge and rewards.
         wanted : (N,) array of bool, optional
-            Cuboids to plan for, instead of drawing (14): of the sequential scheme.
+            Cuboids to plan for, instead of the draw (14); used by the sequential scheme.
         """
         fails, minutes = rng.random(2)
         if self.activity is not Activity.RECHARGING:
@@ -349,7 +350,7 @@ class SearchAgent:
         return self.follow(plan, problem.target)
 
     def problem(self, heard: Sequence[Broadcast], wanted: BoolArray) -> Problem:
-        """Return the problem of the step, with rewards (N,) of 1 for what is `wanted`."""
+        """Return the problem of the step, with rewards (N,) of 1 for `wanted` cuboids."""
         homing = self.activity is not Activity.SEARCHING
         target = self.home if homing else self._target(heard)
         if self.settings.around_corners and (target != self.position).any():
@@ -370,7 +371,7 @@ class SearchAgent:
         )
 
     def _target(self, heard: Sequence[Broadcast]) -> FloatArray:
-        """Return x*: the cuboid nearest to where it will be, or the one assigned to it (10)."""
+        """Return x*: the cuboid nearest to its predicted position, or the assigned one (10)."""
         unvisited = np.flatnonzero(~self.visited)
         if heard:
             if self.settings.assignment == 'predicted':
@@ -386,14 +387,14 @@ class SearchAgent:
         return self.position if chosen is None else self.mission.centres[chosen]
 
     def predicted(self) -> FloatArray:
-        """Return x at t + tau* + 1 as the plan before has it; the position without a plan."""
+        """Return x at t + tau* + 1 of the previous plan; the present position without a plan."""
         if self.plan is None:
             return self.position
         guided = self.solver.objective.guided
         return np.asarray(self.plan.positions[min(guided + 1, len(self.plan.positions) - 1)])
 
     def follow(self, plan: Plan | None, target: FloatArray) -> Choice:
-        """Return the choice that a plan means; without one, the plan before or to brake."""
+        """Return the choice of a plan; without one, of the previous plan, or to brake."""
         how: How
         if plan is not None:
             how = 'optimal' if plan.status == 'optimal' else 'best_so_far'
@@ -405,7 +406,7 @@ class SearchAgent:
                 plan, how = self._stop(), 'brake'
         before = [k - 1 for k, _ in self.plan.visits if k > 1] if self.plan else []
         now = [k for k, _ in plan.visits]
-        # Else a robot can plan to visit later for ever.
+        # Count postponements: otherwise a robot can postpone its visit for ever.
         self.put_off = self.put_off + 1 if before and now and min(now) > min(before) else 0
         self.plan = plan
         if self.activity is not Activity.RECHARGING:
@@ -428,7 +429,7 @@ class SearchAgent:
                 self.plan = None
 
     def _shifted(self) -> Plan | None:
-        """Return the plan before from now on, with braking at its end."""
+        """Return the rest of the previous plan, with braking at its end."""
         if self.plan is None:
             return None
         off = max(
@@ -443,7 +444,7 @@ class SearchAgent:
         return self._flown([], [])
 
     def _flown(self, controls: list[FloatArray], visits: list[tuple[int, int]]) -> Plan:
-        """Return the plan of some controls, and of braking after them."""
+        """Return the plan of given controls, followed by braking."""
         horizon = self.settings.horizon
         positions, velocities, used = [self.position], [self.velocity], []
         for k in range(horizon):

@@ -1,4 +1,4 @@
-"""Batteries that fail, and what robots make of the plans of others: 004, (3), (11) to (14)."""
+"""Battery failures, and rewards given the plans of other robots: 004, (3), (11) to (14)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Hazard:
 
 @dataclass(frozen=True)
 class HeardPlan:
-    """What a robot heard of another one's plan of the step before.
+    """Plan of another robot of the previous step, as received.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class HeardPlan:
     flight_steps : int
         t_Fl, since its last recharge.
     hazard : Hazard
-        Of its battery.
+        Failure hazard of its battery.
     """
 
     visits: Mapping[int, int]
@@ -62,7 +62,7 @@ def rewards(
 ) -> BoolArray:
     """Draw r(n) for all cuboids, (number,): (11) to (14).
 
-    One draw for each cuboid is taken from `rng`, whether it is needed or not.
+    Always takes one draw per cuboid from `rng`, so that the sequence does not depend on the plans.
     """
     draws = rng.random(number)
     result = np.ones(number, dtype=bool)

@@ -1,8 +1,8 @@
-"""All robots planned together: 004, P1, exactly.
+"""Exact joint planning of all robots: 004, P1.
 
-Without (5j) the problem falls apart into one for each robot, P2. Where two robots plan to visit
-the same cuboid, it counts once: a node of a best-first search forbids it to the one or to the
-other. The first node without such a conflict is the optimum.
+Without (5j) the problem decomposes into one problem P2 per robot. A cuboid that two robots plan to
+visit counts once: best-first search branches by forbidding it to one or to the other robot. The
+first node without such a conflict is the optimum.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Literal
 
 from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
 
-# Objectives that differ by less are equal [1].
+# Tolerance of equal objectives [1].
 _GAP = 1e-7
 
 
@@ -31,9 +31,9 @@ class JointPlan:
     objective : float
         Their sum, (6) with each cuboid counted once.
     status : str
-        optimal, or time_limit: conflicts were settled in the order of the robots.
+        optimal, or time_limit: conflicts were resolved in the order of the robots.
     solves : int
-        Problems of single robots that were solved.
+        Number of solved problems of single robots.
     """
 
     plans: list[Plan]
@@ -50,11 +50,11 @@ def solve_jointly(
     Parameters
     ----------
     solver : PlanSolver
-        For all of them: they are alike.
+        Common solver, as the robots are identical.
     problems : sequence of Problem
         One for each robot.
     time_limit : float
-        Wall time after which conflicts are settled one after the other [s].
+        Wall time after which conflicts are resolved sequentially [s].
     """
     begun = time.perf_counter()
     known: dict[tuple[int, frozenset[int]], Plan | None] = {}
@@ -89,7 +89,7 @@ def solve_jointly(
         if time.perf_counter() - begun > time_limit:
             return _in_turn(solver, problems, len(known))
         cuboid, robots = conflict
-        # Either this robot leaves it to others, or all others leave it to this one.
+        # Branch: either this robot or all others must not visit the cuboid.
         one, others = robots[0], [robot for robot in range(len(problems)) if robot != robots[0]]
         for leaving in ([one], others):
             child = list(forbidden)
@@ -101,7 +101,7 @@ def solve_jointly(
                     if again is None:
                         break
                     new[robot] = again
-                # A plan that does not visit it stays optimal.
+                # A plan that does not visit the cuboid remains optimal.
                 known.setdefault((robot, child[robot]), new[robot])
             else:
                 key = tuple(child)
@@ -117,7 +117,7 @@ def _total(plans: Sequence[Plan]) -> float:
 
 
 def _conflict(plans: Sequence[Plan]) -> tuple[int, list[int]] | None:
-    """Return a cuboid that several robots visit, and who."""
+    """Return a cuboid that several robots visit, and these robots."""
     users: dict[int, list[int]] = {}
     for robot, plan in enumerate(plans):
         for _, cuboid in plan.visits:
@@ -130,7 +130,7 @@ def _conflict(plans: Sequence[Plan]) -> tuple[int, list[int]] | None:
 
 
 def _in_turn(solver: PlanSolver, problems: Sequence[Problem], solves: int) -> JointPlan | None:
-    """Return plans made one after the other, each without what those before it visit."""
+    """Return sequential plans, each without the cuboids of the earlier ones."""
     taken: set[int] = set()
     plans: list[Plan] = []
     for problem in problems:

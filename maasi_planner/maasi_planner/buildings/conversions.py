@@ -24,7 +24,7 @@ from maasi_planner.buildings.preplanning import Mission
 
 FloatArray = NDArray[np.float64]
 
-# Of a battery's parameters.
+# Upper bound of the parameters of a battery.
 _LARGEST_HAZARD = 1e9
 
 
@@ -40,7 +40,7 @@ def vector_from_ros(message: Vector3) -> FloatArray:
 
 
 def broadcast_to_ros(broadcast: Broadcast, header: Header) -> SearchLink:
-    """Return what a robot tells the others."""
+    """Return the message of a robot to the others."""
     return SearchLink(
         header=header,
         step=broadcast.step,
@@ -61,14 +61,14 @@ def broadcast_to_ros(broadcast: Broadcast, header: Header) -> SearchLink:
 
 
 def broadcast_from_ros(message: SearchLink, cuboids: int) -> Broadcast:
-    """Return what another robot tells.
+    """Return the broadcast of another robot.
 
     Parameters
     ----------
     message : SearchLink
-        As heard.
+        As received.
     cuboids : int
-        Number of them in this robot's mission.
+        Number of cuboids in the mission.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def mission_markers(mission: Mission, header: Header) -> MarkerArray:
 
 
 def agent_markers(agent: SearchAgent, choice: Choice, header: Header) -> MarkerArray:
-    """Return a robot, its plan, its search map, and where its camera looks."""
+    """Return markers of a robot, its plan, its search map, and its camera direction."""
     name = agent.name
     markers = []
     for number, box in enumerate(agent.mission.boxes):

@@ -43,7 +43,7 @@ from maasi_planner.conversions import path_to_ros
 from maasi_planner.search_control.search_modes import Mode, SearchModes
 from maasi_planner.search_control.search_services import offer_services
 
-# How far an odometry's stamp may be from a step [ns].
+# Largest difference of the stamps of odometry and step [ns].
 _STAMP_TOLERANCE = 1_000_000
 _REASONS = {
     Activity.SEARCHING: '',
@@ -53,19 +53,18 @@ _REASONS = {
 
 
 class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
-    """Plans for the robot whose namespace it is in, with what those in range tell.
+    """Plans for the robot of its namespace, with the messages of robots in range.
 
-    At each step it takes in its state, tells the others, hears them, decides, and commands the
-    velocity that its plan leads to. A message of a robot that is not heard changes nothing: nobody
-    waits for it.
+    At each step it reads its state, sends to the others, receives from them, decides, and commands
+    the velocity of its plan. It does not wait for robots that are out of range.
 
     Subscribes
     ----------
-    `odom` (nav_msgs/Odometry); `link/rx` (maasi_msgs/SearchLinkArray): what it hears at a step
+    `odom` (nav_msgs/Odometry); `link/rx` (maasi_msgs/SearchLinkArray): messages received at a step
 
     Publishes
     ---------
-    `link/tx` (maasi_msgs/SearchLink): what it tells; `cmd_vel` (geometry_msgs/TwistStamped): the
+    `link/tx` (maasi_msgs/SearchLink): message sent; `cmd_vel` (geometry_msgs/TwistStamped): the
     velocity at the next step; `state` (maasi_msgs/AgentState); `decision`
     (maasi_msgs/CuboidDecision); `plan` (nav_msgs/Path); of the team: `markers`,
     `search_area` (visualization_msgs/MarkerArray)
@@ -92,7 +91,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         except ValueError as error:
             raise SettingsError(f'parameter {error}') from error
         self.modes = SearchModes([self.name])
-        # Between two odometry messages there may be several steps [ns].
+        # Odometry may skip steps.
         self._gate = StampGate(max(JUMP, round(3e9 * settings.step)))
         self._begin_anew()
 
@@ -112,7 +111,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._wanted_step = -1
         self._board = MarkerBoard()
         self._told_step = -1
-        # Whether the agent observed the state of that step, and is to decide.
+        # Whether the agent has observed the state of that step, but not decided.
         self._observed = False
         self._decided_step = -1
         self._link: SearchLink | None = None
@@ -182,7 +181,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         return self.modes.of[self.name] is Mode.SEARCHING
 
     def _take_command(self, word: str, _: list[str] | None) -> tuple[bool, str]:
-        """Follow a command; return whether, and an answer in words."""
+        """Execute a command; return whether it was accepted, and an answer as text."""
         if not self.active:
             return False, 'the planner is not active'
         if word == 'home':
@@ -212,10 +211,10 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             'last decision [ms]': f'{1e3 * self._solve_time:.2f}',
         }
 
-    # ---- what comes in -----------------------------------------------------------------------
+    # ---- input -------------------------------------------------------------------------------
 
     def on_step(self, message: LockstepStep) -> None:
-        """Plan when state and messages of this step are there."""
+        """Plan when state and messages of this step have arrived."""
         if self.name in message.robots:
             self._wanted_step = int(message.step)
             self._try_step()
@@ -251,7 +250,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
                 'allowed if the next one follows it',
             )
             return
-        # Odometry starts at zero.
+        # Odometry is relative to the start.
         pose = compose(Pose.from_yaw(self.settings.start, self.settings.yaw), reading)
         self._state = (step, pose, pose.rotation() @ velocity)
         if not self.settings.lockstep:
@@ -277,7 +276,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._try_step()
 
     def _look_at_the_time(self) -> None:
-        """Decide with nobody heard, if the link stays silent for long."""
+        """Decide without other robots if the link is silent for too long."""
         if not self.active or self._told_step != self._wanted_step:
             return
         patience = self.settings.link_patience * self.settings.step
@@ -298,7 +297,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         if self._told_step != step:
             self._tell(step)
         elif self._decided_step == step and self.settings.lockstep:
-            # Another node was started again, and the step came anew.
+            # Duplicate step, after a restart of another node: resend the outputs.
             if self._link is not None and self._command is not None:
                 self._link_publisher.publish(self._link)
                 self._command_publisher.publish(self._command)
@@ -373,7 +372,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self.done(step)
 
     def _stand(self, step: int) -> None:
-        """Do a step without searching: the robot stands."""
+        """Process a step without search: the robot stands."""
         self._decided_step = step
         header = self._header(step)
         self._command = TwistStamped(header=header)

@@ -21,7 +21,7 @@ class Dynamics:
     mass : float
         m [kg].
     retained : float
-        phi = 1 - eta, share of the velocity that is left after a step [1].
+        phi = 1 - eta, share of the velocity that remains after a step [1].
     force : float
         Largest force on each axis [N].
     speed : float
@@ -89,7 +89,7 @@ class Dynamics:
         )
 
     def control_for(self, velocity: ArrayLike, wanted: ArrayLike) -> FloatArray:
-        """Return the force (3,) [N] within its bounds that comes closest to a wanted velocity."""
+        """Return the force (3,) [N] within its bounds that gets closest to a wanted velocity."""
         change = np.asarray(wanted, dtype=float) - self.retained * np.asarray(velocity, dtype=float)
         return np.clip(
             self.mass / self.step * change + self.weight,
@@ -102,7 +102,7 @@ class Dynamics:
         return self.control_for(velocity, np.zeros(3))
 
     def deceleration(self, axis: int) -> tuple[float, float]:
-        """Return the largest loss of speed in a step on top of the air's: moving up, down [m/s]."""
+        """Return the largest deceleration per step beyond air resistance: up, down [m/s]."""
         weight = float(self.weight[axis])
         return (
             self.step / self.mass * (self.force + weight),
@@ -110,7 +110,7 @@ class Dynamics:
         )
 
     def braking_steps(self) -> int:
-        """Return after how many steps the robot has come to rest at the latest, on any axis."""
+        """Return the largest number of steps until the robot is at rest on all axes."""
         most = 0
         for axis in range(3):
             for loss in self.deceleration(axis):

@@ -1,4 +1,4 @@
-"""Where a robot is drawn to: the local assignment (10), and ways around obstacles."""
+"""Guidance targets: the local assignment (10), and paths around obstacles."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from maasi_planner.buildings.preplanning import segment_cuts
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-# Distance of the corners that robots aim at from the obstacle [m].
+# Distance of intermediate targets from the corners of obstacles [m].
 _BERTH = 3.0
 
 
 def nearest(place: FloatArray, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the unvisited cuboid nearest to a place (3,), None: there is none left."""
+    """Return the unvisited cuboid nearest to a position (3,), None if none is left."""
     if not len(unvisited):
         return None
     offset = centres[unvisited] - place
@@ -25,9 +25,9 @@ def nearest(place: FloatArray, centres: FloatArray, unvisited: IntArray) -> int 
 
 
 def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the cuboid that falls to robot `own` when all places (m, 3) share them: (10).
+    """Return the cuboid assigned to robot `own` among robots at positions (m, 3): (10).
 
-    None where more robots than cuboids are left and none falls to this one.
+    None if fewer cuboids than robots are left and this robot gets none.
     """
     if not len(unvisited):
         return None
@@ -38,7 +38,7 @@ def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntAr
 
 
 class WayFinder:
-    """Ways around boxes: a visibility graph over their corners, by time of travel.
+    """Paths around boxes: a visibility graph over their corners, weighted by travel time.
 
     Parameters
     ----------
@@ -57,9 +57,9 @@ class WayFinder:
         self._down = speed
 
     def first_corner(self, place: FloatArray, target: FloatArray) -> FloatArray:
-        """Return where to aim at from a place (3,) on the way to a target (3,).
+        """Return the next intermediate target on the path from a position (3,) to a target (3,).
 
-        The target itself where it is in sight, or where no way is found.
+        The target itself if it is visible, or if there is no path.
         """
         if not segment_cuts(place, target, self.solids).any():
             return target
@@ -94,7 +94,7 @@ class WayFinder:
         return np.asarray(points[node])
 
     def reaches(self, place: FloatArray, target: FloatArray) -> bool:
-        """Return whether a way leads from a place to a target."""
+        """Return whether a path leads from a position to a target."""
         if not segment_cuts(place, target, self.solids).any():
             return True
         return bool((self.first_corner(place, target) != target).any())

@@ -93,6 +93,6 @@ def box_numbers(item: BoxSettings, floor: float) -> list[float]:
 
 
 def face_words(item: ObjectSettings) -> str:
-    """Return the faces of an object as words."""
+    """Return the faces of an object as a string."""
     faces: list[Face] = item.faces
     return ' '.join(faces)

@@ -1,4 +1,4 @@
-"""From objects to cuboids: 004, IV."""
+"""Pre-planning: from objects to cuboids, 004, IV."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from maasi_planner.buildings.settings import (
 )
 
 FloatArray = NDArray[np.float64]
-# Thinnest cuboid that a robot is sent to [m].
+# Least thickness of a cuboid [m].
 _THINNEST = 1.0
 
 
 def detection_probability(distance: float, camera: SearchCameraSettings) -> float:
-    """Return p_d at a distance from the face [m]: (4), with 0 only below d_min."""
+    """Return p_d at a distance from the face [m]: (4), but 0 only below d_min, not at it."""
     if distance < camera.least_distance:
         return 0.0
     span = camera.largest_distance - camera.least_distance
@@ -45,7 +45,7 @@ def distance_for(probability: float, camera: SearchCameraSettings) -> float:
 
 
 def footprint(distance: float, camera: SearchCameraSettings) -> float:
-    """Return r, the side of the square that the camera sees at a distance [m] (III-C)."""
+    """Return r, the side of the square footprint of the camera at a distance [m] (III-C)."""
     return 2.0 * distance * math.tan(0.5 * camera.angle)
 
 
@@ -81,22 +81,22 @@ class Cell:
 
 @dataclass(frozen=True)
 class Mission:
-    """What is searched, decided before take-off.
+    """Mission, planned before take-off.
 
     Attributes
     ----------
     cells : list of Cell
-        That can be searched.
+        Searchable cells.
     lost : list of (Cell, str)
-        Those that cannot, and why.
+        Other cells, and why they are lost.
     area : (3, 2) array
-        Where robots may be [m].
+        Admissible positions [m].
     objects, obstacles : (n, 3, 2) arrays
-        As they are [m].
+        True size, without clearance [m].
     distance, footprint : float
         d and r [m].
     coverage : float
-        Share of the searchable faces that the snapshots show, 0 to 1.
+        Share of the searchable faces that the snapshots cover, 0 to 1.
     """
 
     cells: list[Cell]
@@ -143,7 +143,7 @@ class Mission:
 
 
 def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> NDArray[np.bool_]:
-    """Return which boxes (n, 3, 2) the inside of is cut by segments (..., 3), (..., n)."""
+    """Return which boxes (n, 3, 2) have an interior that segments (..., 3) cut, (..., n)."""
     way = end - begin
     with np.errstate(divide='ignore', invalid='ignore'):
         first = (boxes[:, :, 0] - begin[..., None, :]) / way[..., None, :]
@@ -210,7 +210,7 @@ def _boxes(key: str, items: Sequence[BoxSettings], area: FloatArray) -> FloatArr
     for index, item in enumerate(items):
         box = item.array(float(area[2, 0]))
         outside = (box[:, 0] < area[:, 0] - 1e-9) | (box[:, 1] > area[:, 1] + 1e-9)
-        # An obstacle may go on outside.
+        # An obstacle may extend beyond the area.
         wrong = (
             outside.any()
             if isinstance(item, ObjectSettings)
@@ -233,7 +233,7 @@ def _face_cells(
     side: float,
     settings: CuboidSettings,
 ) -> tuple[list[Cell], float]:
-    """Return the cells of a face, and the share of each that a snapshot shows."""
+    """Return the cells of a face, and the share of each that a snapshot covers."""
     number = FACES.index(face)  # type: ignore[arg-type]
     axis, upper = divmod(number, 2)
     others = [a for a in range(3) if a != axis]
@@ -262,7 +262,7 @@ def _face_cells(
 def _usable(
     cell: Cell, area: FloatArray, solids: FloatArray, settings: CuboidSettings
 ) -> tuple[FloatArray, str]:
-    """Return the part of a cuboid that robots can be in, or why there is none."""
+    """Return the accessible part of a cuboid, or why there is none."""
     box = np.stack(
         [np.maximum(cell.box[:, 0], area[:, 0]), np.minimum(cell.box[:, 1], area[:, 1])], axis=1
     )
@@ -279,7 +279,7 @@ def _usable(
         )
         if ((box[:, 0] >= wall[:, 1]) | (box[:, 1] <= wall[:, 0])).any():
             continue
-        # The largest part beside the solid.
+        # Keep the largest part beside the solid.
         parts = []
         for axis in range(3):
             below, above = box.copy(), box.copy()

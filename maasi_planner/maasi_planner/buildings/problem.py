@@ -18,14 +18,13 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-# By how much bounds give way when rounding has left a state outside of them [m, m/s].
+# Relaxation of bounds if rounding leaves the state outside of them [m, m/s].
 GIVE = 1e-4
-# A given position this far outside a cuboid is inside: plans touch faces, and rounding moves them
-# [m].
+# Tolerance of the present position in a cuboid: plans touch faces, up to rounding [m].
 TOUCH = 1e-6
-# Nodes between two looks at the clock, and most nodes that are held at once.
+# Nodes between two checks of the time limit, and capacity of open nodes.
 _SLICE, _ROOM = 500, 16384
-# Share of the smoothness that is kept when a robot flies home, so that its forces are unique.
+# Share of the smoothness weight of a robot that flies home, so that its forces are unique.
 _HOMING_SMOOTHNESS = 1e-2
 
 
@@ -38,7 +37,7 @@ class Objective:
     horizon : int
         T, at least 2.
     guidance_step : int
-        tau*; T - 1 where it is larger.
+        tau*, limited to T - 1.
     guidance : float
         w1 [1/m^2].
     smoothness : float
@@ -46,7 +45,7 @@ class Objective:
     visit : float
         w3 [1].
     discount : float
-        Of w3 for each step that a visit comes later; 1 is the paper.
+        Factor of w3 per step of delay of a visit; 1 in the paper.
     """
 
     horizon: int = 10
@@ -80,7 +79,7 @@ class Objective:
         Parameters
         ----------
         put_off : int
-            How often in a row the first visit was put off: as many times more is discounted.
+            Consecutive postponements of the first visit: each adds one step of discount.
         """
         steps = np.maximum(np.arange(self.horizon + 1) - 1, 0)
         return np.asarray(self.visit * self.discount ** ((1 + put_off) * steps))
@@ -88,14 +87,14 @@ class Objective:
 
 @dataclass
 class Problem:
-    """What a robot knows when it plans.
+    """State and knowledge of a robot when it plans.
 
     Attributes
     ----------
     position, velocity : (3,) arrays
         Its state [m, m/s].
     target : (3,) array
-        x*, where it is drawn to [m].
+        x*, guidance target [m].
     cuboids : (N, 3, 2) array
         Lower and upper corners [m].
     wanted : (N,) array of bool
@@ -103,16 +102,16 @@ class Problem:
     obstacles : (O, 3, 2) array
         Objects and obstacles, clearance included [m].
     area : (3, 2) array
-        Where it may be [m].
+        Admissible positions [m].
     homing : bool
-        Whether it flies to its target, and searches nothing (8).
+        Whether it only flies to its target, without search (8).
     between, brakes : bool
-        Whether segments keep away from obstacles as positions do, and whether it can stop in time
-        after the horizon.
+        Whether segments between positions avoid obstacles too, and whether the terminal state
+        allows braking in time.
     hint : list of (int, int)
-        Visits (step, cuboid) of the plan before, as of now.
+        Visits (step, cuboid) of the previous plan, shifted to now.
     put_off : int
-        How often in a row the first visit was put off; nothing where rewards are not discounted.
+        Consecutive postponements of the first visit; without effect if rewards are not discounted.
     """
 
     position: FloatArray
@@ -131,7 +130,7 @@ class Problem:
 
 @dataclass
 class Plan:
-    """A plan from P_0 on.
+    """A plan, starting at P_0.
 
     Attributes
     ----------
@@ -142,11 +141,11 @@ class Plan:
     visits : list of (int, int)
         Step, from 1, and cuboid; each cuboid once, in order of the steps.
     objective : float
-        As (9) has it, without what was visited before.
+        Value of (9), without cuboids visited earlier.
     status : str
-        optimal, or which limit ended the solve.
+        optimal, or the limit that ended the solve.
     nodes : int
-        Relaxations that were solved.
+        Number of solved relaxations.
     """
 
     positions: FloatArray
@@ -159,7 +158,7 @@ class Plan:
 
 
 class PlanSolver:
-    """Solve the problems of one kind of robot; keeps its matrices and its room.
+    """Solves the problems of one kind of robot; reuses its matrices and workspace.
 
     Parameters
     ----------
@@ -170,7 +169,7 @@ class PlanSolver:
     node_limit : int
         Relaxations after which a solve returns the best plan so far.
     time_limit : float
-        Wall time after which it does [s].
+        Wall time after which it returns that plan [s].
     """
 
     def __init__(
@@ -198,7 +197,7 @@ class PlanSolver:
             for rows in (self._search, self._homing)
         }
         self._tree = bb.make_tree(_ROOM, horizon, len(self._search.matrix))
-        # How far braking is short of, or longer than, what air resistance alone does.
+        # Distances of braking relative to those of air resistance alone.
         ways = np.zeros((2, 3, self._braking_steps))
         for axis in range(3):
             for side, loss in enumerate(dynamics.deceleration(axis)):
@@ -212,13 +211,13 @@ class PlanSolver:
     def solve(self, problem: Problem) -> Plan | None:
         """Return the best plan; None if there is none.
 
-        Bounds give way by a tenth of a millimetre where rounding has left the state outside.
+        Bounds are relaxed by `GIVE` if rounding has left the state outside.
         """
         plan = self._solve(problem, 0.0)
         return plan if plan is not None else self._solve(problem, GIVE)
 
     def _free_motion(self, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return positions and velocities (T + 1, 3) without force, and the rows' offset."""
+        """Return force-free positions and velocities (T + 1, 3), and the offset of the rows."""
         dynamics, horizon = self.dynamics, self.objective.horizon
         positions = np.empty((horizon + 1, 3))
         velocities = np.empty((horizon + 1, 3))
@@ -267,11 +266,11 @@ class PlanSolver:
     def _instance(
         self, problem: Problem, give: float
     ) -> tuple[bb.Instance, float, float, list[int]]:
-        """Return the compiled form, the most reward, the free objective, and visits already due."""
+        """Return the compiled form, largest reward, unconstrained objective, and due visits."""
         objective, horizon = self.objective, self.objective.horizon
         rows: AxisRows = self._homing if problem.homing else self._search
         positions, _, offset = self._free_motion(problem)
-        # Free minimum: forces -H^-1 f.
+        # Unconstrained minimum: forces -H^-1 f.
         pulled = rows.matrix[: horizon - 1]
         weight = rows.pull[2:]
         away = offset[:, : horizon - 1] - np.asarray(problem.target, dtype=float)[:, None]
@@ -337,7 +336,7 @@ class PlanSolver:
         return lower, upper
 
     def _due(self, problem: Problem, place: FloatArray) -> tuple[list[int], BoolArray]:
-        """Return the cuboids that the next step visits whatever is done, and those left over."""
+        """Return the cuboids that the next step visits under any force, and the others."""
         wanted = np.asarray(problem.wanted, dtype=bool).copy()
         if problem.homing or not len(wanted):
             return [], np.zeros_like(wanted)
@@ -350,9 +349,9 @@ class PlanSolver:
     def _visits(
         self, problem: Problem, positions: FloatArray, wanted: BoolArray
     ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return what can be visited when: steps, cuboids, boxes, and extreme motion.
+        """Return possible visits: steps, cuboids, boxes, and extreme motion.
 
-        A visit can be chosen only where its cuboid meets what extreme forces reach.
+        A visit is possible only if its cuboid intersects the set reachable by extreme forces.
         """
         horizon = self.objective.horizon
         fall, climb = self._extremes(problem)

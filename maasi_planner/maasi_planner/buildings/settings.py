@@ -76,7 +76,7 @@ class DynamicsSettings(Settings):
 
 
 class HazardSettings(Settings):
-    """How batteries fail: probability at each step, 004, (3)."""
+    """Failure probability of a battery at each step, 004, (3)."""
 
     alpha: float = Field(default=100.0, gt=0.0, description='alpha_1 [steps]')
     beta: float = Field(default=0.3, gt=0.0, description='beta_1 [1/step]')
@@ -98,7 +98,7 @@ class HazardSettings(Settings):
 
 
 class CuboidMethodSettings(Settings):
-    """The distributed model predictive control of 004, without what is searched."""
+    """The distributed model predictive control of 004, without its mission."""
 
     detection_probability: float = Field(
         default=0.88, gt=0.0, le=1.0, description='p_d that each snapshot must have, (4) [1]'

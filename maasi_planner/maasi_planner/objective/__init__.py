@@ -1,1 +1,1 @@
-"""The objective of a decision: what a joint candidate of the team is worth (000, section 4.2)."""
+"""Objective of a decision: the value of a joint candidate of the team (000, section 4.2)."""

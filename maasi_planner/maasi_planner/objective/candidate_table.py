@@ -1,4 +1,4 @@
-"""All candidates of the planning robots in arrays: what the joint search works on."""
+"""Candidates of the planning robots as arrays for the joint search."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CACHE_ROWS = 8000
 
 
 class CandidateTable(NamedTuple):
-    """Everything about the planning robots that the joint search needs.
+    """Data of the planning robots for the joint search.
 
     G candidates of R robots, one robot after the other; robot r has start[r] to start[r + 1].
     """
@@ -34,7 +34,7 @@ class CandidateTable(NamedTuple):
     information: bool
     dimension: int
     refinement: FloatArray  # T of paper, (G,)
-    # Predicted measurements, for e that others see: rows of events.
+    # Predicted measurements, which reduce e for others: rows of events.
     event_start: IntArray
     event_time: IntArray
     event_place: FloatArray
@@ -46,8 +46,8 @@ class CandidateTable(NamedTuple):
     entry_value: FloatArray
     entry_node: FloatArray
     entry_time: IntArray
-    # What one candidate's measurements leave of another one's entries: slot (G, G) is a row of
-    # cache (S, longest), filled when first asked for; used (1,) counts the rows in use.
+    # Factors by which the measurements of one candidate reduce the entries of another: slot (G, G)
+    # is a row of cache (S, longest), filled on first use; used (1,) counts the rows in use.
     slot: NDArray[np.int32]
     cache: FloatArray
     used: IntArray

@@ -49,8 +49,8 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 
-# Above this many pairs of a candidate and another robot, values of candidates that were not
-# chosen are reported as without the other planning robots.
+# Above this number of pairs of a candidate and another robot, reported values of candidates that
+# were not chosen neglect the other planning robots.
 REPORT_LIMIT = 600
 
 
@@ -60,15 +60,15 @@ class TeamObjective:
     Parameters
     ----------
     team : TeamView
-        The team; robots that do not plan count with their tails.
+        The team; robots that do not plan count with the rest of their trajectories.
     settings : PlannerSettings
         Weights.
     candidates : mapping of str to (W, 3) array
-        Of each planning robot, metres.
+        Waypoints of each planning robot, metres.
     trajectories : mapping of str to Trajectories
-        Predictions for them.
+        Predicted trajectories to the candidates.
     allowed : mapping of str to (W,) array of bool
-        Which of them may be chosen.
+        Admissible candidates.
 
     Attributes
     ----------
@@ -312,7 +312,7 @@ class TeamObjective:
             rows = slice(int(self.start[index]), int(self.start[index + 1]))
             add_information(view, kernel, item, item.own, first, centres, d, gain[rows])
             if first:
-                # What is measured now is measured whatever is chosen.
+                # The present measurement does not depend on the choice.
                 here = first_row(item)
                 out = np.zeros((1, number, d, d))
                 add_information(view, kernel, here, np.minimum(here.own, 1), 0, centres, d, out)
@@ -329,7 +329,7 @@ class TeamObjective:
         exploration = self.team.exploration
         values, lower, step = exploration.kernel()
         volumes = exploration.cell_volumes().reshape(values.shape)
-        # A view with hard edges needs every node: a place that is left out is never seen.
+        # A field of view with hard edges needs every node: omitted nodes would never be seen.
         hard = any(kernel[0] == BOX for kernel in kernels)
         stride = 1
         if not hard:
@@ -423,7 +423,7 @@ class TeamObjective:
     def given(self, robot: int, chosen: IntArray) -> FloatArray:
         """Return T, E and J of each candidate of one robot, given the others' choices, (W, 3).
 
-        In teams too large for that, all but the chosen one as without the others.
+        In teams too large for that, all but the chosen one without the other planning robots.
         """
         others = len(self.names) - 1
         if others == 0 or int(self.start[-1]) * others > REPORT_LIMIT:
@@ -488,6 +488,6 @@ class TeamObjective:
                 )
                 tries[index] = (trial, value)
                 work += count
-        # More robots on their way come first, then the larger value.
+        # Prefer more moving robots, then the larger value.
         best, best_value = max(tries, key=lambda item: (int((item[0] >= 0).sum()), item[1]))
         return best, best_value, False, work

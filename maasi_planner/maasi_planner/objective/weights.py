@@ -1,4 +1,4 @@
-"""Weights of the objective, with nothing left open."""
+"""Resolved weights of the objective."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from maasi_planner.settings import PlannerSettings
 
 
 class Weights(NamedTuple):
-    """Settings of the objective with nothing left open."""
+    """Resolved settings of the objective."""
 
     information: bool
     alpha: float
@@ -22,7 +22,7 @@ class Weights(NamedTuple):
 
 
 def resolve(settings: PlannerSettings) -> Weights:
-    """Return the weights that settings mean."""
+    """Return the weights of settings."""
     information = settings.objective == 'information'
 
     def given(value: float | None, paper: float, other: float) -> float:

@@ -39,7 +39,7 @@ def make_planner(name: str, settings: PlannerSettings | None = None) -> Planner:
     name : str
         As in `PlannerSettings.name`.
     settings : PlannerSettings, optional
-        Its numbers; `name` wins over the name in there.
+        Its parameters; `name` overrides the name in them.
 
     Raises
     ------

@@ -3,9 +3,9 @@
 Single robot, 001, eq. (9) to (13): sequences of `horizon` position changes, scored by
 T + alpha E with E the sum of e at the positions and T either the sum of pi at the cluster centres
 or the mutual information with the empty measurement set. Several robots, 002, section 4: jointly
-with the sum of T and the product of the robots' own e (12), (14) to (16), or each for itself (10),
-which is this planner once for each robot with a filter of its own. e and the clusters stay as they
-are at the decision.
+with the sum of T and the product of the robots' own e (12), (14) to (16), or independently (10),
+with one instance of planner and filter for each robot. e and the clusters are kept constant during
+prediction.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Sequences:
                     for place, inside in zip(following, keep)
                     if inside and view.motion.keep_out.is_free(place)
                 ]
-                # A dead end goes on by staying, so that it is not lost.
+                # Extend a dead end by staying, so that the sequence is kept.
                 for place in free or [places[-1]]:
                     longer.append((index, [*places, place]))
             kept = longer
@@ -118,10 +118,10 @@ class Sequences:
 
 
 class ActiveSearch(Planner):
-    """Waypoints at a fixed distance, one measurement at each; candidates come from a ring.
+    """Waypoints at a fixed distance, one measurement at each; candidates from a ring.
 
-    `horizon` sequences are made of the same changes of position as the candidates; only the
-    first waypoint is used, and then all is planned again.
+    Sequences of `horizon` waypoints use the same displacements as the candidates; only the first
+    waypoint is executed before replanning (receding horizon).
     """
 
     measures_underway = False
@@ -196,7 +196,7 @@ class ActiveSearch(Planner):
             return {names[0]: int(np.argmax(values))}, True, len(values)
         number = math.prod(len(sequences[name].first) for name in names)
         if len(names) == 2 and number <= self.settings.enumeration_limit:
-            # All pairs at once; then the best that fits.
+            # Evaluate all pairs at once, then take the best admissible one.
             one, two = sequences[names[0]], sequences[names[1]]
             values = one.refinement[:, None] + two.refinement[None, :]
             for j in range(self.settings.horizon):

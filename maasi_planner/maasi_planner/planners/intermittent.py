@@ -25,8 +25,8 @@ class Intermittent(Planner):
     """Joint choice of waypoints anywhere, with several measurements on the way.
 
     Robots that plan at the same step choose jointly (000, algorithm 2); with one robot it is ASI
-    (algorithm 1). Robots on their way count with the tails of their trajectories, extended by
-    constant states.
+    (algorithm 1). Moving robots count with the rest of their trajectories, extended by constant
+    states.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -105,7 +105,7 @@ class Intermittent(Planner):
         return result
 
     def _centres(self, team: TeamView, name: str) -> FloatArray | None:
-        """Return the cluster centres as further candidates of a robot, if wanted."""
+        """Return the cluster centres as further candidates of a robot, if enabled."""
         wanted = self.settings.cluster_candidates
         if wanted is None:
             wanted = self.settings.objective == 'information'
@@ -118,14 +118,14 @@ class Intermittent(Planner):
             return None
         view = team.robots[name]
         centres = np.zeros((len(heavy), 3))
-        # In 2D a robot stays at the height of its waypoints.
+        # In 2D a robot keeps the height of its waypoints.
         centres[:, 2] = view.candidates[0, 2] if len(view.candidates) else 0.0
         for row, cluster in zip(centres, heavy):
             row[: team.dimension] = cluster.position[: team.dimension]
         return centres
 
     def finished(self, team: TeamView) -> str | None:
-        """See `Planner.finished`; also when no candidate of any robot promises a gain any more."""
+        """See `Planner.finished`; also when no candidate of any robot has an expected gain."""
         reason = super().finished(team)
         if reason is not None or self.settings.objective == 'paper':
             return reason

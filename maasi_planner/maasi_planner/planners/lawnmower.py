@@ -1,7 +1,7 @@
 """Lawnmower: lanes that cover the environment evenly (000, sections 5 and 7).
 
-With two robots they start from the two ends and meet in the middle, wherever that turns out to
-be; more robots share the lanes out in blocks, two to a block.
+Two robots start from the two ends and meet between them; more robots divide the lanes into blocks,
+two to a block.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ def lanes(
 
 
 class Lawnmower(Planner):
-    """Lanes one after the other; the candidates are not used.
+    """Lanes in order; the candidates are not used.
 
-    Each robot takes its next lane when it has finished one, so that a faster robot takes more.
+    A robot takes its next lane when it has finished one, so that a faster robot takes more.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -121,7 +121,7 @@ class Lawnmower(Planner):
             ends.append((block, 0, members[0][0]))
             ends.append((block, 1, members[-1][1]))
         free = list(ends)
-        # Each robot, in the order of names, starts from the free end nearest to it.
+        # In the order of names, each robot starts from the nearest free end.
         for name in names:
             position = team.robots[name].state.pose.position
             if not free:
@@ -159,7 +159,7 @@ class Lawnmower(Planner):
                 height = view.candidates[0, 2] if len(view.candidates) else here[2]
                 for end in ends:
                     end[2] = height
-            # From the end that is nearer.
+            # Start from the nearer end.
             gaps = [float(((end - here) ** 2).sum()) for end in ends]
             if gaps[1] < gaps[0]:
                 ends.reverse()

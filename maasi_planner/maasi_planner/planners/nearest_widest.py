@@ -1,6 +1,6 @@
 """Nearest cluster, widest cluster, in turn: Sung and Tokekar (2022) as 000, section 5.1, adapts it.
 
-Where there is no cluster a robot goes to the candidate with the largest e, the nearest of those.
+Without clusters a robot goes to the candidate with the largest e (ties: the nearest).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 
 
 class NearestWidest(Planner):
-    """Each robot by itself, with a turn of its own: nearest, widest, nearest and so on."""
+    """Each robot plans alone and alternates: nearest, widest, nearest and so on."""
 
     def __init__(self, settings: PlannerSettings) -> None:
         super().__init__(settings)
@@ -94,7 +94,7 @@ class NearestWidest(Planner):
     def _cluster_choice(
         clusters: list[Cluster], centres: FloatArray, here: FloatArray, kind: int
     ) -> list[int]:
-        """Return the clusters in the order of preference."""
+        """Return the clusters in order of preference."""
         if kind == 0:
             keys = [float(((centre - here) ** 2).sum()) for centre in centres]
         else:

@@ -1,4 +1,4 @@
-"""The action `search`: a search that a client starts, follows and ends."""
+"""Action `search`: a client starts, monitors and ends a search."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ Result: TypeAlias = SearchTargets.Result
 
 @dataclass
 class Progress:
-    """How far a search is.
+    """Progress of a search.
 
     Attributes
     ----------
     time : float
-        Of the run [s].
+        Time of the run [s].
     feedback : SearchTargets.Feedback
         For the client.
     finished : str
-        Why nothing is left to gain; empty where something is.
+        Why no gain is left; empty otherwise.
     robots : bool
-        Whether a robot can go on, as far as is known.
+        Whether any robot is available, as far as is known.
     """
 
     time: float
@@ -43,19 +43,19 @@ class SearchAction:
     """
     Server of `search`.
 
-    A goal begins a search, or takes over one that is under way. A newer goal preempts an older
-    one, which is aborted, while the robots go on, so that a dead client does not block the next.
+    A goal starts a search, or takes over a running one. A newer goal preempts an older one, which
+    is aborted, while the robots continue, so that a dead client does not block the next one.
 
     Parameters
     ----------
     node : Node
-        Whose server it is.
+        Owner of the server.
     problem : callable
-        Returns why no goal is taken now; empty where one is.
+        Returns why no goal is accepted now; empty if one is.
     on_begin, on_end : callable
-        Called when a search begins, and when the robots are to stop.
+        Called when a search begins, and when the robots must stop.
     on_refusal : callable
-        Called with the kind of a refusal, and why.
+        Called with the kind of a refusal, and its reason.
 
     """
 
@@ -92,7 +92,7 @@ class SearchAction:
         return self._goal is not None
 
     def look(self, progress: Progress) -> None:
-        """Give feedback, and end the goal when it is time."""
+        """Publish feedback, and conclude the goal when the search has ended."""
         goal = self._goal
         if goal is None:
             return
@@ -114,7 +114,7 @@ class SearchAction:
             goal.publish_feedback(feedback)
 
     def stop(self, reason: str) -> None:
-        """End the goal, as the robots are stopped."""
+        """Conclude the goal because the robots are stopped."""
         if self._goal is not None:
             self._conclude(Result.CANCELED, reason)
 

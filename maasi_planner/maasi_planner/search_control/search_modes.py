@@ -18,7 +18,7 @@ class Mode(Enum):
 
 COMMANDS = ('start', 'pause', 'resume', 'home', 'stop')
 
-# From which modes a command leads to which; None: from all.
+# Transitions: allowed modes (None: all) and resulting mode of each command.
 _ALLOWED: dict[str, tuple[frozenset[Mode] | None, Mode]] = {
     'start': (None, Mode.SEARCHING),
     'pause': (frozenset({Mode.SEARCHING, Mode.PAUSED, Mode.HOME}), Mode.PAUSED),
@@ -30,7 +30,7 @@ _ALLOWED: dict[str, tuple[frozenset[Mode] | None, Mode]] = {
 
 class SearchModes:
     """
-    The mode of each robot, and what commands make of it.
+    Mode of each robot, and its transitions by commands.
 
     Parameters
     ----------
@@ -49,12 +49,12 @@ class SearchModes:
 
     @property
     def under_way(self) -> bool:
-        """Whether a search has begun and not been stopped."""
+        """Whether a search has begun and has not been stopped."""
         return any(mode in (Mode.SEARCHING, Mode.PAUSED, Mode.HOME) for mode in self.of.values())
 
     def command(self, word: str, names: Collection[str] | None = None) -> list[str]:
         """
-        Give a command to robots.
+        Apply a command to robots.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class SearchModes:
         Returns
         -------
         list of str
-            The robots that follow it, in order. The others keep their mode: one that was never
+            Robots that follow it, in order. The others keep their mode: a robot that was never
             started cannot be paused or resumed.
 
         """
@@ -81,7 +81,7 @@ class SearchModes:
         return follow
 
     def describe(self, names: Collection[str] | None = None) -> str:
-        """Return the modes of robots (None: all) in words."""
+        """Return the modes of robots (None: all) as text."""
         of = {name: mode for name, mode in self.of.items() if names is None or name in names}
         if len(set(of.values())) == 1:
             return next(iter(of.values())).value

@@ -1,4 +1,4 @@
-"""The services that start, pause, resume, send home and stop a team or one robot."""
+"""Services that start, pause, resume, send home and stop a team or one robot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from maasi_planner.search_control.search_modes import COMMANDS
 
-# Takes a command and robots (none: all), returns whether it was followed, and an answer in words.
+# Takes a command and robots (none: all), returns whether it was accepted, and an answer as text.
 Commander = Callable[[str, 'list[str] | None'], 'tuple[bool, str]']
 
 
@@ -23,7 +23,7 @@ def offer_services(
     for word in COMMANDS:
         for name in names:
             services[team_topic(f'{name}/search/{word}')] = [name]
-        # In the namespace of its only robot, the planner's team is that robot.
+        # In the namespace of its only robot, the team is that robot.
         services.setdefault(node.resolve_service_name(f'search/{word}'), None)
     for service, robots in services.items():
         word = service.rpartition('/')[2]

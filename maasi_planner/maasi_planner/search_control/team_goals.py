@@ -1,4 +1,4 @@
-"""The goals of a team's robots, and whether a robot follows a goal of another client."""
+"""Goals of the robots of a team, and detection of goals of other clients."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from maasi_msgs.msg import AgentState
 from maasi_planner.motion import RobotState
 
 ENDED = (AgentState.IDLE, AgentState.REACHED, AgentState.CANCELED, AgentState.ABORTED)
-# The reason of a driver for the end of a goal that was preempted.
+# Reason in the result of a preempted goal, set by the driver.
 REPLACED = 'replaced'
-# A robot whose states show another goal for so long after it accepted one has lost it [s].
+# Time after acceptance from which a state with another goal means that the goal is lost [s].
 _PATIENCE = 1.0
 
 
 @dataclass
 class HeardState:
-    """The last state heard of a robot."""
+    """Last received state of a robot."""
 
     step: int
     state: RobotState
@@ -40,11 +40,11 @@ class HeardState:
 
 
 class Course(Enum):
-    """The course of a robot's goal."""
+    """Progress of a goal of a robot."""
 
     UNDER_WAY = 0
     ENDED = 1
-    #: The robot knows nothing of it, or has not taken it.
+    #: The robot does not have it, or refused it.
     LOST = 2
     #: It was preempted by a goal of another client.
     REPLACED = 3
@@ -55,7 +55,7 @@ class _Sent:
     number: int
     handle: Any = None
     accepted_at: float | None = None
-    # Of the result, once it has come.
+    # From the result, once it has arrived.
     status: int | None = None
     reason: str = ''
     ended_at: float = math.inf
@@ -63,20 +63,20 @@ class _Sent:
 
 class TeamGoals:
     """
-    Clients of the action `go_to` of all robots.
+    Clients of the action `go_to` of all robots of a team.
 
-    In lockstep only states count: they belong to a step, results come at any time.
+    In lockstep only states are used: they belong to a step, while results arrive at any time.
 
     Parameters
     ----------
     node : Node
-        Whose clients they are.
+        Owner of the clients.
     topics : dict
         Name of the action of each robot.
     lockstep : bool
         Whether results are ignored.
     on_answer : callable
-        Called with robot and number of a goal that was answered, and whether it was accepted.
+        Called with robot and number of an answered goal, and whether it was accepted.
 
     """
 
@@ -94,7 +94,7 @@ class TeamGoals:
             name: ActionClient(node, GoToWaypoint, topic) for name, topic in topics.items()
         }
         self._sent: dict[str, _Sent] = {}
-        # Goals that were cancelled, and when.
+        # Cancelled goals, with wall time.
         self._cancelled: dict[str, tuple[int, float]] = {}
         #: Goals that have not been answered: robot and number.
         self.waiting: set[tuple[str, int]] = set()
@@ -108,7 +108,7 @@ class TeamGoals:
         future.add_done_callback(partial(self._answered, name, sent))
 
     def cancel(self, name: str) -> None:
-        """Cancel a robot's goal, also where it has not been answered yet: the robot stops."""
+        """Cancel the goal of a robot, even if it has not been answered yet: the robot stops."""
         sent = self._sent.pop(name, None)
         if sent is None:
             return
@@ -117,11 +117,11 @@ class TeamGoals:
             sent.handle.cancel_goal_async()
 
     def forget(self, name: str) -> None:
-        """Drop a robot's goal without cancelling it."""
+        """Discard the goal of a robot without cancelling it."""
         self._sent.pop(name, None)
 
     def course(self, name: str, number: int, heard: HeardState) -> Course:
-        """Return the course of goal `number` of a robot, by the last state heard of it."""
+        """Return the progress of goal `number` of a robot, by its last received state."""
         sent = self._sent.get(name)
         if sent is None or sent.number != number:
             return Course.LOST
@@ -139,11 +139,11 @@ class TeamGoals:
         if same and after and heard.status in ENDED:
             return Course.ENDED
         if sent.status == GoalStatus.STATUS_ABORTED and not same:
-            # Refused, as far as can be seen: it never was the robot's goal.
+            # Apparently refused: it was never the goal of the robot.
             return Course.REPLACED if heard.status == AgentState.MOVING and after else Course.LOST
         if sent.status is not None:
             if heard.status == AgentState.MOVING:
-                # A state from before the end, or of another client's goal.
+                # A state from before the end, or with a goal of another client.
                 return Course.UNDER_WAY if same or not after else Course.REPLACED
             return Course.ENDED
         if same or time.monotonic() - sent.accepted_at < _PATIENCE:
@@ -152,11 +152,11 @@ class TeamGoals:
 
     @staticmethod
     def driven(heard: HeardState) -> bool:
-        """Return whether a robot that has no goal of the planner follows another client's."""
+        """Return whether a robot without a goal of the planner follows one of another client."""
         return heard.status == AgentState.MOVING or heard.reason == REPLACED
 
     def ends(self, name: str, heard: HeardState) -> bool:
-        """Return whether a robot is still on its way to a goal that has just been cancelled."""
+        """Return whether a robot is still moving to a goal that has just been cancelled."""
         number, at = self._cancelled.get(name, (-1, -math.inf))
         return heard.goal == number and time.monotonic() - at < _PATIENCE
 
@@ -170,7 +170,7 @@ class TeamGoals:
                 sent.handle = handle
                 handle.get_result_async().add_done_callback(partial(self._ended, name, sent))
             else:
-                # It was cancelled before it was answered.
+                # The goal was cancelled before it was answered.
                 handle.cancel_goal_async()
         self._on_answer(name, sent.number, accepted)
 
