@@ -13,7 +13,7 @@ from maasi_drivers.agent.odometry import StampedPose
 from maasi_planner.motion import RobotState
 from maasi_planner.motion.base import check_waypoints
 from maasi_planner.motion.dynamic_window import window_command
-from maasi_planner.motion.unicycle import Unicycle, five_states
+from maasi_planner.motion.unicycle import Unicycle, as_tuple, five_states
 from maasi_planner.obstacles import Obstacles, is_clear, next_point
 from maasi_planner.settings import MotionSettings
 
@@ -193,7 +193,8 @@ class ScanUnicycle(Unicycle):
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`."""
-        x, y, yaw, forward, turn = (float(value) for value in five_states(state))
+        here = as_tuple(five_states(state))
+        x, y = here[:2]
         away = np.hypot(self.points[:, 0] - x, self.points[:, 1] - y)
         near = away <= self.scan.reach + self.keep_out.radius
         if not near.any():
@@ -221,11 +222,7 @@ class ScanUnicycle(Unicycle):
         )
         out = np.zeros(4)
         out[0], out[3] = window_command(
-            x,
-            y,
-            yaw,
-            forward,
-            turn,
+            here,
             target_x,
             target_y,
             left,

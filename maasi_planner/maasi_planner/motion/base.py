@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.models.pose import Pose
-from maasi_planner.obstacles import KeepOut, Obstacles, hold_back, next_point, segment_distance
+from maasi_planner.motion.steering import Surroundings
+from maasi_planner.obstacles import KeepOut, Obstacles
 from maasi_planner.settings import MotionSettings
 
 FloatArray = NDArray[np.float64]
@@ -55,6 +57,15 @@ class RobotState:
         return cls(Pose.from_yaw(position, yaw))
 
 
+class TrajectoryArrays(NamedTuple):
+    """Arrays of `Trajectories` that kernels fill."""
+
+    positions: FloatArray
+    yaws: FloatArray
+    lengths: IntArray
+    control_cost: FloatArray
+
+
 @dataclass
 class Trajectories:
     """Predicted trajectories to W waypoints.
@@ -79,6 +90,10 @@ class Trajectories:
     lengths: IntArray
     control_cost: FloatArray
     reached: NDArray[np.bool_]
+
+    def arrays(self) -> TrajectoryArrays:
+        """Return the arrays that a roll-out fills."""
+        return TrajectoryArrays(self.positions, self.yaws, self.lengths, self.control_cost)
 
     def distances(self) -> FloatArray:
         """Return the length of each trajectory in metres, (W,)."""
@@ -131,6 +146,9 @@ class MotionModel(ABC):
     ) -> None:
         self.settings = settings
         self.keep_out = KeepOut(obstacles or Obstacles.none(), radius, settings.clearance)
+        self.surroundings = Surroundings(
+            self.keep_out.circles, self.keep_out.vertices, self.keep_out.clearance
+        )
         self._goal: FloatArray | None = None
         self._goal_table = np.zeros(0)
 
@@ -254,6 +272,17 @@ def check_step(step: float) -> float:
 
 
 @njit(cache=True)
+def add_position(
+    out: TrajectoryArrays, w: int, k: int, x: float, y: float, z: float, yaw: float
+) -> None:
+    """Write step k of trajectory w."""
+    out.positions[w, k, 0] = x
+    out.positions[w, k, 1] = y
+    out.positions[w, k, 2] = z
+    out.yaws[w, k] = yaw
+
+
+@njit(cache=True)
 def _trim(
     positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: NDArray[np.bool_]
 ) -> int:
@@ -298,123 +327,3 @@ def _farthest(points: FloatArray, place: FloatArray) -> float:
             square += (points[i, axis] - place[axis]) ** 2
         most = max(most, square)
     return math.sqrt(most)
-
-
-@njit(cache=True)
-def turn_towards(dx: float, dy: float, yaw: float, yaw_rate: float) -> float:
-    """Return the yaw rate that turns the heading towards (dx, dy)."""
-    turn = math.atan2(dy, dx) - yaw
-    turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
-    return min(max(2.0 * turn, -yaw_rate), yaw_rate)
-
-
-@njit(cache=True)
-def straight_command(
-    dx: float,
-    dy: float,
-    dz: float,
-    yaw: float,
-    rate: float,
-    speed: float,
-    face_travel: bool,
-    yaw_rate: float,
-) -> tuple[float, float, float, float]:
-    """Return the command vx, vy, vz (body axes), yaw rate towards a waypoint at (dx, dy, dz).
-
-    The speed is `rate` times the distance, at most `speed`.
-    """
-    size = math.sqrt(dx * dx + dy * dy + dz * dz)
-    scale = rate
-    if rate * size > speed:
-        scale = speed / size
-    vx = scale * dx
-    vy = scale * dy
-    turn = 0.0
-    if face_travel and dx * dx + dy * dy > 1e-6:
-        turn = turn_towards(dx, dy, yaw, yaw_rate)
-    if yaw == 0.0:
-        return vx, vy, scale * dz, turn
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    return cos_yaw * vx + sin_yaw * vy, cos_yaw * vy - sin_yaw * vx, scale * dz, turn
-
-
-@njit(cache=True)
-def sideways_command(
-    position: FloatArray,
-    yaw: float,
-    goal: FloatArray,
-    rate: float,
-    speed: float,
-    barrier: float,
-    deceleration: float,
-    face_travel: bool,
-    yaw_rate: float,
-    circles: FloatArray,
-    vertices: FloatArray,
-    to_goal: FloatArray,
-    clearance: float,
-    work: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write the command of a robot that can move in any direction into `out` (4,), body axes.
-
-    The velocity is `rate` times the way left, at most `speed`, and next to obstacles what
-    `deceleration` can stop; `work` (2, 3) is scratch.
-    """
-    if circles.shape[0] == 0:
-        out[0], out[1], out[2], out[3] = straight_command(
-            goal[0] - position[0],
-            goal[1] - position[1],
-            goal[2] - position[2],
-            yaw,
-            rate,
-            speed,
-            face_travel,
-            yaw_rate,
-        )
-        return
-    target = work[0]
-    velocity = work[1]
-    left = next_point(position, goal, circles, vertices, to_goal, clearance, target)
-    dx = target[0] - position[0]
-    dy = target[1] - position[1]
-    dz = target[2] - position[2]
-    size = math.sqrt(dx * dx + dy * dy + dz * dz)
-    if deceleration < np.inf:
-        room = np.inf
-        for i in range(circles.shape[0]):
-            room = min(
-                room,
-                segment_distance(
-                    position[0],
-                    position[1],
-                    position[2],
-                    position[0],
-                    position[1],
-                    position[2],
-                    circles[i],
-                )
-                - circles[i, 3],
-            )
-        speed = min(speed, math.sqrt(deceleration * max(room, 0.0)) + 0.05 * speed)
-    scale = 0.0
-    if size > 0.0:
-        scale = min(rate * left, speed) / size
-    velocity[0] = scale * dx
-    velocity[1] = scale * dy
-    velocity[2] = scale * dz
-    hold_back(position, circles, barrier, velocity)
-    after = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
-    if after > speed:
-        velocity[0] *= speed / after
-        velocity[1] *= speed / after
-        velocity[2] *= speed / after
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    out[0] = cos_yaw * velocity[0] + sin_yaw * velocity[1]
-    out[1] = cos_yaw * velocity[1] - sin_yaw * velocity[0]
-    out[2] = velocity[2]
-    out[3] = 0.0
-    if face_travel and dx * dx + dy * dy > 1e-6:
-        out[3] = turn_towards(dx, dy, yaw, yaw_rate)

@@ -14,9 +14,15 @@ from maasi_planner.motion.base import (
     MotionModel,
     RobotState,
     Trajectories,
+    TrajectoryArrays,
+    add_position,
     check_command,
     check_step,
     check_waypoints,
+)
+from maasi_planner.motion.steering import (
+    Steering,
+    Surroundings,
     sideways_command,
     straight_command,
 )
@@ -24,28 +30,25 @@ from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
 
 FloatArray = NDArray[np.float64]
+# Position and velocity [m and m/s, map] and heading [rad] of a point.
+PointState = tuple[float, float, float, float, float, float, float]
 APPROACH_RATE = 5.0
 
 
 @njit(cache=True)
 def point_step(
-    x: float,
-    y: float,
-    z: float,
-    vx: float,
-    vy: float,
-    vz: float,
-    yaw: float,
+    state: PointState,
     command: tuple[float, float, float, float],
     speed: float,
     acceleration: float,
     yaw_rate: float,
     dt: float,
-) -> tuple[float, float, float, float, float, float, float]:
-    """Move a point for `dt`; return its new position, velocity and heading.
+) -> PointState:
+    """Move a point for `dt`; return its new state.
 
     The velocity changes by at most `acceleration` per second, and the position by its mean.
     """
+    x, y, z, vx, vy, vz, yaw = state
     wx = command[0]
     wy = command[1]
     wz = command[2]
@@ -85,72 +88,74 @@ def point_step(
 
 
 @njit(cache=True)
-def _roll_out(
-    start: FloatArray,
-    start_velocity: FloatArray,
-    start_yaw: float,
-    waypoints: FloatArray,
-    rate: float,
-    speed: float,
-    acceleration: float,
-    barrier: float,
-    face_travel: bool,
-    yaw_rate: float,
-    tolerance: float,
-    circles: FloatArray,
-    vertices: FloatArray,
-    tables: FloatArray,
-    clearance: float,
+def _straight(
+    start: PointState,
+    goal: FloatArray,
+    steering: Steering,
     dt: float,
-    limit: int,
-    positions: FloatArray,
-    yaws: FloatArray,
-    lengths: NDArray[np.int64],
-    costs: FloatArray,
+    w: int,
+    out: TrajectoryArrays,
+) -> None:
+    """Fill trajectory w of a point without obstacles, heading of travel or inertia.
+
+    It goes straight at a speed that only depends on the distance left, which takes no square
+    roots.
+    """
+    x, y, z, yaw = start[0], start[1], start[2], start[6]
+    gx, gy, gz = goal[0], goal[1], goal[2]
+    limit = out.positions.shape[1] - 1
+    length = limit + 1
+    cost = 0.0
+    left = math.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+    scale = 1.0 / left if left > 0.0 else 0.0
+    ux, uy, uz = (gx - x) * scale, (gy - y) * scale, (gz - z) * scale
+    for k in range(limit + 1):
+        add_position(out, w, k, gx - ux * left, gy - uy * left, gz - uz * left, yaw)
+        if left <= steering.tolerance:
+            length = k
+            break
+        forward = min(steering.rate * left, steering.speed)
+        cost += forward * forward
+        left -= dt * forward
+    add_position(out, w, 0, x, y, z, yaw)
+    out.lengths[w] = length
+    out.control_cost[w] = cost
+
+
+@njit(cache=True)
+def _roll_out(
+    start: PointState,
+    waypoints: FloatArray,
+    tables: FloatArray,
+    steering: Steering,
+    around: Surroundings,
+    dt: float,
+    out: TrajectoryArrays,
 ) -> None:
     work = np.zeros((2, 3))
-    out = np.zeros(4)
+    wanted = np.zeros(4)
     position = np.zeros(3)
-    obstacles = circles.shape[0] > 0
+    obstacles = around.circles.shape[0] > 0
+    rate, speed, yaw_rate = steering.rate, steering.speed, steering.yaw_rate
+    face_travel, tolerance = steering.face_travel, steering.tolerance
+    # The same limit brakes and accelerates.
+    acceleration = steering.deceleration
     plain = not obstacles and not face_travel and acceleration == np.inf
+    limit = out.positions.shape[1] - 1
     for w in range(waypoints.shape[0]):
-        x, y, z = start[0], start[1], start[2]
-        vx, vy, vz = start_velocity[0], start_velocity[1], start_velocity[2]
-        yaw = start_yaw
-        gx, gy, gz = waypoints[w, 0], waypoints[w, 1], waypoints[w, 2]
+        goal = waypoints[w]
+        if plain:
+            _straight(start, goal, steering, dt, w, out)
+            continue
+        state = start
         length = limit + 1
         cost = 0.0
-        if plain:
-            # Straight at a speed that only depends on the distance left: the same without
-            # square roots.
-            left = math.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
-            scale = 1.0 / left if left > 0.0 else 0.0
-            ux, uy, uz = (gx - x) * scale, (gy - y) * scale, (gz - z) * scale
-            for k in range(limit + 1):
-                positions[w, k, 0] = gx - ux * left
-                positions[w, k, 1] = gy - uy * left
-                positions[w, k, 2] = gz - uz * left
-                yaws[w, k] = yaw
-                if left <= tolerance:
-                    length = k
-                    break
-                forward = min(rate * left, speed)
-                cost += forward * forward
-                left -= dt * forward
-            positions[w, 0, 0] = x
-            positions[w, 0, 1] = y
-            positions[w, 0, 2] = z
-            lengths[w] = length
-            costs[w] = cost
-            continue
         for k in range(limit + 1):
-            positions[w, k, 0] = x
-            positions[w, k, 1] = y
-            positions[w, k, 2] = z
-            yaws[w, k] = yaw
-            dx = gx - x
-            dy = gy - y
-            dz = gz - z
+            x, y, z, _, _, _, yaw = state
+            add_position(out, w, k, x, y, z, yaw)
+            dx = goal[0] - x
+            dy = goal[1] - y
+            dz = goal[2] - z
             if dx * dx + dy * dy + dz * dz <= tolerance * tolerance:
                 length = k
                 break
@@ -158,32 +163,14 @@ def _roll_out(
                 position[0] = x
                 position[1] = y
                 position[2] = z
-                sideways_command(
-                    position,
-                    yaw,
-                    waypoints[w],
-                    rate,
-                    speed,
-                    barrier,
-                    acceleration,
-                    face_travel,
-                    yaw_rate,
-                    circles,
-                    vertices,
-                    tables[w],
-                    clearance,
-                    work,
-                    out,
-                )
-                command = (out[0], out[1], out[2], out[3])
+                sideways_command(position, yaw, goal, tables[w], steering, around, work, wanted)
+                command = (wanted[0], wanted[1], wanted[2], wanted[3])
             else:
                 command = straight_command(dx, dy, dz, yaw, rate, speed, face_travel, yaw_rate)
             cost += command[0] ** 2 + command[1] ** 2 + command[2] ** 2 + command[3] ** 2
-            x, y, z, vx, vy, vz, yaw = point_step(
-                x, y, z, vx, vy, vz, yaw, command, speed, acceleration, yaw_rate, dt
-            )
-        lengths[w] = length
-        costs[w] = cost
+            state = point_step(state, command, speed, acceleration, yaw_rate, dt)
+        out.lengths[w] = length
+        out.control_cost[w] = cost
 
 
 class ConstantSpeedBody(Body):
@@ -210,13 +197,7 @@ class ConstantSpeedBody(Body):
         limit = self.settings.yaw_rate
         self._turn = min(max(float(command[3]), -limit), limit)
         moved = point_step(
-            self.position[0],
-            self.position[1],
-            self.position[2],
-            self.velocity[0],
-            self.velocity[1],
-            self.velocity[2],
-            self.yaw,
+            (*self.position, *self.velocity, self.yaw),
             (command[0], command[1], command[2], command[3]),
             self.settings.speed,
             self.settings.acceleration or math.inf,
@@ -246,72 +227,47 @@ class ConstantSpeed(MotionModel):
         radius: float = 0.0,
     ) -> None:
         super().__init__(settings, obstacles, radius)
-        self._acceleration = settings.acceleration or math.inf
         rate = settings.approach_rate or APPROACH_RATE
         if settings.acceleration is not None:
             # Slow enough that braking at the limit follows the approach.
             rate = min(rate, settings.acceleration / settings.speed)
         self.rate = rate
         self.barrier = 0.25 * rate if settings.acceleration is not None else rate
-
-    def _arguments(self) -> tuple[float, float, float, bool, float]:
-        settings = self.settings
-        return (
+        self.steering = Steering(
             self.rate,
             settings.speed,
             self.barrier,
+            settings.acceleration or math.inf,
             settings.heading == 'travel',
             settings.yaw_rate,
+            settings.tolerance,
         )
 
     def roll_out(
         self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
     ) -> None:
         """See `MotionModel.roll_out`."""
-        rate, speed, barrier, face, yaw_rate = self._arguments()
         _roll_out(
-            np.array(state.pose.position),
-            state.velocity,
-            state.pose.yaw,
+            (*state.pose.position, *state.velocity, state.pose.yaw),
             waypoints,
-            rate,
-            speed,
-            self._acceleration,
-            barrier,
-            face,
-            yaw_rate,
-            self.settings.tolerance,
-            self.keep_out.circles,
-            self.keep_out.vertices,
             self._tables(waypoints),
-            self.keep_out.clearance,
+            self.steering,
+            self.surroundings,
             step,
-            out.positions.shape[1] - 1,
-            out.positions,
-            out.yaws,
-            out.lengths,
-            out.control_cost,
+            out.arrays(),
         )
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`."""
         goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
-        rate, speed, barrier, face, yaw_rate = self._arguments()
         out = np.zeros(4)
         sideways_command(
             np.array(state.pose.position),
             state.pose.yaw,
             goal,
-            rate,
-            speed,
-            barrier,
-            self._acceleration,
-            face,
-            yaw_rate,
-            self.keep_out.circles,
-            self.keep_out.vertices,
             self._table(goal),
-            self.keep_out.clearance,
+            self.steering,
+            self.surroundings,
             np.zeros((2, 3)),
             out,
         )

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
+# x, y [m, map], heading [rad], forward speed [m/s], turn rate [rad/s].
+UnicycleState = tuple[float, float, float, float, float]
+
 # Entries of the array of limits.
 RATE, SPEED, BRAKING, YAW_RATE, ACCELERATION, YAW_ACCELERATION = range(6)
 
@@ -45,11 +48,7 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray)
 
 @njit(cache=True)
 def window_command(
-    x: float,
-    y: float,
-    yaw: float,
-    forward: float,
-    turn: float,
+    state: UnicycleState,
     target_x: float,
     target_y: float,
     left: float,
@@ -61,8 +60,8 @@ def window_command(
 
     Parameters
     ----------
-    x, y, yaw, forward, turn : float
-        State of the robot.
+    state : UnicycleState
+        Of the robot.
     target_x, target_y : float
         Point to head for, in sight.
     left : float
@@ -74,6 +73,7 @@ def window_command(
     clearance : float
         Room to obstacles beyond which more is not better, metres.
     """
+    x, y, yaw, forward, turn = state
     fastest = min(limits[SPEED], limits[RATE] * left)
     deceleration = min(limits[ACCELERATION], 2.0 * limits[SPEED])
     low = max(0.0, forward - limits[ACCELERATION] * WINDOW)

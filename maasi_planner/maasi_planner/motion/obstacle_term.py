@@ -9,24 +9,42 @@ direction from the obstacle to the robot.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+KINDS = ('none', 'printed', 'away')
 PRINTED = 1
 AWAY = 2
+
+
+class ObstacleTerm(NamedTuple):
+    """Obstacle term of a robot.
+
+    Attributes
+    ----------
+    kind : int
+        Index in KINDS. PRINTED: the same k_obs off every input. AWAY: k_obs along the way out.
+    distance, gain : float
+        d_l [m] and k_obs [N m and N].
+    circles : (n, 5) array
+        Obstacles: x, y, z, radius, 1 for a sphere; the nearest surface counts.
+    """
+
+    kind: int
+    distance: float
+    gain: float
+    circles: FloatArray
 
 
 @njit(cache=True)
 def add_obstacle_term(
     position: FloatArray,
     yaw: float,
-    circles: FloatArray,
-    kind: int,
-    distance: float,
-    gain: float,
+    term: ObstacleTerm,
     parameters: FloatArray,
     command: FloatArray,
 ) -> None:
@@ -38,15 +56,13 @@ def add_obstacle_term(
         Metres, frame `map`.
     yaw : float
         Heading, radians.
-    circles : (n, 5) array
-        Obstacles: x, y, z, radius, 1 for a sphere; the nearest surface counts.
-    kind : int
-        PRINTED: the same k_obs off every input. AWAY: k_obs along the way out.
-    distance, gain : float
-        d_l [m] and k_obs [N m and N].
+    term : ObstacleTerm
+        Kind, distance, gain and obstacles.
     parameters : (13,) array
         Of the Mambo; the first eight are its gains.
     """
+    circles = term.circles
+    gain = term.gain
     nearest = np.inf
     nx = 0.0
     ny = 0.0
@@ -62,9 +78,9 @@ def add_obstacle_term(
             nx = ox / size
             ny = oy / size
             nz = oz / size
-    if nearest >= distance:
+    if nearest >= term.distance:
         return
-    if kind == PRINTED:
+    if term.kind == PRINTED:
         command[0] -= gain / parameters[0]
         # A roll torque of -k_obs tips the robot to its left: the roll gain has the other sign.
         command[1] -= gain / parameters[3]

@@ -26,12 +26,15 @@ from maasi_planner.motion.base import (
     MotionModel,
     RobotState,
     Trajectories,
+    TrajectoryArrays,
+    add_position,
     check_command,
     check_step,
     check_waypoints,
-    sideways_command,
 )
-from maasi_planner.motion.mambo import GRAVITY, control_periods
+from maasi_planner.motion.mambo_dynamics import control_periods
+from maasi_planner.motion.mambo_gains import GRAVITY
+from maasi_planner.motion.steering import Steering, Surroundings, sideways_command
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
 
@@ -163,60 +166,36 @@ def heading_of(state: FloatArray) -> float:
 def _roll_out(
     start: FloatArray,
     waypoints: FloatArray,
-    limits: FloatArray,
-    rate: float,
-    barrier: float,
-    face_travel: bool,
-    tolerance: float,
-    circles: FloatArray,
-    vertices: FloatArray,
     tables: FloatArray,
-    clearance: float,
+    steering: Steering,
+    around: Surroundings,
+    limits: FloatArray,
     periods: int,
     h: float,
-    limit: int,
-    positions: FloatArray,
-    yaws: FloatArray,
-    lengths: NDArray[np.int64],
-    costs: FloatArray,
+    out: TrajectoryArrays,
 ) -> None:
     work = np.zeros((2, 3))
     command = np.zeros(4)
     state = np.zeros(13)
+    limit = out.positions.shape[1] - 1
     for w in range(waypoints.shape[0]):
         state[:] = start
+        goal = waypoints[w]
         length = limit + 1
         cost = 0.0
         for k in range(limit + 1):
+            yaw = heading_of(state)
+            add_position(out, w, k, state[0], state[1], state[2], yaw)
             square = 0.0
             for axis in range(3):
-                positions[w, k, axis] = state[axis]
-                square += (state[axis] - waypoints[w, axis]) ** 2
-            yaw = heading_of(state)
-            yaws[w, k] = yaw
-            if square <= tolerance * tolerance:
+                square += (state[axis] - goal[axis]) ** 2
+            if square <= steering.tolerance * steering.tolerance:
                 length = k
                 break
-            sideways_command(
-                state[:3],
-                yaw,
-                waypoints[w],
-                rate,
-                limits[SPEED],
-                barrier,
-                np.inf,
-                face_travel,
-                limits[YAW_RATE],
-                circles,
-                vertices,
-                tables[w],
-                clearance,
-                work,
-                command,
-            )
+            sideways_command(state[:3], yaw, goal, tables[w], steering, around, work, command)
             cost += quadrotor_step(state, command, limits, periods, h)
-        lengths[w] = length
-        costs[w] = cost
+        out.lengths[w] = length
+        out.control_cost[w] = cost
 
 
 def thirteen_states(state: RobotState) -> FloatArray:
@@ -293,6 +272,15 @@ class Quadrotor(MotionModel):
         )
         self.rate = float(min(settings.approach_rate or C1, slowing / settings.speed))
         self.barrier = float(min(0.15 * C2, 0.5 * slowing / settings.speed))
+        self.steering = Steering(
+            self.rate,
+            float(self.limits[SPEED]),
+            self.barrier,
+            math.inf,
+            settings.heading == 'travel',
+            float(self.limits[YAW_RATE]),
+            settings.tolerance,
+        )
 
     def roll_out(
         self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
@@ -302,22 +290,13 @@ class Quadrotor(MotionModel):
         _roll_out(
             thirteen_states(state),
             waypoints,
-            self.limits,
-            self.rate,
-            self.barrier,
-            self.settings.heading == 'travel',
-            self.settings.tolerance,
-            self.keep_out.circles,
-            self.keep_out.vertices,
             self._tables(waypoints),
-            self.keep_out.clearance,
+            self.steering,
+            self.surroundings,
+            self.limits,
             periods,
             h,
-            out.positions.shape[1] - 1,
-            out.positions,
-            out.yaws,
-            out.lengths,
-            out.control_cost,
+            out.arrays(),
         )
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
@@ -328,16 +307,9 @@ class Quadrotor(MotionModel):
             np.array(state.pose.position),
             heading_of(thirteen_states(state)),
             goal,
-            self.rate,
-            self.limits[SPEED],
-            self.barrier,
-            math.inf,
-            self.settings.heading == 'travel',
-            self.limits[YAW_RATE],
-            self.keep_out.circles,
-            self.keep_out.vertices,
             self._table(goal),
-            self.keep_out.clearance,
+            self.steering,
+            self.surroundings,
             np.zeros((2, 3)),
             out,
         )

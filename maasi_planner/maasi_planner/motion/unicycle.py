@@ -23,6 +23,8 @@ from maasi_planner.motion.base import (
     MotionModel,
     RobotState,
     Trajectories,
+    TrajectoryArrays,
+    add_position,
     check_command,
     check_step,
     check_waypoints,
@@ -34,9 +36,11 @@ from maasi_planner.motion.dynamic_window import (
     SPEED,
     YAW_ACCELERATION,
     YAW_RATE,
+    UnicycleState,
     way_ahead,
     window_command,
 )
+from maasi_planner.motion.steering import Surroundings
 from maasi_planner.obstacles import Obstacles, next_point
 from maasi_planner.settings import MotionSettings
 
@@ -49,24 +53,18 @@ AHEAD = 0.6
 
 @njit(cache=True)
 def unicycle_step(
-    x: float,
-    y: float,
-    yaw: float,
-    forward: float,
-    turn: float,
-    command_forward: float,
-    command_turn: float,
-    speed: float,
-    acceleration: float,
-    yaw_rate: float,
-    yaw_acceleration: float,
-    dt: float,
-) -> tuple[float, float, float, float, float]:
-    """Move for `dt`; return new x, y, heading, forward speed and turn rate.
+    state: UnicycleState, command: tuple[float, float], limits: FloatArray, dt: float
+) -> UnicycleState:
+    """Move for `dt`; return the new state.
 
-    Both speeds change by at most their acceleration, and the robot follows the arc of the mean
-    of old and new.
+    Forward speed and turn rate change by at most their acceleration towards those of `command`,
+    and the robot follows the arc of the mean of old and new. `limits` (6,): see
+    `unicycle_limits`.
     """
+    x, y, yaw, forward, turn = state
+    command_forward, command_turn = command
+    speed, yaw_rate = limits[SPEED], limits[YAW_RATE]
+    acceleration, yaw_acceleration = limits[ACCELERATION], limits[YAW_ACCELERATION]
     wanted = min(max(command_forward, -speed), speed)
     change = acceleration * dt
     wanted = min(max(wanted, forward - change), forward + change)
@@ -122,47 +120,44 @@ def drive(
 
 @njit(cache=True)
 def unicycle_command(
-    x: float,
-    y: float,
-    yaw: float,
-    forward: float,
-    turn: float,
+    state: UnicycleState,
     goal: FloatArray,
+    to_goal: FloatArray,
     limits: FloatArray,
     window: bool,
-    circles: FloatArray,
-    vertices: FloatArray,
-    to_goal: FloatArray,
-    clearance: float,
+    around: Surroundings,
     work: FloatArray,
 ) -> tuple[float, float]:
     """Return the command of a robot among obstacles: forward speed and turn rate.
 
     Parameters
     ----------
-    x, y, yaw, forward, turn : float
-        State.
+    state : UnicycleState
+        Of the robot.
     goal : (3,) array
         Waypoint.
+    to_goal : (m,) array
+        See `next_point`.
     limits : (6,) array
-        Approach rate, speed, braking rate, yaw rate, acceleration, yaw acceleration.
+        See `unicycle_limits`.
     window : bool
         Whether the dynamic window chooses the speeds near obstacles.
-    circles, vertices, to_goal, clearance
-        See `next_point`.
+    around : Surroundings
+        Obstacles.
     work : (2, 3) array
         Scratch.
     """
+    x, y, yaw = state[0], state[1], state[2]
+    circles = around.circles
+    clearance = around.clearance
     position = work[0]
     target = work[1]
     position[0] = x
     position[1] = y
     position[2] = goal[2]
-    left = next_point(position, goal, circles, vertices, to_goal, clearance, target)
+    left = next_point(position, goal, circles, around.vertices, to_goal, clearance, target)
     if window:
-        return window_command(
-            x, y, yaw, forward, turn, target[0], target[1], left, limits, circles, clearance
-        )
+        return window_command(state, target[0], target[1], left, limits, circles, clearance)
     ahead, turning = drive(
         target[0] - x,
         target[1] - y,
@@ -179,78 +174,61 @@ def unicycle_command(
 
 @njit(cache=True)
 def _roll_out(
-    start: FloatArray,
+    start: UnicycleState,
     height: float,
     waypoints: FloatArray,
+    tables: FloatArray,
     limits: FloatArray,
     window: bool,
     tolerance: float,
-    circles: FloatArray,
-    vertices: FloatArray,
-    tables: FloatArray,
-    clearance: float,
+    around: Surroundings,
     dt: float,
-    limit: int,
-    positions: FloatArray,
-    yaws: FloatArray,
-    lengths: NDArray[np.int64],
-    costs: FloatArray,
+    out: TrajectoryArrays,
 ) -> None:
     work = np.zeros((2, 3))
-    obstacles = circles.shape[0] > 0
+    obstacles = around.circles.shape[0] > 0
     rate, speed, yaw_rate = limits[RATE], limits[SPEED], limits[YAW_RATE]
-    acceleration, yaw_acceleration = limits[ACCELERATION], limits[YAW_ACCELERATION]
+    limit = out.positions.shape[1] - 1
     for w in range(waypoints.shape[0]):
-        x, y, yaw, forward, turn = start[0], start[1], start[2], start[3], start[4]
-        gx, gy = waypoints[w, 0], waypoints[w, 1]
+        state = start
+        goal = waypoints[w]
         length = limit + 1
         cost = 0.0
         for k in range(limit + 1):
-            positions[w, k, 0] = x
-            positions[w, k, 1] = y
-            positions[w, k, 2] = height
-            yaws[w, k] = yaw
-            dx = gx - x
-            dy = gy - y
+            x, y, yaw, _, _ = state
+            add_position(out, w, k, x, y, height, yaw)
+            dx = goal[0] - x
+            dy = goal[1] - y
             square = dx * dx + dy * dy
             if square <= tolerance * tolerance:
                 length = k
                 break
             if obstacles:
-                ahead, turning = unicycle_command(
-                    x,
-                    y,
-                    yaw,
-                    forward,
-                    turn,
-                    waypoints[w],
-                    limits,
-                    window,
-                    circles,
-                    vertices,
-                    tables[w],
-                    clearance,
-                    work,
-                )
+                command = unicycle_command(state, goal, tables[w], limits, window, around, work)
             else:
-                ahead, turning = drive(dx, dy, math.sqrt(square), yaw, rate, speed, yaw_rate, 0.0)
-            cost += ahead * ahead + turning * turning
-            x, y, yaw, forward, turn = unicycle_step(
-                x,
-                y,
-                yaw,
-                forward,
-                turn,
-                ahead,
-                turning,
-                speed,
-                acceleration,
-                yaw_rate,
-                yaw_acceleration,
-                dt,
-            )
-        lengths[w] = length
-        costs[w] = cost
+                command = drive(dx, dy, math.sqrt(square), yaw, rate, speed, yaw_rate, 0.0)
+            cost += command[0] * command[0] + command[1] * command[1]
+            state = unicycle_step(state, command, limits, dt)
+        out.lengths[w] = length
+        out.control_cost[w] = cost
+
+
+def unicycle_limits(settings: MotionSettings) -> FloatArray:
+    """Return approach rate, speed, braking rate, yaw rate and both accelerations, (6,)."""
+    rate = settings.approach_rate or K_RHO
+    braking = 2.0
+    if settings.acceleration is not None:
+        slowing = settings.acceleration / settings.speed
+        rate = min(rate, slowing)
+        braking = min(braking, 0.5 * slowing)
+    out = np.zeros(6)
+    out[RATE] = rate
+    out[SPEED] = settings.speed
+    out[BRAKING] = braking
+    out[YAW_RATE] = settings.yaw_rate
+    out[ACCELERATION] = settings.acceleration or math.inf
+    out[YAW_ACCELERATION] = settings.yaw_acceleration or math.inf
+    return out
 
 
 class UnicycleBody(Body):
@@ -270,27 +248,15 @@ class UnicycleBody(Body):
     """
 
     def __init__(self, settings: MotionSettings, state: RobotState) -> None:
-        self.settings = settings
         self.height = float(state.pose.position[2])
+        self.limits = unicycle_limits(settings)
         self.state = five_states(state)
 
     def step(self, velocity_command: ArrayLike, dt: float) -> None:
         """See `Body.step`; sideways and vertical speeds are ignored."""
         command = check_command(velocity_command)
-        settings = self.settings
         self.state[:] = unicycle_step(
-            self.state[0],
-            self.state[1],
-            self.state[2],
-            self.state[3],
-            self.state[4],
-            command[0],
-            command[3],
-            settings.speed,
-            settings.acceleration or math.inf,
-            settings.yaw_rate,
-            settings.yaw_acceleration or math.inf,
-            check_step(dt),
+            as_tuple(self.state), (command[0], command[3]), self.limits, check_step(dt)
         )
 
     def robot_state(self) -> RobotState:
@@ -318,6 +284,12 @@ def five_states(state: RobotState) -> FloatArray:
     )
 
 
+def as_tuple(state: FloatArray) -> UnicycleState:
+    """Return a (5,) state as kernels take it."""
+    x, y, yaw, forward, turn = state.tolist()
+    return x, y, yaw, forward, turn
+
+
 class Unicycle(MotionModel):
     """Controller and prediction of `UnicycleBody`; the tolerance is horizontal."""
 
@@ -328,22 +300,7 @@ class Unicycle(MotionModel):
         radius: float = 0.0,
     ) -> None:
         super().__init__(settings, obstacles, radius)
-        rate = settings.approach_rate or K_RHO
-        braking = 2.0
-        if settings.acceleration is not None:
-            slowing = settings.acceleration / settings.speed
-            rate = min(rate, slowing)
-            braking = min(braking, 0.5 * slowing)
-        self.limits = np.array(
-            [
-                rate,
-                settings.speed,
-                braking,
-                settings.yaw_rate,
-                settings.acceleration or math.inf,
-                settings.yaw_acceleration or math.inf,
-            ]
-        )
+        self.limits = unicycle_limits(settings)
         self._window = settings.avoidance == 'dynamic_window'
 
     def arrived(self, position: ArrayLike, waypoint: ArrayLike) -> bool:
@@ -357,50 +314,38 @@ class Unicycle(MotionModel):
     ) -> None:
         """See `MotionModel.roll_out`."""
         _roll_out(
-            five_states(state),
+            as_tuple(five_states(state)),
             float(state.pose.position[2]),
             waypoints,
+            self._tables(waypoints),
             self.limits,
             self._window,
             self.settings.tolerance,
-            self.keep_out.circles,
-            self.keep_out.vertices,
-            self._tables(waypoints),
-            self.keep_out.clearance,
+            self.surroundings,
             step,
-            out.positions.shape[1] - 1,
-            out.positions,
-            out.yaws,
-            out.lengths,
-            out.control_cost,
+            out.arrays(),
         )
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`."""
         goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
-        x, y, yaw, forward, turn = (float(value) for value in five_states(state))
+        here = as_tuple(five_states(state))
         out = np.zeros(4)
         if len(self.keep_out):
             out[0], out[3] = unicycle_command(
-                x,
-                y,
-                yaw,
-                forward,
-                turn,
+                here,
                 goal,
+                self._table(goal),
                 self.limits,
                 self._window,
-                self.keep_out.circles,
-                self.keep_out.vertices,
-                self._table(goal),
-                self.keep_out.clearance,
+                self.surroundings,
                 np.zeros((2, 3)),
             )
         else:
-            dx, dy = float(goal[0]) - x, float(goal[1]) - y
+            dx, dy = float(goal[0]) - here[0], float(goal[1]) - here[1]
             rate, speed, _, yaw_rate, _, _ = (float(value) for value in self.limits)
             left = math.sqrt(dx * dx + dy * dy)
-            out[0], out[3] = drive(dx, dy, left, yaw, rate, speed, yaw_rate, 0.0)
+            out[0], out[3] = drive(dx, dy, left, here[2], rate, speed, yaw_rate, 0.0)
         return out
 
     def body(self, state: RobotState) -> UnicycleBody:

@@ -1,0 +1,265 @@
+"""The Mambo's 12-state linear model under its inner loops, over several control periods."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_planner.motion.mambo_gains import (
+    COUNT_FORCE,
+    GRAVITY,
+    INERTIA,
+    K_P,
+    K_PITCH,
+    K_Q,
+    K_R,
+    K_ROLL,
+    K_VX,
+    K_VY,
+    K_VZ,
+    LIFT,
+    MASS,
+    PERIOD,
+    SPEED,
+    TILT,
+    YAW_RATE,
+)
+
+FloatArray = NDArray[np.float64]
+
+# Rows of the tables of `closed_loop`: the chains, and the entries of each.
+PITCH_CHAIN, ROLL_CHAIN, HEIGHT_CHAIN = range(3)
+MATRIX, TRAVEL, COST, BOUND, ENTRIES = 0, 9, 12, 21, 24
+
+
+@njit(cache=True)
+def _chain(
+    row: FloatArray,
+    gains: FloatArray,
+    gravity: float,
+    inertia: float,
+    periods: int,
+    h: float,
+) -> None:
+    """Fill one row of `closed_loop` from the response to each unit deviation."""
+    states = np.zeros((3, 3))
+    inputs = np.zeros(3)
+    for j in range(3):
+        states[j, j] = 1.0
+    for _ in range(periods):
+        for j in range(3):
+            v, a, w = states[j, 0], states[j, 1], states[j, 2]
+            row[BOUND + j] = max(row[BOUND + j], abs(v))
+            u = -gains[0] * v - gains[1] * a - gains[2] * w
+            inputs[j] = u
+            s = u / inertia
+            row[TRAVEL + j] += v * h + gravity * (
+                a * h * h / 2.0 + w * h * h * h / 6.0 + s * h * h * h * h / 24.0
+            )
+            states[j, 0] = v + gravity * (a * h + w * h * h / 2.0 + s * h * h * h / 6.0)
+            states[j, 1] = a + w * h + s * h * h / 2.0
+            states[j, 2] = w + s * h
+        for i in range(3):
+            for j in range(3):
+                row[COST + 3 * i + j] += inputs[i] * inputs[j]
+    for i in range(3):
+        for j in range(3):
+            row[MATRIX + 3 * i + j] = states[j, i]
+
+
+@njit(cache=True)
+def closed_loop(parameters: FloatArray, periods: int, h: float) -> FloatArray:
+    """Return what `periods` control periods do at once while nothing is cut off, (3, 24).
+
+    For deviations s = (velocity - command, angle, rate) of a chain: the matrix of the deviations
+    afterwards, the travel beyond command times time, the sum of u'u as a quadratic form, and the
+    largest |velocity - command| on the way for each unit deviation.
+    """
+    out = np.zeros((3, ENTRIES))
+    gains = np.zeros(3)
+    gains[:] = parameters[0:3]
+    _chain(out[PITCH_CHAIN], gains, GRAVITY, INERTIA[1], periods, h)
+    gains[:] = parameters[3:6]
+    _chain(out[ROLL_CHAIN], gains, -GRAVITY, INERTIA[0], periods, h)
+    # The height has one deviation only.
+    v = 1.0
+    height = out[HEIGHT_CHAIN]
+    for _ in range(periods):
+        force = -parameters[6] * v
+        height[COST] += force * force
+        height[TRAVEL] += v * h + force / MASS * h * h / 2.0
+        v += force / MASS * h
+    height[MATRIX] = v
+    height[BOUND] = 1.0
+    return out
+
+
+@njit(cache=True)
+def _lateral(
+    row: FloatArray, v: float, a: float, w: float
+) -> tuple[float, float, float, float, float]:
+    """Return the deviations afterwards, the travel, and the sum of u'u of one chain."""
+    return (
+        row[0] * v + row[1] * a + row[2] * w,
+        row[3] * v + row[4] * a + row[5] * w,
+        row[6] * v + row[7] * a + row[8] * w,
+        row[9] * v + row[10] * a + row[11] * w,
+        row[12] * v * v
+        + row[16] * a * a
+        + row[20] * w * w
+        + 2.0 * (row[13] * v * a + row[14] * v * w + row[17] * a * w),
+    )
+
+
+@njit(cache=True)
+def mambo_step(
+    state: FloatArray,
+    command: FloatArray,
+    parameters: FloatArray,
+    table: FloatArray,
+    periods: int,
+    h: float,
+) -> float:
+    """Fly `periods` control periods of `h` seconds, in place; return the sum of u'u.
+
+    Parameters
+    ----------
+    state : (12,) array
+        Position, roll pitch yaw, velocity (map), angular velocity (body).
+    command : (4,) array
+        vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+    parameters : (13,) array
+        Gains and limits.
+    table : (3, 24) array
+        From `closed_loop` for the same periods: where no limit acts, all periods at once.
+    """
+    cx = command[0]
+    cy = command[1]
+    cz = command[2]
+    size = math.sqrt(cx * cx + cy * cy + cz * cz)
+    if size > parameters[SPEED]:
+        scale = parameters[SPEED] / size
+        cx *= scale
+        cy *= scale
+        cz *= scale
+    cr = min(max(command[3], -parameters[YAW_RATE]), parameters[YAW_RATE])
+    x = state[0]
+    y = state[1]
+    z = state[2]
+    roll = state[3]
+    pitch = state[4]
+    yaw = state[5]
+    vz = state[8]
+    p = state[9]
+    q = state[10]
+    r = state[11]
+    cos_yaw = math.cos(yaw)
+    sin_yaw = math.sin(yaw)
+    # Velocity along the heading and to its left.
+    vf = cos_yaw * state[6] + sin_yaw * state[7]
+    vl = cos_yaw * state[7] - sin_yaw * state[6]
+    to_pitch = parameters[K_VX] / parameters[K_PITCH]
+    to_roll = parameters[K_VY] / parameters[K_ROLL]
+    tilt = parameters[TILT]
+    h2 = h * h / 2.0
+    h3 = h * h * h / 6.0
+    h4 = h * h * h * h / 24.0
+    turning = cr != 0.0 or r != 0.0
+    cost = 0.0
+    if not turning:
+        df = vf - cx
+        dl = vl - cy
+        dz = vz - cz
+        front = table[PITCH_CHAIN]
+        side = table[ROLL_CHAIN]
+        up = table[HEIGHT_CHAIN]
+        most_front = (
+            front[BOUND] * abs(df) + front[BOUND + 1] * abs(pitch) + front[BOUND + 2] * abs(q)
+        )
+        most_side = side[BOUND] * abs(dl) + side[BOUND + 1] * abs(roll) + side[BOUND + 2] * abs(p)
+        if (
+            abs(to_pitch) * most_front <= tilt
+            and abs(to_roll) * most_side <= tilt
+            and parameters[K_VZ] * abs(dz) <= parameters[LIFT]
+        ):
+            time = periods * h
+            df, pitch, q, forward, spent = _lateral(front, df, pitch, q)
+            cost += spent
+            dl, roll, p, left, spent = _lateral(side, dl, roll, p)
+            cost += spent
+            cost += parameters[COUNT_FORCE] * up[COST] * dz * dz
+            forward += cx * time
+            left += cy * time
+            state[0] = x + cos_yaw * forward - sin_yaw * left
+            state[1] = y + sin_yaw * forward + cos_yaw * left
+            state[2] = z + cz * time + up[TRAVEL] * dz
+            vf = cx + df
+            vl = cy + dl
+            state[3] = roll
+            state[4] = pitch
+            state[6] = cos_yaw * vf - sin_yaw * vl
+            state[7] = sin_yaw * vf + cos_yaw * vl
+            state[8] = cz + up[MATRIX] * dz
+            state[9] = p
+            state[10] = q
+            return cost
+    for _ in range(periods):
+        pitch_wanted = min(max(to_pitch * (cx - vf), -tilt), tilt)
+        roll_wanted = min(max(to_roll * (cy - vl), -tilt), tilt)
+        u_pitch = parameters[K_PITCH] * (pitch_wanted - pitch) - parameters[K_Q] * q
+        u_roll = parameters[K_ROLL] * (roll_wanted - roll) - parameters[K_P] * p
+        force = parameters[K_VZ] * (cz - vz)
+        force = min(max(force, -parameters[LIFT]), parameters[LIFT])
+        u_yaw = parameters[K_R] * (cr - r)
+        cost += u_roll * u_roll + u_pitch * u_pitch + u_yaw * u_yaw
+        cost += parameters[COUNT_FORCE] * force * force
+        aq = u_pitch / INERTIA[1]
+        ap = u_roll / INERTIA[0]
+        ar = u_yaw / INERTIA[2]
+        az = force / MASS
+        forward = vf * h + GRAVITY * (pitch * h2 + q * h3 + aq * h4)
+        left = vl * h - GRAVITY * (roll * h2 + p * h3 + ap * h4)
+        x += cos_yaw * forward - sin_yaw * left
+        y += sin_yaw * forward + cos_yaw * left
+        z += vz * h + az * h2
+        vf += GRAVITY * (pitch * h + q * h2 + aq * h3)
+        vl -= GRAVITY * (roll * h + p * h2 + ap * h3)
+        vz += az * h
+        pitch += q * h + aq * h2
+        q += aq * h
+        roll += p * h + ap * h2
+        p += ap * h
+        if turning:
+            turn = r * h + ar * h2
+            yaw += turn
+            r += ar * h
+            # The velocity stays what it is in the map while the axes turn under it.
+            ct = math.cos(turn)
+            st = math.sin(turn)
+            forward = ct * vf + st * vl
+            vl = ct * vl - st * vf
+            vf = forward
+            cos_yaw = math.cos(yaw)
+            sin_yaw = math.sin(yaw)
+    state[0] = x
+    state[1] = y
+    state[2] = z
+    state[3] = roll
+    state[4] = pitch
+    state[5] = yaw
+    state[6] = cos_yaw * vf - sin_yaw * vl
+    state[7] = sin_yaw * vf + cos_yaw * vl
+    state[8] = vz
+    state[9] = p
+    state[10] = q
+    state[11] = r
+    return cost
+
+
+def control_periods(dt: float) -> tuple[int, float]:
+    """Return how many control periods make `dt` [s], and their length, about PERIOD [s]."""
+    periods = max(1, round(dt / PERIOD))
+    return periods, dt / periods
