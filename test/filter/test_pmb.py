@@ -85,7 +85,7 @@ def test_unseen_targets_are_thinned_as_the_exploration_function_says():
     value = sensor.measurement.measure(np.array([[50.0, 30.0]]), Pose(np.array(PLACES[0])))
     probability, likelihood = densities(sensor, PLACES[0], value)
     expected = 3.0 / SIDE**2 * (search.exploration.at(cells()) * probability * likelihood[0]).sum()
-    member = search._scan(_checked(sensor, PLACES[0], value), {})
+    member = search._scan(_checked(sensor, PLACES[0], value))
     births = draw_births(member, search.exploration, 3.0, 20_000, np.random.default_rng(0))
     assert births.intensity[0] == pytest.approx(expected, rel=0.02)
 

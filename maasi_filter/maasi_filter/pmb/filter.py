@@ -34,6 +34,7 @@ from maasi_filter.pmb.component import LEAST_SUPPORT, Component, merge
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, MISS, SCALE, TERMS, Scan, make_scan
 from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest, same_estimate
+from maasi_filter.pmb.noise_scale import NoiseScale, squared_innovation
 from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
@@ -99,6 +100,7 @@ class PmbFilter:
         self.components: list[Component] = []
         self.clusters: list[Cluster] = []
         self._clutter = ClutterEstimate()
+        self._noise = NoiseScale()
         self._scans = 0
         self._last_id = 0
         self._last_time: float | None = None
@@ -178,7 +180,8 @@ class PmbFilter:
         time: float,
     ) -> bool:
         """Correct with one robot's scan; return whether what is found changed."""
-        scan = self._scan(member, dropped)
+        member = self._within_range(member, dropped)
+        scan = self._scan(member)
         self._scans += 1
         space = measurement_space(member.sensor, self.bounds)
         # kappa: clutter per unit of measurement space.
@@ -198,6 +201,7 @@ class PmbFilter:
             odds[i, view.gated] = item.odds(view)
         # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         marginals = associate(odds, kappa + births.intensity)
+        self._learn_noise(member, marginals.caused)
         self._count_unexplained(scan, births, odds, dropped)
         changed = False
         for i, (item, view) in enumerate(zip(self.components, views)):
@@ -222,19 +226,33 @@ class PmbFilter:
         self.exploration.update(scan.detection, member.pose)
         return changed
 
-    def _scan(self, member: CheckedMeasurement, dropped: dict[str, int]) -> Scan:
-        """Return the scan of a member without detections beyond the range of its sensor."""
-        if math.isfinite(member.sensor.maximum_range):
-            reach = member.values[:, 0] <= member.sensor.maximum_range
-            _count(dropped, 'range', int((~reach).sum()))
-            member = member.only(reach)
+    def _within_range(
+        self, member: CheckedMeasurement, dropped: dict[str, int]
+    ) -> CheckedMeasurement:
+        """Return a member without what is out of its sensor's range."""
+        reach = member.values[:, 0] <= member.sensor.maximum_range
+        _count(dropped, 'range', int((~reach).sum()))
+        return member.only(reach)
+
+    def _learn_noise(self, member: CheckedMeasurement, caused: FloatArray) -> None:
+        """Count the innovations of the detections that found targets caused."""
+        for i, item in enumerate(self.components):
+            if item.target is None or item.foreign:
+                continue
+            for j in np.flatnonzero(caused[i] > 0.5).tolist():
+                density = item.density
+                square = squared_innovation(member, j, density.mean, density.covariance)
+                self._noise.count(member.robot, float(caused[i, j]), square)
+
+    def _scan(self, member: CheckedMeasurement) -> Scan:
+        """Return a member's detections for the kernels, with the noise that was learnt."""
         detection = member.sensor.detection
         if isinstance(detection, BoxDetection):
             # The position error of the robot blurs the edge of a box-shaped field of view.
             detection = detection.softened(2.0 * member.pose_error)
         prepared = prepare_measurements(
             member.values,
-            member.covariances,
+            member.covariances * self._noise.factor(member.robot),
             member.pose,
             member.pose_error,
             cartesian_near=member.own,
@@ -481,7 +499,9 @@ class PmbFilter:
             **cluster_arrays(self.clusters, self.dimension),
             'counters': np.array([self._scans, self._last_id]),
             'last_time': np.array(np.nan if self._last_time is None else self._last_time),
-            **pmb_state.to_arrays(self.components, self._clutter, (number, self.dimension), grid),
+            **pmb_state.to_arrays(
+                self.components, self._clutter, self._noise, (number, self.dimension), grid
+            ),
         }
 
     @classmethod
@@ -511,7 +531,7 @@ class PmbFilter:
         number = search._numbers.pmb.particles
         search.components = pmb_state.components_of(state, number, grid, search._frame)
         search.clusters = clusters_of(state)
-        search._clutter = pmb_state.clutter_of(state)
+        search._clutter, search._noise = pmb_state.learnt_of(state)
         return search
 
 

@@ -13,6 +13,7 @@ from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, HEAD, TERM, TERMS
+from maasi_filter.pmb.noise_scale import NoiseScale
 from maasi_filter.records import FoundTarget
 from maasi_filter.state_check import (
     COMMON,
@@ -51,9 +52,19 @@ _ARRAYS: dict[str, tuple[str, str]] = {
     'found_covariances': ('f', 'b d d'),
     'clutter_scans': ('i', 'r'),
     'clutter_counts': ('f', 'r'),
+    'noise_detections': ('f', 'r'),
+    'noise_squares': ('f', 'r'),
 }
 _SIZES = {'HEAD': HEAD, 'TERM': TERM}
-_NOT_NEGATIVE = ('hits', 'pose_error', 'found_radius', 'cluster_masses', 'clutter_counts')
+_NOT_NEGATIVE = (
+    'hits',
+    'pose_error',
+    'found_radius',
+    'cluster_masses',
+    'clutter_counts',
+    'noise_detections',
+    'noise_squares',
+)
 # Arrays that may contain non-finite numbers: no step yet, unlimited radius.
 _UNDEFINED = ('last_time', 'found_radius', 'heads')
 
@@ -61,10 +72,11 @@ _UNDEFINED = ('last_time', 'found_radius', 'heads')
 def to_arrays(
     items: Sequence[Component],
     clutter: ClutterEstimate,
+    noise: NoiseScale,
     particles: tuple[int, int],
     grid: tuple[int, ...],
 ) -> dict[str, NDArray[Any]]:
-    """Return components and clutter as arrays for a file.
+    """Return components, clutter and noise as arrays for a file.
 
     Parameters
     ----------
@@ -104,6 +116,8 @@ def to_arrays(
         'clutter_robots': text(json.dumps(robots)),
         'clutter_scans': np.array([clutter.scans[name] for name in robots], np.int64),
         'clutter_counts': np.array([clutter.counts[name] for name in robots], float),
+        'noise_detections': np.array([noise.detections.get(name, 0.0) for name in robots], float),
+        'noise_squares': np.array([noise.squares.get(name, 0.0) for name in robots], float),
     }
 
 
@@ -156,19 +170,21 @@ def components_of(
     return components
 
 
-def clutter_of(state: Arrays) -> ClutterEstimate:
-    """Return the clutter of a checked state.
+def learnt_of(state: Arrays) -> tuple[ClutterEstimate, NoiseScale]:
+    """Return what a checked state has learnt of clutter and noise.
 
     Raises
     ------
     ValueError
         If names and counts of robots do not match.
     """
-    clutter = ClutterEstimate()
+    clutter, noise = ClutterEstimate(), NoiseScale()
     robots = names_of(state, 'clutter_robots', len(state['clutter_scans']))
     clutter.scans = dict(zip(robots, state['clutter_scans'].tolist()))
     clutter.counts = dict(zip(robots, state['clutter_counts'].tolist()))
-    return clutter
+    noise.detections = dict(zip(robots, state['noise_detections'].tolist()))
+    noise.squares = dict(zip(robots, state['noise_squares'].tolist()))
+    return clutter, noise
 
 
 def check(state: Arrays) -> None:
