@@ -11,7 +11,7 @@ from maasi_msgs.msg import FoundTarget, FoundTargetArray
 class FoundKeeper:
     """Republishes found targets, latched: a latched message is lost with its publisher.
 
-    Targets are never removed, even if the filter no longer has them.
+    Targets are kept until a new search, even if the filter no longer has them.
 
     Subscribes
     ----------
