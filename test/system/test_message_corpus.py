@@ -69,7 +69,7 @@ class World:
             self.names[kind] = f'{namespace}/{made.name}'
             file = folder / f'{kind}.yaml'
             made.write(file, **CHANGES.get(kind, {}))
-            package, _, executable = made.module.partition('.')
+            package, *_, executable = made.module.split('.')
             words = ['--ros-args', '--remap', f'__ns:={namespace}']
             items.append(
                 {
