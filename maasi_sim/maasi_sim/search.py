@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 
@@ -16,11 +16,14 @@ from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFoll
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_drivers.vision.marker_reading import read_markers
 from maasi_filter.make_filter import make_filter
+from maasi_filter.metrics import match_targets
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import AgentMeasurement, FoundTarget
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
+from maasi_planner.planners import Planner
+from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision
 from maasi_sim.scenario.schema import (
     Scenario,
@@ -264,7 +267,12 @@ def leaving(scenario: Scenario) -> dict[int, list[str]]:
     return steps
 
 
-def search(scenario: Scenario, seed: int, most_measurements: int | None = None) -> SearchResult:
+def search(
+    scenario: Scenario,
+    seed: int,
+    most_measurements: int | None = None,
+    planner: Callable[[PlannerSettings, Callable[[], FloatArray]], Planner] | None = None,
+) -> SearchResult:
     """Run a scenario in this process, step by step as in lockstep.
 
     Parameters
@@ -275,6 +283,9 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
         Of all random numbers.
     most_measurements : int, optional
         End after so many measurements of all robots.
+    planner : function, optional
+        Returns the planner of each group instead of the scenario's, from its settings and a
+        function that returns the true targets that are not found yet, (n, 3) [m].
 
     Raises
     ------
@@ -298,6 +309,14 @@ def search(scenario: Scenario, seed: int, most_measurements: int | None = None) 
     def found_targets() -> list[FoundTarget]:
         return _numbered([item.filter.own_found_targets() for item in groups])
 
+    def missing() -> FloatArray:
+        positions = np.array([item.position for item in found_targets()])
+        pairs = match_targets(positions, world.targets_at(step), radius).pairs
+        return np.delete(world.targets_3d_at(step), [j for _, j in pairs], axis=0)
+
+    if planner is not None:
+        for group in groups:
+            group.coordinator.planner = planner(scenario.planner, missing)
     for step in range(steps_of(scenario.limits.time, scenario.step)):
         time = step * scenario.step
         for name in departures.get(step, []):

@@ -1,0 +1,303 @@
+"""Reference for experiments: a planner that knows where the targets are.
+
+Its robots still have to find them with their sensors and filter; what other planners need more is
+their regret. A target counts as found with its second detection, and the routes minimise the
+expected time until all are found, by local search. It exists in the search in one process only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from maasi_filter.models.detection import PARAMETERS, detection_probability_at
+from maasi_planner.planners.base import (
+    Planner,
+    check_team,
+    explain,
+    options_of,
+    waiting_places,
+)
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Routes = list[list[int]]
+
+# A robot turns to its next target when the present one is found with this probability.
+SURE = 0.8
+# Weight of the mean time to find a target beside the time to find all.
+MEAN_WEIGHT = 1.0
+# A simulated search ends after so many measurement periods.
+TICKS = 4000
+# Rounds of local search.
+ROUNDS = 80
+
+
+class _Robots(NamedTuple):
+    """The R robots in units of ticks, the shortest measurement period."""
+
+    tail: FloatArray  # (R, n, 3) way until each is free [m], padded by its last position
+    free: IntArray  # (R,) when
+    speed: FloatArray  # (R,) [m]
+    pause: FloatArray  # (R,) what a turn costs
+    period: IntArray  # (R,)
+    kind: IntArray  # (R,)
+    parameters: FloatArray  # (R, PARAMETERS)
+    yaw: FloatArray  # (R,) heading that it keeps [rad], nan: faces its travel
+
+
+@njit(cache=True)
+def _expected_end(
+    robots: _Robots,
+    routes: IntArray,
+    targets: FloatArray,
+    detected: NDArray[np.bool_],
+    dimension: int,
+    stops: FloatArray,
+) -> float:
+    """Return the expected time to find all on `routes` (R, n), -1 after the last, in ticks.
+
+    `stops` (R, 3) becomes where each robot turns to its second target.
+    """
+    number, size = routes.shape
+    # Probabilities of no detection and of exactly one.
+    none = np.where(detected, 0.0, 1.0)
+    one = np.where(detected, 1.0, 0.0)
+    place = robots.tail[:, 0].copy()
+    cosine = np.ones(number)
+    sine = np.zeros(number)
+    wait = np.zeros(number)
+    current = np.zeros(number, np.int64)
+    for r in range(number):
+        if not np.isnan(robots.yaw[r]):
+            cosine[r] = np.cos(robots.yaw[r])
+            sine[r] = np.sin(robots.yaw[r])
+        stops[r] = robots.tail[r, -1]
+    cost = 0.0
+    for tick in range(TICKS):
+        for r in range(number):
+            goal = place[r].copy()
+            if tick < robots.free[r]:
+                goal = robots.tail[r, tick].copy()
+            else:
+                while current[r] < size and routes[r, current[r]] >= 0:
+                    j = routes[r, current[r]]
+                    if none[j] + one[j] > 1.0 - SURE:
+                        goal[:dimension] = targets[j, :dimension]
+                        break
+                    if current[r] == 0:
+                        stops[r] = place[r]
+                    current[r] += 1
+                    wait[r] = robots.pause[r]
+            offset = goal - place[r]
+            distance = np.sqrt((offset * offset).sum())
+            if distance > 0.0 and wait[r] >= 1.0:
+                wait[r] -= 1.0
+            elif distance > 0.0:
+                if np.isnan(robots.yaw[r]) and abs(offset[0]) + abs(offset[1]) > 0.0:
+                    level = np.hypot(offset[0], offset[1])
+                    cosine[r] = offset[0] / level
+                    sine[r] = offset[1] / level
+                share = 1.0
+                if tick >= robots.free[r]:
+                    share = min(1.0, robots.speed[r] / distance)
+                place[r] += share * offset
+            if tick % robots.period[r] == 0:
+                for j in range(len(targets)):
+                    away = targets[j] - place[r]
+                    chance = detection_probability_at(
+                        robots.kind[r],
+                        robots.parameters[r],
+                        away[0],
+                        away[1],
+                        away[2] if dimension == 3 else 0.0,
+                        cosine[r],
+                        sine[r],
+                    )
+                    one[j] += none[j] * chance - one[j] * chance
+                    none[j] *= 1.0 - chance
+        complete = 1.0
+        left = 0.0
+        for j in range(len(targets)):
+            missing = none[j] + one[j]
+            complete *= 1.0 - missing
+            left += missing
+        cost += 1.0 - complete + MEAN_WEIGHT * left / len(targets)
+        if complete > 0.99:
+            break
+    for r in range(number):
+        if current[r] == 0 and routes[r, 0] >= 0:
+            stops[r] = place[r]
+    return cost
+
+
+class Clairvoyant(Planner):
+    """Sends the robots along the best routes over the true targets that are not found yet.
+
+    Parameters
+    ----------
+    settings : PlannerSettings
+        Of the scenario.
+    missing : function
+        Returns the true targets that are not found yet, (n, 3) [m].
+    """
+
+    def __init__(self, settings: PlannerSettings, missing: Callable[[], FloatArray]) -> None:
+        super().__init__(settings)
+        self._missing = missing
+
+    def finished(self, team: TeamView) -> str | None:
+        """See `Planner.finished`."""
+        return None if len(self._missing()) else 'all targets are found'
+
+    def decide(self, team: TeamView) -> Decision:
+        """See `Planner.decide`."""
+        check_team(team)
+        targets = self._missing()
+        routes, stops = _best_routes(team, targets)
+        places = waiting_places(team)
+        decision = Decision(step=team.step)
+        for name in team.planning():
+            index = team.names().index(name)
+            wanted = np.vstack([stops[index], targets[[*routes[index], *range(len(targets))]]])
+            robot = self._sent(team, name, wanted, places)
+            decision.robots[name] = robot
+            places.append((robot.waypoint, team.robots[name].radius))
+        return explain(decision)
+
+    @staticmethod
+    def _sent(
+        team: TeamView,
+        name: str,
+        wanted: FloatArray,
+        places: list[tuple[FloatArray, float]],
+    ) -> RobotDecision:
+        """Return the decision for the first of the wanted waypoints that can be reached."""
+        view = team.robots[name]
+        if team.dimension == 2:
+            wanted[:, 2] = view.state.pose.position[2]
+        # A waypoint nearer than a measurement period is passed.
+        least = view.motion.settings.speed * view.period_steps * team.step_time
+        if len(wanted) > 1 and np.linalg.norm(wanted[0] - view.state.pose.position) < least:
+            wanted = wanted[1:]
+        for point in [*wanted, *view.candidates]:
+            alone = TeamView(
+                team.step,
+                team.step_time,
+                {name: RobotView(**{**vars(view), 'candidates': point[None, :]})},
+                team.clusters,
+                team.exploration,
+                taken=places,
+            )
+            options = options_of(alone, name, places)
+            if not isinstance(options, str):
+                return single_choice(options.points, options.prediction, 0, 'on the best route')
+        return stay(view, 'stays: no target can be reached')
+
+
+def _best_routes(team: TeamView, targets: FloatArray) -> tuple[Routes, FloatArray]:
+    """Return a route over the targets for each robot, and where its first leg ends, (R, 3)."""
+    robots = _robots(team, targets)
+    detected = np.array([_has_cluster(team, target) for target in targets], np.bool_)
+    number = len(robots.free)
+    stops = np.zeros((number, 3))
+
+    def cost(routes: Routes) -> float:
+        array = np.full((number, len(targets) + 1), -1, np.int64)
+        for row, route in zip(array, routes):
+            row[: len(route)] = route
+        return float(_expected_end(robots, array, targets, detected, team.dimension, stops))
+
+    routes: Routes = [[] for _ in range(number)]
+    ends = robots.tail[:, -1].copy()
+    times = robots.free.astype(float)
+    left = list(range(len(targets)))
+    while left:
+        gaps = np.linalg.norm(targets[left][None] - ends[:, None], axis=2) / robots.speed[:, None]
+        r, column = np.unravel_index(int((times[:, None] + gaps).argmin()), gaps.shape)
+        times[r] += gaps[r, column]
+        ends[r] = targets[left[column]]
+        routes[r].append(left.pop(int(column)))
+    best = cost(routes)
+    for _ in range(ROUNDS):
+        before = best
+        for changed in _neighbours(routes):
+            value = cost(changed)
+            if value < best - 1e-9:
+                routes, best = changed, value
+                break
+        if best == before:
+            break
+    cost(routes)
+    return routes, stops
+
+
+def _neighbours(routes: Routes) -> Iterator[Routes]:
+    """Yield routes with one target moved, or a part of one reversed."""
+    for r, route in enumerate(routes):
+        for i in range(len(route)):
+            rest = [list(other) for other in routes]
+            target = rest[r].pop(i)
+            for s, other in enumerate(rest):
+                for j in range(len(other) + 1):
+                    if (s, j) != (r, i):
+                        yield [
+                            [*other[:j], target, *other[j:]] if s == q else list(rest[q])
+                            for q in range(len(rest))
+                        ]
+            for j in range(i + 2, len(route) + 1):
+                turned = [*route[:i], *route[i:j][::-1], *route[j:]]
+                yield [turned if q == r else list(routes[q]) for q in range(len(routes))]
+
+
+def _has_cluster(team: TeamView, target: FloatArray) -> bool:
+    """Return whether a target was detected already: a cluster is near it."""
+    d = team.dimension
+    for cluster in team.clusters:
+        offset = cluster.position[:d] - target[:d]
+        if offset @ offset <= 9.0 * float(np.trace(cluster.covariance[:d, :d])):
+            return True
+    return False
+
+
+def _robots(team: TeamView, targets: FloatArray) -> _Robots:
+    """Return all robots of a team for the simulation."""
+    views = [team.robots[name] for name in team.names()]
+    tick = min(view.period_steps for view in views)
+    tails, pauses, speeds, yaws = [], [], [], []
+    parameters = np.zeros((len(views), PARAMETERS))
+    kinds = []
+    for row, view in zip(parameters, views):
+        here = np.array(view.state.pose.position)
+        tail = here[None] if view.tail is None or not len(view.tail) else view.tail
+        tails.append(np.vstack([tail[::tick], tail[-1]]))
+        settings = view.motion.settings
+        speed = settings.speed * team.step_time
+        goals = targets.copy()
+        if team.dimension == 2:
+            goals[:, 2] = here[2]
+        lengths = view.motion.predict(view.state, goals, team.step_time).lengths
+        over = lengths - np.linalg.norm(goals - here, axis=1) / speed
+        pauses.append(max(0.0, float(np.median(over))) / tick)
+        speeds.append(speed * tick)
+        travels = settings.model == 'unicycle' or settings.heading == 'travel'
+        yaws.append(np.nan if travels else view.state.pose.yaw)
+        kind, row[:] = view.sensor.detection.kernel()
+        kinds.append(kind)
+    longest = max(map(len, tails))
+    return _Robots(
+        tail=np.stack([np.pad(t, ((0, longest - len(t)), (0, 0)), mode='edge') for t in tails]),
+        free=np.array([len(t) - 1 if len(t) > 2 else 0 for t in tails], np.int64),
+        speed=np.array(speeds),
+        pause=np.array(pauses),
+        period=np.array([max(1, round(view.period_steps / tick)) for view in views], np.int64),
+        kind=np.array(kinds, np.int64),
+        parameters=parameters,
+        yaw=np.array(yaws),
+    )

@@ -1,0 +1,140 @@
+"""Regimes and planners whose whole searches are compared, as changes of scenarios."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from quality_conditions import NOISES
+
+from maasi_sim.experiments.searches import merged
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.schema import Scenario
+
+GRID_2D = {'grid': [10, 10], 'spacing': 100.0, 'corner': [50.0, 50.0]}
+NEIGHBOURS_3D = {'ring': 6, 'distance': 30.0}
+PAPER = {'objective': 'paper', 'alpha': 0.75, 'beta': 0.75, 'control_weight': 0.0}
+
+
+@dataclass(frozen=True)
+class Regime:
+    """A kind of search.
+
+    Attributes
+    ----------
+    scenario : str
+        Name of its scenario.
+    limit : float
+        Time that a run has, and counts if not all is found [s].
+    change : dict
+        Merged over the scenario; `robots` replaces all robots, types come with the first one.
+    neighbours : dict
+        Candidates of planners that measure at waypoints only.
+    """
+
+    scenario: str
+    limit: float
+    change: dict[str, Any]
+    neighbours: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A planner as it is compared.
+
+    Attributes
+    ----------
+    change : dict
+        Settings of the planner.
+    runs : int
+        Most seeds: fewer where runs take long.
+    stops : bool
+        Whether robots stop at every waypoint.
+    neighbours : bool
+        Whether it chooses among a regime's `neighbours`.
+    clairvoyant : bool
+        Whether it is told the true targets.
+    """
+
+    change: dict[str, Any]
+    runs: int = 64
+    stops: bool = False
+    neighbours: bool = False
+    clairvoyant: bool = False
+
+
+def drones(*starts: tuple[float, float, float], **change: Any) -> dict[str, Any]:
+    """Return the changes of robots drone1, drone2 and so on."""
+    return {
+        f'drone{number}': {'start': list(start), **change}
+        for number, start in enumerate(starts, start=1)
+    }
+
+
+REGIMES: dict[str, Regime] = {
+    'one drone': Regime('ranging_drone_3d', 400.0, {}, NEIGHBOURS_3D),
+    'two drones': Regime('ranging_pair_3d', 250.0, {}, NEIGHBOURS_3D),
+    'mambo': Regime('mambo', 150.0, {}, {'ring': 8, 'distance': 0.3}),
+    'demo': Regime('mambo_turtlebot', 200.0, {}, {'ring': 8, 'distance': 0.3}),
+    '1000 m, three drones': Regime(
+        'ranging_pair_3d',
+        900.0,
+        {
+            'environment': {'bounds': [[0.0, 1000.0]] * 2},
+            'robots': drones(
+                (1.0, 1.0, 30.0),
+                (999.0, 1.0, 30.0),
+                (1.0, 999.0, 30.0),
+                candidates=GRID_2D,
+                sensor={'detection': {'size': [25.0, 25.0]}},
+            ),
+        },
+        {'ring': 8, 'distance': 50.0},
+    ),
+    'ten robots': Regime(
+        'ranging_pair_3d',
+        100.0,
+        {'robots': drones(*[(10.0 + 25.0 * i, 130.0 + 120.0 * (-1) ** i, 1.0) for i in range(10)])},
+        NEIGHBOURS_3D,
+    ),
+    'two clusters': Regime(
+        'ranging_drone_3d',
+        400.0,
+        {'targets': {'distribution': 'clustered', 'clusters': 2, 'separation': 5.0}},
+        NEIGHBOURS_3D,
+    ),
+    'radians': Regime(
+        'ranging_drone_3d',
+        600.0,
+        {'robots': {'drone': {'sensor': {'noise': NOISES['radians'].model_dump(by_alias=True)}}}},
+        NEIGHBOURS_3D,
+    ),
+}
+
+KINDS: dict[str, Kind] = {
+    'lawnmower': Kind({'name': 'lawnmower'}, runs=32, stops=True),
+    'nearest_widest': Kind({'name': 'nearest_widest'}, stops=True),
+    'mutual_information': Kind({'name': 'mutual_information'}, 16, stops=True, neighbours=True),
+    'paper': Kind({'name': 'maasi', **PAPER}, stops=True),
+    'before': Kind({'name': 'maasi'}, stops=True),
+    'maasi': Kind({'name': 'maasi'}),
+    'clairvoyant': Kind({'name': 'maasi'}, runs=32, clairvoyant=True),
+}
+
+
+def prepared(regime: str, kind: str) -> Scenario:
+    """Return the scenario of a regime with a planner."""
+    what, how = REGIMES[regime], KINDS[kind]
+    content = load_scenario(what.scenario).model_dump(by_alias=True, exclude_unset=True)
+    change = dict(what.change)
+    robots = change.pop('robots', {})
+    like = next(iter(content['robots'].values()))
+    if len(robots) > 1:
+        content['robots'] = dict.fromkeys(robots, like)
+    limits = {'limits': {'time': what.limit}, 'filter': {'threads': 1}}
+    content = merged(content, change, {'robots': robots}, limits)
+    content['planner'] = merged(content['planner'], how.change)
+    for robot in content['robots'].values():
+        if how.neighbours:
+            robot['candidates'] = what.neighbours
+    return Scenario.model_validate(content)
