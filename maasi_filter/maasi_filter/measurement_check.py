@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
 from maasi_filter.records import AgentMeasurement, FoundTarget
@@ -33,6 +34,8 @@ class CheckedMeasurement:
     pose_error : float
         Standard deviation of the robot's position error per axis, as far as the covariances do not
         include it [m].
+    labels : tuple of Label
+        Of each detection; empty: none has one.
     """
 
     robot: str
@@ -43,10 +46,14 @@ class CheckedMeasurement:
     own: bool
     index: int
     pose_error: float
+    labels: tuple[Label, ...] = ()
 
     def only(self, keep: NDArray[np.bool_]) -> CheckedMeasurement:
         """Return a copy with some of the detections."""
-        return replace(self, values=self.values[keep], covariances=self.covariances[keep])
+        labels = tuple(label for label, kept in zip(self.labels, keep.tolist()) if kept)
+        return replace(
+            self, values=self.values[keep], covariances=self.covariances[keep], labels=labels
+        )
 
 
 def check_measurements(
@@ -107,6 +114,9 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
         reported = _reported_error(name, measurement.position_covariance, d)
         if settings.pose_error is None and not own:
             pose_error = max(pose_error, reported)
+    labels = tuple(measurement.labels)
+    if len(labels) not in (0, len(values)):
+        raise ValueError(f'{name}: labels: got {len(labels)}, allowed are {len(values)}, or none')
     # Sort, so that the result does not depend on the order in which a sensor lists detections.
     order = np.lexsort(values.T[::-1])
     return CheckedMeasurement(
@@ -118,6 +128,7 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
         own,
         measurement.index,
         pose_error,
+        tuple(labels[i] for i in order.tolist()) if labels else (),
     )
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 
@@ -34,6 +36,8 @@ class AgentMeasurement:
     position_covariance : (3, 3) array, optional
         Covariance of the robot's position error as it reports it, square metres. Covariances of
         detections are assumed to include it.
+    labels : sequence of Label
+        Class and identity of each detection; empty: none is known.
     """
 
     robot: str
@@ -43,6 +47,7 @@ class AgentMeasurement:
     covariances: FloatArray | None = None
     index: int = 0
     position_covariance: FloatArray | None = None
+    labels: Sequence[Label] = ()
 
 
 @dataclass
@@ -87,6 +92,8 @@ class FoundTarget:
         Seconds.
     origin : int
         Its id in the filter of another robot that found it; 0 if this filter found it.
+    label : Label
+        Its class with the share of its detections that named it, and its identity.
     """
 
     id: int
@@ -96,6 +103,7 @@ class FoundTarget:
     measurement: int
     time: float
     origin: int = 0
+    label: Label = UNLABELLED
 
 
 @dataclass

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.exploration import Exploration
+from maasi_filter.models.label import Label
 from maasi_filter.records import Cluster, FoundTarget
 from maasi_filter.settings import FilterSettings
 from maasi_filter.state_file import (
@@ -35,6 +36,7 @@ COMMON = {
     'found_measurements': ('i', 'f'),
     'found_origins': ('i', 'f'),
     'found_times': ('f', 'f'),
+    'found_scores': ('f', 'f'),
     'found_positions': ('f', 'f d'),
     'found_covariances': ('f', 'f d d'),
     'cluster_positions': ('f', 'c d'),
@@ -121,6 +123,9 @@ def found_arrays(targets: Sequence[FoundTarget], d: int) -> dict[str, NDArray[An
     """Return found targets in d dimensions as arrays."""
     return {
         'robots': text(json.dumps([target.robot for target in targets])),
+        'found_classes': text(json.dumps([target.label.class_id for target in targets])),
+        'found_identities': text(json.dumps([target.label.identity for target in targets])),
+        'found_scores': np.array([target.label.score for target in targets], float),
         'found_ids': np.array([target.id for target in targets], np.int64),
         'found_measurements': np.array([target.measurement for target in targets], np.int64),
         'found_origins': np.array([target.origin for target in targets], np.int64),
@@ -132,17 +137,22 @@ def found_arrays(targets: Sequence[FoundTarget], d: int) -> dict[str, NDArray[An
 
 def found_of(state: Arrays) -> list[FoundTarget]:
     """Return the found targets of a checked state."""
+    number = len(state['found_ids'])
+    robots, classes, identities = (
+        names_of(state, name, number) for name in ('robots', 'found_classes', 'found_identities')
+    )
     return [
         FoundTarget(
             int(state['found_ids'][f]),
             state['found_positions'][f].copy(),
             state['found_covariances'][f].copy(),
-            robot,
+            robots[f],
             int(state['found_measurements'][f]),
             float(state['found_times'][f]),
             int(state['found_origins'][f]),
+            Label(classes[f], float(state['found_scores'][f]), identities[f]),
         )
-        for f, robot in enumerate(names_of(state, 'robots', len(state['found_ids'])))
+        for f in range(number)
     ]
 
 

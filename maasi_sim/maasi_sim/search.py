@@ -169,8 +169,8 @@ class _Robot:
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
         """Return what the robot sees at a step."""
         if self.detector is None:
-            ranges = self.body.ranges(step)
-            reading = SensorReading.of_ranges(ranges, self.sensor, self.pose.pose)
+            sweep = self.body.sweep(step)
+            reading = SensorReading.of_sweep(sweep, self.sensor, self.pose.pose)
         else:
             image = self.body.image(step, time)
             reading = read_markers(image, self.pose, self.detector, self.sensor)
@@ -182,6 +182,7 @@ class _Robot:
             reading.covariances,
             index,
             self.pose.covariance[:3, :3],
+            reading.labels,
         )
 
 

@@ -151,6 +151,7 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
         targets(distribution='clustered', clusters=4, spread=4.0, separation=3.0),
     ),
     'pairs at 3 m': (DEGREES, pairs(3.0)),
+    'pairs at 3 m, identified': (DEGREES, pairs(3.0), targets(identified=True)),
     'walk 0.1 m/sqrt(s), told': (DEGREES, walk(0.1)),
     'walk 0.3 m/sqrt(s), told': (DEGREES, walk(0.3)),
 }

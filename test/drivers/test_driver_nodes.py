@@ -341,6 +341,26 @@ def test_ranges_of_a_mounted_sensor_are_turned_by_the_pose(play):
     assert len(item.covariance) == 9
 
 
+def test_class_and_identity_of_ranges_are_passed_on(play):
+    driver, team = play('ranging')
+    team.move()
+    sweep = RangeArray(
+        ranges=[
+            RangeMeasurement(
+                range=2.0, bearing=0.3, class_id='person', score=0.7, identity='tag_4'
+            ),
+            RangeMeasurement(range=2.5, bearing=-0.3),
+            RangeMeasurement(range=3.0, bearing=0.1, class_id='person', score=1.5),
+        ]
+    )
+    team.ranges.publish(sweep)
+    team.ask(0)
+    named, plain = team.answer().detections
+    assert (named.class_id, named.score, named.identity) == ('person', 0.7, 'tag_4')
+    assert (plain.class_id, plain.score, plain.identity) == ('', 0.0, '')
+    assert driver.dropped['range'] == 1
+
+
 # ---- lockstep --------------------------------------------------------------------------------
 
 

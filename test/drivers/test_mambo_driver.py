@@ -26,9 +26,9 @@ from maasi_drivers.links.mambo.mambo_robot_link import _POLL_PERIOD
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.mambo_driver import MamboDriver
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
+from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.measurement_feed import FeedPacket
-from maasi_drivers.vision.segmentation import Blobs
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import pose_to_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.parameters import flatten

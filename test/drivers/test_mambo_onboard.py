@@ -189,8 +189,8 @@ def test_a_driver_that_hangs_is_a_drone_that_hovers_then_lands(fly):
 
 
 def packet(**pose):
+    from maasi_drivers.vision.blobs import Blobs
     from maasi_drivers.vision.measurement_feed import FeedPacket
-    from maasi_drivers.vision.segmentation import Blobs
 
     none = Blobs(
         centroids=np.zeros((0, 2)),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from maasi_drivers.measurement_feed_sender import main
+from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.camera_settings import SegmentationSettings
 from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
 from maasi_drivers.vision.measurement_feed import (
@@ -24,7 +25,7 @@ from maasi_drivers.vision.measurement_feed import (
     decode,
     encode,
 )
-from maasi_drivers.vision.segmentation import Blobs, segment
+from maasi_drivers.vision.segmentation import segment
 
 # Longest wait for anything; the machine may be busy.
 LIMIT = 30.0

@@ -157,6 +157,20 @@ def test_the_node_runs_the_multi_bernoulli_filter():
         assert node.status()['found'] == 1
 
 
+def test_found_targets_carry_class_and_identity():
+    changed = SETTINGS.filter.model_copy(update={'method': 'pmb'})
+    with running(filter=changed) as (_, team, until):
+        for number in range(1, 9):
+            detection = Detection(
+                range=0.3, bearing=0.5, class_id='ball', score=0.5 + 0.04 * number, identity='tag_7'
+            )
+            team.measure(number, ['a'], {'a': []}, detections=[detection])
+            until(lambda number=number: len(team.updates) == number)
+        until(lambda: team.found and len(team.found[-1].targets) == 1)
+        target = team.found[-1].targets[0]
+        assert (target.class_id, target.score, target.identity) == ('ball', 1.0, 'tag_7')
+
+
 def test_a_missing_robot_is_named_and_its_late_answer_is_a_batch_of_its_own(world):
     _, team, until = world
     team.measure(1, ['a', 'b'], {'a': []})

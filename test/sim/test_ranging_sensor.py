@@ -20,7 +20,7 @@ def test_targets_are_detected_as_often_as_pi_says():
     targets = POSE.position + generator.uniform(-60, 60, (12, 3))
     played = RangingSensor(sensor(), targets, 1, 'drone')
     expected = played.sensor.detection.probability(targets, POSE).sum()
-    counts = [len(played.measure(POSE, step)) for step in range(1500)]
+    counts = [len(played.measure(POSE, step)[0]) for step in range(1500)]
     assert_allclose(np.mean(counts), expected, rtol=0.05)
 
 
@@ -28,7 +28,7 @@ def test_targets_are_detected_as_often_as_pi_says():
 def test_noise_has_covariance_r(dimension):
     target = np.array([POSE.position + np.array([12.0, -9.0, 5.0])])
     played = RangingSensor(sensor(dimension), target, 1, 'drone')
-    values = np.concatenate([played.measure(POSE, step) for step in range(4000)])
+    values = np.concatenate([played.measure(POSE, step)[0] for step in range(4000)])
     assert values.shape[1] == dimension
     errors = played.sensor.measurement.residual(
         values, played.sensor.measurement.measure(target[:, :dimension], POSE)
@@ -41,27 +41,27 @@ def test_sweeps_are_keyed_and_what_happens_to_one_target_leaves_the_others_alone
     generator = np.random.default_rng(2)
     targets = POSE.position + generator.uniform(-30, 30, (6, 3))
     first = RangingSensor(sensor(), targets, 5, 'drone')
-    assert_array_equal(first.measure(POSE, 9), first.measure(POSE, 9))
+    assert_array_equal(first.measure(POSE, 9)[0], first.measure(POSE, 9)[0])
     far = targets.copy()
     far[0] += 1e5
     second = RangingSensor(sensor(), far, 5, 'drone')
     for step in range(30):
-        kept = {tuple(row) for row in second.measure(POSE, step)}
-        assert kept <= {tuple(row) for row in first.measure(POSE, step)}
+        kept = {tuple(row) for row in second.measure(POSE, step)[0]}
+        assert kept <= {tuple(row) for row in first.measure(POSE, step)[0]}
 
 
 def test_the_order_tells_nothing():
     targets = POSE.position + np.array([[10.0, 0, 0], [0, 20.0, 0]])
     detection = {'kind': 'box', 'probability': 1.0, 'lower': [-50] * 3, 'upper': [50] * 3}
     played = RangingSensor(sensor(detection=detection), targets, 1, 'drone')
-    nearest_first = [played.measure(POSE, step)[:, 0].argmin() == 0 for step in range(200)]
+    nearest_first = [played.measure(POSE, step)[0][:, 0].argmin() == 0 for step in range(200)]
     assert 60 < sum(nearest_first) < 140
 
 
 def test_clutter_comes_at_its_intensity():
     settings = {'clutter': 0.002, 'detection': {'probability': 0.0}}
     played = RangingSensor(sensor(**settings), np.zeros((3, 3)), 1, 'drone', reach=100.0)
-    sweeps = [played.measure(POSE, step) for step in range(400)]
+    sweeps = [played.measure(POSE, step)[0] for step in range(400)]
     assert_allclose(
         np.mean([len(sweep) for sweep in sweeps]), 0.002 * 100 * 2 * np.pi * np.pi, rtol=0.1
     )
@@ -75,11 +75,25 @@ def test_clutter_comes_at_its_intensity():
 def test_values_stay_in_their_ranges():
     targets = POSE.position + np.array([[-0.01, 0.0, 0.0], [-5.0, 1e-3, 0.0], [0.0, 0.0, 4.0]])
     played = RangingSensor(sensor(), targets, 1, 'drone')
-    values = np.concatenate([played.measure(POSE, step) for step in range(300)])
+    values = np.concatenate([played.measure(POSE, step)[0] for step in range(300)])
     assert (values[:, 0] > 0).all()
     assert np.abs(values[:, 1]).max() <= np.pi
     assert np.abs(values[:, 2]).max() <= np.pi / 2
 
 
 def test_no_targets_no_returns():
-    assert RangingSensor(sensor(), np.zeros((0, 3)), 1, 'drone').measure(POSE, 0).shape == (0, 3)
+    assert RangingSensor(sensor(), np.zeros((0, 3)), 1, 'drone').measure(POSE, 0)[0].shape == (0, 3)
+
+
+def test_each_return_says_which_target_caused_it():
+    targets = POSE.position + np.array([[10.0, 0.0, 0.0], [0.0, 20.0, 5.0], [-15.0, 8.0, -3.0]])
+    played = RangingSensor(sensor(clutter=0.002), targets, 3, 'drone', reach=100.0)
+    model, seen, clutter = played.sensor.measurement, 0, 0
+    for step in range(100):
+        values, causes = played.measure(POSE, step)
+        true = causes >= 0
+        errors = model.residual(values[true], model.measure(targets[causes[true]], POSE))
+        assert (np.abs(errors) < 6.0 * np.sqrt(np.diagonal(played.sensor.covariance))).all()
+        seen, clutter = seen + int(true.sum()), clutter + int((~true).sum())
+    assert seen > 100
+    assert clutter > 100

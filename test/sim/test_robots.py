@@ -204,11 +204,11 @@ def test_moving_and_tilting_the_camera_still_shows_them():
 def test_each_sensor_is_there_only_where_it_is_fitted():
     one = robot('unicycle', GROUND, laser=LaserSettings())
     assert one.scan(0).shape == (360,)
-    for read in (lambda: one.image(0, 0.0), lambda: one.ranges(0)):
+    for read in (lambda: one.image(0, 0.0), lambda: one.sweep(0)):
         with pytest.raises(ValueError, match='robot: has no'):
             read()
     flying = robot('constant_speed', DRONE, sensor=SensorSettings().build('ranging', 2))
-    assert flying.ranges(0).shape[1] == 2
+    assert flying.sweep(0).values.shape[1] == 2
     with pytest.raises(ValueError, match='robot: has no laser'):
         flying.scan(0)
 

@@ -161,7 +161,7 @@ class MeasurementResponder:
         self, request: MeasurementRequest, stamp: int, pose: StampedPose, reading: SensorReading
     ) -> None:
         driver = self._driver
-        values, covariances = reading.values, reading.covariances
+        values, covariances, labels = reading.values, reading.covariances, reading.labels
         dropped = sum(reading.dropped.values())
         self.left_out.update(reading.dropped)
         beyond = len(values) - MOST_DETECTIONS
@@ -173,6 +173,7 @@ class MeasurementResponder:
             )
             values = values[:MOST_DETECTIONS]
             covariances = None if covariances is None else covariances[:MOST_DETECTIONS]
+            labels = labels[:MOST_DETECTIONS]
             dropped += beyond
         answer = DetectionArray(
             batch_id=request.batch,
@@ -180,7 +181,7 @@ class MeasurementResponder:
             robot=driver.robot,
             measurement=request.measurement,
             sensor=driver.sensor.name,
-            detections=detections_to_ros(values, covariances),
+            detections=detections_to_ros(values, covariances, labels),
             dropped=dropped,
         )
         answer.header.stamp = stamp_to_ros(stamp)

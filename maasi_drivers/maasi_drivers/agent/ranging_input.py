@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.ranging_mount import RangingMount
 from maasi_drivers.agent.sensor_input import SensorInput
-from maasi_drivers.agent.sensor_reading import SensorReading
-from maasi_filter.ros.conversions import stamp_from_ros
+from maasi_drivers.agent.sensor_reading import SensorReading, Sweep
+from maasi_filter.ros.conversions import label_problem, labels_of, stamp_from_ros
 from maasi_filter.ros.qos import sensor_reader
 from maasi_msgs.msg import RangeArray
 
 FloatArray = NDArray[np.float64]
 
 
-class RangingInput(SensorInput[FloatArray]):
+class RangingInput(SensorInput[Sweep]):
     """
     A sensor that measures range and direction of what is near.
 
@@ -51,12 +51,19 @@ class RangingInput(SensorInput[FloatArray]):
                 'and an elevation within pi/2 [rad]',
                 int(np.count_nonzero(~good)),
             )
-        self.driver.take_frame('ranges', stamp_from_ros(message.header.stamp), values[good])
+        labelled = np.array([label_problem(item) is None for item in message.ranges], dtype=bool)
+        if not labelled[good].all():
+            first = next(text for item in message.ranges if (text := label_problem(item)))
+            self.driver.drop('range', f'ranges: {first}', int(np.count_nonzero(~labelled[good])))
+            good &= labelled
+        labels = labels_of([item for item, kept in zip(message.ranges, good.tolist()) if kept])
+        sweep = Sweep(values[good], labels)
+        self.driver.take_frame('ranges', stamp_from_ros(message.header.stamp), sweep)
 
-    def detect(self, data: FloatArray, pose: StampedPose) -> SensorReading:
+    def detect(self, data: Sweep, pose: StampedPose) -> SensorReading:
         """Return the measurements of one sweep, relative to the robot's position in the map."""
         sensor = self.driver.sensor
         if self._mount is None:
-            return SensorReading.of_ranges(data, sensor, pose.pose)
-        reading = SensorReading(*self._mount.measurements(data, pose), {})
+            return SensorReading.of_sweep(data, sensor, pose.pose)
+        reading = SensorReading(*self._mount.measurements(data.values, pose), {}, data.labels)
         return reading.in_field_of_view(sensor, pose.pose)

@@ -7,10 +7,38 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """
+    What a ranging sensor returns at one instant.
+
+    Attributes
+    ----------
+    values : ndarray, shape (m, d)
+        Range [m], bearing and, in 3D, elevation [rad].
+    labels : tuple of Label
+        Class and identity of each; empty: none is known.
+
+    """
+
+    values: FloatArray
+    labels: tuple[Label, ...] = ()
+
+    def only(self, keep: NDArray[np.bool_]) -> Sweep:
+        """Return a copy with some of the returns."""
+        return Sweep(self.values[keep], selected(self.labels, keep))
+
+
+def selected(labels: tuple[Label, ...], keep: NDArray[np.bool_]) -> tuple[Label, ...]:
+    """Return the labels where `keep` (m,) is true."""
+    return tuple(label for label, kept in zip(labels, keep.tolist()) if kept)
 
 
 @dataclass(frozen=True)
@@ -28,6 +56,8 @@ class SensorReading:
         Of the targets by these values [m, map].
     dropped : dict
         Detections left out: reason to count.
+    labels : tuple of Label
+        Class and identity of each detection; empty: none is known.
 
     """
 
@@ -35,24 +65,26 @@ class SensorReading:
     covariances: FloatArray | None
     positions: FloatArray
     dropped: dict[str, int]
+    labels: tuple[Label, ...] = ()
 
     @classmethod
-    def of_ranges(cls, values: FloatArray, sensor: Sensor, pose: Pose) -> SensorReading:
+    def of_sweep(cls, sweep: Sweep, sensor: Sensor, pose: Pose) -> SensorReading:
         """
         Return the detections of a ranging sensor that are in its field of view.
 
         Parameters
         ----------
-        values : ndarray, shape (m, d)
-            Range [m], bearing and, in 3D, elevation [rad], from the robot on the map's axes.
+        sweep : Sweep
+            From the robot on the map's axes.
         sensor : Sensor
             Of the robot.
         pose : Pose
             Of the robot in the map.
 
         """
-        positions = sensor.measurement.inverse(values, pose)
-        return cls(values, None, positions, {}).in_field_of_view(sensor, pose)
+        positions = sensor.measurement.inverse(sweep.values, pose)
+        reading = cls(sweep.values, None, positions, {}, sweep.labels)
+        return reading.in_field_of_view(sensor, pose)
 
     def in_field_of_view(self, sensor: Sensor, pose: Pose) -> SensorReading:
         """
@@ -79,4 +111,5 @@ class SensorReading:
             covariances=None if self.covariances is None else self.covariances[inside],
             positions=self.positions[inside],
             dropped=self.dropped | {'outside the field of view': outside},
+            labels=selected(self.labels, inside),
         )

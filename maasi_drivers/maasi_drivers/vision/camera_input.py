@@ -17,6 +17,7 @@ from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.sensor_reading import SensorReading
+from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.camera_settings import CameraSettings, load_calibration
 from maasi_drivers.vision.camera_view import box_view_margin
 from maasi_drivers.vision.image_encoding import decode_image, image_to_array
@@ -24,7 +25,6 @@ from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_drivers.vision.marker_reading import read_markers
 from maasi_drivers.vision.measurement_feed import FeedReceiver
-from maasi_drivers.vision.segmentation import Blobs
 from maasi_drivers.warm_up import warm_up
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.pose import Pose

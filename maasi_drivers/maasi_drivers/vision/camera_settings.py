@@ -17,11 +17,15 @@ _LARGEST_IMAGE, _LARGEST_INTRINSIC, _LARGEST_DISTORTION = 32_768, 1e6, 1e4
 class SegmentationSettings(Settings):
     """How marker pixels are separated from the floor; see `maasi_drivers.vision.segmentation`."""
 
-    rule: Literal['robust', 'paper'] = Field(
+    rule: Literal['robust', 'paper', 'aruco'] = Field(
         default='robust',
         description="'paper': fixed blue excess (001, eq. (16)), blobs of any size from "
-        "minimum_area on; 'robust': adapts to light, and gates on size and shape",
+        "minimum_area on; 'robust': adapts to light, and gates on size and shape; 'aruco': "
+        'fiducial markers, whose ids are the identities of targets',
     )
+    dictionary: Literal[
+        '4X4_50', '4X4_250', '5X5_50', '5X5_250', '6X6_50', '6X6_250', 'APRILTAG_36h11'
+    ] = Field(default='4X4_50', description='Aruco rule: dictionary of the markers')
     threshold: float = Field(
         default=35.0,
         ge=0,

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.camera_settings import CameraSettings
 from maasi_drivers.vision.projection import propagate, range_bearing
-from maasi_drivers.vision.segmentation import Blobs, segment
+from maasi_drivers.vision.segmentation import segment
 from maasi_filter.models.pose import Pose
 
 Array = NDArray[np.float64]

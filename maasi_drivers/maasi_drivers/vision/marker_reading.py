@@ -7,8 +7,10 @@ from numpy.typing import NDArray
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.sensor_reading import SensorReading
+from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_drivers.vision.segmentation import Blobs, segment
+from maasi_drivers.vision.segmentation import segment
+from maasi_filter.models.label import Label
 from maasi_filter.models.sensor import Sensor
 
 
@@ -47,5 +49,6 @@ def read_markers(
     markers = detector.locate(picture, pose.pose, covariance)
     # On the floor, z = 0.
     positions = np.pad(markers.positions, ((0, 0), (0, sensor.dimension - 2)))
-    reading = SensorReading(markers.values, markers.covariances, positions, markers.dropped)
+    labels = tuple(Label(identity=name) for name in markers.blobs.identities)
+    reading = SensorReading(markers.values, markers.covariances, positions, markers.dropped, labels)
     return reading.in_field_of_view(sensor, pose.pose)

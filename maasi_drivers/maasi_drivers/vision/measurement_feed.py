@@ -17,7 +17,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from maasi_drivers.vision.segmentation import Blobs
+from maasi_drivers.vision.blobs import Blobs
 
 MAGIC = b'MSMF'
 VERSION = 1

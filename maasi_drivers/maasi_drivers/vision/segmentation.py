@@ -1,13 +1,12 @@
 """
 Blue markers in an image: the papers' rule, and one that adapts to the light.
 
-Both rules take an RGB image and return `Blobs`; `segment` chooses by name.
+All rules take an RGB image and return `Blobs`; `segment` chooses by name.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -15,7 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.camera_settings import SegmentationSettings
+from maasi_drivers.vision.fiducials import segment_fiducials
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -26,47 +27,6 @@ _BACKGROUND, _UNLABELLED = -1, -2
 _FLOOR_SAMPLES = 4096
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
 _DARK = 6.0
-
-
-@dataclass(frozen=True)
-class Blobs:
-    """
-    Connected marker pixels, in the order of their topmost and then leftmost pixel.
-
-    Attributes
-    ----------
-    centroids : ndarray, shape (n, 2)
-        (column, row), pixel centres at whole numbers [px].
-    areas : ndarray, shape (n,)
-        [px].
-    extents : ndarray, shape (n, 2)
-        Width and height of the bounding box [px].
-    border_cut : ndarray of bool, shape (n,)
-        True where the blob touches the image's border, so that its centroid is biased inwards.
-    covariances : ndarray, shape (n, 2, 2)
-        Of the centroids, as far as image noise explains them; zero where the rule does not tell
-        [px^2].
-
-    """
-
-    centroids: Array
-    areas: Array
-    extents: Array
-    border_cut: NDArray[np.bool_]
-    covariances: Array
-
-    def __len__(self) -> int:
-        return len(self.areas)
-
-    def select(self, mask: NDArray[np.bool_]) -> Blobs:
-        """Return the blobs where ``mask`` (n,) is true."""
-        return Blobs(
-            self.centroids[mask],
-            self.areas[mask],
-            self.extents[mask],
-            self.border_cut[mask],
-            self.covariances[mask],
-        )
 
 
 def check_image(image: NDArray[np.generic]) -> Image:
@@ -502,6 +462,7 @@ def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
 RULES: dict[str, Callable[[Image, SegmentationSettings], Blobs]] = {
     'paper': segment_paper,
     'robust': segment_robust,
+    'aruco': segment_fiducials,
 }
 
 

@@ -22,7 +22,13 @@ from maasi_filter.ic_phd.births import (
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import make_scan, phd_correct
-from maasi_filter.ic_phd.found import SAME_TARGET, FoundTargets, distance, kept_measurements
+from maasi_filter.ic_phd.found import (
+    SAME_TARGET,
+    FoundTargets,
+    distance,
+    kept_measurements,
+    nearest_label,
+)
 from maasi_filter.ic_phd.resampling import jittered, resample
 from maasi_filter.ic_phd.state import check
 from maasi_filter.measurement_check import CheckedMeasurement, check_measurements, check_taken
@@ -248,7 +254,13 @@ class IcPhdFilter:
                 continue
             credit = _nearest_member(position, members)
             target = FoundTarget(
-                self._found.next_id(), position, covariance, credit.robot, credit.index, time
+                self._found.next_id(),
+                position,
+                covariance,
+                credit.robot,
+                credit.index,
+                time,
+                label=nearest_label(position, members, numbers.removal_distance),
             )
             self._found.targets.append(target)
             newly_found.append(target)

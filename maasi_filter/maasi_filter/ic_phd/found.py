@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.measurement_check import CheckedMeasurement
+from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.records import FoundTarget
 
 FloatArray = NDArray[np.float64]
@@ -46,6 +48,24 @@ def kept_measurements(
         elif near.any():
             keep[int(np.argmin(np.where(near, apart, np.inf)))] = False
     return keep
+
+
+def nearest_label(
+    position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
+) -> Label:
+    """Return the label of the detection nearest to a position, within T_z = `limit` metres.
+
+    The PHD filter does not associate detections with targets.
+    """
+    best, least = UNLABELLED, limit
+    for member in members:
+        if not member.labels:
+            continue
+        centres = member.sensor.measurement.inverse(member.values, member.pose)
+        for label, apart in zip(member.labels, np.linalg.norm(centres - position, axis=1).tolist()):
+            if apart <= least:
+                best, least = label, apart
+    return best
 
 
 class FoundTargets:

@@ -18,7 +18,13 @@ _ARRAYS = {
     'weights': ('f', 'n'),
     'centres': ('f', 'k d'),
 }
-_NOT_NEGATIVE = ('weights', 'cluster_radii', 'cluster_masses', 'found_measurements')
+_NOT_NEGATIVE = (
+    'weights',
+    'cluster_radii',
+    'cluster_masses',
+    'found_measurements',
+    'found_scores',
+)
 
 
 def check(state: Arrays) -> None:

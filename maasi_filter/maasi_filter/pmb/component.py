@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb.births import Births
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import (
@@ -85,6 +86,8 @@ class Component:
         T_r of the sensor of that robot, metres.
     target : FoundTarget, optional
         The reported target, if it is found.
+    labels : LabelTally
+        Its class and identity.
     """
 
     existence: float
@@ -94,11 +97,17 @@ class Component:
     pose_error: float
     found_radius: float
     target: FoundTarget | None = None
+    labels: LabelTally = field(default_factory=LabelTally)
 
     @property
     def foreign(self) -> bool:
         """Whether the filter of another robot found it, and provides its estimate."""
         return self.target is not None and self.target.origin != 0
+
+    def differs(self, other: Component) -> bool:
+        """Return whether their identities say that they are two targets."""
+        one, two = self.labels.identity, other.labels.identity
+        return bool(one and two and one != two)
 
     def view(self, scan: Scan, births: Births) -> View:
         """Return the likelihoods of this component in a scan."""
@@ -216,10 +225,10 @@ class Component:
 def same_place(one: Component, other: Component, distance: float) -> bool:
     """Return whether two components may be one target, within a squared normalised distance.
 
-    Not if they were born in one scan, as a target causes at most one detection per scan, nor if
-    their existence probabilities sum to more than one target.
+    Not if they were born in one scan, as a target causes at most one detection per scan, if their
+    identities differ, or if their existence probabilities sum to more than one target.
     """
-    if one.scan == other.scan or one.existence + other.existence > 1.0:
+    if one.scan == other.scan or one.differs(other) or one.existence + other.existence > 1.0:
         return False
     offset = one.density.mean - other.density.mean
     total = one.density.covariance + other.density.covariance
@@ -244,6 +253,7 @@ def merge(components: list[Component], distance: float) -> list[Component]:
         for k in kept:
             if near[i, k] and same_place(components[k], item, distance):
                 components[k].existence += item.existence
+                components[k].labels.merge(item.labels)
                 break
         else:
             kept.append(i)

@@ -25,6 +25,7 @@ from maasi_filter.measurement_check import (
     pose_error_of,
 )
 from maasi_filter.models.detection import BoxDetection
+from maasi_filter.models.label import LabelTally
 from maasi_filter.models.measurement_set import prepare_measurements
 from maasi_filter.pmb import state as pmb_state
 from maasi_filter.pmb.association import associate
@@ -34,6 +35,7 @@ from maasi_filter.pmb.component import LEAST_SUPPORT, Component, merge
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, MISS, SCALE, TERMS, Scan, make_scan
 from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest, same_estimate
+from maasi_filter.pmb.identity import associate_by_identity, learn_labels
 from maasi_filter.pmb.noise_scale import NoiseScale, squared_innovation
 from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
@@ -200,7 +202,10 @@ class PmbFilter:
         for i, (item, view) in enumerate(zip(self.components, views)):
             odds[i, view.gated] = item.odds(view)
         # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
-        marginals = associate(odds, kappa + births.intensity)
+        other = kappa + births.intensity
+        named = associate_by_identity(member.labels, self.components, odds, other)
+        marginals = associate(odds, other)
+        learn_labels(member.labels, self.components, marginals.caused)
         self._learn_noise(member, marginals.caused)
         self._count_unexplained(scan, births, odds, dropped)
         changed = False
@@ -219,7 +224,7 @@ class PmbFilter:
             else:
                 changed |= self._report(item, moved)
         # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
-        real = births.intensity / (kappa + births.intensity)
+        real = np.where(named, 0.0, births.intensity / (kappa + births.intensity))
         self._bear(member, scan, births, marginals.new * real)
         self._clutter.count(member.robot, float((marginals.new * (1.0 - real)).sum()))
         # e <- e (1 - pi).
@@ -290,8 +295,18 @@ class PmbFilter:
                     self._scans,
                     member.pose_error,
                     self._found_radius(member),
+                    labels=self._new_label(member, j),
                 )
             )
+
+    def _new_label(self, member: CheckedMeasurement, j: int) -> LabelTally:
+        """Return the label of a component born from detection j; an identity belongs to one."""
+        if not member.labels:
+            return LabelTally()
+        tally = LabelTally.of(member.labels[j])
+        if any(item.labels.identity == tally.identity for item in self.components):
+            tally.identity = ''
+        return tally
 
     def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
         """Mark a component as found."""
@@ -323,6 +338,7 @@ class PmbFilter:
             target,
             position=item.density.mean.copy(),
             covariance=item.density.covariance + error,
+            label=item.labels.label,
         )
 
     def _predict(self, time: float) -> bool:
@@ -476,6 +492,7 @@ class PmbFilter:
             self.components.append(item)
         item.existence, item.density, item.target = CERTAIN, density, target
         item.pose_error = 0.0
+        item.labels = LabelTally.of(target.label)
 
     def _next_id(self) -> int:
         self._last_id += 1

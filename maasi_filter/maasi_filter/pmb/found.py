@@ -47,7 +47,9 @@ def is_known(i: int, components: Sequence[Component], caused: NDArray[np.float64
     """
     density = components[i].density
     for f, other in enumerate(components):
-        if other.target is None or caused[[i, f]].sum() > SEEN_BOTH:
+        if other.target is None or components[i].differs(other):
+            continue
+        if caused[[i, f]].sum() > SEEN_BOTH:
             continue
         offset = density.mean - other.density.mean
         total = density.covariance + other.density.covariance

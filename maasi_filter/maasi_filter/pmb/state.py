@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.density import Density
@@ -25,7 +26,7 @@ from maasi_filter.state_check import (
     found_of,
     names_of,
 )
-from maasi_filter.state_file import text
+from maasi_filter.state_file import text, untext
 
 # By name: kinds of dtype, and shape; equal letters are equal sizes.
 _ARRAYS: dict[str, tuple[str, str]] = {
@@ -48,6 +49,7 @@ _ARRAYS: dict[str, tuple[str, str]] = {
     'found_measurements': ('i', 'b'),
     'found_origins': ('i', 'b'),
     'found_times': ('f', 'b'),
+    'found_scores': ('f', 'b'),
     'found_positions': ('f', 'b d'),
     'found_covariances': ('f', 'b d d'),
     'clutter_scans': ('i', 'r'),
@@ -60,6 +62,7 @@ _NOT_NEGATIVE = (
     'hits',
     'pose_error',
     'found_radius',
+    'found_scores',
     'cluster_masses',
     'clutter_counts',
     'noise_detections',
@@ -113,6 +116,7 @@ def to_arrays(
         'grid': np.array([numbers.get(id(item.grid), -1) for item in densities], np.int64),
         'grids': np.array(grids).reshape(-1, *grid),
         **found_arrays(targets, d),
+        'labels': text(json.dumps([item.labels.to_json() for item in items])),
         'clutter_robots': text(json.dumps(robots)),
         'clutter_scans': np.array([clutter.scans[name] for name in robots], np.int64),
         'clutter_counts': np.array([clutter.counts[name] for name in robots], float),
@@ -145,6 +149,7 @@ def components_of(
     empty = np.empty((0, 0, 0))
     heads = np.split(state['heads'], np.cumsum(state['head_counts'])[:-1])
     terms = np.split(state['terms'], np.cumsum(state['term_counts'])[:-1])
+    labels = _labels_of(state, len(targets))
     components = []
     for c, target in enumerate(targets):
         number = int(state['grid'][c])
@@ -165,9 +170,24 @@ def components_of(
                 float(state['pose_error'][c]),
                 float(state['found_radius'][c]),
                 target if target.id else None,
+                labels[c],
             )
         )
     return components
+
+
+def _labels_of(state: Arrays, number: int) -> list[LabelTally]:
+    """Return the labels of a state.
+
+    Raises
+    ------
+    ValueError
+        If they are not JSON, or not one for each component.
+    """
+    labels = json.loads(untext(state['labels']))
+    if not isinstance(labels, list) or len(labels) != number:
+        raise ValueError(f'labels: got {str(labels)[:100]}, allowed are {number}')
+    return [LabelTally.from_json(values) for values in labels]
 
 
 def learnt_of(state: Arrays) -> tuple[ClutterEstimate, NoiseScale]:

@@ -16,11 +16,12 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import AgentMeasurement, Cluster, FoundTarget
 from maasi_msgs.msg import Cluster as ClusterMessage
-from maasi_msgs.msg import Detection, DetectionArray
+from maasi_msgs.msg import Detection, DetectionArray, RangeMeasurement
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage
 
 FloatArray = NDArray[np.float64]
@@ -33,6 +34,9 @@ MOST_DETECTIONS = 200
 FARTHEST = 4e7
 #: Largest accepted speed [m/s, rad/s].
 FASTEST = 1e5
+
+#: Most characters of a class or identity.
+LONGEST_NAME = 100
 
 # Relative tolerance of symmetry and positive definiteness.
 _ROUNDING = 1e-9
@@ -159,6 +163,9 @@ def found_target_to_ros(target: FoundTarget, batch: int) -> FoundTargetMessage:
         measurement=target.measurement,
         batch_id=batch,
         stamp=stamp_to_ros(round(target.time * 1e9)),
+        class_id=target.label.class_id,
+        score=target.label.score,
+        identity=target.label.identity,
     )
 
 
@@ -171,10 +178,13 @@ def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundT
         robot=message.robot,
         measurement=int(message.measurement),
         time=stamp_from_ros(message.stamp) * 1e-9,
+        label=Label(message.class_id, message.score, message.identity),
     )
 
 
-def detections_to_ros(values: FloatArray, covariances: FloatArray | None) -> list[Detection]:
+def detections_to_ros(
+    values: FloatArray, covariances: FloatArray | None, labels: Sequence[Label] = ()
+) -> list[Detection]:
     """Return detections.
 
     Parameters
@@ -183,9 +193,12 @@ def detections_to_ros(values: FloatArray, covariances: FloatArray | None) -> lis
         Range, bearing and, in 3D, elevation [m, rad].
     covariances : (m, d, d) array, optional
         Covariances of the values.
+    labels : sequence of Label
+        Classes and identities; empty: none.
     """
     messages = []
     for index, value in enumerate(values):
+        label = labels[index] if labels else UNLABELLED
         messages.append(
             Detection(
                 range=float(value[0]),
@@ -194,9 +207,34 @@ def detections_to_ros(values: FloatArray, covariances: FloatArray | None) -> lis
                 covariance=[]
                 if covariances is None
                 else [float(item) for item in covariances[index].ravel()],
+                class_id=label.class_id,
+                score=label.score,
+                identity=label.identity,
             )
         )
     return messages
+
+
+def label_of(message: Detection | RangeMeasurement) -> Label:
+    """Return the class and identity in a message without a `label_problem`."""
+    return Label(message.class_id, message.score, message.identity)
+
+
+def labels_of(messages: Sequence[Detection] | Sequence[RangeMeasurement]) -> tuple[Label, ...]:
+    """Return their labels; empty if none has one."""
+    labels = tuple(label_of(message) for message in messages)
+    return labels if any(label != UNLABELLED for label in labels) else ()
+
+
+def label_problem(message: Detection | RangeMeasurement) -> str | None:
+    """Return the error of a class, score or identity: field, what was read, what is allowed."""
+    if not 0.0 <= message.score <= 1.0:
+        return f'score: read {message.score}, allowed is 0 to 1'
+    for name in ('class_id', 'identity'):
+        text = getattr(message, name)
+        if len(text) > LONGEST_NAME:
+            return f'{name}: read {len(text)} characters, allowed are {LONGEST_NAME}'
+    return None
 
 
 def detection_problem(detection: Detection, dimension: int) -> str | None:
@@ -207,6 +245,9 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
         value = getattr(detection, name)
         if not (math.isfinite(value) and abs(value) <= limit + 1e-6):
             return f'{name}: read {value}, allowed is {-limit:.4f} to {limit:.4f} [rad]'
+    problem = label_problem(detection)
+    if problem is not None:
+        return problem
     size = len(detection.covariance)
     if not size:
         return None
@@ -301,6 +342,7 @@ def measurement_from_ros(
             position_covariance=(
                 position_covariance if np.diagonal(position_covariance).min() >= 0.0 else None
             ),
+            labels=labels_of(kept),
         ),
         problems,
     )

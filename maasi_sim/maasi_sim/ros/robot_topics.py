@@ -13,8 +13,10 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from std_msgs.msg import Header
 
+from maasi_drivers.agent.sensor_reading import Sweep
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.models.label import UNLABELLED
 from maasi_msgs.msg import RangeArray, RangeMeasurement
 from maasi_sim.scenario.schema import steps_of
 from maasi_sim.world.laser_scan import LaserSettings
@@ -110,14 +112,7 @@ class RobotTopics:
             self._image_publisher.publish(self._image)
         elif imaging and robot.ranging is not None:
             self._ranges.header.stamp = stamp
-            self._ranges.ranges = [
-                RangeMeasurement(
-                    range=values[0],
-                    bearing=values[1],
-                    elevation=values[2] if len(values) == 3 else 0.0,
-                )
-                for values in robot.ranges(simulation.step).tolist()
-            ]
+            self._ranges.ranges = range_messages(robot.sweep(simulation.step))
             self._ranges_publisher.publish(self._ranges)
         if self._scans and simulation.scan_due(name):
             self._scan.header.stamp = stamp
@@ -140,6 +135,22 @@ class RobotTopics:
         linear.x, linear.y, linear.z = reading.velocity.tolist()
         angular.x, angular.y, angular.z = reading.angular_velocity.tolist()
         publisher.publish(message)
+
+
+def range_messages(sweep: Sweep) -> list[RangeMeasurement]:
+    """Return the returns of a ranging sensor."""
+    labels = sweep.labels or (UNLABELLED,) * len(sweep.values)
+    return [
+        RangeMeasurement(
+            range=values[0],
+            bearing=values[1],
+            elevation=values[2] if len(values) == 3 else 0.0,
+            class_id=label.class_id,
+            score=label.score,
+            identity=label.identity,
+        )
+        for values, label in zip(sweep.values.tolist(), labels)
+    ]
 
 
 def camera_messages(settings: CameraSettings, frame: str) -> tuple[Image, CameraInfo]:

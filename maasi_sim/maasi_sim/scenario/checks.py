@@ -141,12 +141,18 @@ def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tu
                     ('simulated', field),
                     f'read {value}, which is of a ranging sensor; allowed without a camera',
                 )
-        if scenario.targets.walk > 0.0:
-            yield (
-                ('camera',),
-                f'is there, and targets.walk is {scenario.targets.walk}; allowed are targets that '
-                'stand still, or robots without a camera',
-            )
+        for field, allowed in (
+            ('walk', 'targets that stand still'),
+            ('identified', 'targets without'),
+            ('classes', 'targets without'),
+        ):
+            value = getattr(scenario.targets, field)
+            if value:
+                yield (
+                    ('camera',),
+                    f'is there, and targets.{field} is {value}; allowed are {allowed}, or robots '
+                    'without a camera',
+                )
     if robot.external and robot.simulated != nothing:
         yield ('simulated',), 'is given for a robot that is external; allowed are simulated robots'
 

@@ -33,6 +33,9 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
                 'agent': target.agent,
                 'measurement': target.measurement,
                 'time': target.time,
+                'class_id': target.label.class_id,
+                'score': target.label.score,
+                'identity': target.label.identity,
             }
             for target in record.found
         ],

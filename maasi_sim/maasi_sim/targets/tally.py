@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.models.label import UNLABELLED, Label
 from maasi_sim.run.topics import seconds
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
@@ -18,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Found:
-    """A target that the team has found; covariance (d, d) [m^2]."""
+    """A target that the team has found; covariance (d, d) [m^2], label as in the filter."""
 
     id: int
     position: FloatArray
@@ -26,6 +27,7 @@ class Found:
     agent: str
     measurement: int
     time: float
+    label: Label = UNLABELLED
 
 
 @dataclass(frozen=True)
@@ -143,4 +145,5 @@ class Tally:
             item.robot,
             int(item.measurement),
             seconds(item.stamp) - self.begin,
+            Label(item.class_id, item.score, item.identity),
         )

@@ -13,6 +13,7 @@ from maasi_filter.models.sensor import Sensor
 from maasi_sim.world.noise_streams import noise_stream
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 class RangingSensor:
@@ -44,9 +45,11 @@ class RangingSensor:
         self.reach = min(reach, sensor.maximum_range)
         self._spread = np.linalg.cholesky(sensor.covariance)
 
-    def measure(self, pose: Pose, step: int, targets: Array | None = None) -> Array:
+    def measure(
+        self, pose: Pose, step: int, targets: Array | None = None
+    ) -> tuple[Array, IntArray]:
         """
-        Return one sweep.
+        Return one sweep, and which target caused each return.
 
         Parameters
         ----------
@@ -59,8 +62,10 @@ class RangingSensor:
 
         Returns
         -------
-        ndarray, shape (m, d)
+        values : ndarray, shape (m, d)
             Range [m], bearing from the map's x axis and, in 3D, elevation [rad], in random order.
+        causes : ndarray of int, shape (m,)
+            Index of the target; -1: clutter.
 
         """
         dimension = self.sensor.dimension
@@ -77,15 +82,18 @@ class RangingSensor:
         errors = np.zeros((count, dimension))
         for column in range(dimension):
             errors += noise[:, column, None] * self._spread[:, column]
-        returns = (values + errors)[seen]
+        returns, causes = (values + errors)[seen], np.flatnonzero(seen)
         if self.sensor.clutter > 0.0 and self.reach > 0.0:
-            returns = np.concatenate([returns, self._clutter(generator, dimension)])
-        returns = returns[generator.permutation(len(returns))]
+            clutter = self._clutter(generator, dimension)
+            returns = np.concatenate([returns, clutter])
+            causes = np.concatenate([causes, np.full(len(clutter), -1)])
+        order = generator.permutation(len(returns))
+        returns, causes = returns[order], causes[order]
         returns[:, 0] = np.maximum(returns[:, 0], 1e-6)
         returns[:, 1] = wrap_angle(returns[:, 1])
         if dimension == 3:
             returns[:, 2] = np.clip(returns[:, 2], -0.5 * math.pi, 0.5 * math.pi)
-        return returns
+        return returns, causes
 
     def _clutter(self, generator: np.random.Generator, dimension: int) -> Array:
         """Draw false returns, uniform in range and angles."""

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from maasi_drivers.agent.sensor_reading import Sweep
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.models.label import UNLABELLED
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import Settings
@@ -257,11 +259,17 @@ class SimulatedRobot:
             raise ValueError(f'{self.name}: has no laser scanner')
         return self.laser.scan(self.state.pose, step, centres, radii)
 
-    def ranges(self, step: int) -> Array:
-        """Return a sweep of the ranging sensor, (m, d) [m, rad]."""
+    def sweep(self, step: int) -> Sweep:
+        """Return a sweep of the ranging sensor."""
         if self.ranging is None:
             raise ValueError(f'{self.name}: has no ranging sensor')
-        return self.ranging.measure(self.state.pose, step, self.world.targets_3d_at(step))
+        world = self.world
+        values, causes = self.ranging.measure(self.state.pose, step, world.targets_3d_at(step))
+        if not world.labels:
+            return Sweep(values)
+        return Sweep(
+            values, tuple(UNLABELLED if i < 0 else world.labels[i] for i in causes.tolist())
+        )
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, what this robot uses; nothing changes."""
@@ -271,7 +279,7 @@ class SimulatedRobot:
         if self.laser is not None:
             self.scan(0)
         if self.ranging is not None:
-            self.ranges(0)
+            self.sweep(0)
 
     def _halt(self, pose: Pose) -> None:
         self._body = self._motion.body(RobotState(Pose.from_yaw(pose.position, pose.yaw)))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from maasi_filter.models.label import Label
 from maasi_filter.settings import EnvironmentSettings, Finite, Settings
 from maasi_planner.obstacles import Obstacles
 from maasi_sim.world.noise_streams import noise_stream
@@ -48,6 +49,16 @@ class TargetSettings(Settings):
         'only [m/sqrt(s)]',
     )
 
+    identified: bool = Field(
+        default=False,
+        description='Whether sensors read the identity of each target, as of a transponder; '
+        'ranging sensors only',
+    )
+    classes: list[str] = Field(
+        default_factory=list,
+        description='Classes that sensors tell, of the targets in turn; ranging sensors only',
+    )
+
     @model_validator(mode='after')
     def _one_way(self) -> TargetSettings:
         if (self.count is None) == (self.positions is None):
@@ -72,6 +83,8 @@ class World:
         Deviation of the targets' random walk on each axis in one step [m].
     seed : int
         Of the walk.
+    labels : tuple of Label
+        What sensors tell of each target; empty: nothing.
 
     """
 
@@ -80,6 +93,7 @@ class World:
     obstacles: Obstacles = field(default_factory=Obstacles.none)
     walk: float = 0.0
     seed: int = 0
+    labels: tuple[Label, ...] = ()
     _way: list[Array] = field(default_factory=list, compare=False, repr=False)
 
     @property
@@ -131,7 +145,22 @@ class World:
             positions = draw_targets(
                 targets, bounds, noise_stream(seed, purpose='targets'), obstacles
             )
-        return cls(bounds, positions, obstacles, targets.walk * step**0.5, seed)
+        walk = targets.walk * step**0.5
+        return cls(bounds, positions, obstacles, walk, seed, labels_of(targets, len(positions)))
+
+
+def labels_of(targets: TargetSettings, count: int) -> tuple[Label, ...]:
+    """Return what sensors tell of `count` targets; empty: nothing."""
+    if not (targets.identified or targets.classes):
+        return ()
+    return tuple(
+        Label(
+            targets.classes[i % len(targets.classes)] if targets.classes else '',
+            1.0 if targets.classes else 0.0,
+            f'target_{i + 1}' if targets.identified else '',
+        )
+        for i in range(count)
+    )
 
 
 def check_positions(positions: ArrayLike, bounds: Array) -> Array:

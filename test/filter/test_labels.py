@@ -1,0 +1,136 @@
+"""Classes, scores and identities of detections and found targets."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pmb_problems import plane_filter, plane_sensor
+from searches import floor_sensor, observe
+
+from maasi_filter import AgentMeasurement, FilterSettings, Pose, load_filter
+from maasi_filter.ic_phd.filter import IcPhdFilter
+from maasi_filter.models.label import Label, LabelTally
+from maasi_filter.pmb.filter import PmbFilter
+
+PAIR = np.array([[50.0, 50.0], [51.0, 50.0]])
+NAMES = ('left', 'right')
+
+
+def pair_scans(number, identified=True):
+    """Return scans of two targets 1 m apart, with an error of 1.5 m, from all around."""
+    generator = np.random.default_rng(8)
+    sensor = plane_sensor(probability=0.99, range_noise=1.5, bearing=0.04)
+    scans = []
+    for step in range(number):
+        position = PAIR.mean(axis=0) + 20.0 * np.array([np.cos(step), np.sin(step)])
+        pose = Pose([*position, 0.0])
+        rows, labels = [], []
+        for target, name in zip(PAIR, NAMES):
+            values = observe(generator, sensor, target[None], pose)
+            rows.append(values)
+            labels += [Label('ball', 0.8, name if identified else '')] * len(values)
+        scans.append(
+            AgentMeasurement('robot', pose, sensor, np.concatenate(rows), None, step, labels=labels)
+        )
+    return scans
+
+
+def play(search, scans, first=0):
+    """Let a filter have scans one by one."""
+    for step, scan in enumerate(scans, start=first):
+        search.step([scan], 1, float(step))
+    return search
+
+
+def test_targets_closer_than_the_noise_are_told_apart_by_identity():
+    search = play(plane_filter(found_radius=1.0), pair_scans(60))
+    found = {target.label.identity: target for target in search.found_targets}
+    assert len(search.found_targets) == 2
+    assert sorted(found) == ['left', 'right']
+    for name, place in zip(NAMES, PAIR):
+        offset = found[name].position - place
+        assert offset @ np.linalg.solve(found[name].covariance, offset) < 16.0
+        assert found[name].label.class_id == 'ball'
+        assert found[name].label.score == pytest.approx(1.0)
+
+
+def test_a_detection_far_from_the_target_of_its_identity_is_taken_as_clutter():
+    search = play(plane_filter(found_radius=1.0), pair_scans(60))
+    before = [target.position.copy() for target in search.found_targets]
+    pose = Pose([20.0, 20.0, 0.0])
+    sensor, labels = plane_sensor(), [Label(identity='left')]
+    for step in range(5):
+        misread = AgentMeasurement(
+            'robot', pose, sensor, np.array([[10.0, 0.3]]), None, step, labels=labels
+        )
+        search.step([misread], 1, 100.0 + step)
+    assert len(search.found_targets) == 2
+    assert not any(item.labels.identity == 'left' for item in search.components if not item.target)
+    for target, place in zip(search.found_targets, before):
+        assert np.linalg.norm(target.position - place) < 0.5
+
+
+def test_the_state_with_labels_continues_to_the_bit(tmp_path):
+    scans = pair_scans(30)
+    search = play(plane_filter(found_radius=1.0), scans[:20])
+    search.save(tmp_path / 'state')
+    again = load_filter(tmp_path / 'state')
+    assert isinstance(again, PmbFilter)
+    play(search, scans[20:], 20)
+    play(again, scans[20:], 20)
+    one, two = search.state(), again.state()
+    for name in one:
+        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
+    assert {target.label.identity for target in again.found_targets} <= {'', *NAMES}
+
+
+def test_labels_do_not_depend_on_the_order_of_detections():
+    scans = pair_scans(20)
+    turned = [
+        replace(scan, values=scan.values[::-1], labels=list(scan.labels)[::-1]) for scan in scans
+    ]
+    one = play(plane_filter(found_radius=1.0), scans).state()
+    two = play(plane_filter(found_radius=1.0), turned).state()
+    for name in one:
+        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
+
+
+def test_the_papers_filter_reports_the_label_of_the_nearest_detection():
+    generator = np.random.default_rng(3)
+    sensor = floor_sensor()
+    pose = Pose([1.0, 1.0, 0.0])
+    targets = np.array([[1.1, 1.0], [0.9, 1.1]])
+    lengths = {'found_radius': 0.03, 'removal_distance': 0.06, 'jitter_deviation': 0.003}
+    search = IcPhdFilter(FilterSettings(**lengths), [[-0.3, 2.4]] * 2, np.random.default_rng(1))
+    for step in range(40):
+        values = sensor.measurement.measure(targets, pose)
+        values += 0.3 * generator.multivariate_normal(np.zeros(2), sensor.covariance, 2)
+        labels = [Label('cup', 0.9, 'a'), Label('plate', 0.7, 'b')]
+        search.step(
+            [AgentMeasurement('mambo', pose, sensor, values, None, step, labels=labels)], 1, step
+        )
+    by_place = {
+        int(np.argmin(np.linalg.norm(targets - target.position, axis=1))): target.label
+        for target in search.found_targets
+    }
+    assert by_place == {0: Label('cup', 0.9, 'a'), 1: Label('plate', 0.7, 'b')}
+
+
+def test_the_class_is_that_of_the_largest_sum_of_scores():
+    tally = LabelTally()
+    for name, score, share in (('a', 0.5, 1.0), ('b', 0.0, 0.8), ('b', 0.4, 0.5), ('', 0.0, 1.0)):
+        tally.add(Label(name, score), share)
+    assert tally.label.class_id == 'b'
+    assert tally.label.score == pytest.approx(1.0 / 1.5)
+
+
+@pytest.mark.parametrize('score', [-0.1, 1.1, float('nan')])
+def test_scores_are_refused_that_are_no_probability(score):
+    with pytest.raises(ValueError, match=r'score: got .*allowed is 0 to 1'):
+        Label('cup', score)
+
+
+def test_a_wrong_number_of_labels_is_refused():
+    scan = replace(pair_scans(1)[0], labels=[Label()])
+    with pytest.raises(ValueError, match='labels: got 1, allowed are 2, or none'):
+        plane_filter().step([scan], 1, 0.0)
