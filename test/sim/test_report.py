@@ -152,6 +152,9 @@ class Run:
                 measurement=3,
                 batch_id=self.batch + 1,
                 stamp=self.stamp(time),
+                class_id='cup',
+                score=0.8,
+                identity='tag_3',
             )
         )
 

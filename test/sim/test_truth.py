@@ -58,7 +58,7 @@ def test_clutter_is_played_as_often_as_told():
     sensor = true_sensor(clutter_per_scan=2.5)
     reach = float(np.linalg.norm(CUBE[:, 1] - CUBE[:, 0]))
     played = RangingSensor(sensor, np.zeros((0, 3)), 3, 'drone', reach)
-    counts = [len(played.measure(POSE, step)) for step in range(2000)]
+    counts = [len(played.measure(POSE, step)[0]) for step in range(2000)]
     assert_allclose(np.mean(counts), 2.5, atol=0.12)
 
 
