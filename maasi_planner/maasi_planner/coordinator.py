@@ -15,13 +15,14 @@ from maasi_filter.exploration import Exploration, default_spacing
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
+from maasi_planner.arrival import arrival_radius
 from maasi_planner.candidates import CandidateSet
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import make_planner
-from maasi_planner.team import Decision, RobotView, TeamView
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
 
 FloatArray = NDArray[np.float64]
 
@@ -60,9 +61,18 @@ class _Plan:
     candidates: CandidateSet
     period: int
     radius: float
+    # Distance from a waypoint at which the next one is decided [m]; 0: it stops at each.
+    arrival_radius: float
     exploration: Exploration | None = None
     decision: int = -1
     decided_at: int | None = None
+    # The same for the present waypoint.
+    turning_distance: float = 0.0
+    # Waypoint that was left for the next one, until its closest point, and its distance squared.
+    passed: FloatArray | None = None
+    nearest: float = 0.0
+    # Step from which the periods of measurements count.
+    measured_from: int = 0
     positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     yaws: FloatArray = field(default_factory=lambda: np.zeros(0))
     staying: bool = True
@@ -106,12 +116,15 @@ class Coordinator:
         own = settings.planner.own_explorations
         for name in sorted(settings.robots):
             robot = settings.robots[name]
+            motion = make_motion(robot.motion, self.obstacles, robot.radius)
+            sensor = robot.sensor.build(name, self.dimension)
             self._plans[name] = _Plan(
-                motion=make_motion(robot.motion, self.obstacles, robot.radius),
-                sensor=robot.sensor.build(name, self.dimension),
+                motion=motion,
+                sensor=sensor,
                 candidates=CandidateSet(robot.candidates, bounds, height=robot.start[2]),
                 period=max(1, round(robot.sensor.period / settings.step)),
                 radius=robot.radius,
+                arrival_radius=arrival_radius(motion, sensor, self.planner),
                 exploration=self.exploration.copy() if own else None,
             )
 
@@ -159,6 +172,7 @@ class Coordinator:
         plan.positions = np.zeros((0, 3))
         plan.yaws = np.zeros(0)
         plan.staying = True
+        plan.passed = None
         plan.due = False
 
     def destined(self, name: str) -> bool:
@@ -169,8 +183,10 @@ class Coordinator:
     def lend(self, name: str, step: int) -> None:
         """Note that a robot follows a goal of another client: it measures without a plan."""
         plan = self._plans[name]
-        began = step if plan.decided_at is None else plan.decided_at
+        began = plan.decided_at
         self.leave(name)
+        if began is None:
+            began = plan.measured_from = step
         plan.decided_at = began
         # Measurements need a decision index, which is not negative.
         plan.decision = max(plan.decision, 0)
@@ -193,20 +209,26 @@ class Coordinator:
     def planning(self, step: int, robots: Mapping[str, PresentRobot]) -> list[str]:
         """Return P_k, the robots that plan at a step, in order of their names.
 
-        A robot plans when it has arrived; one that was commanded to stay replans at its next
-        possible measurement.
+        A robot plans when it has arrived, or is near enough to pass its waypoint without a stop;
+        one that was commanded to stay replans at its next possible measurement.
         """
         if self.finished is not None:
             return []
         chosen = []
         for name in sorted(robots):
-            plan = self._plans[name]
-            if not robots[name].free:
-                continue
+            plan, robot = self._plans[name], robots[name]
             waited = plan.decided_at is None or step - plan.decided_at >= plan.period
-            if not plan.staying or waited:
+            if self._nears(plan, robot) or (robot.free and (not plan.staying or waited)):
                 chosen.append(name)
         return chosen
+
+    @staticmethod
+    def _nears(plan: _Plan, robot: PresentRobot) -> bool:
+        """Return whether a robot on its way is near enough to its waypoint to turn to the next."""
+        if robot.free or plan.staying or not plan.turning_distance:
+            return False
+        left = plan.motion.squared_distance(robot.state.pose.position, plan.positions[-1])
+        return left < plan.turning_distance**2
 
     def plan(
         self,
@@ -215,6 +237,9 @@ class Coordinator:
         taken: Sequence[tuple[FloatArray, float]] = (),
     ) -> Decision | None:
         """Return the joint decision of the robots that plan at a step, None without any.
+
+        A robot that nears its waypoint and has nowhere further to go is not in it: it goes on, and
+        plans again when it has arrived.
 
         Parameters
         ----------
@@ -228,31 +253,58 @@ class Coordinator:
         planning = self.planning(step, robots)
         if not planning:
             return None
+        arrived = [name for name in planning if robots[name].free]
         team = self._team(step, robots, planning, taken)
-        self.finished = self.planner.finished(team)
-        if self.finished is not None:
+        finished = self.planner.finished(team)
+        if finished is not None:
             for name in planning:
+                self._plans[name].turning_distance = 0.0
+            if not arrived:
+                return None
+            self.finished = finished
+            for name in arrived:
                 plan = self._plans[name]
                 plan.decision += 1
-                plan.decided_at, plan.staying = step, True
-            return Decision(step=step, reason=self.finished)
+                plan.decided_at = plan.measured_from = step
+                plan.staying = True
+            return Decision(step=step, reason=finished)
         decision = self.planner.decide(team)
         for name in planning:
-            plan, chosen = self._plans[name], decision.robots[name]
-            plan.decision += 1
-            plan.decided_at = step
-            plan.positions, plan.yaws = chosen.positions, chosen.yaws
-            plan.staying = chosen.stays
-            self.trigger.begin(
-                name,
-                plan.sensor,
-                chosen.positions,
-                chosen.yaws,
-                plan.period,
-                self.clusters,
-                self.exploration,
-            )
-        return decision
+            if name not in arrived and decision.robots[name].stays:
+                self._plans[name].turning_distance = 0.0
+                del decision.robots[name]
+            else:
+                self._adopt(name, step, robots[name], decision.robots[name])
+        return decision if decision.robots else None
+
+    def _adopt(self, name: str, step: int, robot: PresentRobot, chosen: RobotDecision) -> None:
+        """Make what was decided for a robot its plan."""
+        plan = self._plans[name]
+        here = robot.state.pose.position
+        # Of two waypoints passed in a row the first is measured now.
+        plan.due = plan.due or plan.passed is not None
+        plan.passed = None
+        if robot.free:
+            plan.measured_from = step
+        else:
+            plan.passed = plan.positions[-1]
+            plan.nearest = plan.motion.squared_distance(here, plan.passed)
+        plan.decision += 1
+        plan.decided_at = step
+        plan.positions, plan.yaws = chosen.positions, chosen.yaws
+        plan.staying = chosen.stays
+        # A waypoint within the radius already is gone to until it is reached.
+        near = plan.motion.squared_distance(here, chosen.waypoint) <= plan.arrival_radius**2
+        plan.turning_distance = 0.0 if near else plan.arrival_radius
+        self.trigger.begin(
+            name,
+            plan.sensor,
+            chosen.positions,
+            chosen.yaws,
+            plan.period,
+            self.clusters,
+            self.exploration,
+        )
 
     def _team(
         self,
@@ -277,7 +329,7 @@ class Coordinator:
             )
             if not view.planning and plan.decided_at is not None:
                 gone = step - plan.decided_at
-                view.phase = -gone % plan.period
+                view.phase = (plan.measured_from - step) % plan.period
                 if len(plan.positions):
                     first = min(gone, len(plan.positions) - 1)
                     view.tail = plan.positions[first:]
@@ -315,8 +367,9 @@ class Coordinator:
             plan = self._plans[name]
             if plan.decided_at is None:
                 continue
-            gone = step - plan.decided_at
-            # At index 0 the robot is still at its last waypoint.
+            self._pass(plan, step, robots[name])
+            gone = step - plan.measured_from
+            # At index 0 the robot is at its last waypoint, or at the closest point.
             if gone == 0 or (self.planner.measures_underway and gone % plan.period == 0):
                 plan.due = plan.due or self.trigger.measures(
                     name,
@@ -331,6 +384,18 @@ class Coordinator:
                 members.append(Member(name, plan.decision, plan.measurements))
                 plan.measurements += 1
         return members
+
+    @staticmethod
+    def _pass(plan: _Plan, step: int, robot: PresentRobot) -> None:
+        """Count the measurements from the closest point to a waypoint that is passed."""
+        if plan.passed is None or step == plan.decided_at:
+            return
+        distance = plan.motion.squared_distance(robot.state.pose.position, plan.passed)
+        if distance >= plan.nearest:
+            plan.passed = None
+            plan.measured_from = step
+        else:
+            plan.nearest = distance
 
     def absorb(self, poses: Mapping[str, Pose], clusters: list[Cluster]) -> None:
         """Update with a batch that the filter has processed.

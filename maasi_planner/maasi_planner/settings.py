@@ -77,6 +77,13 @@ class MotionSettings(Settings):
     tolerance: float = Field(
         default=0.05, gt=0.0, description='Distance at which a waypoint counts as reached [m]'
     )
+    arrival_radius: float | None = Field(
+        default=None,
+        ge=0.0,
+        description='Distance from the waypoint at which the next one is decided, so that the '
+        'robot passes without slowing down; 0: it stops at each waypoint, as in the papers; none: '
+        'where it begins to brake, at most what the sensor sees to each side [m]',
+    )
     approach_rate: float | None = Field(
         default=None,
         gt=0.0,

@@ -136,7 +136,14 @@ class MotionModel(ABC):
         To get around.
     radius : float
         Of the robot, metres; obstacles are inflated by it.
+
+    Attributes
+    ----------
+    rate : float
+        Speed per distance left, near the waypoint [1/s].
     """
+
+    rate: float
 
     def __init__(
         self,
@@ -198,9 +205,17 @@ class MotionModel(ABC):
 
     def arrived(self, position: ArrayLike, waypoint: ArrayLike) -> bool:
         """Return whether `position` is within the tolerance of `waypoint`, both (3,)."""
-        offset = np.asarray(position, dtype=float) - np.asarray(waypoint, dtype=float)
         tolerance = self.settings.tolerance
-        return float(offset @ offset) <= tolerance * tolerance
+        return self.squared_distance(position, waypoint) <= tolerance * tolerance
+
+    def squared_distance(self, position: ArrayLike, waypoint: ArrayLike) -> float:
+        """Return the squared distance of two points (3,) that counts for arrival [m^2]."""
+        offset = np.asarray(position, dtype=float) - np.asarray(waypoint, dtype=float)
+        return float(offset @ offset)
+
+    def braking_distance(self) -> float:
+        """Return the distance from a waypoint below which the robot gets slower [m]."""
+        return self.settings.speed / self.rate
 
     def steps_limit(self, state: RobotState, waypoints: FloatArray, step: float) -> int:
         """Return the steps after which a waypoint counts as out of reach."""

@@ -301,13 +301,13 @@ class Unicycle(MotionModel):
     ) -> None:
         super().__init__(settings, obstacles, radius)
         self.limits = unicycle_limits(settings)
+        self.rate = float(self.limits[RATE])
         self._window = settings.avoidance == 'dynamic_window'
 
-    def arrived(self, position: ArrayLike, waypoint: ArrayLike) -> bool:
-        """Return whether `position` is within the tolerance of `waypoint`, horizontally."""
+    def squared_distance(self, position: ArrayLike, waypoint: ArrayLike) -> float:
+        """Return the squared horizontal distance of two points (3,) [m^2]."""
         offset = np.asarray(position, dtype=float)[:2] - np.asarray(waypoint, dtype=float)[:2]
-        tolerance = self.settings.tolerance
-        return float(offset[0] * offset[0] + offset[1] * offset[1]) <= tolerance * tolerance
+        return float(offset[0] * offset[0] + offset[1] * offset[1])
 
     def roll_out(
         self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories

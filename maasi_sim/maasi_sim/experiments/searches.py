@@ -62,7 +62,7 @@ def search_case(
     small: bool = False,
     runs: int | None = None,
 ) -> Case:
-    """Return a case that is a search.
+    """Return a case that is a search; robots stop at each waypoint, as in the papers.
 
     Parameters
     ----------
@@ -82,7 +82,9 @@ def search_case(
     if small:
         most_measurements = min(most_measurements, _SMALL)
         values = merged(values, {'filter': {'particles': _SMALL_PARTICLES}})
-    scenario = scenario_from_values(merged(values, {'filter': {'threads': 1}}), name)
+    stopping = {robot: {'motion': {'arrival_radius': 0.0}} for robot in values['robots']}
+    values = merged({'robots': stopping}, values, {'filter': {'threads': 1}})
+    scenario = scenario_from_values(values, name)
     settings = {'scenario': scenario.content(), 'most_measurements': most_measurements}
     return Case(name, settings, preset, runs)  # type: ignore[arg-type]
 
