@@ -9,6 +9,7 @@ setup(
     package_data={
         'maasi_sim.experiments': ['published/*.yaml'],
         'maasi_sim.run': ['discovery.xml'],
+        'maasi_sim.view': ['page/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/maasi_sim']),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -31,6 +32,7 @@ from maasi_sim.scenario.schema import (
     steps_of,
 )
 from maasi_sim.targets.scoring import score, scoring_radius
+from maasi_sim.view.search_trace import SearchTrace
 from maasi_sim.world.simulation import simulated_robot, step_of_event
 from maasi_sim.world.world import World
 
@@ -97,6 +99,8 @@ class SearchResult:
         In their order.
     filter_times, planning_times : list of float
         Wall time of each filter step and of each decision [s].
+    trace : SearchTrace or None
+        What a replay shows.
     """
 
     end_reason: str
@@ -112,6 +116,18 @@ class SearchResult:
     decisions: list[Decision] = field(default_factory=list)
     filter_times: list[float] = field(default_factory=list)
     planning_times: list[float] = field(default_factory=list)
+    trace: SearchTrace | None = field(default=None, repr=False, compare=False)
+
+    def save_replay(self, path: str | Path) -> None:
+        """Write a page that shows the search, one HTML file.
+
+        Raises
+        ------
+        ResultsError
+            If it cannot be written.
+        """
+        assert self.trace is not None, 'a result that `search` returned has a trace'
+        self.trace.save_replay(Path(path))
 
     @property
     def total_measurements(self) -> int:
@@ -189,8 +205,13 @@ class _Robot:
 class _Group:
     """Robots that share filter and planner: all, or one by itself (002, section 4)."""
 
-    def __init__(self, names: list[str], scenario: Scenario, seed: int) -> None:
+    def __init__(
+        self, space: str, names: list[str], scenario: Scenario, trace: SearchTrace
+    ) -> None:
+        self.space = space
         self.names = names
+        self.trace = trace
+        seed = trace.seed
         common = {'step': scenario.step, 'seed': seed, 'lockstep': True}
         self.coordinator = Coordinator(planner_settings(scenario, names, common))
         self.filter = make_filter(
@@ -223,6 +244,9 @@ class _Group:
         decision = coordinator.plan(step, present, taken)
         if decision is not None:
             self.planning_times.append(perf_counter() - begin)
+            self.trace.decision(
+                step * coordinator.settings.step, self.space, decision, coordinator.exploration
+            )
             for name, chosen in decision.robots.items():
                 if not chosen.stays:
                     number = coordinator.decision_index(name) + 1
@@ -252,6 +276,9 @@ class _Group:
             self.filter.take_over(other.names[0], other.shared)
         result = self.filter.step(measurements, gone, time)
         self.filter_times.append(perf_counter() - begin)
+        known = result.found_changed or bool(others)
+        found = self.filter.own_found_targets() if known else None
+        self.trace.update(time, self.space, measurements, result, found)
         self.coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
         return [item.robot for item in members]
 
@@ -297,9 +324,13 @@ def search(
     robots = {name: _Robot(name, scenario, seed, world) for name in scenario.names()}
     departures = leaving(scenario)
     away: set[str] = set()
-    groups = [_Group(names, scenario, seed) for names in scenario.namespaces().values()]
+    trace = SearchTrace(scenario, seed)
+    groups = [
+        _Group(space, names, scenario, trace) for space, names in scenario.namespaces().items()
+    ]
     destinations = {name: np.array(robot.start) for name, robot in scenario.robots.items()}
     truth = np.asarray(world.targets, dtype=float)
+    trace.truth(0.0, truth)
     radius = scoring_radius(scenario, truth)
     counts = dict.fromkeys(robots, 0)
     progress: list[Found] = []
@@ -322,12 +353,14 @@ def search(
         time = step * scenario.step
         for name in departures.get(step, []):
             away.add(name)
+            trace.leave(time, name)
             for group in groups:
                 if name in group.names:
                     group.coordinator.leave(name)
         here = {name: robot for name, robot in robots.items() if name not in away}
         for robot in here.values():
             robot.observe(round(time * 1e9))
+        trace.robots(time, {name: robot.state for name, robot in here.items()})
         commands = {
             name: robot.follower.update(robot.state, step)[0] for name, robot in here.items()
         }
@@ -351,6 +384,8 @@ def search(
             if measured:
                 positions = [target.position for target in found_targets()]
                 truth = world.targets_at(step)
+                if world.walk > 0.0:
+                    trace.truth(time, truth)
                 scores = score(positions, truth, radius, scenario.scoring.order)
                 complete = complete or (bool(len(truth)) and scores.complete)
                 progress.append(
@@ -398,6 +433,7 @@ def search(
         steps=step + 1,
         progress=progress,
         decisions=decisions,
+        trace=trace,
         filter_times=[item for group in groups for item in group.filter_times],
         planning_times=[item for group in groups for item in group.planning_times],
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from maasi_sim.missions import load_mission
+from maasi_sim.run.bag import BagError
 from maasi_sim.run.ending import DONE, NODE_FAILED, NOT_ALL_FOUND, NOT_WRITTEN
 from maasi_sim.run.interruption import Interruption
 from maasi_sim.run.node_plan import (
@@ -20,12 +21,14 @@ from maasi_sim.run.node_plan import (
 from maasi_sim.run.processes import Domain
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.report_files import store_report
-from maasi_sim.run.run_folder import make_folder, write_text
+from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.view.bag_events import read_events
+from maasi_sim.view.page_file import REPLAY, write_replay
 
 if TYPE_CHECKING:
     from maasi_sim.run.session import Session
@@ -148,10 +151,23 @@ class ScenarioRun:
         if stored.folder is not None:
             place = short(stored.folder / 'report.json')
         self.display.say(f'report: {place}')
+        self._leave_replay()
         code = ending.code
         if ending.reason == 'planner_done' and stored.report['missed'] == 0:
             code = DONE
         return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
+
+    def _leave_replay(self) -> None:
+        """Write the page that shows the run, from its recording."""
+        if not self.options.record:
+            return
+        file = self.folder / REPLAY
+        try:
+            write_replay(read_events(self.folder), file)
+        except (BagError, ResultsError) as error:
+            self.display.say(f'warning: no {REPLAY}: {error}')
+        else:
+            self.display.say(f'replay: {short(file)}')
 
 
 def short(path: Path) -> str:

@@ -1,0 +1,132 @@
+"""The event log of a run: JSON lines, the first of them the scene; thinned and packed for a page.
+
+Each event is a list: time since the first step [s], kind, whose it is, and what the kind holds.
+The last event of a kind and owner at or before a time is what holds at that time.
+
+==========  ======================================================================================
+kind        after time, kind and owner
+==========  ======================================================================================
+robot       [x, y, z, yaw], battery (negative: unknown), goal status, reason
+seen        [x, y, z] of the robot, detections [range, bearing, elevation, and a deviation of each]
+filter      expected number, clusters [x, y, z, mass, covariance], measurements so far
+found       targets [id, x, y, z, covariance, robot, time]
+plan        planner, explored share, objective, reason, robots [name, index, chosen, waypoint,
+            candidates [x, y, z, C, T, E, J, K, M], reason]
+way         planned positions [x, y, z]
+map         corner [x, y, z], spacing, number of nodes by axis, e of each node as a digit 0 to 9
+truth       true targets [x, y, z]
+score       true targets found, missed, false, RMSE or null [m], GOSPA [m]
+cuboid      activity, how, target, robots heard, cuboids planned, snapshots [cuboid, x, y, z, p_d],
+            whether it knows that all are visited
+log         level, source, text
+scene       a part of the scene that became known later
+==========  ======================================================================================
+
+Covariances are their upper triangle: xx, xy, xz, yy, yz, zz. Lengths are in metres, angles in
+radians, in the frame of the map.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+Event = list[Any]
+Scene = dict[str, Any]
+Listener = Callable[[Event], None]
+
+# Largest packed log: with the page around it a replay stays below 5 MB.
+LARGEST = 4_500_000
+# Shortest time between states of a robot, and between other events that may be thinned [s].
+STATE_PERIOD = 0.1
+_THINNED = ('robot', 'seen', 'filter', 'map', 'way', 'score', 'cuboid')
+# Thinning is given up at this period [s].
+_LONGEST_PERIOD = 1e5
+
+
+def line(event: Event | Scene) -> str:
+    """Return an event as a line of JSON; nothing in it is infinite or not a number."""
+    return json.dumps(event, separators=(',', ':'), allow_nan=False)
+
+
+@dataclass
+class EventLog:
+    """Scene and events of a run, in the order in which they came."""
+
+    scene: Scene = field(default_factory=dict)
+    events: list[Event] = field(default_factory=list)
+
+    def text(self) -> str:
+        """Return the log as JSON lines."""
+        return '\n'.join([line(self.scene), *map(line, self.events)])
+
+    @property
+    def duration(self) -> float:
+        """Time of the last event [s]."""
+        return max((event[0] for event in self.events), default=0.0)
+
+    def packed(self, largest: int = LARGEST) -> str:
+        """Return the log compressed (gzip) in base64, thinned until it is at most so large.
+
+        What was thinned stands in `thinned` of its scene: the period of states and, where that
+        was not enough, of all that changes gradually. Decisions, found targets and messages stay.
+        """
+        period = 0.0
+        log = self
+        while True:
+            packed = base64.b64encode(gzip.compress(log.text().encode(), 7, mtime=0)).decode()
+            if len(packed) <= largest or period > _LONGEST_PERIOD:
+                return packed
+            period = max(2.0 * period, 2.0 * STATE_PERIOD)
+            log = EventLog({**self.scene, 'thinned': period}, thin(self.events, period))
+
+    @staticmethod
+    def unpacked(text: str) -> EventLog:
+        """Return the log that `packed` returned."""
+        lines = gzip.decompress(base64.b64decode(text)).decode().split('\n')
+        return EventLog(json.loads(lines[0]), [json.loads(item) for item in lines[1:]])
+
+
+class Thinning:
+    """Decides which events are kept so that those of a kind and owner are a period apart.
+
+    Kept are all events of other kinds, the first state of a robot with another status or reason,
+    and detections, except empty ones.
+    """
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._last: dict[tuple[str, str], Event] = {}
+
+    def keeps(self, event: Event) -> bool:
+        """Return whether an event is kept."""
+        if event[1] not in _THINNED or (event[1] == 'seen' and event[4]):
+            return True
+        if event[1] == 'cuboid' and event[8]:
+            return True
+        key = event[1], event[2]
+        last = self._last.get(key)
+        news = last is None or (event[1] == 'robot' and event[5:] != last[5:])
+        if not news and last is not None and event[0] - last[0] < self._period - 1e-6:
+            return False
+        self._last[key] = event
+        return True
+
+
+def thin(events: Iterable[Event], period: float) -> list[Event]:
+    """Return events with at least a period between those that change gradually [s].
+
+    The last event of each kind and owner is kept, so that the end is shown as it was.
+    """
+    thinning = Thinning(period)
+    every = list(events)
+    last = {(event[1], event[2]): index for index, event in enumerate(every)}
+    return [
+        event
+        for index, event in enumerate(every)
+        if thinning.keeps(event) or last[event[1], event[2]] == index
+    ]

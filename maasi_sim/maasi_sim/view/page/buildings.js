@@ -1,0 +1,74 @@
+// Draws a search of buildings: objects, cuboids visited and to visit, and radio links.
+
+import { OPEN, VISITED, robotColour, themed } from './colours.js';
+import { box, path } from './shapes.js';
+
+export function drawBuildings(view, log, time) {
+  const { context, camera } = view;
+  const visited = new Set();
+  const count = log.visits.count(time);
+  for (let index = 0; index < count; index += 1) visited.add(log.visits.events[index].cuboid);
+  const planned = new Map();
+  for (const name of log.owners('cuboid')) {
+    const event = log.at('cuboid', name, time);
+    if (event) for (const cuboid of event[7]) planned.set(cuboid, name);
+  }
+  const boxes = [
+    ...(log.scene.objects || []).map((sides) => ({ sides, fill: 'rgba(140, 140, 160, .75)', stroke: themed('--quiet') })),
+    ...(log.scene.blocks || []).map((sides) => ({ sides, fill: 'rgba(110, 100, 85, .85)', stroke: themed('--text') })),
+    ...(log.scene.cuboids || []).map((sides, cuboid) => ({ sides, ...look(cuboid) })),
+  ];
+  function look(cuboid) {
+    if (visited.has(cuboid)) return { fill: 'rgba(86, 180, 233, .16)', stroke: VISITED };
+    if (planned.has(cuboid)) {
+      return { fill: 'rgba(213, 94, 0, .4)', stroke: robotColour(view.names, planned.get(cuboid)), wide: true };
+    }
+    return { fill: 'rgba(213, 94, 0, .28)', stroke: OPEN };
+  }
+  const middle = ([x, y, z]) => camera.project([(x[0] + x[1]) / 2, (y[0] + y[1]) / 2, (z[0] + z[1]) / 2]);
+  for (const item of boxes) item.depth = middle(item.sides)[2];
+  boxes.sort((a, b) => b.depth - a.depth);
+  for (const item of boxes) {
+    context.lineWidth = item.wide ? 2.5 : 1;
+    if (camera.spatial) box(context, camera, item.sides, item.fill, item.stroke);
+    else {
+      const [[left, right], [low, high]] = item.sides;
+      path(context, camera, [[left, low], [right, low], [right, high], [left, high]], true);
+      context.fillStyle = item.fill;
+      context.strokeStyle = item.stroke;
+      context.fill();
+      context.stroke();
+    }
+  }
+  context.lineWidth = 1;
+  drawLinks(view, log, time);
+}
+
+// Lines between robots of which one hears the other.
+function drawLinks(view, log, time) {
+  const { context, camera } = view;
+  context.strokeStyle = themed('--text');
+  context.globalAlpha = 0.5;
+  context.setLineDash([1, 4]);
+  context.lineWidth = 1.5;
+  for (const name of log.owners('cuboid')) {
+    const event = log.at('cuboid', name, time);
+    const here = log.at('robot', name, time);
+    if (!event || !here) continue;
+    for (const other of event[6]) {
+      const there = log.at('robot', other, time);
+      if (!there || other < name) continue;
+      path(context, camera, [here[3], there[3]]);
+      context.stroke();
+    }
+    context.globalAlpha = 0.9;
+    context.strokeStyle = robotColour(view.names, name);
+    path(context, camera, [here[3], event[5]]);
+    context.stroke();
+    context.globalAlpha = 0.5;
+    context.strokeStyle = themed('--text');
+  }
+  context.setLineDash([]);
+  context.globalAlpha = 1;
+  context.lineWidth = 1;
+}

@@ -1,0 +1,30 @@
+// Colours that colour-blind readers can tell apart (Okabe and Ito; candidates: cividis).
+
+export const FOUND = '#009e73';
+export const POTENTIAL = '#e69f00';
+export const SEEN = '#cc79a7';
+export const VISITED = '#56b4e9';
+export const OPEN = '#d55e00';
+const ROBOTS = ['#0072b2', '#d55e00', '#cc79a7', '#56b4e9', '#8c564b', '#7f7f7f'];
+const NAMED = { purple: '#7b3294', red: '#d62728', green: '#2ca02c', blue: '#0072b2' };
+const CIVIDIS = [
+  [0, 34, 78], [18, 53, 112], [59, 73, 108], [87, 93, 109], [112, 113, 115],
+  [138, 134, 120], [165, 156, 116], [195, 179, 105], [225, 204, 85], [254, 232, 56],
+];
+
+export function robotColour(names, name) {
+  return NAMED[name] || ROBOTS[Math.max(names.indexOf(name), 0) % ROBOTS.length];
+}
+
+// Return the colour of a share, 0 to 1.
+export function scaleColour(share) {
+  const place = Math.min(Math.max(share, 0), 1) * (CIVIDIS.length - 1);
+  const low = Math.floor(place);
+  const high = Math.min(low + 1, CIVIDIS.length - 1);
+  const mixed = CIVIDIS[low].map((value, axis) => Math.round(value + (CIVIDIS[high][axis] - value) * (place - low)));
+  return `rgb(${mixed.join(',')})`;
+}
+
+export function themed(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}

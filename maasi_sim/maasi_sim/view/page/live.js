@@ -1,0 +1,50 @@
+// A run that goes on: its events as they come, and its controls where they are allowed.
+
+import { RunLog } from './run_log.js';
+import { element } from './text.js';
+
+export function follow(onLog, onEvents, onState) {
+  const source = new EventSource('events');
+  source.addEventListener('scene', (message) => {
+    onLog(new RunLog(JSON.parse(message.data)));
+    onState('live');
+  });
+  source.addEventListener('events', (message) => onEvents(JSON.parse(message.data)));
+  source.addEventListener('end', () => {
+    source.close();
+    onState('ended');
+  });
+  source.onerror = () => onState('connection lost');
+}
+
+const COMMANDS = [['pause', 'Pause'], ['resume', 'Resume'], ['home', 'Send home'], ['stop', 'Stop']];
+
+// Show the controls; the token is in the address.
+export function showControls(parent, selectedRobot) {
+  const token = new URLSearchParams(window.location.search).get('token') || '';
+  const answer = element('span', 'quiet', '');
+  answer.setAttribute('role', 'status');
+  for (const [command, title] of COMMANDS) {
+    const button = element('button', '', title);
+    button.dataset.command = command;
+    button.title = 'The selected robot, or the whole search where none is selected';
+    button.onclick = async () => {
+      const robot = selectedRobot();
+      answer.textContent = `${command} ${robot || 'all'} ...`;
+      try {
+        const reply = await fetch('control', {
+          method: 'POST',
+          headers: { 'Content-Type': 'application/json', 'X-Maasi-Token': token },
+          body: JSON.stringify({ command, robot }),
+        });
+        const result = await reply.json();
+        answer.textContent = `${command} ${robot || 'all'}: ${result.message}`;
+      } catch (error) {
+        answer.textContent = `${command}: no answer`;
+      }
+    };
+    parent.append(button);
+  }
+  parent.append(answer);
+  parent.hidden = false;
+}

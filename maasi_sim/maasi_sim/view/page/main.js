@@ -1,0 +1,310 @@
+// The page: what is shown at which time, and what the reader does.
+
+import { Camera } from './camera.js';
+import { Curve } from './curve.js';
+import { follow, showControls } from './live.js';
+import { MapView } from './map.js';
+import { showLegend, showLog, showNumbers, showRobots } from './panels.js';
+import { RunLog, unpack } from './run_log.js';
+import { element } from './text.js';
+import { showWhy } from './why.js';
+
+const $ = (id) => document.getElementById(id);
+// Pictures of a live run per second: the search needs the processor more.
+const LIVE_RATE = 8;
+
+class Page {
+  constructor() {
+    this.log = new RunLog({ name: '' });
+    this.time = 0;
+    this.playing = false;
+    this.following = false;
+    this.isLive = false;
+    this.selected = null;
+    this.marked = null;
+    this.drawn = 0;
+    this.camera = new Camera();
+    this.map = new MapView($('map'), this.camera);
+    this.curve = new Curve($('curve'));
+    this.fitted = false;
+  }
+
+  start() {
+    const dark = window.matchMedia('(prefers-color-scheme: dark)').matches;
+    document.documentElement.dataset.theme = dark ? 'dark' : 'light';
+    this.listen();
+    this.addLayers();
+    const inside = $('run').textContent.trim();
+    if (inside) {
+      unpack(inside).then((log) => {
+        this.setLog(log);
+        this.seek(0);
+        document.body.dataset.ready = 'yes';
+      }).catch((error) => {
+        $('source').textContent = `the run in this file cannot be read: ${error.message}`;
+      });
+    } else this.followRun();
+  }
+
+  followRun() {
+    this.isLive = true;
+    $('live').hidden = false;
+    this.setFollowing(true);
+    follow(
+      (log) => this.setLog(log),
+      (events) => {
+        for (const event of events) this.log.add(event);
+        if (events.some((event) => event[1] === 'scene')) this.setLog(this.log);
+        this.changed = true;
+        document.body.dataset.ready = 'yes';
+      },
+      (state) => {
+        $('source').textContent = state;
+        document.body.dataset.connection = state;
+      },
+    );
+  }
+
+  setLog(log) {
+    this.log = log;
+    $('title').textContent = `MAASI ${log.scene.name || ''}`;
+    document.title = `MAASI ${log.scene.name || ''}`;
+    const { seed, planner } = log.scene;
+    if (!this.isLive) {
+      const facts = [seed === undefined ? '' : `seed ${seed}`, planner ? `planner ${planner}` : ''];
+      facts.push(`replay, ${log.size} events`, log.scene.thinned ? `thinned to ${log.scene.thinned} s` : '');
+      $('source').textContent = facts.filter(Boolean).join(', ');
+    }
+    if (log.scene.control && !$('controls').childElementCount) showControls($('controls'), () => this.selected);
+    $('curve_title').textContent = log.isOfBuildings ? 'Cuboids visited' : 'Found and expected';
+    this.fitted = false;
+    this.changed = true;
+    this.request();
+  }
+
+  addLayers() {
+    const layers = [['truth', 'Truth'], ['unseen', 'Unexplored'], ['view', 'Field of view'], ['ways', 'Ways'], ['clusters', 'Potential'], ['detections', 'Detections']];
+    for (const [name, title] of layers) {
+      const button = element('button', '', title);
+      button.dataset.layer = name;
+      button.setAttribute('aria-pressed', 'true');
+      button.onclick = () => {
+        this.map.layers[name] = !this.map.layers[name];
+        button.setAttribute('aria-pressed', String(this.map.layers[name]));
+        this.request();
+      };
+      $('layers').append(button);
+    }
+    const space = element('button', '', '3D');
+    space.id = 'space';
+    space.onclick = () => this.setSpatial(!this.camera.spatial);
+    const whole = element('button', '', 'Fit');
+    whole.onclick = () => this.fit();
+    $('layers').append(space, whole);
+  }
+
+  setSpatial(spatial) {
+    this.camera.spatial = spatial;
+    $('space').setAttribute('aria-pressed', String(spatial));
+    this.fit();
+  }
+
+  fit() {
+    this.camera.fit(this.log.bounds);
+    this.fitted = true;
+    this.request();
+  }
+
+  listen() {
+    $('play').onclick = () => this.setPlaying(!this.playing);
+    $('previous').onclick = () => this.step(-1);
+    $('next').onclick = () => this.step(1);
+    $('live').onclick = () => this.setFollowing(true);
+    $('time').oninput = () => this.seek(Number($('time').value));
+    $('theme').onclick = () => {
+      const root = document.documentElement;
+      root.dataset.theme = root.dataset.theme === 'dark' ? 'light' : 'dark';
+      this.request();
+    };
+    $('curve').onclick = (event) => {
+      const [left, wide] = this.curve.axis;
+      this.seek((this.log.duration * (event.offsetX - left)) / wide);
+    };
+    window.addEventListener('resize', () => {
+      this.fitted = false;
+      this.request();
+    });
+    window.addEventListener('keydown', (event) => this.press(event));
+    this.listenToPointers();
+  }
+
+  press(event) {
+    const tag = event.target.tagName;
+    if (event.ctrlKey || event.metaKey || event.altKey || tag === 'SELECT') return;
+    const step = event.shiftKey ? 10 : 1;
+    const actions = {
+      ' ': () => this.setPlaying(!this.playing),
+      ArrowLeft: () => this.seek(this.time - step),
+      ArrowRight: () => this.seek(this.time + step),
+      ArrowUp: () => this.step(1),
+      ArrowDown: () => this.step(-1),
+      Home: () => this.seek(0),
+      End: () => this.seek(this.log.duration),
+      Escape: () => this.select(null),
+    };
+    const action = actions[event.key];
+    if (!action || (event.key === ' ' && tag === 'BUTTON')) return;
+    event.preventDefault();
+    action();
+  }
+
+  listenToPointers() {
+    const canvas = $('map');
+    const held = new Map();
+    let moved = 0;
+    canvas.addEventListener('pointerdown', (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      held.set(event.pointerId, [event.offsetX, event.offsetY]);
+      moved = held.size > 1 ? 100 : 0;
+    });
+    canvas.addEventListener('pointermove', (event) => {
+      const before = held.get(event.pointerId);
+      if (!before) return;
+      const now = [event.offsetX, event.offsetY];
+      moved += Math.hypot(now[0] - before[0], now[1] - before[1]);
+      if (held.size === 2) {
+        const other = [...held.entries()].find(([id]) => id !== event.pointerId)[1];
+        const spread = (point) => Math.hypot(point[0] - other[0], point[1] - other[1]) || 1;
+        this.camera.zoom(spread(now) / spread(before), other[0], other[1]);
+      } else this.camera.drag(now[0] - before[0], now[1] - before[1]);
+      held.set(event.pointerId, now);
+      this.request();
+    });
+    const release = (event) => {
+      if (held.delete(event.pointerId) && event.type === 'pointerup' && moved < 5) {
+        this.choose(event.offsetX, event.offsetY);
+      }
+    };
+    canvas.addEventListener('pointerup', release);
+    canvas.addEventListener('pointercancel', release);
+    canvas.addEventListener('wheel', (event) => {
+      event.preventDefault();
+      this.camera.zoom(Math.exp(-0.0015 * event.deltaY), event.offsetX, event.offsetY);
+      this.request();
+    }, { passive: false });
+  }
+
+  choose(x, y) {
+    const hit = this.map.hit(x, y);
+    if (!hit) this.select(null);
+    else if (hit.robot) this.select(hit.robot);
+    else if (hit.candidate !== undefined) this.mark(hit.candidate);
+    else if (hit.found) {
+      const [number, , , , , robot, when] = hit.found;
+      $('source').textContent = `target ${number}: found by ${robot} at ${when.toFixed(1)} s`;
+    }
+  }
+
+  select(name) {
+    this.selected = name;
+    this.marked = null;
+    this.request();
+  }
+
+  mark(candidate) {
+    this.marked = candidate;
+    delete $('why_body').dataset.key;
+    this.request();
+  }
+
+  // Go to the next or previous time at which a decision was made.
+  step(direction) {
+    const { times, events } = this.log.decisions;
+    const count = this.log.decisions.count(this.time + (direction > 0 ? 1e-9 : -1e-9));
+    const index = direction > 0 ? count : count - 1;
+    if (index < 0 || index >= times.length) return;
+    if (!this.selected || events[index].name !== this.selected) this.select(events[index].name);
+    this.seek(times[index]);
+  }
+
+  seek(time) {
+    this.time = Math.min(Math.max(Number.isFinite(time) ? time : 0, 0), this.log.duration);
+    if (this.isLive) this.setFollowing(false);
+    this.request();
+  }
+
+  setPlaying(playing) {
+    if (playing && this.time >= this.log.duration) this.time = 0;
+    if (playing && this.following) this.setFollowing(false);
+    this.playing = playing;
+    $('play').textContent = playing ? '⏸' : '▶';
+    this.request();
+  }
+
+  setFollowing(following) {
+    this.following = following;
+    $('live').setAttribute('aria-pressed', String(following));
+    if (following) this.setPlaying(false);
+    this.request();
+  }
+
+  request() {
+    if (this.requested) return;
+    this.requested = true;
+    requestAnimationFrame((now) => this.frame(now));
+  }
+
+  frame(now) {
+    this.requested = false;
+    const passed = this.last === undefined ? 0 : Math.min(now - this.last, 200);
+    this.last = this.playing ? now : undefined;
+    if (this.playing) {
+      this.time += (passed / 1000) * Number($('speed').value);
+      if (this.time >= this.log.duration) {
+        this.time = this.log.duration;
+        if (!this.isLive) this.setPlaying(false);
+      }
+    }
+    if (this.following) this.time = this.log.duration;
+    this.draw();
+    if (this.playing) this.request();
+  }
+
+  draw() {
+    const { log, time } = this;
+    this.map.resize();
+    if (!this.fitted) {
+      if (log.isSpatial && !this.camera.chosen) {
+        this.camera.spatial = true;
+        this.camera.chosen = true;
+        $('space').setAttribute('aria-pressed', 'true');
+      }
+      this.camera.fit(log.bounds);
+      this.fitted = Boolean(log.scene.bounds) || !this.isLive;
+    }
+    this.map.marked = this.marked;
+    this.map.draw(log, time, this.selected);
+    this.curve.draw(log, time);
+    showNumbers($('numbers'), log, time);
+    showRobots($('robots').tBodies[0], log, time, this.selected, (name) => this.select(name));
+    showWhy($('why_body'), log, time, this.selected, this.marked, (row) => this.mark(row));
+    showLog($('log'), log, time, (event) => {
+      if (log.slots.has(`decision/${event[4]}`)) this.select(event[4]);
+      this.seek(event[0]);
+    });
+    showLegend($('legend'), log);
+    $('time').max = log.duration;
+    $('time').value = time;
+    $('clock').textContent = `${time.toFixed(1)} / ${log.duration.toFixed(1)} s`;
+    this.changed = false;
+    this.drawn += 1;
+  }
+}
+
+const page = new Page();
+// For tests and for readers who look behind the page.
+window.maasi = page;
+page.start();
+setInterval(() => {
+  if (page.changed && (page.following || page.drawn === 0 || !page.playing)) page.request();
+}, 1000 / LIVE_RATE);

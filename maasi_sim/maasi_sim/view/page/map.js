@@ -1,0 +1,426 @@
+// Draws a search for targets at a time.
+
+import { FOUND, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
+import { circle, cross, dropLine, ellipse, matrix, path } from './shapes.js';
+import { drawBuildings } from './buildings.js';
+
+// Detections are shown for this time [s].
+const FADE = 1.5;
+// Points of a way that are drawn.
+const MOST_POINTS = 1200;
+
+export class MapView {
+  constructor(canvas, camera) {
+    this.canvas = canvas;
+    this.context = canvas.getContext('2d');
+    this.camera = camera;
+    this.layers = { truth: true, unseen: true, view: true, ways: true, clusters: true, detections: true };
+    this.marked = null;
+    this.shading = { event: null, canvas: document.createElement('canvas') };
+    // Where robots and candidates were drawn, for clicks.
+    this.targets = [];
+  }
+
+  resize() {
+    const ratio = window.devicePixelRatio || 1;
+    const { clientWidth, clientHeight } = this.canvas;
+    this.canvas.width = Math.round(clientWidth * ratio);
+    this.canvas.height = Math.round(clientHeight * ratio);
+    this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.camera.width = clientWidth;
+    this.camera.height = clientHeight;
+  }
+
+  draw(log, time, selected) {
+    const { context, camera } = this;
+    this.targets = [];
+    this.names = log.robots();
+    this.floor = log.isSpatial ? log.bounds[2][0] : 0;
+    context.globalAlpha = 1;
+    context.setLineDash([]);
+    context.fillStyle = themed('--back');
+    context.fillRect(0, 0, camera.width, camera.height);
+    this.drawGround(log);
+    if (this.layers.unseen) this.drawUnseen(log, time);
+    this.drawObstacles(log);
+    if (log.isOfBuildings || log.scene.objects) drawBuildings(this, log, time);
+    if (this.layers.ways) this.drawWays(log, time);
+    if (this.layers.clusters) this.drawClusters(log, time);
+    if (this.layers.detections) this.drawDetections(log, time);
+    this.drawFound(log, time);
+    if (this.layers.truth) this.drawTruth(log, time);
+    if (selected) this.drawCandidates(log, time, selected);
+    for (const name of this.names) this.drawRobot(log, time, name, name === selected);
+  }
+
+  drawGround(log) {
+    const { context, camera } = this;
+    const [[left, right], [low, high]] = log.bounds;
+    const corners = [[left, low], [right, low], [right, high], [left, high]];
+    context.fillStyle = themed('--floor');
+    context.strokeStyle = themed('--line');
+    context.lineWidth = 1;
+    path(context, camera, corners.map(([x, y]) => [x, y, this.floor]), true);
+    context.fill();
+    context.stroke();
+    const step = niceStep(Math.max(right - left, high - low) / 8);
+    context.globalAlpha = 0.5;
+    for (let x = Math.ceil(left / step) * step; x <= right; x += step) {
+      path(context, camera, [[x, low, this.floor], [x, high, this.floor]]);
+      context.stroke();
+    }
+    for (let y = Math.ceil(low / step) * step; y <= high; y += step) {
+      path(context, camera, [[left, y, this.floor], [right, y, this.floor]]);
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+    if (log.isSpatial && camera.spatial) {
+      const top = log.bounds[2][1];
+      for (const [x, y] of corners) {
+        path(context, camera, [[x, y, this.floor], [x, y, top]]);
+        context.stroke();
+      }
+      path(context, camera, corners.map(([x, y]) => [x, y, top]), true);
+      context.stroke();
+    }
+    context.fillStyle = themed('--quiet');
+    context.font = '11px system-ui, sans-serif';
+    const [x, y] = camera.project([right, low, this.floor]);
+    context.textAlign = 'right';
+    context.fillText(`grid ${Number(step.toPrecision(2))} m`, x, y + 14);
+    context.textAlign = 'left';
+  }
+
+  drawUnseen(log, time) {
+    for (const space of log.owners('map')) {
+      const event = log.at('map', space, time);
+      if (!event) continue;
+      if (event[5][2] > 1) this.drawUnseenSpace(event);
+      else this.drawUnseenFloor(event);
+      return;
+    }
+  }
+
+  drawUnseenFloor([, , , corner, step, [nx, ny], digits]) {
+    const { context, camera } = this;
+    const half = [step[0] / 2, step[1] / 2];
+    const colour = themed('--unseen');
+    if (camera.spatial) {
+      for (let level = 1; level <= 9; level += 1) {
+        context.fillStyle = `rgba(${colour}, ${0.06 * level})`;
+        context.beginPath();
+        for (let i = 0; i < nx; i += 1) {
+          for (let j = 0; j < ny; j += 1) {
+            if (digits.charCodeAt(i * ny + j) - 48 !== level) continue;
+            const [x, y] = [corner[0] + i * step[0], corner[1] + j * step[1]];
+            const around = [[x - half[0], y - half[1]], [x + half[0], y - half[1]], [x + half[0], y + half[1]], [x - half[0], y + half[1]]];
+            around.forEach(([px, py], index) => {
+              const [sx, sy] = camera.project([px, py, this.floor]);
+              if (index) context.lineTo(sx, sy);
+              else context.moveTo(sx, sy);
+            });
+            context.closePath();
+          }
+        }
+        context.fill();
+      }
+      return;
+    }
+    if (this.shading.event !== digits || this.shading.colour !== colour) {
+      const { canvas } = this.shading;
+      [canvas.width, canvas.height] = [nx, ny];
+      const pixels = new ImageData(nx, ny);
+      const [red, green, blue] = colour.split(',').map(Number);
+      for (let i = 0; i < nx; i += 1) {
+        for (let j = 0; j < ny; j += 1) {
+          const value = digits.charCodeAt(i * ny + j) - 48;
+          pixels.data.set([red, green, blue, 15 * value], 4 * ((ny - 1 - j) * nx + i));
+        }
+      }
+      canvas.getContext('2d').putImageData(pixels, 0, 0);
+      this.shading.event = digits;
+      this.shading.colour = colour;
+    }
+    const [x, y] = camera.project([corner[0] - half[0], corner[1] + (ny - 0.5) * step[1]]);
+    context.imageSmoothingEnabled = false;
+    context.drawImage(this.shading.canvas, x, y, nx * step[0] * camera.scale, ny * step[1] * camera.scale);
+  }
+
+  drawUnseenSpace([, , , corner, step, [nx, ny, nz], digits]) {
+    const { context, camera } = this;
+    const colour = themed('--unseen');
+    const skip = Math.max(1, Math.round(Math.cbrt((nx * ny * nz) / 3000)));
+    for (let i = 0; i < nx; i += skip) {
+      for (let j = 0; j < ny; j += skip) {
+        for (let k = 0; k < nz; k += camera.spatial ? skip : nz) {
+          const value = digits.charCodeAt((i * ny + j) * nz + k) - 48;
+          if (value < 1) continue;
+          const [x, y] = camera.project([corner[0] + i * step[0], corner[1] + j * step[1], corner[2] + k * step[2]]);
+          context.fillStyle = `rgba(${colour}, ${0.05 * value})`;
+          context.fillRect(x - 2, y - 2, 4, 4);
+        }
+      }
+    }
+  }
+
+  drawObstacles(log) {
+    const { context, camera } = this;
+    const keptAway = Math.max(0, ...Object.values(log.scene.robots).map((robot) => robot.clearance || 0));
+    for (const obstacle of log.scene.obstacles || []) {
+      const radius = obstacle[obstacle.length - 1];
+      const place = obstacle.length === 4 ? obstacle.slice(0, 3) : [...obstacle.slice(0, 2), this.floor];
+      context.fillStyle = themed('--quiet');
+      context.strokeStyle = themed('--text');
+      if (obstacle.length === 4) {
+        const variance = radius * radius;
+        ellipse(context, camera, place, matrix([variance, 0, 0, variance, 0, variance]), 1);
+      } else path(context, camera, circle(place, radius), true);
+      context.globalAlpha = 0.85;
+      context.fill();
+      context.stroke();
+      if (camera.spatial && log.isSpatial && obstacle.length === 3) {
+        path(context, camera, circle([place[0], place[1], log.bounds[2][1]], radius), true);
+        context.globalAlpha = 0.4;
+        context.fill();
+        context.stroke();
+      }
+      context.globalAlpha = 0.8;
+      if (keptAway) {
+        context.setLineDash([3, 3]);
+        path(context, camera, circle(place, radius + keptAway), true);
+        context.stroke();
+        context.setLineDash([]);
+      }
+      context.globalAlpha = 1;
+    }
+  }
+
+  drawWays(log, time) {
+    const { context, camera } = this;
+    for (const name of this.names) {
+      const slot = log.slot('robot', name);
+      const count = slot.count(time);
+      if (!count) continue;
+      context.strokeStyle = robotColour(this.names, name);
+      const stride = Math.ceil(count / MOST_POINTS);
+      const points = [];
+      for (let index = 0; index < count; index += stride) points.push(slot.events[index][3]);
+      points.push(slot.events[count - 1][3]);
+      context.lineWidth = 1.6;
+      context.globalAlpha = 0.75;
+      path(context, camera, points);
+      context.stroke();
+      const way = log.at('way', name, time);
+      const decision = log.at('decision', name, time);
+      context.lineWidth = 2;
+      context.globalAlpha = 1;
+      context.setLineDash([6, 5]);
+      if (way) {
+        path(context, camera, way[3]);
+        context.stroke();
+      } else if (decision && decision.robot && decision.robot[2] >= 0) {
+        path(context, camera, [slot.events[count - 1][3], decision.robot[3]]);
+        context.stroke();
+      }
+      context.setLineDash([]);
+      if (decision && decision.robot && decision.robot[2] >= 0) {
+        const [x, y] = camera.project(decision.robot[3]);
+        context.strokeRect(x - 5, y - 5, 10, 10);
+        dropLine(context, camera, decision.robot[3], this.floor);
+      }
+    }
+    context.lineWidth = 1;
+  }
+
+  drawClusters(log, time) {
+    const { context, camera } = this;
+    context.font = '11px system-ui, sans-serif';
+    for (const space of log.owners('filter')) {
+      const event = log.at('filter', space, time);
+      if (!event) continue;
+      for (const [x, y, z, mass, ...covariance] of event[4]) {
+        const share = Math.min(mass, 1);
+        ellipse(context, camera, [x, y, z], matrix(covariance), 2, 3);
+        context.fillStyle = POTENTIAL;
+        context.strokeStyle = POTENTIAL;
+        context.globalAlpha = 0.12 + 0.3 * share;
+        context.fill();
+        context.globalAlpha = 0.35 + 0.65 * share;
+        context.lineWidth = 1.5;
+        context.stroke();
+        dropLine(context, camera, [x, y, z], this.floor);
+        context.globalAlpha = 1;
+        if (mass >= 0.05) {
+          const [px, py] = camera.project([x, y, z]);
+          context.fillStyle = themed('--text');
+          context.fillText(mass.toFixed(2), px + 6, py - 6);
+        }
+      }
+    }
+  }
+
+  drawDetections(log, time) {
+    const { context, camera } = this;
+    context.strokeStyle = SEEN;
+    for (const name of this.names) {
+      const slot = log.slot('seen', name);
+      for (let index = slot.count(time) - 1; index >= 0 && slot.times[index] > time - FADE; index -= 1) {
+        const [when, , , from, detections] = slot.events[index];
+        context.globalAlpha = 0.9 * (1 - (time - when) / FADE) + 0.1;
+        for (const [range, bearing, elevation, alongRange, alongBearing, alongElevation] of detections) {
+          const level = range * Math.cos(elevation);
+          const out = [Math.cos(bearing), Math.sin(bearing)];
+          const height = log.isSpatial ? from[2] + range * Math.sin(elevation) : 0;
+          const place = [from[0] + level * out[0], from[1] + level * out[1], height];
+          const basis = [
+            [Math.cos(elevation) * out[0], Math.cos(elevation) * out[1], Math.sin(elevation), alongRange],
+            [-out[1], out[0], 0, level * alongBearing],
+            [-Math.sin(elevation) * out[0], -Math.sin(elevation) * out[1], Math.cos(elevation), log.isSpatial ? range * alongElevation : 0],
+          ];
+          const covariance = [0, 1, 2].map((i) => [0, 1, 2].map((j) => basis.reduce((sum, row) => sum + row[i] * row[j] * row[3] * row[3], 0)));
+          ellipse(context, camera, place, covariance, 1, 2);
+          context.stroke();
+          const [x, y] = camera.project(place);
+          cross(context, x, y, 3);
+        }
+      }
+    }
+    context.globalAlpha = 1;
+  }
+
+  drawFound(log, time) {
+    const { context, camera } = this;
+    context.font = '12px system-ui, sans-serif';
+    for (const space of log.owners('found')) {
+      const event = log.at('found', space, time);
+      if (!event) continue;
+      for (const [number, x, y, z, covariance] of event[3]) {
+        context.strokeStyle = FOUND;
+        context.fillStyle = FOUND;
+        context.lineWidth = 2;
+        ellipse(context, camera, [x, y, z], matrix(covariance), 3, 4);
+        context.stroke();
+        const [px, py] = camera.project([x, y, z]);
+        context.beginPath();
+        context.arc(px, py, 3, 0, 2 * Math.PI);
+        context.fill();
+        dropLine(context, camera, [x, y, z], this.floor);
+        context.fillStyle = themed('--text');
+        context.fillText(String(number), px + 8, py + 12);
+        this.targets.push({ x: px, y: py, found: event[3].find((item) => item[0] === number) });
+      }
+    }
+    context.lineWidth = 1;
+  }
+
+  drawTruth(log, time) {
+    const event = log.at('truth', '', time);
+    if (!event) return;
+    const { context, camera } = this;
+    context.strokeStyle = themed('--text');
+    context.lineWidth = 1.5;
+    for (const place of event[3]) {
+      const [x, y] = camera.project(place);
+      cross(context, x, y, 5);
+      dropLine(context, camera, place, this.floor);
+    }
+    context.lineWidth = 1;
+  }
+
+  drawCandidates(log, time, name) {
+    const decision = log.at('decision', name, time);
+    if (!decision || !decision.robot) return;
+    const { context, camera } = this;
+    const [, , chosen, , candidates] = decision.robot;
+    const values = candidates.map((item) => item[6]).filter((value) => value !== null);
+    const [low, high] = [Math.min(...values), Math.max(...values)];
+    candidates.forEach((item, index) => {
+      const [x, y] = camera.project(item);
+      const size = index === chosen ? 8 : 5.5;
+      context.beginPath();
+      context.arc(x, y, size, 0, 2 * Math.PI);
+      if (item[6] !== null) {
+        context.fillStyle = scaleColour(high > low ? (item[6] - low) / (high - low) : 1);
+        context.fill();
+      }
+      context.lineWidth = index === chosen || index === this.marked ? 3 : 1;
+      context.strokeStyle = index === this.marked ? SEEN : themed('--text');
+      context.stroke();
+      this.targets.push({ x, y, candidate: index });
+    });
+    context.lineWidth = 1;
+  }
+
+  drawRobot(log, time, name, selected) {
+    const event = log.at('robot', name, time);
+    if (!event) return;
+    const { context, camera } = this;
+    const [x, y, z, yaw] = event[3];
+    const robot = log.scene.robots[name] || {};
+    const colour = robotColour(this.names, name);
+    context.strokeStyle = colour;
+    context.fillStyle = colour;
+    if (this.layers.view && robot.view) this.drawFieldOfView(robot.view, event[3], log.isSpatial);
+    if (log.isSpatial || z > 0) dropLine(context, camera, [x, y, z], this.floor);
+    const nose = 9 / camera.scale;
+    const size = Math.max(robot.radius || 0, nose);
+    const outline = [[1.4, 0], [-0.9, 0.8], [-0.5, 0], [-0.9, -0.8]].map(([ahead, left]) => [
+      x + size * (ahead * Math.cos(yaw) - left * Math.sin(yaw)),
+      y + size * (ahead * Math.sin(yaw) + left * Math.cos(yaw)),
+      z,
+    ]);
+    path(context, camera, outline, true);
+    context.globalAlpha = event[5] === 5 ? 0.35 : 1;
+    context.fill();
+    context.globalAlpha = 1;
+    context.strokeStyle = selected ? themed('--text') : themed('--back');
+    context.lineWidth = selected ? 2.5 : 1;
+    context.stroke();
+    context.lineWidth = 1;
+    const [px, py] = camera.project([x, y, z]);
+    context.fillStyle = themed('--text');
+    context.font = '600 12px system-ui, sans-serif';
+    context.fillText(name, px + 12, py - 10);
+    this.targets.push({ x: px, y: py, robot: name });
+  }
+
+  drawFieldOfView(view, [x, y, z, yaw], isSpatial) {
+    const { context, camera } = this;
+    context.globalAlpha = 0.9;
+    context.setLineDash([2, 2]);
+    if (view.kind === 'box') {
+      const [cos, sin] = view.turns ? [Math.cos(yaw), Math.sin(yaw)] : [1, 0];
+      const heights = isSpatial && view.lower.length === 3 ? [z + view.lower[2], z + view.upper[2]] : [0];
+      for (const height of heights) {
+        const corners = [[view.lower[0], view.lower[1]], [view.upper[0], view.lower[1]], [view.upper[0], view.upper[1]], [view.lower[0], view.upper[1]]];
+        path(context, camera, corners.map(([ahead, left]) => [x + ahead * cos - left * sin, y + ahead * sin + left * cos, height]), true);
+        context.stroke();
+        context.save();
+        context.globalAlpha = 0.12;
+        context.fill();
+        context.restore();
+      }
+    } else {
+      const [a, b, c = 0] = view.size;
+      ellipse(context, camera, [x, y, z], matrix([a * a, 0, 0, b * b, 0, c * c]), 1);
+      context.stroke();
+    }
+    context.setLineDash([]);
+    context.globalAlpha = 1;
+  }
+
+  // Return what is at a point of the canvas: robots before candidates before found targets.
+  hit(x, y) {
+    const near = this.targets
+      .map((item) => ({ ...item, distance: Math.hypot(item.x - x, item.y - y) }))
+      .filter((item) => item.distance < 16)
+      .sort((a, b) => (b.robot !== undefined) - (a.robot !== undefined) || a.distance - b.distance);
+    return near[0];
+  }
+}
+
+// Return a step of 1, 2 or 5 times a power of ten near a length.
+function niceStep(length) {
+  const power = 10 ** Math.floor(Math.log10(length));
+  return power * [1, 2, 5, 10].find((factor) => factor * power >= length);
+}

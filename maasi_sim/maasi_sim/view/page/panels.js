@@ -1,0 +1,118 @@
+// The panels beside the map: numbers, robots, log.
+
+import { FOUND, POTENTIAL, SEEN, OPEN, VISITED, robotColour } from './colours.js';
+import { element, number } from './text.js';
+
+const STATES = ['no goal', 'on the way', 'goal reached', 'goal cancelled', 'goal given up', 'cannot go on'];
+const SIGNS = { found: '●', decision: '→', team: '◇', warning: '!', fault: '✖' };
+// Lines of the log that are shown.
+const MOST_LINES = 150;
+
+export function showNumbers(parent, log, time) {
+  const score = log.at('score', '', time);
+  const plans = log.owners('plan').map((space) => log.at('plan', space, time)).filter(Boolean);
+  const explored = plans.length ? Math.max(...plans.map((plan) => plan[4])) : null;
+  const total = log.total;
+  const rows = [
+    [log.isOfBuildings ? 'visited' : 'found', `${log.found(time)}${total ? ` of ${total}` : ''}`, 'found_count'],
+  ];
+  if (log.isOfBuildings) rows.push(['snapshots', shots(log, time)]);
+  else {
+    rows.push(['expected left', number(log.left.at(time))]);
+    rows.push(['measurements', log.measurements(time)]);
+    rows.push(['explored', explored === null ? '-' : `${Math.round(100 * explored)} %`]);
+    rows.push(['decisions', log.decisions.count(time)]);
+  }
+  if (score) {
+    rows.push(['true, false', `${score[3]}, ${score[5]}`]);
+    rows.push(['missed', score[4]]);
+    rows.push(['RMSE', score[6] === null ? '-' : `${number(score[6])} m`]);
+    rows.push(['GOSPA', `${number(score[7])} m`]);
+  }
+  parent.replaceChildren(
+    ...rows.flatMap(([title, value, id]) => {
+      const cell = element('dd', '', String(value));
+      if (id) cell.id = id;
+      return [element('dt', '', title), cell];
+    }),
+  );
+}
+
+function shots(log, time) {
+  let sum = 0;
+  for (const name of log.owners('cuboid')) {
+    const slot = log.slot('cuboid', name);
+    for (let index = slot.count(time) - 1; index >= 0; index -= 1) sum += slot.events[index][8].length;
+  }
+  return sum;
+}
+
+export function showRobots(body, log, time, selected, onSelect) {
+  const names = log.robots();
+  body.replaceChildren(
+    ...names.map((name) => {
+      const event = log.at('robot', name, time);
+      const cuboid = log.at('cuboid', name, time);
+      const row = element('tr', name === selected ? 'selected' : '');
+      row.tabIndex = 0;
+      row.dataset.robot = name;
+      row.onclick = () => onSelect(name);
+      row.onkeydown = (key) => key.key === 'Enter' && onSelect(name);
+      const first = element('td', '');
+      const swatch = element('span', 'swatch');
+      swatch.style.background = robotColour(names, name);
+      first.append(swatch, name);
+      first.title = (log.scene.robots[name] || {}).description || '';
+      let state = event ? STATES[event[5]] || 'unknown' : 'not heard';
+      if (cuboid) state = cuboid[3];
+      if (event && event[6]) state += `: ${event[6]}`;
+      const battery = element('td', '');
+      if (event && event[4] >= 0) {
+        const bar = element('span', 'bar');
+        const level = element('i', '');
+        level.style.width = `${Math.round(100 * event[4])}%`;
+        bar.append(level);
+        battery.append(bar, `${Math.round(100 * event[4])} %`);
+      } else battery.append('unknown');
+      row.append(first, element('td', 'text', state), battery);
+      return row;
+    }),
+  );
+}
+
+export function showLog(list, log, time, onChoose) {
+  const count = log.lines.count(time);
+  const key = `${log.scene.name} ${count}`;
+  if (list.dataset.key === key) return;
+  list.dataset.key = key;
+  const lines = log.lines.events.slice(Math.max(0, count - MOST_LINES), count).reverse();
+  list.replaceChildren(
+    ...lines.map((event) => {
+      const [when, , , level, source, text] = event;
+      const line = element('li', level);
+      line.tabIndex = 0;
+      line.dataset.level = level;
+      line.onclick = () => onChoose(event);
+      line.onkeydown = (pressed) => pressed.key === 'Enter' && onChoose(event);
+      line.append(element('time', '', `${when.toFixed(1)} s`), element('b', '', SIGNS[level] || ''), element('span', '', `${source}: ${text}`));
+      return line;
+    }),
+  );
+}
+
+export function showLegend(parent, log) {
+  const entries = log.isOfBuildings
+    ? [['cuboid visited', VISITED], ['to visit', OPEN]]
+    : [['found (3 sigma)', FOUND], ['potential (mass)', POTENTIAL], ['detection', SEEN]];
+  parent.replaceChildren(
+    ...entries.map(([text, colour]) => {
+      const entry = element('span', '');
+      const mark = element('i', '');
+      mark.style.borderColor = colour;
+      entry.append(mark, text);
+      return entry;
+    }),
+  );
+  if (!log.isOfBuildings) parent.append(element('span', '', '✕ true target'), element('span', '', '□ waypoint'));
+  if (log.scene.thinned) parent.append(element('span', '', `thinned: one state per ${log.scene.thinned} s`));
+}

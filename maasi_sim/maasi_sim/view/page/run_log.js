@@ -1,0 +1,173 @@
+// The events of a run, by kind and owner, so that what holds at a time is found by binary search.
+
+export class Slot {
+  constructor() {
+    this.times = [];
+    this.events = [];
+  }
+
+  add(time, event) {
+    // Almost always at the end; messages of different filters may be a little out of order.
+    let index = this.times.length;
+    while (index > 0 && this.times[index - 1] > time) index -= 1;
+    if (index === this.times.length) {
+      this.times.push(time);
+      this.events.push(event);
+    } else {
+      this.times.splice(index, 0, time);
+      this.events.splice(index, 0, event);
+    }
+  }
+
+  // Number of events at or before a time.
+  count(time) {
+    let low = 0;
+    let high = this.times.length;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (this.times[middle] <= time) low = middle + 1;
+      else high = middle;
+    }
+    return low;
+  }
+
+  // The event that holds at a time.
+  at(time) {
+    const count = this.count(time);
+    return count ? this.events[count - 1] : undefined;
+  }
+}
+
+export class RunLog {
+  constructor(scene) {
+    this.scene = { robots: {}, ...scene };
+    this.slots = new Map();
+    this.size = 0;
+    this.duration = 0;
+    // All robots' decisions, all lines, and the numbers over time.
+    this.decisions = new Slot();
+    this.lines = new Slot();
+    this.totals = new Slot();
+    this.left = new Slot();
+    this.visits = new Slot();
+    this.foundBy = new Map();
+    this.leftBy = new Map();
+    this.visited = new Set();
+  }
+
+  slot(kind, owner) {
+    const key = `${kind}/${owner}`;
+    let slot = this.slots.get(key);
+    if (!slot) {
+      slot = new Slot();
+      this.slots.set(key, slot);
+    }
+    return slot;
+  }
+
+  at(kind, owner, time) {
+    const slot = this.slots.get(`${kind}/${owner}`);
+    return slot && slot.at(time);
+  }
+
+  owners(kind) {
+    const names = [];
+    for (const key of this.slots.keys()) {
+      if (key.startsWith(`${kind}/`)) names.push(key.slice(kind.length + 1));
+    }
+    return names.sort();
+  }
+
+  robots() {
+    return [...new Set([...Object.keys(this.scene.robots), ...this.owners('robot')])].sort();
+  }
+
+  add(event) {
+    const [time, kind, owner] = event;
+    this.size += 1;
+    this.duration = Math.max(this.duration, time);
+    if (kind === 'scene') {
+      Object.assign(this.scene, event[3]);
+      return;
+    }
+    if (kind === 'log') {
+      this.lines.add(time, event);
+      return;
+    }
+    this.slot(kind, owner).add(time, event);
+    if (kind === 'found') {
+      this.foundBy.set(owner, event[3].length);
+      this.totals.add(time, [...this.foundBy.values()].reduce((sum, item) => sum + item, 0));
+    } else if (kind === 'filter') {
+      this.leftBy.set(owner, event[3]);
+      this.left.add(time, Math.max(...this.leftBy.values()));
+    } else if (kind === 'plan') {
+      for (const robot of event[7]) {
+        const decision = { time, event, robot, name: robot[0] };
+        this.decisions.add(time, decision);
+        this.slot('decision', robot[0]).add(time, decision);
+      }
+    } else if (kind === 'cuboid') {
+      this.slot('decision', owner).add(time, { time, cuboid: event, name: owner });
+      if (event[8].length) this.decisions.add(time, { time, cuboid: event, name: owner });
+      for (const shot of event[8]) {
+        if (this.visited.has(shot[0])) continue;
+        this.visited.add(shot[0]);
+        this.visits.add(time, { cuboid: shot[0], robot: owner, place: shot.slice(1, 4) });
+      }
+    }
+  }
+
+  // What was found by a time: targets, or cuboids in a search of buildings.
+  found(time) {
+    return this.isOfBuildings ? this.visits.count(time) : this.totals.at(time) || 0;
+  }
+
+  get isOfBuildings() {
+    return Boolean(this.scene.cuboids);
+  }
+
+  get total() {
+    return this.isOfBuildings ? this.scene.cuboids.length : this.scene.targets;
+  }
+
+  measurements(time) {
+    let sum = 0;
+    for (const space of this.owners('filter')) {
+      const event = this.at('filter', space, time);
+      if (event) sum = Math.max(sum, event[5]);
+    }
+    return sum;
+  }
+
+  // Bounds of the environment, or of what is known of it.
+  get bounds() {
+    if (this.scene.bounds) return this.scene.bounds;
+    const low = [Infinity, Infinity, Infinity];
+    const high = [-Infinity, -Infinity, -Infinity];
+    for (const name of this.owners('robot')) {
+      for (const event of this.slot('robot', name).events) {
+        for (let axis = 0; axis < 3; axis += 1) {
+          low[axis] = Math.min(low[axis], event[3][axis]);
+          high[axis] = Math.max(high[axis], event[3][axis]);
+        }
+      }
+    }
+    if (low[0] > high[0]) return [[0, 1], [0, 1]];
+    return [0, 1].map((axis) => [low[axis] - 1, high[axis] + 1]);
+  }
+
+  get isSpatial() {
+    return this.bounds.length === 3;
+  }
+}
+
+// Return the log that a replay has inside: JSON lines, compressed, in base64.
+export async function unpack(text) {
+  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
+  const lines = (await new Response(stream).text()).split('\n');
+  const log = new RunLog(JSON.parse(lines[0]));
+  for (const line of lines.slice(1)) log.add(JSON.parse(line));
+  return log;
+}

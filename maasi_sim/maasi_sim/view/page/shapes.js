@@ -1,0 +1,91 @@
+// Lines, ellipses and boxes in the projection of a camera.
+
+export function path(context, camera, points, closed = false) {
+  context.beginPath();
+  points.forEach((point, index) => {
+    const [x, y] = camera.project(point);
+    if (index === 0) context.moveTo(x, y);
+    else context.lineTo(x, y);
+  });
+  if (closed) context.closePath();
+}
+
+// Return the matrix of a covariance given as xx, xy, xz, yy, yz, zz.
+export function matrix([xx, xy, xz, yy, yz, zz]) {
+  return [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+}
+
+// Trace the outline of the ellipsoid of some deviations; at least so many pixels large.
+export function ellipse(context, camera, place, covariance, deviations, smallest = 0) {
+  const [across, down] = camera.jacobian(place);
+  const product = (a, b) => {
+    let sum = 0;
+    for (let i = 0; i < 3; i += 1) for (let j = 0; j < 3; j += 1) sum += a[i] * covariance[i][j] * b[j];
+    return sum;
+  };
+  const [a, b, c] = [product(across, across), product(across, down), product(down, down)];
+  const mean = (a + c) / 2;
+  const spread = Math.hypot((a - c) / 2, b);
+  const large = Math.max(deviations * Math.sqrt(Math.max(mean + spread, 0)), smallest);
+  const small = Math.max(deviations * Math.sqrt(Math.max(mean - spread, 0)), smallest);
+  const [x, y] = camera.project(place);
+  context.beginPath();
+  context.ellipse(x, y, large, small, Math.atan2(2 * b, a - c) / 2, 0, 2 * Math.PI);
+}
+
+// Return points of a circle parallel to the ground.
+export function circle([x, y, z = 0], radius, count = 48) {
+  return Array.from({ length: count }, (_, index) => {
+    const angle = (2 * Math.PI * index) / count;
+    return [x + radius * Math.cos(angle), y + radius * Math.sin(angle), z];
+  });
+}
+
+const SIDES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
+
+// Draw the sides of a box that face the reader.
+export function box(context, camera, [xs, ys, zs], fill, stroke) {
+  const corners = [];
+  for (const x of xs) for (const y of ys) for (const z of zs) corners.push(camera.project([x, y, z]));
+  context.fillStyle = fill;
+  context.strokeStyle = stroke;
+  for (const side of SIDES) {
+    const points = side.map((index) => corners[index]);
+    let area = 0;
+    points.forEach(([x, y], index) => {
+      const [nx, ny] = points[(index + 1) % 4];
+      area += x * ny - nx * y;
+    });
+    if (area >= 0) continue;
+    context.beginPath();
+    points.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
+    context.closePath();
+    context.fill();
+    context.stroke();
+  }
+}
+
+export function cross(context, x, y, size) {
+  context.beginPath();
+  context.moveTo(x - size, y - size);
+  context.lineTo(x + size, y + size);
+  context.moveTo(x - size, y + size);
+  context.lineTo(x + size, y - size);
+  context.stroke();
+}
+
+// A line from a place to the ground, and its foot.
+export function dropLine(context, camera, place, floor) {
+  if (!camera.spatial) return;
+  const foot = [place[0], place[1], floor];
+  context.save();
+  context.setLineDash([2, 3]);
+  context.lineWidth = 1;
+  context.globalAlpha *= 0.6;
+  path(context, camera, [place, foot]);
+  context.stroke();
+  const [x, y] = camera.project(foot);
+  context.fillStyle = context.strokeStyle;
+  context.fillRect(x - 1.5, y - 1.5, 3, 3);
+  context.restore();
+}

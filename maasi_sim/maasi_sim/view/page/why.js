@@ -1,0 +1,120 @@
+// The panel that says why a robot goes where it goes.
+
+import { scaleColour } from './colours.js';
+import { element, number } from './text.js';
+
+const COLUMNS = [
+  ['x', 0, 'm'], ['y', 1, 'm'], ['z', 2, 'm'], ['J', 6, '1/step'], ['C', 3, ''], ['T', 4, ''], ['E', 5, ''], ['K', 7, 'steps'], ['M', 8, ''],
+];
+const TITLES = {
+  J: 'objective: (-C + alpha T + beta E) / K', C: 'control cost', T: 'target refinement', E: 'exploration', K: 'steps to reach it', M: 'measurements on the way',
+};
+let order = 6;
+
+// Units of the terms: docs/planners.md.
+function units(log) {
+  if (log.scene.objective === 'information') return { C: '', T: 'nat', E: 'targets', J: 'per step' };
+  return { C: '', T: '', E: '', J: 'per step' };
+}
+
+// Return the sentence on the choice that the node gives, or what follows from the numbers.
+export function reasonOf(decision) {
+  const { robot, event } = decision;
+  const [, , chosen, , candidates, own] = robot;
+  const given = own || event[6];
+  if (given) return given;
+  if (chosen < 0) return 'stays: no candidate is worth going to';
+  const values = candidates.map((item) => item[6]).filter((value) => value !== null);
+  const best = candidates[chosen] && candidates[chosen][6];
+  if (values.every((value) => value === 0)) return `chosen by the planner ${event[3]}, which does not use J`;
+  if (best >= Math.max(...values)) return `largest J of ${values.length} admissible candidates`;
+  return `part of the best joint choice of ${event[7].length} robots; alone, another candidate has a larger J`;
+}
+
+// Return what the chosen candidate has more than the best of the others.
+export function gains(candidates, chosen) {
+  let next = -1;
+  candidates.forEach((item, index) => {
+    if (index === chosen || item[6] === null) return;
+    if (next < 0 || item[6] > candidates[next][6]) next = index;
+  });
+  if (next < 0 || chosen < 0 || !candidates[chosen]) return null;
+  const [a, b] = [candidates[chosen], candidates[next]];
+  return { next, C: a[3] - b[3], T: a[4] - b[4], E: a[5] - b[5], J: a[6] - b[6], K: a[7] - b[7] };
+}
+
+export function showWhy(parent, log, time, selected, marked, onMark) {
+  const decision = selected && log.at('decision', selected, time);
+  const key = decision ? `${selected} ${decision.time} ${order} ${marked} ${log.scene.name}` : `none ${selected}`;
+  if (parent.dataset.key === key) return;
+  parent.dataset.key = key;
+  parent.replaceChildren();
+  if (!decision) {
+    parent.append(selected ? `${selected} has not decided yet.` : 'Click a robot or a decision.');
+    return;
+  }
+  if (decision.cuboid) showCuboid(parent, decision);
+  else showCandidates(parent, log, decision, marked, onMark);
+}
+
+function showCuboid(parent, { time, cuboid, name }) {
+  const [, , , activity, how, target, heard, planned, shots] = cuboid;
+  const place = target.map((value) => number(value)).join(', ');
+  parent.append(
+    element('p', '', `${name} at ${time.toFixed(1)} s: ${activity}; plan: ${how.replace('_', ' ')}`),
+    element('p', '', `drawn to (${place}) m`),
+    element('p', '', `plans to visit cuboids ${planned.join(', ') || 'none'}`),
+    element('p', '', `hears ${heard.join(', ') || 'nobody'}`),
+    element('p', '', shots.length ? `takes snapshots of ${shots.map((shot) => shot[0]).join(', ')}` : 'no snapshot now'),
+  );
+}
+
+function showCandidates(parent, log, decision, marked, onMark) {
+  const [name, index, chosen, waypoint, candidates] = decision.robot;
+  const unit = units(log);
+  const place = waypoint.map((value) => number(value)).join(', ');
+  parent.append(
+    element('p', '', `${name}, decision ${index} at ${decision.time.toFixed(2)} s: ${chosen < 0 ? 'stays at' : 'goes to'} (${place}) m`),
+    element('p', 'reason', reasonOf(decision)),
+  );
+  const gain = gains(candidates, chosen);
+  if (gain && gain.J !== 0) {
+    const part = (term) => `${term} ${gain[term] >= 0 ? '+' : ''}${number(gain[term])} ${unit[term]}`.trim();
+    const steps = `K ${gain.K >= 0 ? '+' : ''}${gain.K} steps`;
+    parent.append(element('p', 'gain', `Over the next best (candidate ${gain.next}): ${['J', 'C', 'T', 'E'].map(part).join(', ')}, ${steps}`));
+  }
+  const { alpha, beta } = log.scene.weights || {};
+  if (alpha !== undefined) parent.append(element('p', 'quiet', `J = (-C + alpha T + beta E) / K; alpha ${alpha}, beta ${beta === null ? 'of the preset' : beta}`));
+  const table = element('table', '');
+  const head = table.createTHead().insertRow();
+  head.append(element('th', '', '#'));
+  const columns = COLUMNS.filter(([title]) => title !== 'z' || candidates.some((item) => item[2] !== candidates[0][2]));
+  for (const [title, column, columnUnit] of columns) {
+    const cell = element('th', '', title + (order === column ? ' ▾' : ''));
+    cell.title = [TITLES[title], unit[title] || columnUnit].filter(Boolean).join(' ');
+    cell.onclick = () => {
+      order = column;
+      onMark(marked);
+    };
+    head.append(cell);
+  }
+  const values = candidates.map((item) => item[6]).filter((value) => value !== null);
+  const [low, high] = [Math.min(...values), Math.max(...values)];
+  const rows = candidates.map((item, row) => [row, item]);
+  rows.sort((a, b) => (b[1][order] ?? -Infinity) - (a[1][order] ?? -Infinity));
+  const body = table.createTBody();
+  for (const [row, item] of rows) {
+    const line = body.insertRow();
+    line.className = `${row === chosen ? 'chosen' : ''} ${row === marked ? 'marked' : ''}`;
+    line.onclick = () => onMark(row);
+    const first = element('td', '');
+    const swatch = element('span', 'swatch');
+    if (item[6] !== null) swatch.style.background = scaleColour(high > low ? (item[6] - low) / (high - low) : 1);
+    first.append(swatch, String(row));
+    line.append(first);
+    for (const [, column] of columns) line.append(element('td', '', item[column] === null ? 'not allowed' : number(item[column])));
+  }
+  const rowsBox = element('div', 'rows');
+  rowsBox.append(table);
+  parent.append(rowsBox);
+}

@@ -1,0 +1,72 @@
+"""The page that shows a run, as one HTML file: alone for a live run, or with a run inside."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+from maasi_sim.run.run_folder import write_text
+from maasi_sim.view.event_log import EventLog
+
+FOLDER = Path(__file__).with_name('page')
+REPLAY = 'replay.html'
+# Each uses only what is before it.
+_MODULES = (
+    'run_log',
+    'camera',
+    'colours',
+    'text',
+    'shapes',
+    'buildings',
+    'map',
+    'why',
+    'panels',
+    'curve',
+    'live',
+    'main',
+)
+_IMPORT = re.compile(r'^import .*;\n', re.MULTILINE)
+_EXPORT = re.compile(r'^export ', re.MULTILINE)
+
+
+@cache
+def empty_page() -> str:
+    """Return the page without a run: it asks the server that it came from."""
+    return _with('RUN', _page(), '')
+
+
+def replay_page(log: EventLog) -> str:
+    """Return the page with a run inside."""
+    return _with('RUN', _page(), log.packed())
+
+
+def write_replay(log: EventLog, path: Path) -> None:
+    """Write the page with a run inside.
+
+    Raises
+    ------
+    ResultsError
+        If it cannot be written; nothing of it is left.
+    """
+    write_text(path, replay_page(log))
+
+
+@cache
+def _page() -> str:
+    """Return the page with style and modules: browsers load no modules beside a local file."""
+    text = (FOLDER / 'index.html').read_text(encoding='utf-8')
+    style = (FOLDER / 'page.css').read_text(encoding='utf-8')
+    return _with('SCRIPT', _with('STYLE', text, style), '\n'.join(map(_module, _MODULES)))
+
+
+def _module(name: str) -> str:
+    """Return a module for one scope with the others."""
+    text = (FOLDER / f'{name}.js').read_text(encoding='utf-8')
+    return _EXPORT.sub('', _IMPORT.sub('', text))
+
+
+def _with(place: str, text: str, content: str) -> str:
+    before, mark, after = text.partition(f'/*{place}*/')
+    assert mark, place
+    return before + content + after

@@ -1,0 +1,116 @@
+"""The scene of a run: what does not change, from its scenario or from its messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maasi_sim.buildings.scenario import NAME as BUILDINGS
+from maasi_sim.buildings.scenario import CuboidScenario
+from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.scenario.schema import RobotSettings, Scenario
+from maasi_sim.targets.scoring import scoring_radius
+from maasi_sim.view.event_log import Scene
+
+
+def empty_scene(name: str = '') -> Scene:
+    """Return the scene of a run of which nothing is known yet."""
+    return {'name': name, 'robots': {}}
+
+
+def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scene:
+    """Return the scene of a scenario.
+
+    Parameters
+    ----------
+    name : str
+        Of the scenario.
+    scenario : Scenario or CuboidScenario
+        With all layers.
+    seed : int, optional
+        Of the run; that of the scenario if not given.
+    """
+    seed = scenario.seed if seed is None else seed
+    scene: Scene = {
+        'name': name,
+        'description': scenario.description,
+        'seed': seed,
+        'planner': scenario.planner.name,
+        'step': scenario.step,
+        'bounds': rounded(scenario.environment.array()),
+    }
+    if isinstance(scenario, CuboidScenario):
+        return scene | _buildings(scenario)
+    assert isinstance(scenario, Scenario)
+    truth = np.asarray(scenario.world(seed).targets, dtype=float)
+    return scene | {
+        'obstacles': [
+            [*map(float, obstacle.centre), float(obstacle.radius)]
+            for obstacle in scenario.environment.obstacles
+        ],
+        'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
+        'targets': len(truth),
+        'expected_targets': scenario.planner.expected_targets,
+        'weights': {'alpha': scenario.planner.alpha, 'beta': scenario.planner.beta},
+        'objective': scenario.planner.objective,
+        'scoring_radius': scoring_radius(scenario, truth) if len(truth) else None,
+        'scoring_order': scenario.scoring.order,
+    }
+
+
+def scene_of_facts(facts: Mapping[str, Any]) -> Scene:
+    """Return the scene of what a recording says of its run; of another version, what is known.
+
+    Raises
+    ------
+    ValueError
+        If its scenario is none of this version.
+    """
+    content = facts['scenario']
+    buildings = content.get('planner', {}).get('name') == BUILDINGS
+    model: type[BaseScenario] = CuboidScenario if buildings else Scenario
+    return scene_of(str(facts.get('name', '')), model.model_validate(content), facts.get('seed'))
+
+
+def rounded(values: ArrayLike) -> list[Any]:
+    """Return an array as nested lists, to a tenth of a millimetre."""
+    return list(np.round(np.asarray(values, dtype=float), 4).tolist())
+
+
+def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
+    detection = robot.sensor.detection
+    view: dict[str, Any] = {'kind': detection.kind, 'turns': detection.frame == 'robot'}
+    if detection.kind == 'box':
+        view |= {'lower': list(detection.lower), 'upper': list(detection.upper)}
+    else:
+        view['size'] = list(detection.size)[: scenario.dimension]
+    deviations = [float(value) for value in robot.sensor.noise.deviations(scenario.dimension)]
+    return {
+        'type': robot.type,
+        'description': robot.description,
+        'radius': robot.radius,
+        'clearance': robot.motion.clearance,
+        'view': view,
+        'deviations': [*deviations, 0.0][:3],
+    }
+
+
+def _buildings(scenario: CuboidScenario) -> Scene:
+    mission = scenario.mission()
+    return {
+        'objects': rounded(mission.objects),
+        'blocks': rounded(mission.obstacles),
+        'cuboids': rounded(mission.boxes),
+        'robots': {
+            name: {
+                'type': robot.type,
+                'description': robot.description,
+                'radius': 1.0,
+                'reach': scenario.planner.communication_range,
+            }
+            for name, robot in scenario.robots.items()
+        },
+    }

@@ -1,0 +1,78 @@
+"""Headless Chromium for tests of pages; skipped by name where there is none."""
+
+import contextlib
+import os
+import shutil
+import time
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.sync_api import sync_playwright
+
+CHROMIUM = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+
+needs_chromium = pytest.mark.skipif(
+    CHROMIUM is None, reason='no Chromium on this machine (sudo apt install chromium)'
+)
+
+
+class Page:
+    """A page, and what it complained of and asked for."""
+
+    def __init__(self, page):
+        self.page = page
+        self.errors = []
+        self.requests = []
+        page.on('console', self._hear)
+        page.on('pageerror', lambda error: self.errors.append(str(error)))
+        page.on('request', lambda request: self.requests.append(request.url))
+
+    def _hear(self, message):
+        if message.type in ('error', 'warning'):
+            self.errors.append(message.text)
+
+    def open(self, address):
+        self.page.goto(address)
+        self.page.wait_for_selector('body[data-ready]')
+
+    def number(self):
+        """Return the number that the page gives as found."""
+        return int(self.page.inner_text('#found_count').split()[0])
+
+    def seek(self, seconds):
+        self.page.evaluate(f'maasi.seek({seconds})')
+        self.settle()
+
+    def until(self, condition, patience=30.0):
+        """Wait until an expression is true; the page lets nothing be evaluated inside it."""
+        end = time.monotonic() + patience
+        while not self.page.evaluate(condition):
+            assert time.monotonic() < end, condition
+            self.page.wait_for_timeout(50)
+
+    def settle(self):
+        """Wait until what was asked for is drawn."""
+        self.page.evaluate(
+            'new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))'
+        )
+
+    def check(self):
+        """Check that nothing was complained of, and nothing was asked of other hosts."""
+        assert self.errors == []
+        for address in self.requests:
+            parts = urlsplit(address)
+            assert parts.scheme in ('file', 'data', 'blob') or parts.hostname == '127.0.0.1'
+
+
+@contextlib.contextmanager
+def chromium(width=1280, height=720, **options):
+    """Yield a page of a browser of its own."""
+    with sync_playwright() as player:
+        # Root, as in containers, has no sandbox.
+        arguments = ['--no-sandbox'] if os.geteuid() == 0 else []
+        browser = player.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        try:
+            viewport = {'width': width, 'height': height}
+            yield Page(browser.new_page(viewport=viewport, **options))
+        finally:
+            browser.close()

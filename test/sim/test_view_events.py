@@ -1,0 +1,221 @@
+"""The event log of a run: what is in it, thinned, packed, and from a search in one process."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseArray
+from nav_msgs.msg import OccupancyGrid
+
+from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray, PlanDecision
+from maasi_sim.missions import load_mission
+from maasi_sim.search import search
+from maasi_sim.view.event_log import EventLog, line, thin
+from maasi_sim.view.event_maker import EventMaker
+from maasi_sim.view.messages import MessageEvents, is_shown
+from maasi_sim.view.page_file import REPLAY, empty_page, replay_page
+from maasi_sim.view.scene import empty_scene, scene_of, scene_of_facts
+
+
+def state(seconds, **fields):
+    message = AgentState(robot='rover', **fields)
+    message.header.stamp = stamp_to_ros(round(seconds * 1e9))
+    message.pose.pose.orientation.w = 1.0
+    return message
+
+
+class Taken:
+    """Events made of messages."""
+
+    def __init__(self, scene=None, begin=0.0):
+        self.events = []
+        self.maker = EventMaker(scene or empty_scene(), self.events.append)
+        self.messages = MessageEvents(self.maker, begin)
+
+    def take(self, topic, message):
+        package = type(message).__module__.split('.')[0]
+        self.messages.take(topic, f'{package}/msg/{type(message).__name__}', message)
+
+    def of(self, kind):
+        return [event for event in self.events if event[1] == kind]
+
+
+def test_states_are_one_per_period_except_where_the_robot_says_something_else():
+    taken = Taken()
+    for step in range(10):
+        taken.take('/rover/state', state(0.05 * step, goal_status=AgentState.MOVING))
+    assert len(taken.of('robot')) == 5
+    lost = state(0.5, goal_status=AgentState.UNAVAILABLE, reason='its link is lost')
+    taken.take('/rover/state', lost)
+    assert taken.of('robot')[-1][5:] == [AgentState.UNAVAILABLE, 'its link is lost']
+    assert [event[5] for event in taken.of('log')] == ['cannot go on: its link is lost']
+
+
+def test_a_state_that_is_not_finite_is_left_out():
+    taken = Taken()
+    broken = state(0.0)
+    broken.pose.pose.position.x = math.nan
+    taken.take('/rover/state', broken)
+    taken.take('/rover/state', state(0.1, battery=math.inf))
+    assert [event[4] for event in taken.of('robot')] == [-1.0]
+    assert all(json.loads(line(event)) for event in taken.events)
+
+
+def test_candidates_that_are_not_allowed_have_no_objective():
+    from maasi_msgs.msg import Candidate, RobotDecision
+
+    taken = Taken()
+    candidates = [Candidate(objective=-1e30), Candidate(objective=0.5, length=7, measurements=2)]
+    robot = RobotDecision(robot='rover', chosen=1, candidates=candidates)
+    taken.take('/decisions', PlanDecision(planner='maasi', robots=[robot], explored=0.25))
+    (plan,) = taken.of('plan')
+    assert [item[6:] for item in plan[7][0][4]] == [[None, 0, 0], [0.5, 7, 2]]
+    assert plan[3:5] == ['maasi', 0.25]
+
+
+def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario():
+    taken = Taken()
+    grid = OccupancyGrid(data=[0, 100, 50, 50, 0, 0])
+    grid.info.resolution, grid.info.width, grid.info.height = 0.5, 3, 2
+    grid.info.origin.position.x = grid.info.origin.position.y = -0.25
+    taken.take('/exploration', grid)
+    assert taken.maker.scene['bounds'] == [[0.0, 1.0], [0.0, 0.5]]
+    # By x, then by y: e of (1, 0) is 1.
+    assert taken.of('map')[0][5:] == [[3, 2, 1], '049040']
+
+
+def test_found_targets_are_scored_where_the_truth_is_known():
+    scenario = load_mission('mambo_turtlebot').scenario
+    taken = Taken(scene_of('demo', scenario))
+    truth = PoseArray()
+    from geometry_msgs.msg import Point, Pose
+
+    targets = scenario.world(scenario.seed).targets
+    truth.poses = [Pose(position=Point(x=float(x), y=float(y))) for x, y in targets]
+    taken.take('/ground_truth/targets', truth)
+    place = Point(x=float(targets[0][0]) + 0.01, y=float(targets[0][1]))
+    found = FoundTarget(id=1, position=place, robot='mambo')
+    taken.take('/found_targets', FoundTargetArray(targets=[found]))
+    assert taken.of('score')[-1][3:7] == [1, 11, 0, pytest.approx(0.01, abs=1e-4)]
+
+
+def test_a_filter_of_one_robot_counts_only_what_it_found_itself():
+    scenario = load_mission('mambo_turtlebot').scenario
+    taken = Taken(scene_of('demo', scenario))
+    both = [FoundTarget(id=1, robot='mambo'), FoundTarget(id=2, robot='turtlebot')]
+    taken.take('/mambo/found_targets', FoundTargetArray(targets=both))
+    assert [item[0] for item in taken.of('found')[-1][3]] == [1]
+    taken.take('/team/found_targets', FoundTargetArray(targets=both))
+    assert [item[0] for item in taken.of('found')[-1][3]] == [1, 2]
+
+
+def test_time_that_jumps_back_begins_another_run():
+    events = []
+    made = []
+
+    def begin():
+        made.append(EventMaker(empty_scene(), events.append))
+        return made[-1]
+
+    messages = MessageEvents(begin(), None, begin)
+    messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(100.0))
+    messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(130.0))
+    messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(101.0))
+    assert len(made) == 2
+    assert [event[0] for event in events] == [0.0, 30.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ('topic', 'kind', 'shown'),
+    [
+        ('/team/rover/state', 'maasi_msgs/msg/AgentState', True),
+        ('/rover/plan', 'nav_msgs/msg/Path', True),
+        ('/rover/local_path', 'nav_msgs/msg/Path', False),
+        ('/found_targets/kept', 'maasi_msgs/msg/FoundTargetArray', False),
+        ('/search/_action/state', 'maasi_msgs/msg/AgentState', False),
+        ('/rover/odom', 'nav_msgs/msg/Odometry', False),
+    ],
+)
+def test_topics_are_known_by_type_and_name(topic, kind, shown):
+    assert is_shown(topic, kind) is shown
+
+
+def long_run(seconds):
+    rng = np.random.default_rng(1)
+    events = []
+    for step in range(seconds * 10):
+        place = [round(float(value), 4) for value in rng.normal(size=4)]
+        events.append([step / 10, 'robot', 'rover', place, 0.5, 1, ''])
+        if step % 100 == 0:
+            events.append([step / 10, 'log', '', 'found', 'rover', 'target'])
+    return EventLog({'name': 'long'}, events)
+
+
+def test_a_long_run_is_thinned_until_it_fits_and_says_so():
+    log = long_run(2000)
+    whole = EventLog.unpacked(log.packed())
+    assert whole == log
+    packed = log.packed(100_000)
+    assert len(packed) <= 100_000
+    thinned = EventLog.unpacked(packed)
+    assert thinned.scene['thinned'] >= 0.2
+    assert thinned.events[-1] == log.events[-1]
+    lines = [event for event in log.events if event[1] == 'log']
+    assert [event for event in thinned.events if event[1] == 'log'] == lines
+
+
+def test_thinning_keeps_detections_and_the_end():
+    events = [
+        [0.0, 'seen', 'a', [0, 0, 0], []],
+        [0.1, 'seen', 'a', [0, 0, 0], []],
+        [0.2, 'seen', 'a', [0, 0, 0], [[1, 0, 0, 0, 0, 0]]],
+        [0.3, 'seen', 'a', [0, 0, 0], []],
+    ]
+    assert [event[0] for event in thin(events, 10.0)] == [0.0, 0.2, 0.3]
+
+
+def test_scenes_are_the_same_from_a_scenario_and_from_what_a_recording_says_of_it():
+    for name in ('mambo_turtlebot_obstacles', 'ranging_pair_3d', 'buildings_four'):
+        scenario = load_mission(name).scenario
+        facts = {'name': name, 'seed': 3, 'scenario': scenario.content()}
+        scene = scene_of_facts(facts)
+        assert scene == scene_of(name, scenario, 3)
+        assert json.loads(line(scene)) == scene
+    assert len(scene['cuboids']) == 32 and len(scene['objects']) == 2
+
+
+@pytest.fixture(scope='module')
+def result():
+    scenario = load_mission('ranging_drone_3d').scenario
+    return search(scenario, 1)
+
+
+def test_a_search_in_one_process_leaves_the_same_events(result, tmp_path):
+    log = result.trace.log('drone')
+    found = [event for event in log.events if event[1] == 'found'][-1]
+    assert [item[0] for item in found[3]] == [item.id for item in result.found_targets]
+    assert np.allclose(found[3][0][1:4], result.found_targets[0].position, atol=0.01)
+    plans = [event for event in log.events if event[1] == 'plan']
+    assert len(plans) == len(result.decisions)
+    chosen = plans[0][7][0]
+    decision = result.decisions[0].robots['drone']
+    assert chosen[2] == decision.chosen and chosen[5] == decision.reason
+    updates = [event for event in log.events if event[1] == 'filter']
+    assert updates[-1][5] == result.total_measurements
+    result.save_replay(tmp_path / REPLAY)
+    assert (tmp_path / REPLAY).stat().st_size < 1_000_000
+
+
+def test_the_page_is_one_file_without_addresses(result):
+    for page in (empty_page(), replay_page(result.trace.log())):
+        assert 'http' not in page.replace('http-equiv', '')
+        assert 'import ' not in page.partition('<script type="module">')[2]
+        assert '/*RUN*/' not in page
+
+
+def test_names_cannot_end_the_script_of_a_page():
+    log = EventLog({'name': '</script><script>alert(1)</script>', 'robots': {}})
+    assert replay_page(log).count('</script>') == empty_page().count('</script>')
+    assert EventLog.unpacked(log.packed()) == log

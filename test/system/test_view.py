@@ -1,0 +1,171 @@
+"""The page of a run in a browser: what it shows is what the bag and the report hold."""
+
+import pytest
+from browsers import chromium, needs_chromium
+from scenario_runs import of_topic, run_scenario
+
+from maasi_sim.view.bag_events import read_events
+from maasi_sim.view.page_file import REPLAY
+from maasi_sim.view.view_run import main
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('viewed') / 'run'
+    options = ('--seed', 1, '--lockstep', '--time-limit', 20)
+    return run_scenario('mambo_turtlebot', folder, *options)
+
+
+@pytest.fixture(scope='module')
+def address(run):
+    return (run.folder / REPLAY).as_uri()
+
+
+def seconds(stamp):
+    return stamp['sec'] + 1e-9 * stamp['nanosec']
+
+
+def state_at(run, robot, time):
+    """Return the last state of a robot in the bag at or before a time."""
+    states = of_topic(run, f'/{robot}/state')
+    return [item for item in states if seconds(item['header']['stamp']) <= time + 1e-6][-1]
+
+
+def test_every_run_leaves_a_replay(run):
+    assert run.code in (0, 1), run.output
+    assert 'replay:' in run.output
+    assert 10_000 < (run.folder / REPLAY).stat().st_size < 5_000_000
+
+
+def test_the_events_are_those_of_the_bag(run):
+    log = read_events(run.folder)
+    found = [event for event in log.events if event[1] == 'found'][-1]
+    assert len(found[3]) == len(run.report['found'])
+    plans = [event for event in log.events if event[1] == 'plan']
+    decisions = of_topic(run, '/decisions')
+    assert [[row[0] for row in event[7]] for event in plans] == [
+        [robot['robot'] for robot in item['robots']] for item in decisions
+    ]
+    assert log.events[-1][0] <= 20.0 + 1e-6
+
+
+@needs_chromium
+def test_the_page_shows_the_bag(run, address):
+    with chromium() as shown:
+        shown.open(address)
+        shown.page.keyboard.press('End')
+        shown.settle()
+        assert shown.number() == len(run.report['found'])
+        last = shown.page.screenshot()
+        shown.seek(10.0)
+        for robot in ('mambo', 'turtlebot'):
+            when, *_, place = shown.page.evaluate(
+                f'maasi.log.at("robot", "{robot}", 10.0).slice(0, 4)'
+            )
+            # One state in a tenth of a second is shown.
+            assert 9.9 - 1e-6 < when <= 10.0
+            expected = state_at(run, robot, when)['pose']['pose']['position']
+            assert place[0] == pytest.approx(expected['x'], abs=1e-3)
+            assert place[1] == pytest.approx(expected['y'], abs=1e-3)
+        found = [item for item in run.report['found'] if item['time'] <= 10.0]
+        assert shown.number() == len(found)
+        assert shown.page.screenshot() != last
+        colours = shown.page.evaluate(
+            """() => {
+              const map = document.getElementById('map');
+              const data = map.getContext('2d').getImageData(0, 0, map.width, map.height).data;
+              return new Set(new Uint32Array(data.buffer)).size;
+            }"""
+        )
+        assert colours > 20
+        shown.check()
+
+
+@needs_chromium
+def test_a_click_on_a_decision_shows_its_candidates(run, address):
+    decisions = of_topic(run, '/decisions')
+    first = decisions[0]['robots'][0]
+    with chromium() as shown:
+        shown.open(address)
+        shown.page.click(f'#log li.decision:has-text("{first["robot"]}: decision 0")')
+        shown.settle()
+        rows = shown.page.locator('#why tbody tr')
+        assert rows.count() == len(first['candidates'])
+        chosen = shown.page.inner_text('#why tr.chosen td').strip()
+        assert int(chosen) == first['chosen']
+        assert 'admissible' in shown.page.inner_text('#why .reason')
+        # Sorted by the objective, and by another column where that is clicked.
+        best = max(range(len(first['candidates'])), key=lambda i: objective(first, i))
+        assert int(rows.first.locator('td').first.inner_text()) == best
+        shown.page.click('#why th:text-is("E")')
+        shown.settle()
+        widest = max(
+            range(len(first['candidates'])), key=lambda i: first['candidates'][i]['exploration']
+        )
+        assert int(rows.first.locator('td').first.inner_text()) == widest
+        # The arrow goes to the next decision.
+        shown.page.keyboard.press('ArrowUp')
+        shown.settle()
+        later = next(item for item in decisions if seconds(item['header']['stamp']) > 0.0)
+        assert shown.page.evaluate('maasi.time') == pytest.approx(
+            seconds(later['header']['stamp']), abs=1e-3
+        )
+        shown.check()
+
+
+def objective(robot, index):
+    return robot['candidates'][index]['objective']
+
+
+@needs_chromium
+def test_a_click_on_a_robot_shows_why_it_goes_there(run, address):
+    with chromium() as shown:
+        shown.open(address)
+        shown.seek(5.0)
+        x, y = shown.page.evaluate(
+            'maasi.camera.project(maasi.log.at("robot", "mambo", 5.0)[3]).slice(0, 2)'
+        )
+        box = shown.page.locator('#map').bounding_box()
+        shown.page.mouse.click(box['x'] + x, box['y'] + y)
+        shown.settle()
+        assert 'mambo, decision' in shown.page.inner_text('#why')
+        shown.page.click('#robots tr[data-robot=turtlebot]')
+        shown.settle()
+        assert 'turtlebot, decision' in shown.page.inner_text('#why')
+        shown.check()
+
+
+@needs_chromium
+def test_it_plays_by_the_space_bar_also_on_a_phone_in_space_and_in_the_dark(run, address):
+    with chromium(390, 844, color_scheme='dark', has_touch=True) as shown:
+        shown.open(address)
+        assert shown.page.get_attribute('html', 'data-theme') == 'dark'
+        shown.page.select_option('#speed', '20')
+        shown.page.locator('#map').focus()
+        shown.page.keyboard.press(' ')
+        shown.until('maasi.time > 1.0')
+        shown.page.keyboard.press(' ')
+        shown.settle()
+        at = shown.page.evaluate('maasi.time')
+        shown.page.keyboard.press('ArrowLeft')
+        shown.settle()
+        assert shown.page.evaluate('maasi.time') == pytest.approx(max(at - 1.0, 0.0), abs=0.01)
+        flat = shown.page.locator('#map').screenshot()
+        shown.page.tap('#space')
+        shown.settle()
+        assert shown.page.locator('#map').screenshot() != flat
+        # Nothing is wider than the phone.
+        assert shown.page.evaluate('document.documentElement.scrollWidth') <= 390
+        shown.check()
+
+
+def test_a_recording_that_is_none_is_refused(tmp_path, capsys):
+    assert main([str(tmp_path / 'nothing'), '--no-open']) == 2
+    assert 'there is no such recording' in capsys.readouterr().err
+
+
+def test_a_page_is_made_of_a_bag(run, tmp_path, capsys):
+    assert main([str(run.bag), '--no-open', '--out', str(tmp_path / 'page.html')]) == 0
+    assert (tmp_path / 'page.html').read_text() == (run.folder / REPLAY).read_text()
