@@ -173,7 +173,7 @@ def test_a_linked_robot_has_its_link_and_no_commands_by_topic():
     driver, _ = read_back(plans['/drone/driver'], DriverSettings)
     assert driver.link == 'mavlink'
     assert driver.mavlink == scenario.robots['drone'].mavlink
-    expected = ('/drone/state', '/drone/detections', '/drone/robot_description')
+    expected = ('/drone/state', '/drone/detections', '/drone/robot_description', '/tf')
     assert plans['/drone/driver'].topics == expected
     # Its autopilot stops it.
     assert '/drone/guard' not in plans

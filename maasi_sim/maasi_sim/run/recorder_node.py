@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import math
 import struct
 import time
-from collections import deque
-from collections.abc import Collection
+from collections import Counter, deque
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import rclpy
@@ -222,15 +223,24 @@ class Recorder:
             )
             self._subscriptions[topic] = self._subscribe(topic, kind, qos)
 
-    def missing(self, topics: Collection[str]) -> list[str]:
-        """Return those topics, of use to the recorder, whose publisher is not connected yet."""
-        return [full for full in topics if self._is_missing(self._relative(full))]
+    def missing(self, topics: Sequence[str]) -> list[str]:
+        """Return those topics, of use to the recorder, of which a publisher is not connected yet.
 
-    def _is_missing(self, topic: str | None) -> bool:
+        A topic is given once for each of its publishers.
+        """
+        publishers = Counter(topics)
+        return [
+            full
+            for full, number in publishers.items()
+            if self._connected(self._relative(full)) < number
+        ]
+
+    def _connected(self, topic: str | None) -> float:
+        """Return the number of connected publishers; unlimited if it is of no use."""
         if topic is None or not self._wants(topic):
-            return False
+            return math.inf
         subscription = self._subscriptions.get(topic)
-        return subscription is None or subscription.handle.get_publisher_count() == 0
+        return 0 if subscription is None else subscription.handle.get_publisher_count()
 
     def _wants(self, topic: str) -> bool:
         # A name with an underscore in front is hidden: the inner topics of actions.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 from maasi_drivers.agent.driver_settings import DriverSettings
@@ -87,6 +88,9 @@ def _robot_plans(
     topics = ['state', 'detections', 'robot_description']
     if robot.link == 'topics':
         topics.append('cmd_vel')
+    # Published by several robots; without its package there are no transforms.
+    has_transforms = settings.poses != 'tf' and find_spec('tf2_msgs') is not None
+    shared = ('/tf',) if has_transforms else ()
     own = name in scenario.namespaces()
     plans = [
         NodePlan(
@@ -97,7 +101,7 @@ def _robot_plans(
             {**flatten(settings), **SIMULATED},
             # A robot with its own planner gets its batches from that one.
             remaps={BATCH: within(name, BATCH)} if own else {},
-            topics=tuple(f'/{name}/{topic}' for topic in topics),
+            topics=(*(f'/{name}/{topic}' for topic in topics), *shared),
             drives=True,
         )
     ]
