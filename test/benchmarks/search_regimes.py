@@ -7,7 +7,7 @@ from typing import Any
 
 from quality_conditions import NOISES
 
-from maasi_sim.experiments.searches import merged
+from maasi_sim.experiments.searches import NEVER_DONE, merged
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
 
@@ -133,8 +133,10 @@ def prepared(regime: str, kind: str) -> Scenario:
         content['robots'] = dict.fromkeys(robots, like)
     limits = {'limits': {'time': what.limit}, 'filter': {'threads': 1}}
     content = merged(content, change, {'robots': robots}, limits)
-    content['planner'] = merged(content['planner'], how.change)
+    content['planner'] = merged(content['planner'], NEVER_DONE, how.change)
     for robot in content['robots'].values():
         if how.neighbours:
             robot['candidates'] = what.neighbours
+        if how.stops:
+            robot['motion'] = merged(robot['motion'], {'arrival_radius': 0.0})
     return Scenario.model_validate(content)
