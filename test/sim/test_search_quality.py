@@ -12,8 +12,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'benchmarks'))
 
-import search_quality  # noqa: E402
-import search_regimes  # noqa: E402
+import search_quality
+import search_regimes
 
 RUN = search_quality.Run(
     regime='mambo',
