@@ -28,6 +28,7 @@ setup(
             'sim_node = maasi_entry:maasi_sim.sim_node',
             'fake_mambo = maasi_entry:maasi_sim.emulators.mambo.fake_mambo',
             'fake_mavlink_vehicle = maasi_entry:maasi_sim.emulators.mavlink.fake_mavlink_vehicle',
+            'view_node = maasi_entry:maasi_sim.view.view_node',
             'run_scenario = maasi_entry:maasi_sim.run.run_scenario',
         ],
     },

@@ -32,6 +32,7 @@ from maasi_sim.scenario.schema import (
     steps_of,
 )
 from maasi_sim.targets.scoring import score, scoring_radius
+from maasi_sim.view.live_view import open_view
 from maasi_sim.view.search_trace import SearchTrace
 from maasi_sim.world.simulation import simulated_robot, step_of_event
 from maasi_sim.world.world import World
@@ -300,6 +301,7 @@ def search(
     seed: int,
     most_measurements: int | None = None,
     planner: Callable[[PlannerSettings, Callable[[], FloatArray]], Planner] | None = None,
+    view: bool = False,
 ) -> SearchResult:
     """Run a scenario in this process, step by step as in lockstep.
 
@@ -325,6 +327,7 @@ def search(
     departures = leaving(scenario)
     away: set[str] = set()
     trace = SearchTrace(scenario, seed)
+    feed = open_view(trace) if view else None
     groups = [
         _Group(space, names, scenario, trace) for space, names in scenario.namespaces().items()
     ]
@@ -418,6 +421,8 @@ def search(
             robot.body.step(step + 1, scenario.step)
             moved = robot.body.state.pose.position - before
             robot.distance += float(np.sqrt((moved * moved).sum()))
+    if feed is not None:
+        feed.close(f'ended: {end_reason}')
     found = found_targets()
     truth = np.asarray(world.targets_at(max(step, 0)), dtype=float)
     scores = score([item.position for item in found], truth, radius, scenario.scoring.order)

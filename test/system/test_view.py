@@ -1,8 +1,10 @@
 """The page of a run in a browser: what it shows is what the bag and the report hold."""
 
+import subprocess
+
 import pytest
-from browsers import chromium, needs_chromium
-from scenario_runs import of_topic, run_scenario
+from browsers import CHROMIUM, chromium, needs_chromium
+from scenario_runs import PATIENCE, Run, command, of_topic
 
 from maasi_sim.view.bag_events import read_events
 from maasi_sim.view.page_file import REPLAY
@@ -11,11 +13,54 @@ from maasi_sim.view.view_run import main
 pytestmark = pytest.mark.system
 
 
+class Watched:
+    """A run, and what a browser saw of it while it went on."""
+
+    def __init__(self, folder):
+        options = ('--seed', 1, '--lockstep', '--time-limit', 30, '--view', '--control')
+        self.process = subprocess.Popen(
+            [*command('mambo_turtlebot', folder, *options), '--port', '0'],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.errors, self.answer, self.found, self.decisions = [], '', None, 0
+        lines = []
+        for line in self.process.stdout:
+            lines.append(line)
+            if line.startswith('view: '):
+                break
+        if CHROMIUM is not None:
+            self._watch(lines[-1].split()[1])
+        rest, _ = self.process.communicate(timeout=PATIENCE)
+        self.run = Run(folder, self.process.returncode, ''.join([*lines, rest]))
+
+    def _watch(self, address):
+        with chromium() as shown:
+            shown.open(address)
+            shown.until('maasi.log.duration > 1')
+            shown.page.click('#robots tr[data-robot=turtlebot]')
+            shown.page.click('button[data-command=pause]')
+            answer = shown.page.locator('#controls [role=status]')
+            shown.until("/turtlebot: \\S/.test(document.querySelector('#controls').innerText)")
+            self.answer = answer.inner_text()
+            shown.until('document.body.dataset.connection === "ended"', PATIENCE)
+            shown.page.keyboard.press('End')
+            shown.settle()
+            self.found = shown.number()
+            self.decisions = shown.page.evaluate('maasi.log.decisions.times.length')
+            shown.check()
+
+
 @pytest.fixture(scope='module')
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('viewed') / 'run'
-    options = ('--seed', 1, '--lockstep', '--time-limit', 20)
-    return run_scenario('mambo_turtlebot', folder, *options)
+def watched(tmp_path_factory):
+    return Watched(tmp_path_factory.mktemp('viewed') / 'run')
+
+
+@pytest.fixture(scope='module')
+def run(watched):
+    return watched.run
 
 
 @pytest.fixture(scope='module')
@@ -39,6 +84,15 @@ def test_every_run_leaves_a_replay(run):
     assert 10_000 < (run.folder / REPLAY).stat().st_size < 5_000_000
 
 
+@needs_chromium
+def test_a_browser_saw_the_run_while_it_went_on(watched):
+    assert watched.found == len(watched.run.report['found'])
+    assert watched.decisions == sum(
+        len(item['robots']) for item in of_topic(watched.run, '/decisions')
+    )
+    assert watched.answer == 'pause turtlebot: pause: turtlebot'
+
+
 def test_the_events_are_those_of_the_bag(run):
     log = read_events(run.folder)
     found = [event for event in log.events if event[1] == 'found'][-1]
@@ -48,7 +102,7 @@ def test_the_events_are_those_of_the_bag(run):
     assert [[row[0] for row in event[7]] for event in plans] == [
         [robot['robot'] for robot in item['robots']] for item in decisions
     ]
-    assert log.events[-1][0] <= 20.0 + 1e-6
+    assert log.events[-1][0] <= 30.0 + 1e-6
 
 
 @needs_chromium

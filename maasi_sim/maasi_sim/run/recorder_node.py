@@ -7,7 +7,7 @@ import math
 import struct
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import rclpy
@@ -39,6 +39,7 @@ from maasi_msgs.msg import (
 from maasi_sim.run.bag import BagError, BagWriter, TopicQos
 from maasi_sim.run.mission import Observer
 from maasi_sim.run.topics import CLOCK, STEP, within
+from maasi_sim.view.messages import is_shown
 
 NAME = 'recorder'
 READY, DONE = '/lockstep/ready', '/lockstep/done'
@@ -151,6 +152,9 @@ class Recorder:
         self._finished = False
         self._last_step = -1
         self.complaints: list[str] = []
+        #: Takes topic, type and content of each message that a page shows.
+        self.listener: Callable[[str, str, bytes], None] | None = None
+        self._shown: dict[str, str] = {}
         self._wanted = {*observer.topics, CLOCK, DONE, DIAGNOSTICS}
         self._subscriptions: dict[str, Subscription] = {}
         self._refused: set[str] = set()
@@ -191,7 +195,8 @@ class Recorder:
             topic = self._relative(full)
             if topic is None or topic in self._subscriptions or topic in self._refused:
                 continue
-            if not self._wants(topic):
+            shown = self.listener is not None and is_shown(topic, types[0])
+            if not (self._wants(topic) or shown):
                 continue
             infos = self.node.get_publishers_info_by_topic(full)
             if not infos:
@@ -222,6 +227,8 @@ class Recorder:
                 ),
             )
             self._subscriptions[topic] = self._subscribe(topic, kind, qos)
+            if shown:
+                self._shown[topic] = types[0]
 
     def missing(self, topics: Sequence[str]) -> list[str]:
         """Return those topics, of use to the recorder, of which a publisher is not connected yet.
@@ -323,6 +330,8 @@ class Recorder:
                     self.heartbeats[status.name] = now
             if not self._finished or topic in self.observer.result_topics:
                 self.observer.add(topic, data)
+            if self.listener is not None and topic in self._shown:
+                self.listener(topic, self._shown[topic], data)
         self.observer.settle()
         if self.observer.end_step is not None and not self._finished:
             self._last_step = self.observer.end_step

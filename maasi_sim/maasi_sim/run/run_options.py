@@ -28,6 +28,16 @@ class Options:
     namespace: str = ''
     follow_clock: bool = False
     replay: Path | None = None
+    view: ViewOptions | None = None
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Where the page of a run is served, and whether it may command robots."""
+
+    port: int | None = None
+    host: str = '127.0.0.1'
+    control: bool = False
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -80,7 +90,37 @@ def build_parser() -> argparse.ArgumentParser:
         metavar='BAG',
         help='feed the filter the recorded measurements, and compare what it finds',
     )
+    add_view_options(parser)
+    parser.add_argument('--view', action='store_true', help='show the run in a browser')
     return parser
+
+
+def add_view_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a server of the page."""
+    parser.add_argument('--port', type=_port, metavar='N', help='of the page (default: 8420)')
+    parser.add_argument(
+        '--host',
+        default='127.0.0.1',
+        metavar='ADDRESS',
+        help='that the page is served on (default: 127.0.0.1, this machine only)',
+    )
+    parser.add_argument(
+        '--control',
+        action='store_true',
+        help='let the page pause, resume, send home and stop; its address has a token',
+    )
+
+
+def view_options(options: argparse.Namespace) -> ViewOptions:
+    """Return where the page is served."""
+    return ViewOptions(options.port, options.host, options.control)
+
+
+def _port(text: str) -> int:
+    number = _whole(text)
+    if number > 65535:
+        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are ports up to 65535")
+    return number
 
 
 def _whole(text: str) -> int:
@@ -120,6 +160,8 @@ def parse(arguments: list[str] | None) -> Options:
         parser.error('--follow-clock needs the --domain-id of the run whose clock it is')
     if options.follow_clock and (options.lockstep or options.rate is not None):
         parser.error('--follow-clock: allowed without --lockstep and --rate')
+    if not options.view and (options.port is not None or options.control):
+        parser.error('--port and --control need --view')
     return Options(
         scenario=options.scenario or '',
         out=options.out,
@@ -134,4 +176,5 @@ def parse(arguments: list[str] | None) -> Options:
         namespace=options.namespace or '',
         follow_clock=options.follow_clock,
         replay=options.replay,
+        view=view_options(options) if options.view else None,
     )

@@ -22,7 +22,8 @@ from maasi_sim.run.processes import Domain
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.report_files import store_report
 from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
-from maasi_sim.run.run_options import Options
+from maasi_sim.run.run_options import Options, ViewOptions
+from maasi_sim.run.run_page import RunPage
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
@@ -107,16 +108,20 @@ class ScenarioRun:
 
     def _execute(self, domain: Domain) -> int:
         session: Session | None = None
+        page: RunPage | None = None
         try:
             # Before anything that takes time, and while this process has a single thread.
             if not self.interruption:
                 self.supervisor.start()
+            if self.options.view is not None:
+                page = self._page(self.options.view, domain.number)
             # rclpy starts threads when it is imported, and a process with threads is not forked.
             from maasi_sim.run.session import Session
 
             session = Session(
                 self.mission, self.supervisor, self.options, self.interruption, self.display
             )
+            session.listener = None if page is None else page.put
             session.open(domain.number, self.folder)
             session.run()
             if session.is_followed:
@@ -128,6 +133,8 @@ class ScenarioRun:
             self.supervisor.stop_all()
             if session is not None:
                 session.close()
+            if page is not None:
+                page.close()
             self.display.close()
         return self._report(session)
 
@@ -156,6 +163,16 @@ class ScenarioRun:
         if ending.reason == 'planner_done' and stored.report['missed'] == 0:
             code = DONE
         return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
+
+    def _page(self, options: ViewOptions, domain: int) -> RunPage | None:
+        """Serve the page of the run; a run goes on without one."""
+        try:
+            page = RunPage(self.mission, options, domain, self.options.namespace)
+        except OSError as error:
+            self.display.say(f'warning: no view: {options.host}: {error.strerror or error}')
+            return None
+        page.view.announce(self.display.say)
+        return page
 
     def _leave_replay(self) -> None:
         """Write the page that shows the run, from its recording."""

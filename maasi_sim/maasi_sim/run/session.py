@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,8 @@ class Session:
     ----------
     recorder : Recorder
     observer : Observer
+    listener : callable or None
+        Takes topic, type and content of each message that a page shows; set before `open`.
     ending : Ending
         How the run ended, after `run`.
     unwritten : list of str
@@ -75,6 +78,7 @@ class Session:
     ) -> None:
         self.mission = mission
         self.unwritten: list[str] = []
+        self.listener: Callable[[str, str, bytes], None] | None = None
         self._types = load_types()
         self.observer = mission.observer(self._types)
         self._scenario = mission.scenario
@@ -98,6 +102,7 @@ class Session:
         self.recorder = Recorder(
             domain, self.observer, self._scenario.step, self._bag, self._options.namespace
         )
+        self.recorder.listener = self.listener
         self._open.callback(self.recorder.close)
 
     def close(self) -> None:

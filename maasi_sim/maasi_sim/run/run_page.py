@@ -1,0 +1,58 @@
+"""The page of a run while it goes on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from maasi_sim.run.bag import load_types
+from maasi_sim.run.mission import Mission
+from maasi_sim.run.run_options import ViewOptions
+from maasi_sim.view.live_view import LiveView, MessageFeed
+from maasi_sim.view.scene import scene_of
+from maasi_sim.view.server import Commander
+
+
+class RunPage:
+    """Serve a run, fed with the messages that its recorder takes.
+
+    Parameters
+    ----------
+    mission : Mission
+        What is run.
+    options : ViewOptions
+        Where it is served.
+    domain : int
+        ROS domain of the run.
+    namespace : str
+        Of its nodes.
+
+    Raises
+    ------
+    OSError
+        If the port cannot be listened on.
+    """
+
+    def __init__(
+        self, mission: Mission[Any], options: ViewOptions, domain: int, namespace: str
+    ) -> None:
+        commander: Commander | None = None
+        if options.control:
+            # rclpy starts threads when it is imported.
+            from maasi_sim.view.control_node import ControlNode
+
+            commander = ControlNode(domain, namespace)
+        self._commander = commander
+        scene = scene_of(mission.name, mission.scenario)
+        self.view = LiveView(scene, options.port, options.host, commander)
+        self._feed = MessageFeed(self.view, load_types())
+
+    def put(self, topic: str, type_name: str, data: bytes) -> None:
+        """Take a message; never waits."""
+        self._feed.put(topic, type_name, data)
+
+    def close(self) -> None:
+        """Show what is left, and stop serving."""
+        self._feed.close()
+        self.view.end('the run has ended')
+        if self._commander is not None:
+            self._commander.close()  # type: ignore[attr-defined]

@@ -1,0 +1,67 @@
+"""Calls the services that pause, resume, send home and stop, for a page."""
+
+from __future__ import annotations
+
+import argparse
+import threading
+
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from maasi_planner.search_command import call_all
+
+# Longest wait for the answers of all services [s].
+_PATIENCE = 5.0
+
+
+class ControlNode:
+    """A node that calls the services of planners and drivers, one command at a time.
+
+    Parameters
+    ----------
+    domain : int
+        ROS domain.
+    namespace : str
+        Of the team, without slashes at its ends.
+    """
+
+    def __init__(self, domain: int | None, namespace: str = '') -> None:
+        self._namespace = namespace
+        self._lock = threading.Lock()
+        self._context = Context()
+        rclpy.init(
+            context=self._context,
+            domain_id=domain,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._node = Node(
+            'view_control',
+            context=self._context,
+            start_parameter_services=False,
+            enable_rosout=False,
+            use_global_arguments=False,
+        )
+
+    def __call__(self, command: str, robot: str | None) -> tuple[bool, str]:
+        """Carry out a command for a robot (None: all); return whether all followed, and answers."""
+        options = argparse.Namespace(
+            command=command, robot=robot, namespace=self._namespace, timeout=_PATIENCE
+        )
+        with self._lock:
+            if not self._context.ok():
+                return False, 'the run has ended'
+            answers = call_all(self._node, options)
+        if not answers:
+            return False, f'no service for {command} within {_PATIENCE:g} s'
+        done = all(answer is not None and answer.success for answer in answers.values())
+        words = {'no answer' if answer is None else answer.message for answer in answers.values()}
+        return done, '; '.join(sorted(words))
+
+    def close(self) -> None:
+        """Leave the graph."""
+        with self._lock:
+            if self._context.ok():
+                self._node.destroy_node()
+                rclpy.shutdown(context=self._context)

@@ -1,0 +1,121 @@
+"""Where the events of a live run wait for browsers: each reads at its own pace."""
+
+from __future__ import annotations
+
+import json
+import threading
+from dataclasses import dataclass
+
+from maasi_sim.view.event_log import STATE_PERIOD, Event, Scene, line, thin
+
+# Events that are kept; beyond them those that change gradually are thinned.
+MOST_EVENTS = 200_000
+# Events in one message to a browser.
+_MOST_AT_ONCE = 2000
+
+
+@dataclass(frozen=True)
+class Portion:
+    """What a browser gets next.
+
+    Attributes
+    ----------
+    scene : str
+        JSON of the scene, where the browser is to begin anew; else empty.
+    events : str
+        JSON list of events.
+    generation, position : int
+        Where the next portion begins.
+    closed : bool
+        Whether nothing follows.
+    """
+
+    scene: str
+    events: str
+    generation: int
+    position: int
+    closed: bool
+
+
+class Hub:
+    """Keeps the events of a run; nothing that puts an event waits for a browser.
+
+    Parameters
+    ----------
+    scene : dict
+        Of the run.
+    most : int
+        Events that are kept. When there are more, those that change gradually are thinned, and
+        browsers begin anew.
+    """
+
+    def __init__(self, scene: Scene, most: int = MOST_EVENTS) -> None:
+        self._scene = dict(scene)
+        self._most = most
+        self._events: list[Event] = []
+        self._period = STATE_PERIOD
+        self._generation = 0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def put(self, event: Event) -> None:
+        """Add an event."""
+        with self._changed:
+            if event[1] == 'scene':
+                self._scene.update(event[3])
+            self._events.append(event)
+            if len(self._events) > self._most:
+                self._thin()
+            self._changed.notify_all()
+
+    def restart(self, scene: Scene) -> None:
+        """Forget all events: another run begins."""
+        with self._changed:
+            self._scene = dict(scene)
+            self._events.clear()
+            self._generation += 1
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Say that no event follows."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    @property
+    def size(self) -> int:
+        """Number of events kept."""
+        return len(self._events)
+
+    def next(self, generation: int, position: int, patience: float) -> Portion:
+        """Return what follows a position; nothing new within the patience [s] is an empty portion.
+
+        A browser begins with generation -1.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: (
+                    self._closed or generation != self._generation or position < len(self._events)
+                ),
+                patience,
+            )
+            scene = ''
+            if generation != self._generation:
+                scene, position = line(self._scene), 0
+            events = self._events[position : position + _MOST_AT_ONCE]
+            position += len(events)
+            closed = self._closed and position == len(self._events)
+            generation = self._generation
+        # Outside of the lock: a large portion takes a while.
+        text = json.dumps(events, separators=(',', ':'), allow_nan=False)
+        return Portion(scene, text if events else '', generation, position, closed)
+
+    def _thin(self) -> None:
+        """Halve what changes gradually, until a tenth of the room is free."""
+        while len(self._events) > 0.9 * self._most and self._period < 1e5:
+            self._period *= 2.0
+            self._events = thin(self._events, self._period)
+        # Where nothing can be thinned, the oldest go.
+        del self._events[: max(0, len(self._events) - self._most)]
+        self._scene['thinned'] = self._period
+        self._generation += 1

@@ -1,0 +1,152 @@
+"""The page of a run that goes on: server, events, and what feeds them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rosbags.typesys.store import Typestore
+
+from maasi_sim.view.browser import open_browser
+from maasi_sim.view.event_log import Scene
+from maasi_sim.view.event_maker import EventMaker
+from maasi_sim.view.hub import Hub
+from maasi_sim.view.live_feed import LiveFeed
+from maasi_sim.view.messages import MessageEvents
+from maasi_sim.view.scene import scene_of
+from maasi_sim.view.search_trace import SearchTrace, hand_over
+from maasi_sim.view.server import Commander, ViewServer
+
+# For browsers to take the last events [s].
+_FAREWELL = 2.0
+_STEP = 'maasi_msgs/msg/LockstepStep'
+_MARKERS = 'visualization_msgs/msg/MarkerArray'
+
+
+class LiveView:
+    """Serve the page of a run that goes on.
+
+    Parameters
+    ----------
+    scene : dict
+        Of the run.
+    port : int, optional
+        Of the server; one that is free if not given.
+    host : str
+        Address that it listens on.
+    commander : callable, optional
+        Carries out commands; None: read only.
+
+    Raises
+    ------
+    OSError
+        If the port cannot be listened on.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        port: int | None = None,
+        host: str = '127.0.0.1',
+        commander: Commander | None = None,
+    ) -> None:
+        self._scene = scene
+        self.hub = Hub(scene)
+        self.maker = EventMaker(dict(scene), self.hub.put)
+        self.server = ViewServer(self.hub, port, host, commander)
+
+    def announce(self, say: Callable[[str], object]) -> None:
+        """Say where the page is, and open it where there is a browser."""
+        say(f'view: {self.server.address}')
+        open_browser(self.server.address)
+
+    def restart(self) -> EventMaker:
+        """Forget all events: another run begins."""
+        self.hub.restart(self._scene)
+        self.maker = EventMaker(dict(self._scene), self.hub.put)
+        return self.maker
+
+    def end(self, text: str = '') -> None:
+        """Say how the run ended, let browsers take what is left, and stop serving."""
+        if text:
+            self.maker.message(self.maker.latest, 'run', 'team', text)
+        self.hub.close()
+        deadline = time.monotonic() + _FAREWELL
+        while self.server.browsers and time.monotonic() < deadline:
+            time.sleep(0.02)
+        self.server.close()
+
+
+class MessageFeed:
+    """Feeds a page with serialised messages.
+
+    Parameters
+    ----------
+    view : LiveView
+        Is fed.
+    types : Typestore
+        Message types.
+    waits : bool
+        Whether the run begins with a `LockstepStep`; what comes before it is shown at its time.
+    """
+
+    def __init__(self, view: LiveView, types: Typestore, waits: bool = True) -> None:
+        self._types = types
+        self._waits = waits
+        self._early: list[tuple[str, str, bytes]] = []
+        self._known = 'bounds' in view.maker.scene
+        self._events = MessageEvents(view.maker, None, None if waits else view.restart)
+        self._feed = LiveFeed(self._take)
+
+    def put(self, topic: str, type_name: str, data: bytes) -> None:
+        """Take a message of a topic that is shown; never waits."""
+        if not (self._known and type_name == _MARKERS):
+            self._feed.put((topic, type_name, data))
+
+    def close(self) -> None:
+        """Take what waits, and end."""
+        self._feed.close()
+
+    def _take(self, item: Any) -> None:
+        if self._waits:
+            self._early.append(item)
+            if item[1] != _STEP:
+                return
+            self._waits = False
+            begun, self._early = [item, *self._early[:-1]], []
+            for one in begun:
+                self._decode(*one)
+        else:
+            self._decode(*item)
+
+    def _decode(self, topic: str, type_name: str, data: bytes) -> None:
+        self._events.take(topic, type_name, self._types.deserialize_cdr(data, type_name))
+
+
+class TraceFeed:
+    """Feeds a page with the records of a search in this process."""
+
+    def __init__(self, view: LiveView) -> None:
+        self._view = view
+        self._feed = LiveFeed(lambda item: hand_over(view.maker, *item))
+
+    def put(self, time: float, space: str, record: Any) -> None:
+        """Take a record; never waits."""
+        self._feed.put((time, space, record))
+
+    def close(self, text: str) -> None:
+        """Take what waits, say how the search ended, and stop serving."""
+        self._feed.close()
+        self._view.end(text)
+
+
+def open_view(trace: SearchTrace) -> TraceFeed:
+    """Serve the page of a search in this process, and say where."""
+    view = LiveView(scene_of('search', trace.scenario, trace.seed))
+    view.announce(print)
+    feed = TraceFeed(view)
+    for record in trace.records:
+        feed.put(*record)
+    trace.live = feed.put
+    return feed

@@ -1,0 +1,270 @@
+"""Serves the page of a live run, its events, and its controls where they are allowed.
+
+GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command with a
+token. Everything else is refused. A browser is served by a thread of its own, which alone waits
+for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import json
+import secrets
+import socket
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import urlsplit
+
+from maasi_sim.view.hub import Hub
+from maasi_sim.view.page_file import empty_page
+
+PORT = 8420
+# Takes a command and a robot (None: all); returns whether it was followed, and an answer.
+Commander = Callable[[str, 'str | None'], 'tuple[bool, str]']
+COMMANDS = ('pause', 'resume', 'home', 'stop')
+# Browsers at once; further ones are refused.
+MOST_BROWSERS = 32
+# Longest body of a request [bytes], and longest wait for a browser that reads or writes [s].
+LARGEST_BODY = 4096
+PATIENCE = 10.0
+# Period of portions, which bounds the load of a browser, and of signs of life [s].
+_PORTION_PERIOD = 0.1
+_BEAT = 5.0
+
+
+class ViewServer:
+    """Serve a hub to browsers until it is closed.
+
+    Parameters
+    ----------
+    hub : Hub
+        Events.
+    port : int
+        0: any that is free. The default is tried first, then any.
+    host : str
+        Address to listen on.
+    commander : callable, optional
+        Carries out commands; None: read only.
+
+    Raises
+    ------
+    OSError
+        If the port cannot be listened on.
+    """
+
+    def __init__(
+        self,
+        hub: Hub,
+        port: int | None = None,
+        host: str = '127.0.0.1',
+        commander: Commander | None = None,
+    ) -> None:
+        self.hub = hub
+        self.host = host
+        self.commander = commander
+        self.token = secrets.token_urlsafe(16) if commander is not None else ''
+        self.browsers = 0
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        try:
+            self._server = _Server((host, PORT if port is None else port), _Handler)
+        except OSError:
+            if port is not None:
+                raise
+            self._server = _Server((host, 0), _Handler)
+        self._server.view = self
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, name='view server', daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        """Port that it listens on."""
+        return int(self._server.server_address[1])
+
+    @property
+    def address(self) -> str:
+        """Address of the page, with the token where commands are allowed."""
+        host = f'[{self.host}]' if ':' in self.host else self.host
+        place = f'http://{host}:{self.port}/'
+        return f'{place}?token={self.token}' if self.token else place
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed."""
+        return self._closed.is_set()
+
+    def enter(self) -> bool:
+        """Count a browser; return whether there is room for it."""
+        with self._lock:
+            if self.browsers >= MOST_BROWSERS:
+                return False
+            self.browsers += 1
+            return True
+
+    def leave(self) -> None:
+        """Count a browser out."""
+        with self._lock:
+            self.browsers -= 1
+
+    def close(self) -> None:
+        """Stop serving; browsers get what is left for a moment."""
+        self.hub.close()
+        self._closed.set()
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    view: ViewServer
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Do nothing: a browser that breaks a connection is no error of the run."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    server_version = 'maasi'
+    sys_version = ''
+    protocol_version = 'HTTP/1.1'
+    timeout = PATIENCE
+
+    def do_GET(self) -> None:
+        """Answer with the page or the stream of events."""
+        if not self._is_for_this_host():
+            return
+        path = urlsplit(self.path).path
+        if path == '/':
+            self._answer(HTTPStatus.OK, empty_page().encode(), 'text/html; charset=utf-8')
+        elif path == '/events':
+            self._stream()
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, 'no such page')
+
+    def do_POST(self) -> None:
+        """Carry out a command."""
+        # What is left of a refused request is not read.
+        self.close_connection = True
+        if not self._is_for_this_host():
+            return
+        if urlsplit(self.path).path != '/control':
+            self._refuse(HTTPStatus.NOT_FOUND, 'no such page')
+            return
+        view = self.server.view
+        token = self.headers.get('X-Maasi-Token', '')
+        if view.commander is None:
+            self._refuse(HTTPStatus.FORBIDDEN, 'read only: started without --control')
+        elif not hmac.compare_digest(token.encode('utf-8', 'replace'), view.token.encode()):
+            self._refuse(HTTPStatus.FORBIDDEN, 'wrong token')
+        else:
+            command = self._read_command()
+            if command is not None:
+                done, text = view.commander(*command)
+                self._answer_json(HTTPStatus.OK, {'done': done, 'message': text})
+
+    def _read_command(self) -> tuple[str, str | None] | None:
+        """Return command and robot; None: it was refused."""
+        length = self.headers.get('Content-Length', '')
+        if not (length.isascii() and length.isdecimal()):
+            self._refuse(HTTPStatus.LENGTH_REQUIRED, 'Content-Length: allowed is a number')
+            return None
+        if int(length) > LARGEST_BODY:
+            self._refuse(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f'allowed are {LARGEST_BODY} bytes at most'
+            )
+            return None
+        try:
+            body = json.loads(self.rfile.read(int(length)))
+        except (ValueError, RecursionError):
+            body = None
+        if not isinstance(body, dict):
+            self._refuse(HTTPStatus.BAD_REQUEST, 'allowed is a JSON object')
+            return None
+        command, robot = body.get('command'), body.get('robot')
+        if command not in COMMANDS:
+            self._refuse(HTTPStatus.BAD_REQUEST, f'command: allowed are {", ".join(COMMANDS)}')
+            return None
+        if robot is not None and not (isinstance(robot, str) and robot.isidentifier()):
+            self._refuse(HTTPStatus.BAD_REQUEST, 'robot: allowed is the name of one, or null')
+            return None
+        return command, robot
+
+    def _is_for_this_host(self) -> bool:
+        """Refuse what another page asks by a name that it made point here."""
+        view = self.server.view
+        name = urlsplit(f'//{self.headers.get("Host", "")}').hostname
+        allowed = {view.host, 'localhost', '127.0.0.1', '::1'}
+        # Where it listens on all addresses, any name may be the right one.
+        if view.host not in ('0.0.0.0', '::') and name not in allowed:
+            self._refuse(HTTPStatus.FORBIDDEN, 'Host: allowed is the address that was printed')
+            return False
+        return True
+
+    def _stream(self) -> None:
+        """Send events until the run or the browser ends."""
+        view = self.server.view
+        self.close_connection = True
+        if not view.enter():
+            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_BROWSERS} browsers are here')
+            return
+        try:
+            self.send_response(HTTPStatus.OK)
+            self.send_header('Content-Type', 'text/event-stream')
+            self.send_header('Cache-Control', 'no-store')
+            self.end_headers()
+            self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._send_portions(view)
+        except OSError:
+            # It went away, or reads nothing.
+            pass
+        finally:
+            view.leave()
+
+    def _send_portions(self, view: ViewServer) -> None:
+        generation, position = -1, 0
+        pause = threading.Event()
+        while True:
+            portion = view.hub.next(generation, position, _BEAT)
+            text = ''
+            if portion.scene:
+                scene = portion.scene
+                if view.commander is not None:
+                    scene = f'{scene[:-1]},"control":true}}'
+                text += f'event: scene\ndata: {scene}\n\n'
+            if portion.events:
+                text += f'event: events\ndata: {portion.events}\n\n'
+            if portion.closed:
+                text += 'event: end\ndata:\n\n'
+            self.wfile.write((text or ': \n\n').encode())
+            generation, position = portion.generation, portion.position
+            if portion.closed:
+                return
+            pause.wait(_PORTION_PERIOD)
+
+    def _refuse(self, status: HTTPStatus, text: str) -> None:
+        self.close_connection = True
+        self._answer_json(status, {'done': False, 'message': text})
+
+    def _answer_json(self, status: HTTPStatus, content: dict[str, Any]) -> None:
+        self._answer(status, json.dumps(content).encode(), 'application/json')
+
+    def _answer(self, status: HTTPStatus, content: bytes, kind: str) -> None:
+        with contextlib.suppress(OSError):
+            self.send_response(status)
+            self.send_header('Content-Type', kind)
+            self.send_header('Content-Length', str(len(content)))
+            self.send_header('Cache-Control', 'no-store')
+            self.send_header('X-Content-Type-Options', 'nosniff')
+            self.send_header('Referrer-Policy', 'no-referrer')
+            self.end_headers()
+            self.wfile.write(content)
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Say nothing of requests."""
