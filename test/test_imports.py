@@ -26,7 +26,7 @@ FOLDERS = (
     'maasi_sim/maasi_sim',
 )
 # Folders and files that may import ROS.
-ROS_FOLDERS = ('ros',)
+ROS_FOLDERS = ('ros', 'node')
 ROS_FILES = (
     '*_node.py',
     '*_driver.py',

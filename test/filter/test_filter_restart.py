@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_filter_node import running, seen_from_a
 
-from maasi_filter.filter_memory import FilterMemory
-from maasi_filter.kept_found_targets import KeptFoundTargets, checked_found
+from maasi_filter.node.filter_memory import FilterMemory
+from maasi_filter.node.kept_found_targets import KeptFoundTargets, checked_found
 from maasi_filter.records import FoundTarget
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTargetArray
@@ -98,7 +98,7 @@ def test_a_node_without_state_takes_found_targets_from_the_latched_topic():
         until(lambda: node.count_publishers('/found_targets/kept') == 1)
         # The batch waits for the message: a new target would get the id of a kept one.
         team.measure(20, ['a'], {'a': [(0.3, 0.5), (0.25, -1.0), (0.4, 2.0)]})
-        until(lambda: 20 in node._pending and node._pending[20].complete)
+        until(lambda: 20 in node._batches.pending and node._batches.pending[20].complete)
         assert not team.updates
         publisher.publish(kept)
         until(lambda: team.updates and team.found)

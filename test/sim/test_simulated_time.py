@@ -109,7 +109,7 @@ def test_a_batch_is_given_up_in_simulated_time(world):
     world.simulate(SECOND)
     world.until(lambda: world.count_publishers('/filter_update'))
     world.ask()
-    world.until(lambda: node._pending)
+    world.until(lambda: node._batches.pending)
     world.wait_in_vain()
     assert not world.updates
     world.tell(2 * SECOND)

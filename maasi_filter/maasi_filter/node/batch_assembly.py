@@ -1,0 +1,270 @@
+"""Puts the measurements of each batch together, in the order of the batches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import AgentMeasurement
+from maasi_filter.ros.conversions import measurement_from_ros, stamp_from_ros
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.silence import Silence
+from maasi_filter.ros.stamps import batch_id_limit
+from maasi_msgs.msg import BatchMember, DetectionArray, MeasurementBatch
+
+# Largest lead of the stamp of a measurement over that of its batch [ns].
+_STAMP_AHEAD = 60_000_000_000
+# Capacity of the buffer of detections that arrive before their batch.
+_MOST_EARLY = 64
+
+
+@dataclass
+class PendingBatch:
+    """A batch whose measurements have not all arrived."""
+
+    id: int
+    step: int
+    stamp: int
+    members: list[BatchMember]
+    measurements: dict[str, AgentMeasurement] = field(default_factory=dict)
+    failed: set[str] = field(default_factory=set)
+    silence: Silence | None = None
+
+    @property
+    def missing(self) -> list[str]:
+        """Names of the members whose measurements have not arrived."""
+        return [item.robot for item in self.members if item.robot not in self.measurements]
+
+    @property
+    def complete(self) -> bool:
+        """Whether no measurement is missing."""
+        return all(name in self.failed for name in self.missing)
+
+
+class BatchAssembly:
+    """Matches batches and detections; what is refused is dropped and counted by the node.
+
+    Parameters
+    ----------
+    node : LockstepLifecycleNode
+        The filter node.
+    sensors : mapping of str to Sensor
+        By robot.
+
+    Attributes
+    ----------
+    pending : dict
+        Batches that have not been taken, by id.
+    last : int
+        Id of the last batch taken.
+    last_stamp : int
+        Its stamp [ns].
+    heard : dict
+        Batch, measurement and stamp [ns] of the last detections, by robot.
+    """
+
+    def __init__(
+        self, node: LockstepLifecycleNode[FilterNodeSettings], sensors: Mapping[str, Sensor]
+    ) -> None:
+        self._node = node
+        self._sensors = sensors
+        self._dimension = node.settings.environment.dimension
+        self.pending: dict[int, PendingBatch] = {}
+        self.last = 0
+        self.last_stamp = -1
+        self.heard: dict[str, tuple[int, int, int]] = {}
+        self._early: dict[tuple[int, str], DetectionArray] = {}
+
+    def add(self, batch: MeasurementBatch) -> None:
+        """Take a batch, and the detections that arrived before it."""
+        node = self._node
+        number = int(batch.id)
+        stamp = stamp_from_ros(batch.stamp)
+        known = {key: item.stamp for key, item in self.pending.items()}
+        known[self.last] = self.last_stamp
+        if known.get(number) == stamp:
+            # Duplicate batch: the planner republishes batches that may have been missed.
+            return
+        if number <= self.last or (number in self.pending and not node.settings.lockstep):
+            node.drop('old batch', f'measurement_batch.id: read {number}, allowed is a new one')
+            return
+        if number > batch_id_limit(self.last):
+            node.drop(
+                'bad batch',
+                f'measurement_batch.id: read {number}, allowed is up to '
+                f'{batch_id_limit(self.last)}',
+            )
+            return
+        for item in batch.members:
+            if item.robot not in self._sensors:
+                node.drop(
+                    'unknown robot',
+                    f'measurement_batch.members: read {item.robot!r}, allowed are '
+                    f'{", ".join(self._sensors)}',
+                )
+        members = [item for item in batch.members if item.robot in self._sensors]
+        members.sort(key=lambda item: item.robot)
+        pending = PendingBatch(number, int(batch.step), stamp, members, silence=Silence(node))
+        if node.settings.lockstep:
+            # A planner waits for each batch: older pending ones are from a planner that is gone.
+            for other in self.pending.values():
+                other.failed.update(other.missing)
+        self.pending[number] = pending
+        for member in members:
+            early = self._early.pop((number, member.robot), None)
+            # Stamped before the batch: it answered an earlier planner's batch with that number.
+            if (
+                early is not None
+                and 0 <= stamp_from_ros(early.header.stamp) - stamp <= _STAMP_AHEAD
+            ):
+                self._take(pending, early)
+
+    def take(self, name: str, message: DetectionArray) -> PendingBatch | None:
+        """Take detections; return a batch of their own if they are late or were not asked for."""
+        node = self._node
+        number = int(message.batch_id)
+        problem = self._problem(name, message)
+        pending = self.pending.get(number)
+        expected = pending is not None and name in pending.missing
+        problem = problem or self._stamp_problem(name, message, pending if expected else None)
+        if problem is not None:
+            node.drop('bad detections', f'{name}/detections.{problem}')
+            if pending is not None and expected:
+                pending.failed.add(name)
+            return None
+        key = (number, int(message.measurement), stamp_from_ros(message.header.stamp))
+        if self.heard.get(name) == key:
+            # Duplicate: drivers also republish.
+            return None
+        self.heard[name] = key
+        if pending is not None and expected:
+            self._take(pending, message)
+        elif number > self.last and pending is None:
+            # Its batch has not arrived yet.
+            self._early[(number, name)] = message
+            if len(self._early) > _MOST_EARLY:
+                oldest = next(iter(self._early))
+                del self._early[oldest]
+                node.drop('no batch', f'{oldest[1]}/detections.batch_id: no batch {oldest[0]} came')
+        else:
+            return self._late(name, message)
+        return None
+
+    def next_complete(self) -> PendingBatch | None:
+        """Remove and return the first batch if no measurement of it is missing."""
+        first = self.first
+        if first is None or not first.complete:
+            return None
+        del self.pending[first.id]
+        self.last, self.last_stamp = first.id, first.stamp
+        for key in [key for key in self._early if key[0] <= first.id]:
+            del self._early[key]
+        return first
+
+    @property
+    def first(self) -> PendingBatch | None:
+        """The pending batch of the lowest id."""
+        return self.pending[min(self.pending)] if self.pending else None
+
+    def give_up(self, timeout: float) -> bool:
+        """Return whether the first batch goes on without what is missing after `timeout` [s]."""
+        first = self.first
+        if first is None or first.silence is None or first.silence.length <= timeout:
+            return False
+        missing = [name for name in first.missing if name not in first.failed]
+        self._node.warn_throttled(
+            'missing', f'batch {first.id}: no detections from {", ".join(missing)}, goes on'
+        )
+        first.failed.update(missing)
+        return True
+
+    def _problem(self, name: str, message: DetectionArray) -> str | None:
+        """Return why a whole message is refused, or None."""
+        if message.robot != name:
+            return f'robot: read {message.robot!r}, allowed on this topic is {name!r}'
+        if message.header.frame_id != self._node.settings.frame:
+            return (
+                f'header.frame_id: read {message.header.frame_id!r}, allowed is '
+                f'{self._node.settings.frame!r}'
+            )
+        if message.measurement > batch_id_limit(0):
+            return f'measurement: read {message.measurement}, allowed is up to {batch_id_limit(0)}'
+        pose = message.pose.pose
+        numbers = (
+            *(pose.position.x, pose.position.y, pose.position.z),
+            *(pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w),
+        )
+        if not all(math.isfinite(number) for number in numbers):
+            return f'pose: read {numbers}, allowed are finite numbers'
+        return None
+
+    def _stamp_problem(
+        self, name: str, message: DetectionArray, expected: PendingBatch | None
+    ) -> str | None:
+        """Return why the stamp of detections is refused, or None.
+
+        Parameters
+        ----------
+        name : str
+            Of the robot.
+        message : DetectionArray
+            From it.
+        expected : PendingBatch, optional
+            The batch that it answers.
+        """
+        stamp = stamp_from_ros(message.header.stamp)
+        last = self.heard[name][2] if name in self.heard else 0
+        if expected is not None:
+            # After one stamp from the future, later messages with valid stamps are not late.
+            earliest, latest = min(last, expected.stamp), expected.stamp + _STAMP_AHEAD
+        elif message.batch_id > self.last:
+            # Its batch may still arrive.
+            return None
+        else:
+            earliest, latest = last, max(self.last_stamp, last) + _STAMP_AHEAD
+        if earliest <= stamp <= latest:
+            return None
+        return (
+            f'header.stamp: read {stamp * 1e-9:.6f} s, allowed is {earliest * 1e-9:.6f} to '
+            f'{latest * 1e-9:.6f} s'
+        )
+
+    def _measurement(self, message: DetectionArray) -> AgentMeasurement | None:
+        name = message.robot
+        try:
+            measurement, problems = measurement_from_ros(
+                message, self._sensors[name], self._dimension
+            )
+        except ValueError as error:
+            self._node.drop('bad detections', f'{name}/detections.pose.{error}')
+            return None
+        for reason, texts in problems.items():
+            for text, number in texts.items():
+                self._node.drop(reason, f'{name}/detections.{text}', number)
+        return measurement
+
+    def _take(self, pending: PendingBatch, message: DetectionArray) -> None:
+        measurement = self._measurement(message)
+        if measurement is None:
+            pending.failed.add(message.robot)
+        else:
+            pending.measurements[message.robot] = measurement
+
+    def _late(self, name: str, message: DetectionArray) -> PendingBatch | None:
+        """Return a late measurement, or one that was not asked for, as a batch of its own."""
+        measurement = self._measurement(message)
+        if measurement is None:
+            return None
+        self._node.warn_throttled(
+            'late', f'{name}/detections: batch {message.batch_id} came late: a batch of its own'
+        )
+        return PendingBatch(
+            int(message.batch_id),
+            int(message.step),
+            stamp_from_ros(message.header.stamp),
+            [BatchMember(robot=name, measurement=message.measurement)],
+            {name: measurement},
+        )

@@ -1,0 +1,101 @@
+"""Exchange of found targets between filters of single robots (002, section 4)."""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+
+from rclpy.subscription import Subscription
+
+from maasi_filter.ros.conversions import found_target_from_ros, stamp_from_ros
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.qos import LATCHED_ALL
+from maasi_filter.search_filter import SearchFilter
+from maasi_msgs.msg import FoundTargetArray
+
+
+class SharedFoundTargets:
+    """Found targets that the filters of other robots publish.
+
+    Subscribes
+    ----------
+    `<robot>/found_targets` (maasi_msgs/FoundTargetArray) of robots with filters of their own
+
+    Parameters
+    ----------
+    node : LockstepLifecycleNode
+        The filter node.
+    """
+
+    def __init__(self, node: LockstepLifecycleNode[FilterNodeSettings]) -> None:
+        self._node = node
+        self._subscriptions: list[Subscription] = []
+        self._waiting: dict[str, deque[FoundTargetArray]] = {}
+        self.reset()
+
+    def __len__(self) -> int:
+        """Return the number of other filters."""
+        return len(self._waiting)
+
+    def reset(self) -> None:
+        """Discard what was received."""
+        self._waiting = {name: deque() for name in sorted(self._node.settings.share_with)}
+
+    def set_up(self) -> None:
+        """Subscribe."""
+        node = self._node
+        self._subscriptions = []
+        for name in self._waiting:
+            topic = node.team_topic(f'{name}/found_targets')
+            self._subscriptions.append(
+                node.create_subscription(
+                    FoundTargetArray, topic, partial(self._on_found, name), LATCHED_ALL
+                )
+            )
+            node.expect_publisher(topic)
+
+    def merge_into(self, search: SearchFilter, stamp: int) -> bool:
+        """Merge what was found before a batch; return whether anything changed.
+
+        Parameters
+        ----------
+        search : SearchFilter
+            The own filter.
+        stamp : int
+            Of the batch [ns].
+        """
+        for subscription in self._subscriptions:
+            # Lockstep only guarantees that the messages have arrived, not that they were read.
+            while (taken := subscription.handle.take_message(FoundTargetArray, False)) is not None:
+                subscription.callback(taken[0])
+        changed = False
+        for name, waiting in self._waiting.items():
+            last = None
+            while waiting and stamp_from_ros(waiting[0].header.stamp) < stamp:
+                last = waiting.popleft()
+            if last is None:
+                continue
+            # Targets that it received itself arrive from the filter that found them.
+            targets = [item for item in last.targets if item.robot == name]
+            dimension = self._node.settings.environment.dimension
+            try:
+                changed |= search.take_over(
+                    name, [found_target_from_ros(item, dimension) for item in targets]
+                )
+            except ValueError as error:
+                self._node.drop('bad found targets', f'{name}/found_targets: {error}')
+        return changed
+
+    def _on_found(self, name: str, message: FoundTargetArray) -> None:
+        node = self._node
+        if not node.active:
+            return
+        if message.header.frame_id != node.settings.frame:
+            node.drop(
+                'bad found targets',
+                f'{name}/found_targets.header.frame_id: read {message.header.frame_id!r}, allowed '
+                f'is {node.settings.frame!r}',
+            )
+            return
+        self._waiting[name].append(message)
