@@ -174,9 +174,9 @@ class Exploration:
     ----------
     bounds : (d, 2) array
         Lower and upper bound on each axis, metres; d = 2 or 3.
-    spacing : float
-        Wanted spacing of the nodes, metres. On each axis the largest spacing up to this one is
-        used that puts nodes on both bounds.
+    spacing : float, optional
+        Wanted spacing of the nodes, metres; none: `default_spacing`. On each axis the largest
+        spacing up to this one is used that puts nodes on both bounds.
 
     Attributes
     ----------
@@ -193,8 +193,10 @@ class Exploration:
         If the bounds or the spacing are not usable, or the grid would be too large.
     """
 
-    def __init__(self, bounds: ArrayLike, spacing: float) -> None:
+    def __init__(self, bounds: ArrayLike, spacing: float | None = None) -> None:
         self.bounds = check_bounds(bounds)
+        if spacing is None:
+            spacing = default_spacing(self.bounds)
         if not (math.isfinite(spacing) and spacing > 0.0):
             raise ValueError(f'spacing: got {spacing}, allowed are finite numbers above 0')
         self.spacing = float(spacing)

@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +81,9 @@ def _content() -> dict[str, Any]:
     return load_scenario(SCENARIO).model_dump(by_alias=True, exclude_unset=True)
 
 
-def prepared(condition: str, method: str, seed: int) -> Scenario:
+def prepared(
+    condition: str, method: str, seed: int, settings: dict[str, Any] | None = None
+) -> Scenario:
     """Return the scenario of one run, with no limit but the number of measurements."""
     content: dict[str, Any] = json.loads(json.dumps(_content()))
     content['planner'] = {**content['planner'], **PERSISTENT}
@@ -90,12 +92,13 @@ def prepared(condition: str, method: str, seed: int) -> Scenario:
     content['scoring'] = {**content.get('scoring', {}), 'radius': RADIUS}
     for change in CONDITIONS[condition]:
         change(content, seed)
+    content['filter'].update(settings or {})
     return Scenario.model_validate(content)
 
 
-def run_one(condition: str, method: str, seed: int) -> Run:
+def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | None = None) -> Run:
     """Run one search up to CAP measurements."""
-    scenario = prepared(condition, method, seed)
+    scenario = prepared(condition, method, seed, settings)
     result = search(scenario, seed, CAP)
     d = scenario.dimension
     found = np.array([target.position for target in result.found_targets]).reshape(-1, d)
@@ -183,10 +186,28 @@ def show(condition: str, method: str, row: dict[str, Any], gap: tuple[float, flo
     return text + f' | {row["step_ms"]:.1f} |'
 
 
+def runs_in(path: Path | None) -> dict[tuple[str, str], dict[int, Run]]:
+    """Return the runs of a file by condition and method, and by seed."""
+    kept: dict[tuple[str, str], dict[int, Run]] = {}
+    if path is not None and path.exists():
+        for line in path.read_text(encoding='utf-8').splitlines():
+            values = json.loads(line)
+            key = values.pop('condition'), values.pop('method')
+            kept.setdefault(key, {})[values['seed']] = Run(**values)
+    return kept
+
+
+def keep(path: Path | None, condition: str, method: str, run: Run) -> None:
+    """Add a run to a file, as a line of JSON."""
+    if path is not None:
+        with path.open('a', encoding='utf-8') as file:
+            file.write(json.dumps({'condition': condition, 'method': method, **asdict(run)}) + '\n')
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the searches and print the table."""
     parser = argparse.ArgumentParser(prog='quality', description=__doc__)
-    parser.add_argument('conditions', nargs='*', help='parts of their names; none: all of them')
+    parser.add_argument('conditions', nargs='*', help='names, or parts of names; none: all')
     parser.add_argument('--method', nargs='*', choices=METHODS, default=METHODS)
     parser.add_argument('--seeds', choices=sorted(SEEDS), default='development')
     parser.add_argument('--runs', type=int, default=20, metavar='N', help='first N of the block')
@@ -195,13 +216,18 @@ def main(arguments: list[str] | None = None) -> int:
         '--json',
         type=Path,
         metavar='FILE',
-        help='keep runs and table there; go on with those that are',
+        help='add each run there as a line; those that are there are not run again',
+    )
+    parser.add_argument(
+        '--filter', type=json.loads, metavar='JSON', help='settings of the filter, in all runs'
     )
     options = parser.parse_args(arguments)
     wanted = [
         name
         for name in CONDITIONS
-        if not options.conditions or any(part in name for part in options.conditions)
+        if not options.conditions
+        or name in options.conditions
+        or any(part in name for part in options.conditions if part not in CONDITIONS)
     ]
     if not wanted:
         parser.error(f'conditions: read {options.conditions}, known are {", ".join(CONDITIONS)}')
@@ -209,31 +235,24 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f'--runs: read {options.runs}, allowed is 1 to {len(SEEDS[options.seeds])}')
     seeds = SEEDS[options.seeds][: options.runs]
     warm_up()
-    kept: dict[str, Any] = {}
-    if options.json is not None and options.json.exists():
-        kept = json.loads(options.json.read_text(encoding='utf-8'))
+    kept = runs_in(options.json)
     print(HEAD, flush=True)
     begin = time.perf_counter()
     with ProcessPoolExecutor(max(options.jobs, 1)) as pool:
         for condition in wanted:
             done: dict[str, list[Run]] = {}
             for method in options.method:
-                key = f'{condition} | {method}'
-                there = {run['seed']: Run(**run) for run in kept.get(key, {}).get('runs', [])}
+                there = kept.setdefault((condition, method), {})
                 missing = [seed for seed in seeds if seed not in there]
-                count = len(missing)
-                new = pool.map(run_one, [condition] * count, [method] * count, missing)
-                there.update({run.seed: run for run in new})
-                runs = [there[seed] for seed in seeds]
-                done[method] = runs
+                one = partial(run_one, condition, method, settings=options.filter)
+                for run in pool.map(one, missing):
+                    there[run.seed] = run
+                    keep(options.json, condition, method, run)
+                done[method] = [there[seed] for seed in seeds]
                 gap = None
                 if method != 'ic_phd' and 'ic_phd' in done:
-                    gap = difference(runs, done['ic_phd'])
-                row = summary(runs)
-                kept[key] = {'runs': [asdict(run) for run in there.values()], 'table': row}
-                if options.json is not None:
-                    options.json.write_text(json.dumps(kept, indent=1) + '\n', encoding='utf-8')
-                print(show(condition, method, row, gap), flush=True)
+                    gap = difference(done[method], done['ic_phd'])
+                print(show(condition, method, summary(done[method]), gap), flush=True)
     print(f'{time.perf_counter() - begin:.0f} s', file=sys.stderr)
     return 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from typing import Any
@@ -97,6 +98,28 @@ def pairs(distance: float) -> Change:
     return change
 
 
+def offset(**values: float) -> Change:
+    """The filter estimates errors of the robots' positions that last."""
+
+    def change(content: Content, seed: int) -> None:
+        content['filter'].setdefault('pmb', {})['offset'] = values
+
+    return change
+
+
+def two_drones() -> Change:
+    """A second drone that starts in the opposite corner."""
+
+    def change(content: Content, seed: int) -> None:
+        drone = content['robots'].pop('drone')
+        content['robots'] = {
+            'drone1': drone,
+            'drone2': {**json.loads(json.dumps(drone)), 'start': [250.0, 250.0, 250.0]},
+        }
+
+    return change
+
+
 def filter_settings(**values: Any) -> Change:
     """Other settings of the filter."""
 
@@ -135,8 +158,21 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
     'pi 0.9 of believed': (DEGREES, simulated(probability_factor=0.9)),
     'positions off by 1 m': (DEGREES, odometry(position_noise=1.0)),
     'positions off by 3 m': (DEGREES, odometry(position_noise=3.0)),
-    'drift 0.08 m/sqrt(m)': (DEGREES, odometry(position_drift=0.08)),
-    'constant bias 1 m': (DEGREES, odometry(position_offset=1.0)),
+    **{
+        f'{robots}{errors}{", estimated" if estimated else ""}': (
+            DEGREES,
+            odometry(**change),
+            *((two_drones(),) if robots else ()),
+            *((offset(**told),) if estimated else ()),
+        )
+        for errors, change, told in (
+            ('drift 0.08 m/sqrt(m)', {'position_drift': 0.08}, {'drift': 0.08}),
+            # Of a length of 1 m, on each axis.
+            ('constant bias 1 m', {'position_offset': 1.0}, {'deviation': 0.577}),
+        )
+        for robots in ('', 'two drones, ')
+        for estimated in (False, True)
+    },
     'noise 1.5 of believed': (DEGREES, simulated(noise_factor=1.5)),
     'noise 0.67 of believed': (DEGREES, simulated(noise_factor=0.67)),
     '1 target': (DEGREES, targets(count=1)),

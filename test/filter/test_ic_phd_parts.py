@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from maasi_filter import ExponentialDetection, Pose, Sensor
+from maasi_filter.found_targets import FoundTargets
 from maasi_filter.ic_phd.births import (
     gaussian_births,
     measurement_births,
@@ -13,7 +14,7 @@ from maasi_filter.ic_phd.births import (
     uniform_births,
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
-from maasi_filter.ic_phd.found import FoundTargets, kept_measurements
+from maasi_filter.ic_phd.removal import kept_measurements
 from maasi_filter.ic_phd.resampling import jittered, resample
 from maasi_filter.records import FoundTarget
 

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.clutter import least_clutter
-from maasi_filter.exploration import Exploration, check_bounds, default_spacing
+from maasi_filter.dropped import count_dropped, count_unexplained, within_range
+from maasi_filter.exploration import Exploration
+from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
     MeasurementBirths,
     gaussian_births,
@@ -22,13 +24,7 @@ from maasi_filter.ic_phd.births import (
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import make_scan, phd_correct
-from maasi_filter.ic_phd.found import (
-    SAME_TARGET,
-    FoundTargets,
-    distance,
-    kept_measurements,
-    nearest_label,
-)
+from maasi_filter.ic_phd.removal import kept_measurements, nearest_label
 from maasi_filter.ic_phd.resampling import jittered, resample
 from maasi_filter.ic_phd.state import check
 from maasi_filter.measurement_check import CheckedMeasurement, check_measurements, check_taken
@@ -84,12 +80,10 @@ class IcPhdFilter:
         self.settings = settings
         self._settings = settings.resolved()
         self._numbers = IcPhdNumbers.of(self._settings)
-        self.bounds = check_bounds(bounds)
-        self.dimension = len(self.bounds)
+        self.exploration = Exploration(bounds, settings.exploration_spacing)
+        self.bounds = self.exploration.bounds
+        self.dimension = self.exploration.dimension
         self.generator = generator
-        self.exploration = Exploration(
-            self.bounds, settings.exploration_spacing or default_spacing(self.bounds)
-        )
         self.particles: FloatArray = np.empty((0, self.dimension))
         self.weights: FloatArray = np.empty(0)
         self.clusters: list[Cluster] = []
@@ -163,7 +157,9 @@ class IcPhdFilter:
         self.weights = self.weights * factor
         self._append(births.particles, (births.intensity / normaliser[:, None]).ravel())
         self.exploration.update(member.sensor.detection, member.pose)
-        self._count_unexplained(member, normaliser <= clutter, dropped)
+        unexplained = member.values[normaliser <= clutter]
+        centres = member.sensor.measurement.inverse(unexplained, member.pose)
+        count_unexplained(centres, self.bounds, dropped)
 
     def _births(
         self, member: CheckedMeasurement, before: Sequence[CheckedMeasurement]
@@ -275,9 +271,7 @@ class IcPhdFilter:
         self, member: CheckedMeasurement, dropped: dict[str, int]
     ) -> CheckedMeasurement:
         """Return a measurement without detections of found targets and beyond maximum range."""
-        reach = member.values[:, 0] <= member.sensor.maximum_range
-        _count(dropped, 'range', int((~reach).sum()))
-        member = member.only(reach)
+        member = within_range(member, dropped)
         centres = member.sensor.measurement.inverse(member.values, member.pose)
         keep = kept_measurements(
             centres,
@@ -285,17 +279,8 @@ class IcPhdFilter:
             self._numbers.removal_distance,
             self._numbers.removal == 'every',
         )
-        _count(dropped, 'found', int((~keep).sum()))
+        count_dropped(dropped, 'found', int((~keep).sum()))
         return member.only(keep)
-
-    def _count_unexplained(
-        self, member: CheckedMeasurement, unexplained: NDArray[np.bool_], dropped: dict[str, int]
-    ) -> None:
-        """Count detections that no particle and no birth explains, by reason."""
-        centres = member.sensor.measurement.inverse(member.values[unexplained], member.pose)
-        inside = ((centres >= self.bounds[:, 0]) & (centres <= self.bounds[:, 1])).all(axis=1)
-        _count(dropped, 'outside', int((~inside).sum()))
-        _count(dropped, 'unseen', int(inside.sum()))
 
     def _threads(self) -> ThreadPoolExecutor | None:
         threads = self.settings.threads or os.cpu_count() or 1
@@ -331,7 +316,7 @@ class IcPhdFilter:
         check_taken(robot, targets, self.dimension)
         added, changed = self._found.take_over(robot, targets)
         self._forget(added)
-        return changed
+        return bool(added or changed)
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets that were found before this filter was created; return the new ones.
@@ -407,8 +392,3 @@ def _nearest_member(
         apart.append(float(squares.min()) if len(squares) else math.inf)
     best = int(np.argmin(apart))
     return members[best] if math.isfinite(apart[best]) else members[-1]
-
-
-def _count(dropped: dict[str, int], reason: str, number: int) -> None:
-    if number:
-        dropped[reason] = dropped.get(reason, 0) + number

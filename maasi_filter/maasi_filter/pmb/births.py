@@ -10,9 +10,21 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.exploration import Exploration
-from maasi_filter.pmb.factors import LEAST_UNEXPLORED, MOST_PROBABLE, Scan
+from maasi_filter.pmb.density import Density
+from maasi_filter.pmb.factors import (
+    FIRST,
+    LEAST_UNEXPLORED,
+    MISS,
+    MOST_PROBABLE,
+    SCALE,
+    TERMS,
+    Scan,
+)
 
 FloatArray = NDArray[np.float64]
+
+# Fewest effective draws that stand for a density.
+LEAST_SUPPORT = 10.0
 
 
 @njit(cache=True, error_model='numpy')
@@ -114,3 +126,36 @@ def draw_births(
     spread = particles - means[:, None]
     covariances = np.einsum('mia,mib->mab', spread, spread) / number
     return Births(particles, volume, weights, means, covariances, intensity)
+
+
+def born(
+    scan: Scan, births: Births, wanted: NDArray[np.bool_], grid: FloatArray, frame: FloatArray
+) -> list[tuple[int, Density]]:
+    """Return the density e pi g_j of each detection that is wanted, by its number.
+
+    A detection near or beyond the bounds has few draws inside the environment, and none is made.
+
+    Parameters
+    ----------
+    grid : array
+        e before the scan; it is copied.
+    frame : (3, 3) array
+        As of a density.
+    """
+    total, squares = births.weights.sum(axis=1), np.square(births.weights).sum(axis=1)
+    wanted = wanted & (np.square(total) > LEAST_SUPPORT * squares)
+    if not wanted.any():
+        return []
+    grid = grid.copy()
+    head = scan.head.copy()
+    head[MISS], head[FIRST], head[TERMS] = 0.0, 0.0, 1.0
+    densities = []
+    for j in np.flatnonzero(wanted).tolist():
+        terms = scan.terms[j : j + 1].copy()
+        terms[0, SCALE] -= math.log(births.weights[j].mean())
+        weights = births.weights[j] / total[j]
+        density = Density(
+            births.particles[j].copy(), weights, head[None].copy(), terms, grid, frame
+        )
+        densities.append((j, density))
+    return densities

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.models.label import LabelTally
-from maasi_filter.pmb.births import Births
+from maasi_filter.pmb.births import LEAST_SUPPORT, Births
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import (
     LEAST_FACTOR,
@@ -25,9 +25,7 @@ IntArray = NDArray[np.int64]
 
 # Gate of a detection, in standard deviations and root mean square radii.
 GATE = 6.0
-# Fewest effective particles for a likelihood; below it, draws from the detection are used.
-LEAST_SUPPORT = 10.0
-# Largest squared normalised distance for such draws.
+# Largest squared normalised distance for draws from a detection with too few particles.
 SUPPORT_DISTANCE = 36.0
 SUPPORT_DRAWS = 100
 # Association probabilities and changes of the log density below these are neglected.
@@ -84,6 +82,8 @@ class Component:
         Position error of the robot that detected it last, metres.
     found_radius : float
         T_r of the sensor of that robot, metres.
+    robot : str
+        Robot whose detection it was born from; '' of a target of another filter.
     target : FoundTarget, optional
         The reported target, if it is found.
     labels : LabelTally
@@ -96,6 +96,7 @@ class Component:
     scan: int
     pose_error: float
     found_radius: float
+    robot: str = ''
     target: FoundTarget | None = None
     labels: LabelTally = field(default_factory=LabelTally)
 

@@ -14,7 +14,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.pmb.factors import (
+    CARTESIAN,
+    CENTRE,
     FIRST,
+    SENSOR,
     TERMS,
     gaussian_factor,
     log_products,
@@ -247,6 +250,15 @@ class Density:
     def replace_particles(self, particles: FloatArray) -> None:
         """Put others in place of the particles, with the same weights."""
         self.particles = particles
+        self._measure()
+
+    def shift(self, way: FloatArray) -> None:
+        """Move the whole density, factors included, by `way` (d,), metres."""
+        d = len(way)
+        self.particles = np.clip(self.particles + way, self.frame[0, :d], self.frame[1, :d])
+        self.heads[:, SENSOR : SENSOR + d] += way
+        cartesian = self.terms[:, CARTESIAN] > 0.5
+        self.terms[cartesian, CENTRE : CENTRE + d] += way
         self._measure()
 
     def condense(self) -> None:

@@ -2,7 +2,7 @@
 
 Undetected targets are a Poisson process of intensity (N0 / V) e(x); each detection that may
 originate from one of them creates a Bernoulli component (Williams 2015, TOMB/P). The equations are
-in `docs/filter_pmb.md`.
+in `docs/filter.md`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.clutter import measurement_space
-from maasi_filter.exploration import Exploration, check_bounds, default_spacing
+from maasi_filter.dropped import count_unexplained, within_range
+from maasi_filter.exploration import Exploration
+from maasi_filter.found_targets import FoundTargets
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
     check_measurements,
@@ -29,14 +31,16 @@ from maasi_filter.models.label import LabelTally
 from maasi_filter.models.measurement_set import prepare_measurements
 from maasi_filter.pmb import state as pmb_state
 from maasi_filter.pmb.association import associate
-from maasi_filter.pmb.births import Births, draw_births
+from maasi_filter.pmb.births import born, draw_births
 from maasi_filter.pmb.clutter import ClutterEstimate
-from maasi_filter.pmb.component import LEAST_SUPPORT, Component, merge
+from maasi_filter.pmb.component import Component, merge
 from maasi_filter.pmb.density import Density
-from maasi_filter.pmb.factors import FIRST, MISS, SCALE, TERMS, Scan, make_scan
-from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest, same_estimate
-from maasi_filter.pmb.identity import associate_by_identity, learn_labels
+from maasi_filter.pmb.factors import Scan, make_scan
+from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest
+from maasi_filter.pmb.identity import associate_by_identity, learn_labels, new_label
 from maasi_filter.pmb.noise_scale import NoiseScale, squared_innovation
+from maasi_filter.pmb.offset_state import offset_arrays, restore_offsets
+from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
@@ -93,16 +97,15 @@ class PmbFilter:
         self.settings = settings
         self._numbers = settings.resolved()
         self._expected_targets = self._numbers.expected_targets
-        self.bounds = check_bounds(bounds)
-        self.dimension = len(self.bounds)
+        self.exploration = Exploration(bounds, settings.exploration_spacing)
+        self.bounds = self.exploration.bounds
+        self.dimension = self.exploration.dimension
         self.generator = generator
-        self.exploration = Exploration(
-            self.bounds, settings.exploration_spacing or default_spacing(self.bounds)
-        )
         self.components: list[Component] = []
         self.clusters: list[Cluster] = []
         self._clutter = ClutterEstimate()
         self._noise = NoiseScale()
+        self._offsets = Offsets(self._numbers.pmb.offset, self.dimension)
         self._scans = 0
         self._last_id = 0
         self._last_time: float | None = None
@@ -182,12 +185,13 @@ class PmbFilter:
         time: float,
     ) -> bool:
         """Correct with one robot's scan; return whether what is found changed."""
-        member = self._within_range(member, dropped)
-        scan = self._scan(member)
-        self._scans += 1
+        member = within_range(member, dropped)
         space = measurement_space(member.sensor, self.bounds)
         # kappa: clutter per unit of measurement space.
         kappa = self._clutter.per_scan(member.robot, member.sensor.clutter * space) / space
+        member = self._localised(member, kappa)
+        scan = self._scan(member)
+        self._scans += 1
         # lambda_j = (N0 / V) int e pi g_j dx, by importance sampling from the detections.
         births = draw_births(
             scan,
@@ -207,8 +211,9 @@ class PmbFilter:
         marginals = associate(odds, other)
         learn_labels(member.labels, self.components, marginals.caused)
         self._learn_noise(member, marginals.caused)
-        self._count_unexplained(scan, births, odds, dropped)
-        changed = False
+        alone = (births.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
+        count_unexplained(scan.measurements.centres[alone], self.bounds, dropped)
+        changed = self._offsets.active and bool(self.own_found_targets())
         for i, (item, view) in enumerate(zip(self.components, views)):
             # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
             moved = item.update(
@@ -225,19 +230,31 @@ class PmbFilter:
                 changed |= self._report(item, moved)
         # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
         real = np.where(named, 0.0, births.intensity / (kappa + births.intensity))
-        self._bear(member, scan, births, marginals.new * real)
+        existence = marginals.new * real
+        likely, e = existence >= LEAST_EXISTENCE, self.exploration.kernel()[0]
+        error, radius = member.pose_error, self._found_radius(member)
+        for j, density in born(scan, births, likely, e, self._frame):
+            item = Component(
+                float(existence[j]), density, 1.0, self._scans, error, radius, member.robot
+            )
+            item.labels = new_label(member.labels, j, self.components)
+            self.components.append(item)
         self._clutter.count(member.robot, float((marginals.new * (1.0 - real)).sum()))
         # e <- e (1 - pi).
         self.exploration.update(scan.detection, member.pose)
         return changed
 
-    def _within_range(
-        self, member: CheckedMeasurement, dropped: dict[str, int]
-    ) -> CheckedMeasurement:
-        """Return a member without what is out of its sensor's range."""
-        reach = member.values[:, 0] <= member.sensor.maximum_range
-        _count(dropped, 'range', int((~reach).sum()))
-        return member.only(reach)
+    def _localised(self, member: CheckedMeasurement, kappa: float) -> CheckedMeasurement:
+        """Return a scan at the robot's estimated pose, and move found targets with their errors."""
+        if not self._offsets.active:
+            return member
+        self._offsets.keep({target.id for target in self.own_found_targets()})
+        density = self._expected_targets / self.exploration.volume
+        member = self._offsets.localise(member, self.components, kappa, density)
+        for item in self.components:
+            if item.target is not None and not item.foreign:
+                item.target = self._estimate(item.target, item)
+        return member
 
     def _learn_noise(self, member: CheckedMeasurement, caused: FloatArray) -> None:
         """Count the innovations of the detections that found targets caused."""
@@ -264,55 +281,14 @@ class PmbFilter:
         )
         return make_scan(prepared, member.pose, detection)
 
-    def _bear(
-        self, member: CheckedMeasurement, scan: Scan, births: Births, existence: FloatArray
-    ) -> None:
-        """Add a component for each detection that may originate from a new target."""
-        grid: FloatArray | None = None
-        # A detection near or beyond the bounds has few draws inside the environment.
-        total, squares = births.weights.sum(axis=1), np.square(births.weights).sum(axis=1)
-        supported = np.square(total) > LEAST_SUPPORT * squares
-        for j in np.flatnonzero(supported & (existence >= LEAST_EXISTENCE)).tolist():
-            if grid is None:
-                grid = self.exploration.kernel()[0].copy()
-            head = scan.head.copy()
-            head[MISS], head[FIRST], head[TERMS] = 0.0, 0.0, 1.0
-            terms = scan.terms[j : j + 1].copy()
-            terms[0, SCALE] -= math.log(births.weights[j].mean())
-            density = Density(
-                births.particles[j].copy(),
-                births.weights[j] / births.weights[j].sum(),
-                head[None],
-                terms,
-                grid,
-                self._frame,
-            )
-            self.components.append(
-                Component(
-                    float(existence[j]),
-                    density,
-                    1.0,
-                    self._scans,
-                    member.pose_error,
-                    self._found_radius(member),
-                    labels=self._new_label(member, j),
-                )
-            )
-
-    def _new_label(self, member: CheckedMeasurement, j: int) -> LabelTally:
-        """Return the label of a component born from detection j; an identity belongs to one."""
-        if not member.labels:
-            return LabelTally()
-        tally = LabelTally.of(member.labels[j])
-        if any(item.labels.identity == tally.identity for item in self.components):
-            tally.identity = ''
-        return tally
-
     def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
         """Mark a component as found."""
         d = self.dimension
         nowhere = np.zeros(d), np.zeros((d, d))
-        target = FoundTarget(self._next_id(), *nowhere, member.robot, member.index, time)
+        self._last_id += 1
+        target = FoundTarget(self._last_id, *nowhere, member.robot, member.index, time)
+        if self._offsets.active:
+            self._offsets.find(member.robot, target.id)
         item.target = self._estimate(target, item)
         return item.target
 
@@ -333,7 +309,7 @@ class PmbFilter:
 
     def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
         """Return a target with the moments of its particles and the position error of the robot."""
-        error = item.pose_error**2 * np.eye(self.dimension)
+        error = item.pose_error**2 * np.eye(self.dimension) + self._offsets.covariance_of(target.id)
         return replace(
             target,
             position=item.density.mean.copy(),
@@ -390,16 +366,6 @@ class PmbFilter:
         error = pose_error_of(member.sensor, self._numbers, self.dimension)
         return FOUND_RADIUS_DEVIATIONS * math.sqrt(member.sensor.covariance[0, 0] + error**2)
 
-    def _count_unexplained(
-        self, scan: Scan, births: Births, odds: FloatArray, dropped: dict[str, int]
-    ) -> None:
-        """Count detections that only clutter explains."""
-        alone = (births.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
-        centres = scan.measurements.centres[alone]
-        inside = ((centres >= self.bounds[:, 0]) & (centres <= self.bounds[:, 1])).all(axis=1)
-        _count(dropped, 'outside', int((~inside).sum()))
-        _count(dropped, 'unseen', int(inside.sum()))
-
     # Found targets of other filters.
 
     def own_found_targets(self) -> list[FoundTarget]:
@@ -425,32 +391,10 @@ class PmbFilter:
             If a number is not finite, or dimensions do not fit. The filter is then unchanged.
         """
         check_taken(robot, targets, self.dimension)
-        changed = False
-        for target in targets:
-            same = [
-                item
-                for item in self.components
-                if item.target is not None
-                and (item.target.robot, item.target.origin) == (robot, target.id)
-            ]
-            item = same[0] if same else nearest(target, self.components)
-            known = None if item is None else item.target
-            earlier = known is not None and (known.time, known.robot) <= (target.time, robot)
-            if earlier and not same:
-                continue
-            taken = replace(
-                target,
-                id=self._next_id() if known is None else known.id,
-                position=target.position.copy(),
-                covariance=target.covariance.copy(),
-                robot=robot,
-                origin=target.id,
-            )
-            if known is not None and same_estimate(taken, known):
-                continue
-            self._place(taken, item)
-            changed = True
-        return changed
+        found = FoundTargets(self.found_targets, self._last_id)
+        added, changed = found.take_over(robot, targets)
+        self._place(added + changed, found.last_id)
+        return bool(added or changed)
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets that were found before this filter was created; return the new ones.
@@ -462,41 +406,30 @@ class PmbFilter:
         targets : sequence of FoundTarget
             With finite positions and covariances of this dimension.
         """
-        found = [item for item in self.components if item.target is not None]
-        own = {item.target.id: item for item in found if item.target is not None}
-        kept = {target.id for target in targets}
-        since = [item for number, item in own.items() if number not in kept]
-        new: list[FoundTarget] = []
+        found = FoundTargets(self.found_targets, self._last_id)
+        added = found.keep(targets)
+        self._place(added, found.last_id)
+        return added
+
+    def _place(self, targets: Sequence[FoundTarget], last_id: int) -> None:
+        """Mark components, or new ones, as found targets."""
+        self._last_id = last_id
         for target in targets:
-            same_id = [own[target.id]] if target.id in own else []
-            if nearest(target, same_id or since) is not None:
-                continue
-            added = replace(target, id=self._next_id() if same_id else target.id)
-            self._last_id = max(self._last_id, added.id)
-            others = [item for item in self.components if item.target is None]
-            self._place(added, nearest(added, others))
-            new.append(added)
-        return new
-
-    def _place(self, target: FoundTarget, item: Component | None) -> None:
-        """Mark a component, or a new one, as a found target."""
-        density = Density.normal(
-            target.position,
-            target.covariance,
-            self._numbers.pmb.particles,
-            self._frame,
-            self.generator,
-        )
-        if item is None:
-            item = Component(CERTAIN, density, LEAST_HITS, -1, 0.0, math.inf)
-            self.components.append(item)
-        item.existence, item.density, item.target = CERTAIN, density, target
-        item.pose_error = 0.0
-        item.labels = LabelTally.of(target.label)
-
-    def _next_id(self) -> int:
-        self._last_id += 1
-        return self._last_id
+            same = [item for item in self.components if item.target and item.target.id == target.id]
+            item = same[0] if same else nearest(target, self.components)
+            density = Density.normal(
+                target.position,
+                target.covariance,
+                self._numbers.pmb.particles,
+                self._frame,
+                self.generator,
+            )
+            if item is None:
+                item = Component(CERTAIN, density, LEAST_HITS, -1, 0.0, math.inf)
+                self.components.append(item)
+            item.existence, item.density, item.target = CERTAIN, density, target
+            item.pose_error = 0.0
+            item.labels = LabelTally.of(target.label)
 
     # Saved state.
 
@@ -516,8 +449,9 @@ class PmbFilter:
             **cluster_arrays(self.clusters, self.dimension),
             'counters': np.array([self._scans, self._last_id]),
             'last_time': np.array(np.nan if self._last_time is None else self._last_time),
+            **offset_arrays(self._offsets),
             **pmb_state.to_arrays(
-                self.components, self._clutter, self._noise, (number, self.dimension), grid
+                self.components, (self._clutter, self._noise), (number, self.dimension), grid
             ),
         }
 
@@ -549,9 +483,5 @@ class PmbFilter:
         search.components = pmb_state.components_of(state, number, grid, search._frame)
         search.clusters = clusters_of(state)
         search._clutter, search._noise = pmb_state.learnt_of(state)
+        restore_offsets(search._offsets, state)
         return search
-
-
-def _count(dropped: dict[str, int], reason: str, number: int) -> None:
-    if number:
-        dropped[reason] = dropped.get(reason, 0) + number

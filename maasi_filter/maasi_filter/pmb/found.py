@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.found_targets import SAME_TARGET, distance
 from maasi_filter.pmb.component import Component
 from maasi_filter.records import FoundTarget
 
-# Gate on the squared normalised distance of two estimates of the same target.
-SAME_TARGET = 16.0
 # Least expected number of detections of a found target: one precise detection is not enough.
 LEAST_HITS = 1.5
 # Expected joint detections in a scan from which two components are different targets.
@@ -59,24 +58,11 @@ def is_known(i: int, components: Sequence[Component], caused: NDArray[np.float64
 
 
 def nearest(target: FoundTarget, components: Sequence[Component]) -> Component | None:
-    """Return the nearest component within the gate of a target, or None."""
+    """Return the nearest component that is not found within the gate of a target, or None."""
     best, least = None, SAME_TARGET
     for item in components:
-        position, covariance = item.density.mean, item.density.covariance
-        if item.target is not None:
-            position, covariance = item.target.position, item.target.covariance
-        offset = position - target.position
-        distance = float(offset @ np.linalg.solve(covariance + target.covariance, offset))
-        if distance < least:
-            best, least = item, distance
+        if item.target is None:
+            gap = distance(item.density.mean, item.density.covariance, target)
+            if gap < least:
+                best, least = item, gap
     return best
-
-
-def same_estimate(one: FoundTarget, other: FoundTarget) -> bool:
-    """Return whether two estimates are identical."""
-    return (
-        one.origin == other.origin
-        and one.robot == other.robot
-        and np.array_equal(one.position, other.position)
-        and np.array_equal(one.covariance, other.covariance)
-    )

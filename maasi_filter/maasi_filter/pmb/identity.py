@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.models.label import Label
+from maasi_filter.models.label import Label, LabelTally
 from maasi_filter.pmb.component import Component
 
 FloatArray = NDArray[np.float64]
@@ -75,3 +75,13 @@ def learn_labels(
             if caused[:, j].max() > LEAST_SHARE and not best.labels.identity:
                 best.labels.identity = label.identity
                 taken.add(label.identity)
+
+
+def new_label(labels: Sequence[Label], j: int, components: Sequence[Component]) -> LabelTally:
+    """Return the label of a component born from detection j; an identity belongs to one."""
+    if not labels:
+        return LabelTally()
+    tally = LabelTally.of(labels[j])
+    if any(item.labels.identity == tally.identity for item in components):
+        tally.identity = ''
+    return tally

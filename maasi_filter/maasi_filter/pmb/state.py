@@ -15,6 +15,7 @@ from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, HEAD, TERM, TERMS
 from maasi_filter.pmb.noise_scale import NoiseScale
+from maasi_filter.pmb.offset_state import OFFSET_ARRAYS
 from maasi_filter.records import FoundTarget
 from maasi_filter.state_check import (
     COMMON,
@@ -56,6 +57,7 @@ _ARRAYS: dict[str, tuple[str, str]] = {
     'clutter_counts': ('f', 'r'),
     'noise_detections': ('f', 'r'),
     'noise_squares': ('f', 'r'),
+    **OFFSET_ARRAYS,
 }
 _SIZES = {'HEAD': HEAD, 'TERM': TERM}
 _NOT_NEGATIVE = (
@@ -67,6 +69,7 @@ _NOT_NEGATIVE = (
     'clutter_counts',
     'noise_detections',
     'noise_squares',
+    'offset_ways',
 )
 # Arrays that may contain non-finite numbers: no step yet, unlimited radius.
 _UNDEFINED = ('last_time', 'found_radius', 'heads')
@@ -74,8 +77,7 @@ _UNDEFINED = ('last_time', 'found_radius', 'heads')
 
 def to_arrays(
     items: Sequence[Component],
-    clutter: ClutterEstimate,
-    noise: NoiseScale,
+    learnt: tuple[ClutterEstimate, NoiseScale],
     particles: tuple[int, int],
     grid: tuple[int, ...],
 ) -> dict[str, NDArray[Any]]:
@@ -89,6 +91,7 @@ def to_arrays(
         Shape of e's grid.
     """
     n, d = particles
+    clutter, noise = learnt
     densities = [item.density for item in items]
     grids: list[NDArray[Any]] = []
     numbers: dict[int, int] = {}
@@ -107,6 +110,7 @@ def to_arrays(
         'scan': np.array([item.scan for item in items], np.int64),
         'pose_error': np.array([item.pose_error for item in items], float),
         'found_radius': np.array([item.found_radius for item in items], float),
+        'birth_robots': text(json.dumps([item.robot for item in items])),
         'particles': np.array([item.particles for item in densities]).reshape(-1, n, d),
         'weights': np.array([item.weights for item in densities]).reshape(-1, n),
         'head_counts': np.array([len(item.heads) for item in densities], np.int64),
@@ -144,6 +148,7 @@ def components_of(
             f'{particles}'
         )
     targets = found_of(state)
+    births = names_of(state, 'birth_robots', len(targets))
     # Share one array between the components of one scan, as before saving.
     shared = list(grids)
     empty = np.empty((0, 0, 0))
@@ -169,6 +174,7 @@ def components_of(
                 int(state['scan'][c]),
                 float(state['pose_error'][c]),
                 float(state['found_radius'][c]),
+                births[c],
                 target if target.id else None,
                 labels[c],
             )

@@ -1,4 +1,4 @@
-"""Found targets: they remove their measurements from later corrections (000, section 3.3)."""
+"""Found targets of a filter, its own and those of other filters (002, section 4)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.measurement_check import CheckedMeasurement
-from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.records import FoundTarget
 
 FloatArray = NDArray[np.float64]
@@ -24,50 +22,6 @@ def distance(position: FloatArray, covariance: FloatArray, target: FoundTarget) 
     return float(offset @ np.linalg.solve(covariance + target.covariance, offset))
 
 
-def kept_measurements(
-    centres: FloatArray, targets: Sequence[FoundTarget], limit: float, every: bool
-) -> NDArray[np.bool_]:
-    """Return which of m detections remain after removing those of found targets.
-
-    Parameters
-    ----------
-    centres : (m, d) array
-        g^-1(z), metres.
-    limit : float
-        T_z, metres.
-    every : bool
-        Whether to remove all detections within T_z of a found target (003, algorithm 1), or only
-        the closest one to each (000, section 3.3; 001, algorithm 1).
-    """
-    keep = np.ones(len(centres), np.bool_)
-    for target in targets:
-        apart = np.sqrt(((centres - target.position) ** 2).sum(axis=1))
-        near = keep & (apart <= limit)
-        if every:
-            keep &= ~near
-        elif near.any():
-            keep[int(np.argmin(np.where(near, apart, np.inf)))] = False
-    return keep
-
-
-def nearest_label(
-    position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
-) -> Label:
-    """Return the label of the detection nearest to a position, within T_z = `limit` metres.
-
-    The PHD filter does not associate detections with targets.
-    """
-    best, least = UNLABELLED, limit
-    for member in members:
-        if not member.labels:
-            continue
-        centres = member.sensor.measurement.inverse(member.values, member.pose)
-        for label, apart in zip(member.labels, np.linalg.norm(centres - position, axis=1).tolist()):
-            if apart <= least:
-                best, least = label, apart
-    return best
-
-
 class FoundTargets:
     """Found targets of a filter: its own, and those of the filters of other robots.
 
@@ -75,36 +29,33 @@ class FoundTargets:
     ----------
     targets : list of FoundTarget
         In the order of being found.
+    last_id : int
+        Largest id given so far.
     """
 
-    def __init__(self, targets: Sequence[FoundTarget] = ()) -> None:
+    def __init__(self, targets: Sequence[FoundTarget] = (), last_id: int = 0) -> None:
         self.targets = list(targets)
+        self.last_id = max([last_id, *(target.id for target in targets)])
 
     def next_id(self) -> int:
         """Return the id of the next found target."""
-        return 1 + max((target.id for target in self.targets), default=0)
+        self.last_id += 1
+        return self.last_id
 
     def own(self) -> list[FoundTarget]:
         """Return the targets that this filter found itself."""
         return [target for target in self.targets if not target.origin]
 
-    def _nearest(self, target: FoundTarget) -> int:
-        """Return the index of the nearest found target within the gate, or -1."""
-        apart = [distance(target.position, target.covariance, known) for known in self.targets]
-        best = int(np.argmin(apart)) if apart else -1
-        return best if apart and apart[best] < SAME_TARGET else -1
-
-    def _is_older(self, f: int, time: float, robot: str) -> bool:
-        return (self.targets[f].time, self.targets[f].robot) <= (time, robot)
-
-    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> tuple[list, bool]:
-        """Merge targets found by another filter; return the new ones, and whether any changed.
+    def take_over(
+        self, robot: str, targets: Sequence[FoundTarget]
+    ) -> tuple[list[FoundTarget], list[FoundTarget]]:
+        """Merge targets found by another filter; return those that are new, and that changed.
 
         A target that two robots found belongs to the robot that found it first (ties: first by
         name), and follows the estimate of that robot (002, section 4).
         """
         added: list[FoundTarget] = []
-        changed = False
+        changed: list[FoundTarget] = []
         for target in targets:
             indices = {(item.robot, item.origin): f for f, item in enumerate(self.targets)}
             f = indices.get((robot, target.id), -1)
@@ -121,7 +72,7 @@ class FoundTargets:
                 continue
             else:
                 self.targets[f] = taken
-            changed = True
+                changed.append(taken)
         return added, changed
 
     def keep(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
@@ -139,9 +90,19 @@ class FoundTargets:
             if min(apart, default=np.inf) < SAME_TARGET:
                 continue
             added = replace(target, id=self.next_id() if target.id in own else target.id)
+            self.last_id = max(self.last_id, added.id)
             self.targets.append(added)
             new.append(added)
         return new
+
+    def _nearest(self, target: FoundTarget) -> int:
+        """Return the index of the nearest found target within the gate, or -1."""
+        apart = [distance(target.position, target.covariance, known) for known in self.targets]
+        best = int(np.argmin(apart)) if apart else -1
+        return best if apart and apart[best] < SAME_TARGET else -1
+
+    def _is_older(self, f: int, time: float, robot: str) -> bool:
+        return (self.targets[f].time, self.targets[f].robot) <= (time, robot)
 
 
 def _is_equal(one: FoundTarget, other: FoundTarget) -> bool:

@@ -1,0 +1,218 @@
+"""Errors of the robots' positions that last, a constant offset and drift, as a state.
+
+A robot reports q + b. The errors b of the robots, and for each found target the error a that its
+position inherited from the robot that found it, have one joint normal density: a equals b when the
+target is found; later b drifts with the robot's way. A detection of a found target by a robot
+measures b - a, as in simultaneous localisation and mapping (Smith, Self and Cheeseman 1990).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_filter.measurement_check import CheckedMeasurement
+from maasi_filter.models.pose import Pose
+from maasi_filter.pmb.association import associate
+from maasi_filter.pmb.component import Component
+from maasi_filter.pmb.factors import MOST_PROBABLE
+from maasi_filter.pmb.settings import OffsetSettings
+
+FloatArray = NDArray[np.float64]
+
+# Components below this r are not considered, nor associations below this probability.
+LEAST_EXISTENCE = 0.1
+LEAST_PROBABILITY = 0.5
+# Gate on the squared normalised innovation.
+GATE = 25.0
+# Differences of two errors below this deviation are not estimated, metres.
+LEAST_DIFFERENCE = 1e-3
+
+
+class Offsets:
+    """Joint normal density of the errors of robots and of found targets.
+
+    Attributes
+    ----------
+    keys : list
+        Names of robots, and ids of found targets.
+    mean, covariance : (n d,), (n d, n d) arrays
+        Metres.
+    last : dict
+        Reported position of each robot at its last scan, (3,), metres.
+    way : dict
+        Way of each robot on the level since its first scan, metres.
+    """
+
+    def __init__(self, settings: OffsetSettings, dimension: int) -> None:
+        self.settings = settings
+        self.dimension = dimension
+        self.keys: list[str | int] = []
+        self.mean: FloatArray = np.empty(0)
+        self.covariance: FloatArray = np.empty((0, 0))
+        self.last: dict[str, FloatArray] = {}
+        self.way: dict[str, float] = {}
+
+    @property
+    def active(self) -> bool:
+        """Whether the settings say that errors last."""
+        return self.settings.deviation > 0.0 or self.settings.drift > 0.0
+
+    def localise(
+        self,
+        member: CheckedMeasurement,
+        components: Sequence[Component],
+        clutter: float,
+        unseen: float,
+    ) -> CheckedMeasurement:
+        """Return a robot's scan at its estimated pose; the components are moved.
+
+        Parameters
+        ----------
+        components : sequence of Component
+            Potential and found targets.
+        clutter : float
+            kappa, per unit of measurement space.
+        unseen : float
+            N0 / V, per m^d: the largest intensity of undetected targets.
+        """
+        self._predict(member)
+        before = self.mean.copy()
+        lasting = self.settings.deviation**2 + self.settings.drift**2 * self.way[member.robot]
+        member = replace(
+            member,
+            pose=self._corrected(member),
+            pose_error=math.sqrt(max(member.pose_error**2 - lasting, 0.0)),
+        )
+        reported = member.pose
+        model = member.sensor.measurement
+        jacobians = model.jacobian(model.inverse(member.values, member.pose), member.pose)
+        other = clutter + unseen / np.maximum(np.abs(np.linalg.det(jacobians)), 1e-12)
+        self._update(member, components, other)
+        change = self.mean - before
+        for item in components:
+            # What is not found yet has the error of the robot that detected it.
+            key = item.robot if item.target is None else item.target.id
+            if key in self.keys:
+                item.density.shift(-change[self._part(key)])
+        position = reported.position.copy()
+        position[: self.dimension] -= change[self._part(member.robot)]
+        return replace(
+            member,
+            pose=Pose(position, reported.orientation),
+            pose_error=math.hypot(member.pose_error, self._deviation_from_others(member.robot)),
+        )
+
+    def find(self, robot: str, target: int) -> None:
+        """Let a target that a robot has just found inherit the robot's error."""
+        part = self._part(robot)
+        self._append(target, self.mean[part], self.covariance[part], self.covariance[part, part])
+
+    def keep(self, targets: set[int]) -> None:
+        """Marginalise found targets that are none of these."""
+        kept = [k for k, key in enumerate(self.keys) if isinstance(key, str) or key in targets]
+        if len(kept) < len(self.keys):
+            index = (self.dimension * np.array(kept)[:, None] + np.arange(self.dimension)).ravel()
+            self.mean = self.mean[index]
+            self.covariance = self.covariance[np.ix_(index, index)]
+            self.keys = [self.keys[k] for k in kept]
+
+    def covariance_of(self, target: int) -> FloatArray:
+        """Return the covariance of the error of a found target, (d, d); 0 of one of others."""
+        if target not in self.keys:
+            return np.zeros((self.dimension, self.dimension))
+        part = self._part(target)
+        return self.covariance[part, part]
+
+    def _predict(self, member: CheckedMeasurement) -> None:
+        """Add a robot that is new; let the error of another one drift with its way."""
+        robot, d, position = member.robot, self.dimension, member.pose.position
+        if robot not in self.keys:
+            own = self.settings.deviation**2 * np.eye(d)
+            self._append(robot, np.zeros(d), np.zeros((d, len(self.mean))), own)
+            self.last[robot], self.way[robot] = position, 0.0
+        step = position[:2] - self.last[robot][:2]
+        way = math.sqrt(float(step @ step))
+        self.last[robot] = position
+        self.way[robot] += way
+        # Heights do not drift: they are measured against the ground.
+        level = self._part(robot).start + np.arange(2)
+        self.covariance[level, level] += self.settings.drift**2 * way
+
+    def _corrected(self, member: CheckedMeasurement) -> Pose:
+        position = member.pose.position.copy()
+        position[: self.dimension] -= self.mean[self._part(member.robot)]
+        return Pose(position, member.pose.orientation)
+
+    def _update(
+        self, member: CheckedMeasurement, components: Sequence[Component], other: FloatArray
+    ) -> None:
+        """Kalman update with the detections that found targets most probably caused."""
+        d, m = self.dimension, len(member.values)
+        likely = [item for item in components if item.existence >= LEAST_EXISTENCE]
+        rows = [self._difference(member.robot, item) for item in likely]
+        apart = [row @ self.covariance @ row.T for row in rows]
+        if not m or max(map(np.trace, apart), default=0.0) < LEAST_DIFFERENCE**2:
+            return
+        means = np.array([item.density.mean for item in likely])
+        model, pose = member.sensor.measurement, member.pose
+        errors = model.residual(member.values[None], model.measure(means, pose)[:, None])
+        jacobians = model.jacobian(means, pose)
+        spread = np.array([item.density.covariance for item in likely]) + apart
+        spread[:, np.arange(d), np.arange(d)] += member.pose_error**2
+        totals = (jacobians @ spread @ jacobians.swapaxes(1, 2))[:, None] + member.covariances
+        solved = np.linalg.solve(totals, errors[..., None])[..., 0]
+        squares = (errors * solved).sum(axis=2)
+        # r L / (1 - r p_D) with a normal density and pi at its mean.
+        probability = np.minimum(member.sensor.detection.probability(means, pose), MOST_PROBABLE)
+        detected = probability * [item.existence for item in likely]
+        peaks = np.sqrt(np.linalg.det(2.0 * math.pi * totals))
+        odds = np.exp(-0.5 * squares) / peaks * (detected / (1.0 - detected))[:, None]
+        odds[squares > GATE] = 0.0
+        caused = associate(odds, other).caused
+        used = [
+            (i, j) for i, j in np.argwhere(caused > LEAST_PROBABILITY).tolist() if apart[i].any()
+        ]
+        if not used:
+            return
+        error = np.concatenate([errors[i, j] for i, j in used])
+        design = np.concatenate([jacobians[i] @ rows[i] for i, _ in used])
+        total = design @ self.covariance @ design.T
+        for k, (i, j) in enumerate(used):
+            total[k * d : k * d + d, k * d : k * d + d] = totals[i, j]
+        gain = np.linalg.solve(total, design @ self.covariance).T
+        self.mean = self.mean + gain @ error
+        covariance = self.covariance - gain @ design @ self.covariance
+        self.covariance = 0.5 * (covariance + covariance.T)
+
+    def _deviation_from_others(self, robot: str) -> float:
+        """Return the deviation of a robot's error from those of the other robots, per axis [m]."""
+        rows = [self._rows(robot, key) for key in self.last if key != robot]
+        variances = [np.trace(row @ self.covariance @ row.T) / self.dimension for row in rows]
+        return math.sqrt(float(np.mean(variances))) if variances else 0.0
+
+    def _difference(self, robot: str, item: Component) -> FloatArray:
+        """Return what takes the error of a component from that of a robot; 0 if it has none."""
+        if item.target is None or item.target.id not in self.keys:
+            return np.zeros((self.dimension, len(self.mean)))
+        return self._rows(robot, item.target.id)
+
+    def _rows(self, one: str | int, other: str | int) -> FloatArray:
+        """Return the (d, n d) matrix of one error minus another one."""
+        rows = np.zeros((self.dimension, len(self.mean)))
+        rows[:, self._part(one)] += np.eye(self.dimension)
+        rows[:, self._part(other)] -= np.eye(self.dimension)
+        return rows
+
+    def _part(self, key: str | int) -> slice:
+        first = self.dimension * self.keys.index(key)
+        return slice(first, first + self.dimension)
+
+    def _append(self, key: str | int, mean: FloatArray, cross: FloatArray, own: FloatArray) -> None:
+        self.keys.append(key)
+        self.mean = np.concatenate([self.mean, mean])
+        self.covariance = np.block([[self.covariance, cross.T], [cross, own]])
