@@ -66,6 +66,7 @@ class _Plan:
     exploration: Exploration | None = None
     decision: int = -1
     decided_at: int | None = None
+    waypoint: FloatArray = field(default_factory=lambda: np.zeros(3))
     # The same for the present waypoint.
     turning_distance: float = 0.0
     # Waypoint that was left for the next one, until its closest point, and its distance squared.
@@ -227,7 +228,7 @@ class Coordinator:
         """Return whether a robot on its way is near enough to its waypoint to turn to the next."""
         if robot.free or plan.staying or not plan.turning_distance:
             return False
-        left = plan.motion.squared_distance(robot.state.pose.position, plan.positions[-1])
+        left = plan.motion.squared_distance(robot.state.pose.position, plan.waypoint)
         return left < plan.turning_distance**2
 
     def plan(
@@ -287,12 +288,12 @@ class Coordinator:
         if robot.free:
             plan.measured_from = step
         else:
-            plan.passed = plan.positions[-1]
+            plan.passed = plan.waypoint
             plan.nearest = plan.motion.squared_distance(here, plan.passed)
         plan.decision += 1
         plan.decided_at = step
         plan.positions, plan.yaws = chosen.positions, chosen.yaws
-        plan.staying = chosen.stays
+        plan.staying, plan.waypoint = chosen.stays, chosen.waypoint
         # A waypoint within the radius already is gone to until it is reached.
         near = plan.motion.squared_distance(here, chosen.waypoint) <= plan.arrival_radius**2
         plan.turning_distance = 0.0 if near else plan.arrival_radius

@@ -1,7 +1,7 @@
 """
 Plays Nav2's `navigate_to_pose`, and prints a line for each goal and what becomes of it.
 
-As Nav2 does, it gives feedback all the time that it has a goal.
+As Nav2 does, it gives feedback all the time that it has a goal, and aborts it for a new one.
 
 A goal with x below 0.5 is reached, one below 1 goes on until it is cancelled, one below 1.5 is
 given up with an error, one beyond is refused.
@@ -25,16 +25,24 @@ def say(event, pose):
     print(json.dumps(line | {'turn': [turn.z, turn.w]}), flush=True)
 
 
+present = []
+
+
 def execute(handle):
     pose = handle.request.pose
+    present[:] = [handle]
     say('goal', pose)
     x = pose.pose.position.x
-    while 0.5 <= x < 1.0 and not handle.is_cancel_requested:
+    while 0.5 <= x < 1.0 and not handle.is_cancel_requested and present[0] is handle:
         handle.publish_feedback(NavigateToPose.Feedback())
         time.sleep(0.02)
     if handle.is_cancel_requested:
         handle.canceled()
         say('cancelled', pose)
+        return NavigateToPose.Result()
+    if present[0] is not handle:
+        handle.abort()
+        say('preempted', pose)
         return NavigateToPose.Result()
     if x < 0.5:
         handle.succeed()

@@ -1,6 +1,7 @@
 """Drivers and guard over real topics, against a robot and a team that the tests play."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rclpy.node import Node
 from robot_team import (
     NANOSECONDS,
+    STEP,
     TURTLEBOT,
     image_message,
     lockstep_step,
+    numbers,
     rendered,
     stamped,
 )
@@ -57,6 +60,48 @@ def test_a_waypoint_is_reached_and_held(play, kind):
         assert_array_equal(team.command, np.zeros(4))
     else:
         assert np.linalg.norm(team.body.robot_state().pose.position - goal) < 0.1
+
+
+@pytest.mark.parametrize('kind', ['turtlebot', 'mambo', 'ranging'])
+@pytest.mark.parametrize('lockstep', [False, True])
+def test_the_next_waypoint_replaces_one_without_a_stop(play, kind, lockstep):
+    _, team = play(kind, lockstep=lockstep)
+    go = team.move if not lockstep else partial(_lockstep_move, team)
+    size = 5.0 if kind == 'ranging' else 1.0
+    first = team.start.position + size * np.array([0.4, 0.34, 0.0])
+    second = first + size * np.array([0.4, 0.2, 0.0])
+    go()
+    _, replaced = team.send_accepted(first, number=1, step=team.step)
+    while np.linalg.norm(team.body.robot_state().pose.position - first) > 0.2 * size:
+        go()
+    commands = len(team.commands)
+    slowest = np.linalg.norm(team.body.robot_state().velocity)
+    _, result = team.send_accepted(second, number=2, step=team.step)
+    for _ in range(20):
+        go()
+        slowest = min(slowest, np.linalg.norm(team.body.robot_state().velocity))
+    assert team.state.goal_id == 2 and team.state.goal_status == AgentState.MOVING
+    sent = np.array([numbers(item) for item in team.commands[commands:]])
+    # Driven and flown on at the speed at which it was: the controller slows down near a waypoint.
+    assert np.linalg.norm(sent[:, :3], axis=1).min() > 0.09
+    assert slowest > 0.09
+    team.until(replaced.done)
+    assert replaced.result().status == GoalStatus.STATUS_ABORTED
+    assert replaced.result().result.reason == 'replaced'
+    assert not result.done()
+    # Nobody says anything more: it stops at its last waypoint.
+    for _ in range(400):
+        go()
+    assert team.state.goal_status == AgentState.REACHED
+    assert np.linalg.norm(team.body.robot_state().pose.position - second) < 0.1
+    assert np.linalg.norm(team.body.robot_state().velocity) < 0.02
+
+
+def _lockstep_move(team):
+    steps = len(team.states) + 1
+    lockstep_step(team, team.step + 1)
+    team.until_done(steps)
+    team.body.step(team.command, STEP)
 
 
 def test_the_state_is_the_odometry_placed_in_the_map(play):

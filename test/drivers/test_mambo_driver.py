@@ -134,6 +134,29 @@ def test_it_takes_off_goes_where_it_is_sent_and_lands(fly):
     assert flight.fake.refused == 0
 
 
+def test_the_next_waypoint_replaces_one_without_a_stop(fly, monkeypatch):
+    flight = fly().up()
+    shares = []
+    link = flight.driver.link._link
+    steer = link.steer
+    monkeypatch.setattr(link, 'steer', lambda *item: (shares.append(item), steer(*item)))
+    _, replaced = flight.team.send_accepted([1.0, 0.4, START[2]], number=1)
+    flight.until(lambda: flight.where[1] < 0.75)
+    shares.clear()
+    _, result = flight.team.send_accepted([1.0, -0.1, START[2]], number=2)
+    slowest = []
+    flight.until(lambda: slowest.append(flight.speed) or flight.where[1] < 0.3)
+    assert replaced.done() and replaced.result().result.reason == 'replaced'
+    # It is never made to hover in between.
+    assert len(shares) > 5 and (0.0, 0.0, 0.0, 0.0) not in [tuple(item) for item in shares]
+    assert min(slowest) > 0.1
+    # Nobody sends it further: it stops at its last waypoint.
+    flight.until(result.done)
+    assert result.result().result.reached
+    flight.until(lambda: flight.speed < 0.05)
+    assert_allclose(flight.where, [1.0, -0.1, START[2]], atol=0.15)
+
+
 def test_nothing_takes_off_without_arm(fly):
     flight = fly(mambo={'arm': False})
     flight.until(lambda: 'mambo.arm' in flight.reason)

@@ -199,6 +199,35 @@ def test_it_is_armed_flies_to_its_waypoint_and_lands_at_the_end(fly, firmware):
     assert flight.mode in ('LAND', 'SURFACE', 'AUTO.LAND')
 
 
+@pytest.mark.parametrize('firmware', ['arducopter', 'ardusub', 'px4'])
+def test_the_next_waypoint_replaces_one_without_a_stop(fly, firmware, monkeypatch):
+    flight = fly(firmware).fly()
+    height = flight.driver.settings.start[2]
+    _, replaced = flight.team.send_accepted([1.0, -3.0, height], number=1)
+    flight.until(lambda: flight.position[1] < -1.5)
+    leads = []
+    send_target = flight.driver.link._send_target
+
+    def noting(position, yaw):
+        here = flight.driver.history.latest.pose.position
+        leads.append(float(np.linalg.norm(position - here)))
+        send_target(position, yaw)
+
+    monkeypatch.setattr(flight.driver.link, '_send_target', noting)
+    _, result = flight.team.send_accepted([3.0, -5.0, height], number=2)
+    slowest = []
+    flight.until(lambda: slowest.append(flight.speed) or flight.position[0] > 2.0)
+    assert replaced.done() and replaced.result().result.reason == 'replaced'
+    # No set-point at its place, which would stop it; it flies on.
+    assert len(leads) > 10 and min(leads) > 0.5 * SPEED
+    assert min(slowest) > 0.4 * SPEED
+    # Nobody sends it further: it stops at its last waypoint.
+    flight.until(result.done)
+    assert result.result().result.reached
+    flight.until(lambda: flight.speed < STOPPED)
+    assert_allclose(flight.position, [3.0, -5.0, height], atol=0.35)
+
+
 def test_a_map_that_is_turned_against_north(fly):
     flight = fly(link={'map_yaw': 0.5}).fly()
     goal = [2.0, 0.5, 0.8]

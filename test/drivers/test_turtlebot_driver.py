@@ -282,20 +282,36 @@ def test_nav2_drives_to_the_waypoints(driven):
     result = send(team, [1.8, 0.8, 0.0]).get_result_async()
     team.until(lambda: stand(team) or result.done())
     assert 'Nav2 refuses' in result.result().result.reason
-    # On the way the commands are Nav2's; replaced, and cancelled, it is told so.
+    # On the way the commands are Nav2's. A new goal preempts; cancelled, it is told so.
     replaced = send(team, [0.7, 0.8, 0.0]).get_result_async()
     heard(team, said, 'goal')
     since = team.step
     team.until(lambda: stand(team) or team.state.step > since + 10)
     assert all(stamp_from_ros(item.header.stamp) <= since * NANOSECONDS for item in team.commands)
+    since = team.step
     handle = send(team, [0.9, 0.8, 0.0])
-    assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.7)
+    lines = []
+    while not lines or lines[-1]['event'] != 'preempted':
+        team.until(lambda: stand(team) or not said.empty())
+        lines.append(said.get())
+    # Its own stop of the goal before would be one of the robot.
+    assert sorted(line['event'] for line in lines) == ['goal', 'preempted']
+    assert lines[-1]['position'][0] == pytest.approx(0.7)
     team.until(lambda: stand(team) or replaced.done())
+    assert replaced.result().result.reason == 'replaced'
+    team.until(lambda: stand(team) or team.state.step > since + 10)
+    assert all(stamp_from_ros(item.header.stamp) <= since * NANOSECONDS for item in team.commands)
     result, cancelled = handle.get_result_async(), handle.cancel_goal_async()
     assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.9)
     team.until(lambda: stand(team) or (cancelled.done() and result.done()))
     assert result.result().status == GoalStatus.STATUS_CANCELED
     assert_array_equal(team.command, np.zeros(4))
+    # Refused by Nav2 on the way: it stops.
+    send(team, [0.7, 0.8, 0.0])
+    heard(team, said, 'goal')
+    result = send(team, [1.8, 0.8, 0.0]).get_result_async()
+    assert heard(team, said, 'cancelled')['position'][0] == pytest.approx(0.7)
+    assert 'Nav2 refuses' in reason_of_abort(team, result)
     # A pose that hangs while the odometry's velocity says that it should not.
     result = send(team, [0.7, 0.8, 0.0]).get_result_async()
     heard(team, said, 'goal')

@@ -24,8 +24,9 @@ class GoalServer:
     """
     Takes goals of `go_to` (maasi_msgs/GoToWaypoint).
 
-    The newest goal replaces the one before. One that cannot be taken is aborted at once, with the
-    reason in its result: the protocol has no reason in a rejection.
+    The newest goal replaces the one before, and the robot turns to it without a stop. One that
+    cannot be taken is aborted at once, with the reason in its result: the protocol has no reason
+    in a rejection.
 
     Parameters
     ----------
@@ -144,9 +145,10 @@ class GoalServer:
             self.finish(goal)
             return
         replaced = self._driver.follower.take(goal)
+        # Before the end of the other: the link must not stop the robot in between.
+        self._link.goal_taken(goal)
         if replaced is not None:
             self.finish(replaced)
-        self._link.goal_taken(goal)
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         goal = self._driver.follower.current

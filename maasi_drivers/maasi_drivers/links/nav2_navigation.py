@@ -61,6 +61,8 @@ class Nav2Navigation:
         self._client = ActionClient(node, NavigateToPose, 'navigate_to_pose')
         self._goal: Goal | None = None
         self._handle: Any = None
+        # Of the goal before, until Nav2 has taken the present one instead.
+        self._replaced: Any = None
 
     @property
     def available(self) -> bool:
@@ -84,7 +86,12 @@ class Nav2Navigation:
         return None
 
     def go(self, goal: Goal, heading: float) -> None:
-        """Send the robot to a waypoint, to face `heading` there [rad]; the goal before is over."""
+        """
+        Send the robot to a waypoint, to face `heading` there [rad].
+
+        Nav2 replaces the goal before, without a stop.
+        """
+        self._replaced = self._handle or self._replaced
         self._goal, self._handle = goal, None
         self._silence.end()
         pose = PoseStamped()
@@ -101,13 +108,18 @@ class Nav2Navigation:
     def _answered(self, goal: Goal, handle: Any) -> None:
         self._silence.end()
         if handle is None or not handle.accepted:
+            if goal is self._goal:
+                self._stop_replaced()
             self._ended(goal, False, 'Nav2 refuses the waypoint')
             return
-        if goal is not self._goal:
+        if goal is self._goal:
+            self._handle, self._replaced = handle, None
+        elif self._goal is None:
             # Given up before Nav2 had answered.
             handle.cancel_goal_async()
             return
-        self._handle = handle
+        elif self._handle is None:
+            self._replaced = handle
         result = handle.get_result_async()
         result.add_done_callback(lambda answer: self._finished(goal, answer.result()))
 
@@ -134,5 +146,12 @@ class Nav2Navigation:
         if goal is not self._goal:
             return
         handle, self._goal, self._handle = self._handle, None, None
+        self._stop_replaced()
+        if handle is not None:
+            handle.cancel_goal_async()
+
+    def _stop_replaced(self) -> None:
+        """Cancel the goal before, where Nav2 has not taken another one instead."""
+        handle, self._replaced = self._replaced, None
         if handle is not None:
             handle.cancel_goal_async()

@@ -59,6 +59,13 @@ class _Sent:
     status: int | None = None
     reason: str = ''
     ended_at: float = math.inf
+    # The goal that it replaces, which the robot keeps if it refuses this one.
+    before: _Sent | None = None
+
+    def cancel(self) -> None:
+        """Cancel it, if it has been accepted and has not ended."""
+        if self.handle is not None and self.status is None:
+            self.handle.cancel_goal_async()
 
 
 class TeamGoals:
@@ -94,14 +101,16 @@ class TeamGoals:
             name: ActionClient(node, GoToWaypoint, topic) for name, topic in topics.items()
         }
         self._sent: dict[str, _Sent] = {}
-        # Cancelled goals, with wall time.
-        self._cancelled: dict[str, tuple[int, float]] = {}
+        # Numbers of goals that were cancelled last, with wall time.
+        self._cancelled: dict[str, tuple[set[int], float]] = {}
         #: Goals that have not been answered: robot and number.
         self.waiting: set[tuple[str, int]] = set()
 
     def send(self, name: str, goal: GoToWaypoint.Goal) -> None:
-        """Send a goal to a robot."""
-        sent = _Sent(int(goal.goal_id))
+        """Send a goal to a robot; it replaces the one that the robot has."""
+        sent = _Sent(int(goal.goal_id), before=self._sent.get(name))
+        if sent.before is not None:
+            sent.before.before = None
         self._sent[name] = sent
         self.waiting.add((name, sent.number))
         future = self.clients[name].send_goal_async(goal)
@@ -112,9 +121,10 @@ class TeamGoals:
         sent = self._sent.pop(name, None)
         if sent is None:
             return
-        self._cancelled[name] = (sent.number, time.monotonic())
-        if sent.handle is not None and sent.status is None:
-            sent.handle.cancel_goal_async()
+        goals = [sent] if sent.before is None else [sent, sent.before]
+        self._cancelled[name] = ({goal.number for goal in goals}, time.monotonic())
+        for goal in goals:
+            goal.cancel()
 
     def forget(self, name: str) -> None:
         """Discard the goal of a robot without cancelling it."""
@@ -129,7 +139,7 @@ class TeamGoals:
         if self._lockstep:
             if same:
                 return Course.ENDED if heard.status in ENDED else Course.UNDER_WAY
-            return Course.REPLACED if heard.status == AgentState.MOVING else Course.LOST
+            return self._other(name, sent, heard)
         if sent.accepted_at is None:
             return Course.UNDER_WAY
         if sent.status == GoalStatus.STATUS_ABORTED and sent.reason == REPLACED:
@@ -140,7 +150,7 @@ class TeamGoals:
             return Course.ENDED
         if sent.status == GoalStatus.STATUS_ABORTED and not same:
             # Apparently refused: it was never the goal of the robot.
-            return Course.REPLACED if heard.status == AgentState.MOVING and after else Course.LOST
+            return self._other(name, sent, heard, after)
         if sent.status is not None:
             if heard.status == AgentState.MOVING:
                 # A state from before the end, or with a goal of another client.
@@ -148,7 +158,19 @@ class TeamGoals:
             return Course.ENDED
         if same or time.monotonic() - sent.accepted_at < _PATIENCE:
             return Course.UNDER_WAY
-        return Course.REPLACED if heard.status == AgentState.MOVING else Course.LOST
+        return self._other(name, sent, heard)
+
+    def _other(self, name: str, sent: _Sent, heard: HeardState, after: bool = True) -> Course:
+        """Return the progress of a goal that a robot does not have, if heard after its answer."""
+        if heard.status != AgentState.MOVING:
+            return Course.LOST
+        before = sent.before
+        if before is not None and heard.goal == before.number:
+            # It has refused this one, and goes on to the one before.
+            self._cancelled[name] = ({before.number}, time.monotonic())
+            before.cancel()
+            return Course.LOST
+        return Course.REPLACED if after else Course.LOST
 
     @staticmethod
     def driven(heard: HeardState) -> bool:
@@ -157,8 +179,8 @@ class TeamGoals:
 
     def ends(self, name: str, heard: HeardState) -> bool:
         """Return whether a robot is still moving to a goal that has just been cancelled."""
-        number, at = self._cancelled.get(name, (-1, -math.inf))
-        return heard.goal == number and time.monotonic() - at < _PATIENCE
+        numbers, at = self._cancelled.get(name, (set(), -math.inf))
+        return heard.goal in numbers and time.monotonic() - at < _PATIENCE
 
     def _answered(self, name: str, sent: _Sent, future: Any) -> None:
         self.waiting.discard((name, sent.number))
