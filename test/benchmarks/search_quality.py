@@ -245,12 +245,13 @@ def main(arguments: list[str] | None = None) -> int:
                 with options.json.open('a', encoding='utf-8') as file:
                     file.write(json.dumps(asdict(run)) + '\n')
     ordered = sorted(runs.values(), key=lambda run: run.seed)
-    text = table(ordered)
+    block = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer for slow planners).'
+    text = f'{block}\n\n{table(ordered)}'
     print(text)
     if options.document is not None:
         write(options.document, text)
     print(
-        f'{len(missing)} runs in {time.perf_counter() - begin:.0f} s, processor time of all '
+        f'{len(missing)} runs in {time.perf_counter() - begin:.0f} s, wall time of all '
         f'{sum(run.took for run in ordered):.0f} s',
         file=sys.stderr,
     )

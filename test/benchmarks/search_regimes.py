@@ -112,8 +112,8 @@ REGIMES: dict[str, Regime] = {
 }
 
 KINDS: dict[str, Kind] = {
-    'lawnmower': Kind({'name': 'lawnmower'}, runs=32, stops=True),
-    'nearest_widest': Kind({'name': 'nearest_widest'}, stops=True),
+    'lawnmower': Kind({'name': 'lawnmower'}, runs=16, stops=True),
+    'nearest_widest': Kind({'name': 'nearest_widest'}, runs=32, stops=True),
     'mutual_information': Kind({'name': 'mutual_information'}, 16, stops=True, neighbours=True),
     'paper': Kind({'name': 'maasi', **PAPER}, stops=True),
     'before': Kind({'name': 'maasi'}, stops=True),
