@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_planner.buildings.axis_problem import solve_axis
+from maasi_planner.buildings.search_tree import Tree, copy_node, free, pop, push
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -85,149 +86,6 @@ class Instance(NamedTuple):
     obstacles: FloatArray
     between: bool
     brakes: bool
-
-
-class Tree(NamedTuple):
-    """Nodes of the search, best bound first; room for so many, used again and again.
-
-    Attributes
-    ----------
-    bound, reward : (n,) arrays
-        Lower bound of the objective, and the reward of the visits made.
-    cost : (n, 3) array
-        Of each axis.
-    dirty : (n,) array
-        Bit mask of the axes that have to be solved anew.
-    closed : (n,) array of bool
-        Whether no further visits are made.
-    visits, number : (n, V) and (n,) arrays
-        The visits made.
-    low, high : (n, 3, T + 2) arrays
-        Bounds of the positions P_0 to P_T and, last, of the way to brake [m].
-    values : (n, 3, m) array
-        Of the rows.
-    heap, spare : (n,) arrays
-        Nodes by bound, and nodes that are free.
-    counts : (6,) array
-        Sizes of `heap` and `spare`, nodes solved, the best node (-1: none), ways out, axes solved.
-    best : (1,) array
-        Objective of the best node.
-    scratch : (3, m) array
-        Bounds of an axis while it is solved.
-    active, multipliers, factor, work : arrays
-        Room for `solve_axis`.
-    """
-
-    bound: FloatArray
-    reward: FloatArray
-    cost: FloatArray
-    dirty: IntArray
-    closed: BoolArray
-    visits: IntArray
-    number: IntArray
-    low: FloatArray
-    high: FloatArray
-    values: FloatArray
-    heap: IntArray
-    spare: IntArray
-    counts: IntArray
-    best: FloatArray
-    scratch: FloatArray
-    active: IntArray
-    multipliers: FloatArray
-    factor: FloatArray
-    work: FloatArray
-
-
-def make_tree(size: int, horizon: int, rows: int) -> Tree:
-    """Return room for `size` nodes."""
-    room = horizon + 1
-    return Tree(
-        bound=np.empty(size),
-        reward=np.empty(size),
-        cost=np.empty((size, 3)),
-        dirty=np.empty(size, dtype=np.int64),
-        closed=np.empty(size, dtype=np.bool_),
-        visits=np.empty((size, 2 * horizon), dtype=np.int64),
-        number=np.empty(size, dtype=np.int64),
-        low=np.empty((size, 3, horizon + 2)),
-        high=np.empty((size, 3, horizon + 2)),
-        values=np.empty((size, 3, rows)),
-        heap=np.empty(size, dtype=np.int64),
-        spare=np.empty(size, dtype=np.int64),
-        counts=np.zeros(6, dtype=np.int64),
-        best=np.full(1, np.inf),
-        scratch=np.empty((3, rows)),
-        active=np.empty(room, dtype=np.int64),
-        multipliers=np.empty(room),
-        factor=np.empty((room, room)),
-        work=np.empty((2, room)),
-    )
-
-
-@njit(cache=True)
-def _push(tree: Tree, node: int) -> None:
-    place = tree.counts[0]
-    tree.counts[0] += 1
-    while place > 0:
-        parent = (place - 1) // 2
-        if tree.bound[tree.heap[parent]] <= tree.bound[node]:
-            break
-        tree.heap[place] = tree.heap[parent]
-        place = parent
-    tree.heap[place] = node
-
-
-@njit(cache=True)
-def _pop(tree: Tree) -> int:
-    top = tree.heap[0]
-    tree.counts[0] -= 1
-    size = tree.counts[0]
-    if size:
-        node = tree.heap[size]
-        place = 0
-        while True:
-            child = 2 * place + 1
-            if child >= size:
-                break
-            if child + 1 < size and tree.bound[tree.heap[child + 1]] < tree.bound[tree.heap[child]]:
-                child += 1
-            if tree.bound[tree.heap[child]] >= tree.bound[node]:
-                break
-            tree.heap[place] = tree.heap[child]
-            place = child
-        tree.heap[place] = node
-    return top
-
-
-@njit(cache=True)
-def _free(tree: Tree, node: int) -> None:
-    tree.spare[tree.counts[1]] = node
-    tree.counts[1] += 1
-
-
-@njit(cache=True)
-def _copy(tree: Tree, source: int, size: int) -> int:
-    """Return a copy of a node whose bounds can be tightened; -1: there is no room."""
-    if tree.counts[1] == 0:
-        tree.counts[4] = 1
-        return -1
-    tree.counts[1] -= 1
-    node = tree.spare[tree.counts[1]]
-    tree.reward[node] = tree.reward[source]
-    tree.closed[node] = tree.closed[source]
-    tree.number[node] = tree.number[source]
-    tree.dirty[node] = tree.dirty[source]
-    for i in range(tree.number[source]):
-        tree.visits[node, i] = tree.visits[source, i]
-    for a in range(3):
-        tree.cost[node, a] = tree.cost[source, a]
-        for k in range(size):
-            tree.low[node, a, k] = tree.low[source, a, k]
-            tree.high[node, a, k] = tree.high[source, a, k]
-        for i in range(tree.values.shape[2]):
-            tree.values[node, a, i] = tree.values[source, a, i]
-    return node
 
 
 @njit(cache=True)
@@ -354,7 +212,7 @@ def _branch_on_faces(
                     continue
                 if side == 1 and given < face - GIVEN_TOLERANCE:
                     continue
-            child = _copy(tree, node, horizon + 2)
+            child = copy_node(tree, node, horizon + 2)
             if child < 0:
                 return
             tree.closed[child] = closed
@@ -366,7 +224,7 @@ def _branch_on_faces(
                     tree.low[child, a, i] = max(tree.low[child, a, i], face)
             tree.dirty[child] = 1 << a
             tree.bound[child] = total - tree.reward[child] - _ahead(instance, tree, child, first)
-            _push(tree, child)
+            push(tree, child)
 
 
 @njit(cache=True)
@@ -389,14 +247,14 @@ def begin(instance: Instance, tree: Tree, first: float, hint: IntArray) -> None:
     tree.high[0] = math.inf
     tree.cost[0] = 0.0
     if hint.shape[0]:
-        child = _copy(tree, 0, horizon + 2)
+        child = copy_node(tree, 0, horizon + 2)
         tree.closed[child] = True
         for i in range(hint.shape[0]):
             _visit(instance, tree, child, hint[i])
         # Before all others: its objective prunes.
         tree.bound[child] = -math.inf
-        _push(tree, child)
-    _push(tree, 0)
+        push(tree, child)
+    push(tree, 0)
 
 
 @njit(cache=True)
@@ -444,12 +302,12 @@ def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
                 break
         if not meets:
             continue
-        child = _copy(tree, node, instance.horizon + 2)
+        child = copy_node(tree, node, instance.horizon + 2)
         if child < 0:
             return
         _visit(instance, tree, child, q)
         tree.bound[child] = bound
-        _push(tree, child)
+        push(tree, child)
 
 
 @njit(cache=True)
@@ -470,12 +328,12 @@ def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
             return FULL
         if solved >= most:
             return UNFINISHED
-        node = _pop(tree)
+        node = pop(tree)
         if tree.bound[node] >= tree.best[0] - GAP:
             # All others are no better.
-            _free(tree, node)
+            free(tree, node)
             while tree.counts[0] > 0:
-                _free(tree, tree.heap[tree.counts[0] - 1])
+                free(tree, tree.heap[tree.counts[0] - 1])
                 tree.counts[0] -= 1
             break
         if tree.dirty[node]:
@@ -483,13 +341,13 @@ def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
             tree.counts[2] += 1
             gain = tree.reward[node] + _ahead(instance, tree, node, first)
             if not _solve(instance, tree, node, tree.best[0] + gain - GAP):
-                _free(tree, node)
+                free(tree, node)
                 continue
             bound = tree.cost[node, 0] + tree.cost[node, 1] + tree.cost[node, 2] - gain
             early = tree.bound[node] == -math.inf
             tree.bound[node] = bound
             if not early and tree.counts[0] > 0 and bound > tree.bound[tree.heap[0]]:
-                _push(tree, node)
+                push(tree, node)
                 continue
         total = tree.cost[node, 0] + tree.cost[node, 1] + tree.cost[node, 2]
         number = tree.number[node]
@@ -500,7 +358,7 @@ def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
         k, o = _obstructed(instance, tree, node, 2, until)
         if k >= 0:
             _branch_on_faces(instance, tree, node, k, o, tree.closed[node], first)
-            _free(tree, node)
+            free(tree, node)
             continue
         own = total - tree.reward[node]
         better = own < tree.best[0] - GAP
@@ -513,11 +371,11 @@ def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
             _extend(instance, tree, node, total)
         if better:
             if tree.counts[3] >= 0:
-                _free(tree, tree.counts[3])
+                free(tree, tree.counts[3])
             tree.counts[3] = node
             tree.best[0] = own
         else:
-            _free(tree, node)
+            free(tree, node)
     if tree.counts[4]:
         return FULL
     return FOUND if tree.counts[3] >= 0 else EXHAUSTED

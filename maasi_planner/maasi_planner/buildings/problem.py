@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from maasi_planner.buildings import branch_and_bound as bb
 from maasi_planner.buildings.axis_problem import SCALE, AxisRows, axis_rows
 from maasi_planner.buildings.dynamics import Dynamics
+from maasi_planner.buildings.search_tree import make_tree
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -196,7 +197,7 @@ class PlanSolver:
             rows is self._homing: np.ascontiguousarray(np.stack([rows.gram] * 3))
             for rows in (self._search, self._homing)
         }
-        self._tree = bb.make_tree(_ROOM, horizon, len(self._search.matrix))
+        self._tree = make_tree(_ROOM, horizon, len(self._search.matrix))
         # Distances of braking relative to those of air resistance alone.
         ways = np.zeros((2, 3, self._braking_steps))
         for axis in range(3):

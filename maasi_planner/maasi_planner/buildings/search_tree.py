@@ -1,0 +1,159 @@
+"""Nodes of the branch and bound search, best bound first, in arrays of fixed size."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+class Tree(NamedTuple):
+    """Nodes of the search, best bound first; room for so many, used again and again.
+
+    Attributes
+    ----------
+    bound, reward : (n,) arrays
+        Lower bound of the objective, and the reward of the visits made.
+    cost : (n, 3) array
+        Of each axis.
+    dirty : (n,) array
+        Bit mask of the axes that have to be solved anew.
+    closed : (n,) array of bool
+        Whether no further visits are made.
+    visits, number : (n, V) and (n,) arrays
+        The visits made.
+    low, high : (n, 3, T + 2) arrays
+        Bounds of the positions P_0 to P_T and, last, of the way to brake [m].
+    values : (n, 3, m) array
+        Of the rows.
+    heap, spare : (n,) arrays
+        Nodes by bound, and nodes that are free.
+    counts : (6,) array
+        Sizes of `heap` and `spare`, nodes solved, the best node (-1: none), ways out, axes solved.
+    best : (1,) array
+        Objective of the best node.
+    scratch : (3, m) array
+        Bounds of an axis while it is solved.
+    active, multipliers, factor, work : arrays
+        Room for `solve_axis`.
+    """
+
+    bound: FloatArray
+    reward: FloatArray
+    cost: FloatArray
+    dirty: IntArray
+    closed: BoolArray
+    visits: IntArray
+    number: IntArray
+    low: FloatArray
+    high: FloatArray
+    values: FloatArray
+    heap: IntArray
+    spare: IntArray
+    counts: IntArray
+    best: FloatArray
+    scratch: FloatArray
+    active: IntArray
+    multipliers: FloatArray
+    factor: FloatArray
+    work: FloatArray
+
+
+def make_tree(size: int, horizon: int, rows: int) -> Tree:
+    """Return room for `size` nodes."""
+    room = horizon + 1
+    return Tree(
+        bound=np.empty(size),
+        reward=np.empty(size),
+        cost=np.empty((size, 3)),
+        dirty=np.empty(size, dtype=np.int64),
+        closed=np.empty(size, dtype=np.bool_),
+        visits=np.empty((size, 2 * horizon), dtype=np.int64),
+        number=np.empty(size, dtype=np.int64),
+        low=np.empty((size, 3, horizon + 2)),
+        high=np.empty((size, 3, horizon + 2)),
+        values=np.empty((size, 3, rows)),
+        heap=np.empty(size, dtype=np.int64),
+        spare=np.empty(size, dtype=np.int64),
+        counts=np.zeros(6, dtype=np.int64),
+        best=np.full(1, np.inf),
+        scratch=np.empty((3, rows)),
+        active=np.empty(room, dtype=np.int64),
+        multipliers=np.empty(room),
+        factor=np.empty((room, room)),
+        work=np.empty((2, room)),
+    )
+
+
+@njit(cache=True)
+def push(tree: Tree, node: int) -> None:
+    """Put a node into the heap of bounds."""
+    place = tree.counts[0]
+    tree.counts[0] += 1
+    while place > 0:
+        parent = (place - 1) // 2
+        if tree.bound[tree.heap[parent]] <= tree.bound[node]:
+            break
+        tree.heap[place] = tree.heap[parent]
+        place = parent
+    tree.heap[place] = node
+
+
+@njit(cache=True)
+def pop(tree: Tree) -> int:
+    """Remove and return the node of the lowest bound."""
+    top = tree.heap[0]
+    tree.counts[0] -= 1
+    size = tree.counts[0]
+    if size:
+        node = tree.heap[size]
+        place = 0
+        while True:
+            child = 2 * place + 1
+            if child >= size:
+                break
+            if child + 1 < size and tree.bound[tree.heap[child + 1]] < tree.bound[tree.heap[child]]:
+                child += 1
+            if tree.bound[tree.heap[child]] >= tree.bound[node]:
+                break
+            tree.heap[place] = tree.heap[child]
+            place = child
+        tree.heap[place] = node
+    return top
+
+
+@njit(cache=True)
+def free(tree: Tree, node: int) -> None:
+    """Make the room of a node free."""
+    tree.spare[tree.counts[1]] = node
+    tree.counts[1] += 1
+
+
+@njit(cache=True)
+def copy_node(tree: Tree, source: int, size: int) -> int:
+    """Return a copy of a node whose bounds can be tightened; -1: there is no room."""
+    if tree.counts[1] == 0:
+        tree.counts[4] = 1
+        return -1
+    tree.counts[1] -= 1
+    node = tree.spare[tree.counts[1]]
+    tree.reward[node] = tree.reward[source]
+    tree.closed[node] = tree.closed[source]
+    tree.number[node] = tree.number[source]
+    tree.dirty[node] = tree.dirty[source]
+    for i in range(tree.number[source]):
+        tree.visits[node, i] = tree.visits[source, i]
+    for a in range(3):
+        tree.cost[node, a] = tree.cost[source, a]
+        for k in range(size):
+            tree.low[node, a, k] = tree.low[source, a, k]
+            tree.high[node, a, k] = tree.high[source, a, k]
+        for i in range(tree.values.shape[2]):
+            tree.values[node, a, i] = tree.values[source, a, i]
+    return node
