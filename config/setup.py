@@ -11,6 +11,7 @@ setup(
         ('share/maasi_config', ['package.xml']),
         ('share/maasi_config/robots', glob('robots/*.yaml')),
         ('share/maasi_config/scenarios', glob('scenarios/*.yaml')),
+        ('share/maasi_config/foxglove', glob('foxglove/*.json')),
         ('share/maasi_config/rviz', glob('rviz/*.rviz')),
     ],
     install_requires=['setuptools'],

@@ -50,13 +50,13 @@ def draw_mission(
         Predicted positions of each robot, (T + 1, 3) [m].
     """
     for box in mission.objects:
-        _draw_box(axes, box, _OBJECT, 0.35, 'object')
+        draw_box(axes, box, _OBJECT, 0.35, 'object')
     for box in mission.obstacles:
-        _draw_box(axes, box, _OBSTACLE, 0.6, 'obstacle')
+        draw_box(axes, box, _OBSTACLE, 0.6, 'obstacle')
     seen = set(visited)
     for number, box in enumerate(mission.boxes):
         done = number in seen
-        _draw_box(
+        draw_box(
             axes,
             box,
             _VISITED if done else _OPEN,
@@ -98,7 +98,8 @@ def legend(axes: Any, columns: int = 4) -> None:
     )
 
 
-def _draw_box(axes: Any, box: FloatArray, colour: str, alpha: float, label: str) -> None:
+def draw_box(axes: Any, box: FloatArray, colour: str, alpha: float, label: str) -> None:
+    """Draw a box (3, 2) [m] on 3D axes."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     corners = np.array([[x, y, z] for x in box[0] for y in box[1] for z in box[2]])

@@ -1,0 +1,267 @@
+"""Renders the events of a run as a video, without a browser."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Ellipse
+from numpy.typing import NDArray
+
+from maasi_sim.buildings.picture import colours_of, draw_box
+from maasi_sim.run.run_folder import write_whole
+from maasi_sim.view.event_log import Event, EventLog
+
+FloatArray = NDArray[np.float64]
+
+# Pictures per second, and size [in] at a resolution [px/in].
+RATE = 10
+_SIZE, _RESOLUTION = (9.6, 7.2), 80
+_FOUND, _POTENTIAL, _SEEN, _OPEN, _VISITED = '#009E73', '#E69F00', '#CC79A7', '#D55E00', '#56B4E9'
+# The last picture is shown for so long [s].
+_HOLD = 2.0
+# Detections are shown for so long [s].
+_FADE = 1.0
+
+
+class Moments:
+    """What holds at a time: the last event of each kind and owner."""
+
+    def __init__(self, log: EventLog) -> None:
+        self.log = log
+        self._times: dict[tuple[str, str], list[float]] = {}
+        self._events: dict[tuple[str, str], list[Event]] = {}
+        for event in sorted(log.events, key=lambda item: float(item[0])):
+            key = event[1], event[2]
+            self._times.setdefault(key, []).append(event[0])
+            self._events.setdefault(key, []).append(event)
+
+    def until(self, kind: str, owner: str, time: float) -> list[Event]:
+        """Return the events of a kind and owner at or before a time."""
+        key = kind, owner
+        return self._events.get(key, [])[: bisect.bisect_right(self._times.get(key, []), time)]
+
+    def now(self, kind: str, time: float) -> Iterator[Event]:
+        """Yield the event of each owner that holds at a time."""
+        for known, owner in sorted(self._times):
+            if known == kind:
+                events = self.until(kind, owner, time)
+                if events:
+                    yield events[-1]
+
+    def found(self, time: float) -> int:
+        """Return how many targets or cuboids were found by a time."""
+        if 'cuboids' in self.log.scene:
+            return len(self.visited(time))
+        return sum(len(event[3]) for event in self.now('found', time))
+
+    def visited(self, time: float) -> set[int]:
+        """Return the cuboids visited by a time."""
+        owners = {owner for kind, owner in self._times if kind == 'cuboid'}
+        return {
+            shot[0]
+            for owner in owners
+            for event in self.until('cuboid', owner, time)
+            for shot in event[8]
+        }
+
+
+def write_video(log: EventLog, path: Path, speed: float = 5.0) -> None:
+    """Write a run as FILE.mp4 or FILE.gif.
+
+    Parameters
+    ----------
+    log : EventLog
+        Of the run.
+    path : Path
+        Of the video.
+    speed : float
+        Time of the run over that of the video.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; nothing of it is left.
+    """
+    pictures = _pictures(log, speed)
+    write = _write_gif if path.suffix == '.gif' else _write_mp4
+    # The kind of a file is known by the end of its name, which stays.
+    write_whole(path, lambda part: write(part, pictures))
+
+
+def _write_mp4(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
+    import cv2
+
+    first = next(pictures)
+    height, width = first.shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'mp4v'), RATE, (width, height))
+    try:
+        if not writer.isOpened():
+            raise OSError(f'{path}: cannot be written as a video')
+        writer.write(np.ascontiguousarray(first[:, :, ::-1]))
+        for picture in pictures:
+            writer.write(np.ascontiguousarray(picture[:, :, ::-1]))
+    finally:
+        writer.release()
+
+
+def _write_gif(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
+    from PIL import Image
+
+    frames = [Image.fromarray(item).quantize(64, Image.Quantize.MEDIANCUT) for item in pictures]
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=1000 // RATE, loop=0, optimize=True
+    )
+
+
+def _pictures(log: EventLog, speed: float) -> Iterator[NDArray[np.uint8]]:
+    """Yield pictures of the run, (height, width, 3)."""
+    moments = Moments(log)
+    figure = Figure(figsize=_SIZE, dpi=_RESOLUTION, layout='constrained')
+    canvas = FigureCanvasAgg(figure)
+    count = max(1, math.ceil(log.duration / speed * RATE)) + 1
+    picture = np.zeros((1, 1, 3), np.uint8)
+    for index in range(count):
+        time = min(index * speed / RATE, log.duration)
+        figure.clear()
+        _draw(figure, moments, time)
+        canvas.draw()
+        picture = np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+        yield picture
+    for _ in range(round(_HOLD * RATE)):
+        yield picture
+
+
+def _draw(figure: Figure, moments: Moments, time: float) -> None:
+    scene = moments.log.scene
+    bounds = np.array(scene.get('bounds') or _extent(moments.log))
+    spatial = len(bounds) == 3
+    axes: Any = figure.add_subplot(projection='3d' if spatial else None)
+    axes.set_xlim(*bounds[0])
+    axes.set_ylim(*bounds[1])
+    axes.set_xlabel('x [m]')
+    axes.set_ylabel('y [m]')
+    if spatial:
+        axes.set_zlim(*bounds[2])
+        axes.set_zlabel('z [m]')
+        axes.set_box_aspect(bounds[:, 1] - bounds[:, 0])
+        _draw_boxes(axes, moments, time)
+    else:
+        axes.set_aspect('equal')
+        _draw_floor(axes, moments, time)
+    _draw_targets(axes, moments, time, spatial)
+    _draw_robots(axes, moments, time, spatial)
+    total = len(scene['cuboids']) if 'cuboids' in scene else scene.get('targets')
+    of = f' of {total}' if total else ''
+    word = 'visited' if 'cuboids' in scene else 'found'
+    axes.set_title(f'{scene.get("name", "")}   {time:.1f} s   {word} {moments.found(time)}{of}')
+
+
+def _extent(log: EventLog) -> list[list[float]]:
+    places = [event[3][:2] for event in log.events if event[1] == 'robot'] or [[0, 0], [1, 1]]
+    low, high = np.min(places, axis=0) - 1.0, np.max(places, axis=0) + 1.0
+    return np.stack([low, high], axis=1).tolist()
+
+
+def _draw_floor(axes: Any, moments: Moments, time: float) -> None:
+    for event in moments.now('map', time):
+        (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
+        values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
+        extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
+        axes.imshow(values, origin='lower', extent=extent, cmap='Greys', vmin=0, vmax=24)
+        break
+    for obstacle in moments.log.scene.get('obstacles', []):
+        axes.add_patch(Circle(obstacle[:2], obstacle[-1], color='#59636e'))
+
+
+def _draw_boxes(axes: Any, moments: Moments, time: float) -> None:
+    scene = moments.log.scene
+    visited = moments.visited(time)
+    for box in scene.get('objects', []):
+        draw_box(axes, np.array(box), '#B9B9C9', 0.35, '')
+    for box in scene.get('blocks', []):
+        draw_box(axes, np.array(box), '#8A8478', 0.6, '')
+    for number, box in enumerate(scene.get('cuboids', [])):
+        done = number in visited
+        colour = _VISITED if done else _OPEN
+        draw_box(axes, np.array(box), colour, 0.12 if done else 0.35, '')
+
+
+def _draw_targets(axes: Any, moments: Moments, time: float, spatial: bool) -> None:
+    size = 3 if spatial else 2
+    for event in moments.now('truth', time):
+        axes.plot(*np.array(event[3]).reshape(-1, 3)[:, :size].T, 'x', color='0.2', ms=6)
+    for event in moments.now('filter', time):
+        for x, y, z, mass, *covariance in event[4]:
+            _mark(axes, (x, y, z)[:size], covariance, 2.0, _POTENTIAL, min(0.3 + mass, 1.0))
+    for event in moments.now('found', time):
+        for number, x, y, z, covariance, *_ in event[3]:
+            _mark(axes, (x, y, z)[:size], covariance, 3.0, _FOUND, 1.0)
+            axes.text(*(x, y, z)[:size], f'  {number}', fontsize=8)
+    for name in moments.log.scene.get('robots', {}):
+        for when, *_, place, detections in reversed(moments.until('seen', name, time)):
+            if when < time - _FADE:
+                break
+            for reach, bearing, elevation, *_ in detections:
+                level = reach * math.cos(elevation)
+                spot = np.add(
+                    place,
+                    (
+                        level * math.cos(bearing),
+                        level * math.sin(bearing),
+                        reach * math.sin(elevation),
+                    ),
+                )
+                axes.plot(*spot[:size, None], '+', color=_SEEN, ms=6)
+
+
+def _mark(
+    axes: Any,
+    place: tuple[float, ...],
+    covariance: list[float],
+    deviations: float,
+    colour: str,
+    alpha: float,
+) -> None:
+    """Draw a place; in the plane with the ellipse of its covariance."""
+    axes.plot(*np.array(place)[:, None], 'o', color=colour, ms=4, alpha=alpha)
+    if len(place) == 3:
+        return
+    xx, xy, _, yy, *_ = covariance
+    values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
+    widths = 2.0 * deviations * np.sqrt(np.maximum(values, 0.0))
+    angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+    axes.add_patch(
+        Ellipse(
+            (place[0], place[1]),
+            widths[1],
+            widths[0],
+            angle=angle,
+            fill=False,
+            color=colour,
+            alpha=alpha,
+        )
+    )
+
+
+def _draw_robots(axes: Any, moments: Moments, time: float, spatial: bool) -> None:
+    size = 3 if spatial else 2
+    now = {event[2]: event for event in moments.now('robot', time)}
+    for name, colour in colours_of(now).items():
+        path = np.array([event[3][:size] for event in moments.until('robot', name, time)])
+        axes.plot(*path.T, '-', color=colour, lw=1.3)
+        ways = moments.until('way', name, time)
+        if ways and ways[-1][3]:
+            axes.plot(*np.array(ways[-1][3])[:, :size].T, '--', color=colour, lw=1.3)
+        *place, yaw = now[name][3]
+        marker: Any = 'D' if spatial else (3, 0, math.degrees(yaw) - 90.0)
+        axes.plot(
+            *np.array(place)[:size, None], marker=marker, color=colour, ms=8 if spatial else 13
+        )
+        axes.text(*place[:size], f'   {name}', fontsize=9, weight='bold')

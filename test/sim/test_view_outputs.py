@@ -1,0 +1,102 @@
+"""What is made of a run beside the page: videos, and a layout for Foxglove."""
+
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from maasi_sim.missions import load_mission
+from maasi_sim.run.bag import load_types
+from maasi_sim.scenario.loading import config_folder
+from maasi_sim.search import search
+from maasi_sim.view.event_log import EventLog
+from maasi_sim.view.scene import scene_of
+from maasi_sim.view.video import write_video
+from maasi_sim.view.view_run import main
+
+
+@pytest.fixture(scope='module')
+def log():
+    return search(load_mission('ranging_drone_3d').scenario, 1).trace.log('drone')
+
+
+def planar():
+    """Return a run in the plane with one of each kind of events."""
+    scene = scene_of('plane', load_mission('mambo_turtlebot_obstacles').scenario)
+    unit = [0.01, 0.0, 0.0, 0.02, 0.0, 0.0]
+    events = [
+        [0.0, 'map', '', [0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2, 2, 1], '0949'],
+        [0.0, 'truth', '', [[1.0, 1.0, 0.0]]],
+        [0.0, 'robot', 'mambo', [0.0, 0.0, 1.0, 0.0], 1.0, 1, ''],
+        [0.0, 'way', 'mambo', [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]],
+        [0.5, 'seen', 'mambo', [0.0, 0.0, 1.0], [[1.0, 0.5, 0.0, 0.1, 0.1, 0.0]]],
+        [0.5, 'filter', '', 3.0, [[1.0, 1.0, 0.0, 0.5, *unit]], 1],
+        [1.0, 'found', '', [[1, 1.0, 1.0, 0.0, unit, 'mambo', 1.0]]],
+        [2.0, 'robot', 'mambo', [2.0, 2.0, 1.0, 0.5], 1.0, 1, ''],
+    ]
+    return EventLog(scene, events)
+
+
+def frames(path):
+    video = cv2.VideoCapture(str(path))
+    pictures = []
+    while True:
+        read, picture = video.read()
+        if not read:
+            return pictures
+        pictures.append(picture)
+
+
+@pytest.mark.parametrize('suffix', ['.mp4', '.gif'])
+def test_a_video_shows_the_run_move(tmp_path, suffix):
+    path = tmp_path / f'run{suffix}'
+    write_video(planar(), path, speed=5.0)
+    pictures = frames(path)
+    assert len(pictures) >= 2
+    assert pictures[0].std() > 5.0
+    assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 100
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_video_of_a_search_in_space(log, tmp_path):
+    write_video(log, tmp_path / 'run.mp4', speed=1e3)
+    assert frames(tmp_path / 'run.mp4')[0].shape == (576, 768, 3)
+
+
+def test_a_video_of_another_kind_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), '--video', 'run.avi'])
+    assert 'allowed are FILE.mp4 and FILE.gif' in capsys.readouterr().err
+
+
+def layout():
+    return json.loads((config_folder() / 'foxglove' / 'search.json').read_text())
+
+
+def test_foxglove_shows_each_panel_once():
+    content = layout()
+    names = re.findall(r'"(\w+!\w+)"', json.dumps(content['layout']))
+    assert sorted(names) == sorted(content['configById'])
+
+
+def test_the_paths_of_foxglove_are_fields_of_our_messages():
+    types = {'/filter_update': 'FilterUpdate', '/decisions': 'PlanDecision'}
+    store = load_types()
+    panels = layout()['configById']
+    paths = [item['value'] for item in panels['Plot!found']['paths']]
+    paths.append(panels['RawMessages!decisions']['topicPath'].removesuffix('[:]'))
+    for path in paths:
+        topic, _, field = path.partition('.')
+        fields = store.fielddefs[f'maasi_msgs/msg/{types[topic]}'][1]
+        assert field in [name for name, _ in fields], path
+
+
+def test_the_topics_of_foxglove_are_those_of_rviz():
+    from maasi_sim.run.rviz_view import shown_topics
+
+    folder = config_folder() / 'rviz'
+    known = {topic for path in folder.glob('*.rviz') for topic in shown_topics(path)}
+    shown = set(layout()['configById']['3D!search']['topics'])
+    assert shown - {'/search_area'} <= known
