@@ -316,6 +316,8 @@ def search(
     planner : function, optional
         Returns the planner of each group instead of the scenario's, from its settings and a
         function that returns the true targets that are not found yet, (n, 3) [m].
+    view : bool
+        Whether to show the search in a browser while it goes on.
 
     Raises
     ------

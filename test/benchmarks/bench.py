@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-AREAS = ('filter', 'planner', 'cuboid', 'drivers', 'system')
+AREAS = ('filter', 'planner', 'cuboid', 'drivers', 'system', 'view')
 
 
 def load(area: str) -> ModuleType:

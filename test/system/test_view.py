@@ -2,11 +2,14 @@
 
 import subprocess
 
+import numpy as np
 import pytest
 from browsers import CHROMIUM, chromium, needs_chromium
 from scenario_runs import PATIENCE, Run, command, of_topic
 
+from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.view.bag_events import read_events
+from maasi_sim.view.messages import is_shown
 from maasi_sim.view.page_file import REPLAY
 from maasi_sim.view.view_run import main
 
@@ -223,3 +226,24 @@ def test_a_recording_that_is_none_is_refused(tmp_path, capsys):
 def test_a_page_is_made_of_a_bag(run, tmp_path, capsys):
     assert main([str(run.bag), '--no-open', '--out', str(tmp_path / 'page.html')]) == 0
     assert (tmp_path / 'page.html').read_text() == (run.folder / REPLAY).read_text()
+
+
+def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
+    types = load_types()
+    writer = BagWriter(tmp_path / 'bag', types)
+    with Bag(run.bag) as bag:
+        kept = {topic: kind for topic, kind in bag.types.items() if is_shown(topic, kind)}
+        for topic, kind in kept.items():
+            writer.add_topic(topic, kind)
+        for topic, _, time, data in bag.raw(kept):
+            writer.write(topic, time, data)
+    writer.close()
+    log = read_events(tmp_path)
+    whole = read_events(run.folder)
+    # The exploration function is in single precision.
+    assert np.allclose(log.scene['bounds'], whole.scene['bounds'], atol=1e-3)
+    kinds = ('robot', 'plan', 'found', 'filter', 'truth')
+    for kind in kinds:
+        assert sum(event[1] == kind for event in log.events) == sum(
+            event[1] == kind for event in whole.events
+        )

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from maasi_sim.run.run_folder import write_text
-from maasi_sim.view.event_log import EventLog
+from maasi_sim.view.event_log import LARGEST, EventLog
 
 FOLDER = Path(__file__).with_name('page')
 REPLAY = 'replay.html'
@@ -36,20 +36,20 @@ def empty_page() -> str:
     return _with('RUN', _page(), '')
 
 
-def replay_page(log: EventLog) -> str:
-    """Return the page with a run inside."""
-    return _with('RUN', _page(), log.packed())
+def replay_page(log: EventLog, largest: int = LARGEST) -> str:
+    """Return the page with a run inside, thinned to a size [characters]."""
+    return _with('RUN', _page(), log.packed(largest))
 
 
-def write_replay(log: EventLog, path: Path) -> None:
-    """Write the page with a run inside.
+def write_replay(log: EventLog, path: Path, largest: int = LARGEST) -> None:
+    """Write the page with a run inside, thinned to a size [characters].
 
     Raises
     ------
     ResultsError
         If it cannot be written; nothing of it is left.
     """
-    write_text(path, replay_page(log))
+    write_text(path, replay_page(log, largest))
 
 
 @cache

@@ -1,0 +1,185 @@
+"""The page: what browsers cost a run in lockstep, when it is usable, and how fast it seeks."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maasi_sim.missions import load_mission
+from maasi_sim.view.event_log import Event, EventLog
+from maasi_sim.view.page_file import write_replay
+from maasi_sim.view.scene import scene_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from browsers import CHROMIUM, chromium
+
+# Of a run [s], and runs of each kind, of which the fastest counts: others share the machine.
+SECONDS, RUNS = 40.0, 2
+EVENTS, SEEKS = 100_000, 60
+
+
+def row(name: str, value: float, unit: str) -> dict[str, Any]:
+    """Return one result; there is nothing to compare it with."""
+    return {'name': name, 'value': value, 'unit': unit, 'baseline': None, 'ratio': None}
+
+
+def demo(folder: Path, watch: Callable[[str], Any] | None) -> float:
+    """Run the demo, watched from its address, and return its real-time factor."""
+    options = ['--view', '--port', '0'] if watch is not None else []
+    process = subprocess.Popen(
+        [
+            *(sys.executable, '-m', 'maasi_sim.run.run_scenario', 'mambo_turtlebot'),
+            *('--lockstep', '--seed', '1', '--no-record', '--out', str(folder)),
+            *('--time-limit', str(SECONDS), *options),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if watch is not None and line.startswith('view: '):
+            watch(line.split()[1])
+    if process.wait() not in (0, 1):
+        raise RuntimeError(f'the demo ended with {process.returncode}')
+    return float(json.loads((folder / 'report.json').read_text())['real_time_factor'])
+
+
+def read_stream(address: str) -> None:
+    """Read the events of a run until its end."""
+    with contextlib.suppress(OSError), urllib.request.urlopen(f'{address}events') as stream:
+        for _ in stream:
+            pass
+
+
+def streams(number: int) -> Callable[[str], None]:
+    """Return what watches a run with so many readers that show nothing."""
+
+    def watch(address: str) -> None:
+        for _ in range(number):
+            threading.Thread(target=read_stream, args=(address,), daemon=True).start()
+
+    return watch
+
+
+class BrowserWatch:
+    """Watches runs with Chromium, in a thread of its own; notes when the page is usable."""
+
+    def __init__(self) -> None:
+        self.usable: list[float] = []
+
+    def __call__(self, address: str) -> None:
+        """Watch a run."""
+        threading.Thread(target=self._watch, args=(address,), daemon=True).start()
+
+    def _watch(self, address: str) -> None:
+        with chromium() as shown, contextlib.suppress(Exception):
+            begin = time.monotonic()
+            shown.page.goto(address)
+            shown.until('maasi.drawn > 0')
+            self.usable.append(time.monotonic() - begin)
+            shown.until('document.body.dataset.connection === "ended"', 300.0)
+
+
+def long_log() -> EventLog:
+    """Return a run with many events of all kinds that grow with time."""
+    rng = np.random.default_rng(1)
+    scene = scene_of('long', load_mission('mambo_turtlebot').scenario)
+    events: list[Event] = []
+    places = rng.normal(scale=0.02, size=(EVENTS, 2)).cumsum(axis=0) % 2.4
+    found: list[Any] = []
+    for index in range(EVENTS):
+        now, name = index / 40.0, ('mambo', 'turtlebot')[index % 2]
+        x, y = (round(float(value), 4) for value in places[index])
+        kind = index % 10
+        if kind < 6:
+            events.append([now, 'robot', name, [x, y, 0.5, 0.1], 0.9, 1, ''])
+        elif kind < 8:
+            events.append([now, 'seen', name, [x, y, 0.5], [[0.1, 0.2, 0.0, 0.01, 0.05, 0.0]]])
+        elif kind == 8:
+            clusters = [[x, y, 0.0, 0.5, 1e-3, 0.0, 0.0, 1e-3, 0.0, 0.0]] * 8
+            events.append([now, 'filter', '', 3.0, clusters, index])
+        else:
+            events.append([now, 'log', '', 'team', name, f'line {index}'])
+        if index % 2000 == 0:
+            found.append([len(found) + 1, x, y, 0.0, [1e-4, 0, 0, 1e-4, 0, 0], name, now])
+            events.append([now, 'found', '', list(found)])
+    return EventLog(scene, events)
+
+
+def seeks(folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield how long seeks take in a long run."""
+    log = long_log()
+    file = folder / 'long.html'
+    # Not thinned: all of it is to be sought in.
+    write_replay(log, file, 10**9)
+    rng = np.random.default_rng(2)
+    times = []
+    with chromium() as shown:
+        begin = time.monotonic()
+        shown.open(file.as_uri())
+        yield row('open_100000_events', time.monotonic() - begin, 's')
+        for share in rng.random(SEEKS):
+            # From the request to the end of the frame in which it is drawn.
+            took = shown.page.evaluate(
+                """async (share) => {
+                  const begin = performance.now();
+                  maasi.seek(share * maasi.log.duration);
+                  await new Promise((done) => requestAnimationFrame(() => setTimeout(done)));
+                  return performance.now() - begin;
+                }""",
+                float(share),
+            )
+            times.append(float(took))
+    yield row('replay_of_100000_events', file.stat().st_size / 1e6, 'MB')
+    yield row('seek_p50', float(np.median(times)), 'ms')
+    yield row('seek_largest', float(np.max(times)), 'ms')
+
+
+def factors(folder: Path, kinds: dict[str, Callable[[str], Any] | None]) -> dict[str, float]:
+    """Return the largest real-time factor of each kind of run; kinds take turns."""
+    best = dict.fromkeys(kinds, 0.0)
+    for turn in range(RUNS):
+        for kind, watch in kinds.items():
+            best[kind] = max(best[kind], demo(folder / f'{kind}_{turn}', watch))
+    return best
+
+
+def results() -> Iterator[dict[str, Any]]:
+    """Yield the results."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        demo(folder / 'cold', None)
+        browser = BrowserWatch()
+        kinds: dict[str, Callable[[str], Any] | None] = {
+            'none': None,
+            'one': streams(1),
+            'ten': streams(10),
+        }
+        if CHROMIUM is not None:
+            kinds['chromium'] = browser
+        best = factors(folder, kinds)
+        yield row('demo_factor_without_view', best['none'], 'x')
+        for kind in list(kinds)[1:]:
+            yield row(f'demo_slower_with_{kind}', 100.0 * (best['none'] / best[kind] - 1.0), '%')
+        if browser.usable:
+            yield row('page_usable_after', max(browser.usable), 's')
+        if CHROMIUM is not None:
+            yield from seeks(folder)
+
+
+def run() -> list[dict[str, Any]]:
+    """Run the benchmarks."""
+    return list(results())

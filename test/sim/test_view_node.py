@@ -1,0 +1,68 @@
+"""The node that shows any search: which topics it takes, and what the page gets of them."""
+
+import time
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+
+from maasi_filter.ros.qos import LATCHED, RELIABLE
+from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray
+from maasi_sim.run.bag import load_types
+from maasi_sim.run.processes import Domain
+from maasi_sim.view.live_view import LiveView, MessageFeed
+from maasi_sim.view.scene import empty_scene
+from maasi_sim.view.view_node import ViewNode, main
+
+PATIENCE = 60.0
+
+
+@pytest.fixture
+def ros(monkeypatch):
+    with Domain() as domain:
+        for name, value in domain.environment().items():
+            monkeypatch.setenv(name, value)
+        rclpy.init(domain_id=domain.number)
+        yield
+        rclpy.try_shutdown()
+
+
+def test_a_node_that_comes_late_shows_what_is_there(ros):
+    robot = rclpy.create_node('robot')
+    states = robot.create_publisher(AgentState, '/team/rover/state', RELIABLE)
+    found = robot.create_publisher(FoundTargetArray, '/team/found_targets', LATCHED)
+    found.publish(FoundTargetArray(targets=[FoundTarget(id=1, robot='rover')]))
+    view = LiveView(empty_scene(), 0)
+    feed = MessageFeed(view, load_types(), waits=False)
+    node = ViewNode(feed.put)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    kinds = set()
+    deadline = time.monotonic() + PATIENCE
+    try:
+        while not {'robot', 'found'} <= kinds:
+            assert time.monotonic() < deadline, kinds
+            message = AgentState(robot='rover', goal_status=AgentState.MOVING)
+            message.header.stamp = robot.get_clock().now().to_msg()
+            message.pose.pose.orientation.w = 1.0
+            states.publish(message)
+            executor.spin_once(timeout_sec=0.05)
+            kinds = {event[1] for event in view.hub._events}
+    finally:
+        node.destroy_node()
+        robot.destroy_node()
+        feed.close()
+        view.end()
+
+
+def test_a_port_that_is_taken_is_refused(ros, capsys):
+    view = LiveView(empty_scene(), 0)
+    rclpy.shutdown()
+    assert main(['--port', str(view.server.port)]) == 2
+    assert 'in use' in capsys.readouterr().err
+    view.end()
+
+
+def test_a_scenario_that_is_none_is_refused(capsys):
+    assert main(['--scenario', 'no_such_scenario']) == 2
+    assert 'no_such_scenario' in capsys.readouterr().err
