@@ -25,6 +25,11 @@ export function scaleColour(share) {
   return `rgb(${mixed.join(',')})`;
 }
 
+const known = new Map();
+
+// Return a colour of the theme; asked for often, so it is read once.
 export function themed(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const key = `${document.documentElement.dataset.theme} ${name}`;
+  if (!known.has(key)) known.set(key, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return known.get(key);
 }

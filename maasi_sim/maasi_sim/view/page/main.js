@@ -11,7 +11,7 @@ import { showWhy } from './why.js';
 
 const $ = (id) => document.getElementById(id);
 // Pictures of a live run per second: the search needs the processor more.
-const LIVE_RATE = 8;
+const LIVE_RATE = 3;
 
 class Page {
   constructor() {

@@ -7,7 +7,7 @@ import { drawBuildings } from './buildings.js';
 // Detections are shown for this time [s].
 const FADE = 1.5;
 // Points of a way that are drawn.
-const MOST_POINTS = 1200;
+const MOST_POINTS = 600;
 
 export class MapView {
   constructor(canvas, camera) {
@@ -24,8 +24,9 @@ export class MapView {
   resize() {
     const ratio = window.devicePixelRatio || 1;
     const { clientWidth, clientHeight } = this.canvas;
-    this.canvas.width = Math.round(clientWidth * ratio);
-    this.canvas.height = Math.round(clientHeight * ratio);
+    const [width, height] = [Math.round(clientWidth * ratio), Math.round(clientHeight * ratio)];
+    if (this.canvas.width === width && this.canvas.height === height) return;
+    [this.canvas.width, this.canvas.height] = [width, height];
     this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.camera.width = clientWidth;
     this.camera.height = clientHeight;

@@ -6,7 +6,7 @@ import { element, number } from './text.js';
 const STATES = ['no goal', 'on the way', 'goal reached', 'goal cancelled', 'goal given up', 'cannot go on'];
 const SIGNS = { found: '●', decision: '→', team: '◇', warning: '!', fault: '✖' };
 // Lines of the log that are shown.
-const MOST_LINES = 150;
+const MOST_LINES = 60;
 
 export function showNumbers(parent, log, time) {
   const score = log.at('score', '', time);
