@@ -221,6 +221,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         '--filter', type=json.loads, metavar='JSON', help='settings of the filter, in all runs'
     )
+    parser.add_argument(
+        '--stone-soup', action='store_true', help="GOSPA beside Stone Soup's JPDA tracker instead"
+    )
     options = parser.parse_args(arguments)
     wanted = [
         name
@@ -235,6 +238,12 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f'--runs: read {options.runs}, allowed is 1 to {len(SEEDS[options.seeds])}')
     seeds = SEEDS[options.seeds][: options.runs]
     warm_up()
+    if options.stone_soup:
+        # Stone Soup takes seconds to import.
+        from stone_soup_quality import print_table
+
+        print_table(wanted, seeds, prepared)
+        return 0
     kept = runs_in(options.json)
     print(HEAD, flush=True)
     begin = time.perf_counter()

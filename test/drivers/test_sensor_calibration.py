@@ -319,7 +319,13 @@ def test_detections_of_a_driver_do_as_well(tmp_path, capsys):
             )
             detections = [
                 made['maasi_msgs/msg/Detection'](
-                    range=value[0], bearing=value[1], elevation=0.0, covariance=np.zeros(0)
+                    range=value[0],
+                    bearing=value[1],
+                    elevation=0.0,
+                    covariance=np.zeros(0),
+                    class_id='',
+                    score=0.0,
+                    identity='',
                 )
                 for value in observation.values
             ]

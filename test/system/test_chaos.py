@@ -148,6 +148,9 @@ def test_lost_targets_are_found(recording):
                 measurement=1,
                 batch_id=1,
                 stamp=recording.header(1.0).stamp,
+                class_id='',
+                score=0.0,
+                identity='',
             )
         )
     for second, found in ((1, targets), (2, targets[1:])):
