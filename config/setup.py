@@ -14,7 +14,7 @@ setup(
         ('share/maasi_config/foxglove', glob('foxglove/*.json')),
         ('share/maasi_config/rviz', glob('rviz/*.rviz')),
     ],
-    install_requires=['setuptools'],
+    python_requires='>=3.10,<3.14',
     zip_safe=True,
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import signal
+import sys
 from typing import Any
 
 
@@ -24,7 +25,25 @@ class _Script:
         # Nothing has been created yet, so there is nothing to clean up. A node, and whatever has
         # to clean up, sets its own handler in `main`.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        return importlib.import_module(self._module).main()
+        try:
+            return importlib.import_module(self._module).main()
+        except ModuleNotFoundError as error:
+            if not _is_of_ros(error.name or ''):
+                raise
+            name = self._module.rpartition('.')[2]
+            print(
+                f'error: {name}: no module {error.name}: it needs ROS 2 Jazzy and maasi_msgs, '
+                'built and sourced (docs/install.md)',
+                file=sys.stderr,
+            )
+            return 2
+
+
+def _is_of_ros(module: str) -> bool:
+    package = module.partition('.')[0]
+    return package.startswith(('ament_', 'rcl')) or package.endswith(
+        ('_interfaces', '_msgs', '_srvs')
+    )
 
 
 def __getattr__(package: str) -> _Script:

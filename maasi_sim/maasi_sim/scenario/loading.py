@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from copy import deepcopy
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
@@ -25,20 +27,27 @@ from maasi_sim.scenario.schema import RobotSettings, Scenario
 
 
 def config_folder() -> Path:
-    """Return the folder of `robots/` and `scenarios/`: installed, or in this repository.
+    """Return the folder of `robots/` and `scenarios/`: of ROS, of pip, or of this repository.
 
     Raises
     ------
     ScenarioError
-        If it is in neither.
+        If it is in none of them.
     """
-    places = [Path(__file__).resolve().parents[3] / 'config']
+    places = []
     try:
         from ament_index_python.packages import get_package_share_directory
 
-        places.insert(0, Path(get_package_share_directory('maasi_config')))
+        places.append(Path(get_package_share_directory('maasi_config')))
     except (ImportError, LookupError, OSError):
         pass
+    try:
+        files = distribution('maasi_config').files or []
+    except PackageNotFoundError:
+        files = []
+    manifests = [file for file in files if file.match('share/maasi_config/package.xml')]
+    places += [Path(os.path.normpath(file.locate())).parent for file in manifests]
+    places.append(Path(__file__).resolve().parents[3] / 'config')
     for folder in places:
         if (folder / 'robots').is_dir():
             return folder

@@ -1,0 +1,134 @@
+"""What the packages declare is what they import, and what rosdep and pip can install."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).resolve().parents[1]
+FACTS = yaml.safe_load((ROOT / 'test' / 'data' / 'noble.yaml').read_text())
+PACKAGES = sorted(path.parent for path in ROOT.glob('*/setup.py'))
+MANIFESTS = sorted(ROOT.glob('*/package.xml'))
+OURS = {path.parent.name.replace('config', 'maasi_config') for path in MANIFESTS}
+# Needed without an import: files that are read, and a module that is imported by its name.
+READ = {'maasi_sim': {'maasi_config'}}
+BY_NAME = {'maasi_drivers': {'pyparrot', 'zeroconf'}}
+
+packages = pytest.mark.parametrize('package', PACKAGES, ids=lambda path: path.name)
+
+
+def imported(package: Path, tests: bool) -> set[str]:
+    """Return the modules from outside that a package, or its tests, import: first names."""
+    found = set() if tests else set(BY_NAME.get(package.name, ()))
+    for path in package.rglob('*.py'):
+        inside = path.relative_to(package)
+        if inside.parts[0] == 'setup.py' or (inside.parts[0] == 'test') != tests:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {item.name.partition('.')[0] for item in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
+                found.add(node.module.partition('.')[0])
+    own = {path.parent.name for path in package.glob('*/__init__.py')}
+    return found - own - set(sys.stdlib_module_names)
+
+
+def declared(package: Path, *tags: str) -> set[str]:
+    """Return what a manifest names in elements with these tags; with all ending in `depend`."""
+    elements = ElementTree.parse(package / 'package.xml').getroot()
+    return {
+        (element.text or '').strip()
+        for element in elements
+        if (element.tag in tags if tags else element.tag.endswith('depend'))
+    }
+
+
+def requirements(package: Path, tests: bool) -> dict[str, Requirement]:
+    """Return what setup.py requires, or requires for tests, by its name on PyPI."""
+    values: dict[str, Any] = {}
+    for node in ast.walk(ast.parse((package / 'setup.py').read_text())):
+        if isinstance(node, ast.keyword) and node.arg in ('install_requires', 'extras_require'):
+            values[node.arg] = ast.literal_eval(node.value)
+    groups = {'': values.get('install_requires', []), **values.get('extras_require', {})}
+    lines = [line for name, group in groups.items() if (name == 'test') == tests for line in group]
+    return {item.name: item for item in map(Requirement, lines)}
+
+
+def keys(modules: set[str], required: dict[str, Requirement]) -> set[str]:
+    """Return the rosdep keys of modules, without those that noble lacks or has too old."""
+    found = set()
+    for module in modules:
+        if module in OURS or module in FACTS['jazzy']:
+            found.add(module)
+            continue
+        fact = FACTS['modules'][module]
+        if 'noble' in fact and fact['noble'] in required[fact['pip']].specifier:
+            found.add(fact['key'])
+    return found
+
+
+def from_pip(modules: set[str]) -> set[str]:
+    """Return the names on PyPI of modules that do not come with ROS."""
+    known = FACTS['modules']
+    return {known[name]['pip'] if name in known else name for name in modules - set(FACTS['jazzy'])}
+
+
+@packages
+def test_what_is_imported_is_declared_and_nothing_else(package: Path) -> None:
+    modules = imported(package, False) | READ.get(package.name, set())
+    required = requirements(package, False)
+    assert set(required) == from_pip(modules - {'maasi_msgs'})
+    assert declared(package, 'depend', 'exec_depend') == keys(modules, required)
+
+
+@packages
+def test_what_tests_import_is_declared_and_nothing_else(package: Path) -> None:
+    modules = imported(package, True) - imported(package, False)
+    required = requirements(package, True)
+    assert set(required) == from_pip(modules)
+    assert declared(package, 'test_depend') == keys(modules, required)
+
+
+@pytest.mark.parametrize('manifest', MANIFESTS, ids=lambda path: path.parent.name)
+def test_rosdep_can_install_each_key(manifest: Path) -> None:
+    there = {fact['key'] for fact in FACTS['modules'].values() if 'noble' in fact}
+    assert declared(manifest.parent) <= OURS | set(FACTS['jazzy']) | there
+
+
+@packages
+@pytest.mark.parametrize('tests', [False, True], ids=['runtime', 'tests'])
+def test_the_versions_that_are_tested_are_allowed(package: Path, tests: bool) -> None:
+    for name, item in requirements(package, tests).items():
+        if name not in OURS:
+            assert version(name) in item.specifier, f'{name} {version(name)}: {item}'
+
+
+def test_what_is_installed_is_declared() -> None:
+    lines = (ROOT / 'requirements.txt').read_text().splitlines()
+    installed = {Requirement(line).name for line in lines if line and not line.startswith('#')}
+    needed = {name for package in PACKAGES for name in requirements(package, False)}
+    # These come with pydantic and matplotlib.
+    assert installed == needed - OURS - {'typing_extensions', 'Pillow'}
+
+
+def test_an_import_that_is_not_declared_is_found(tmp_path: Path) -> None:
+    package = tmp_path / 'some'
+    package.mkdir()
+    (package / '__init__.py').write_text('import json\n\ndef f():\n    import cv2.aruco\n')
+    (package / 'node.py').write_text('from some import f\nfrom scipy.linalg import inv\n')
+    (tmp_path / 'package.xml').write_text('<package><exec_depend>numpy</exec_depend></package>')
+    lines = "'scipy>=1.12', 'opencv-python-headless'"
+    (tmp_path / 'setup.py').write_text(f'setup(install_requires=[{lines}])')
+    modules, required = imported(tmp_path, False), requirements(tmp_path, False)
+    assert modules == {'cv2', 'scipy'}
+    # SciPy would be too old, OpenCV not.
+    assert keys(modules, required) == {'python3-opencv'}
+    assert declared(tmp_path) == {'numpy'}
