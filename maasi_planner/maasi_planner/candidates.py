@@ -159,9 +159,16 @@ class Unseen:
             parts.append(f'({axes})')
         more = f' and {len(self.boxes) - 6} more' if len(self.boxes) > 6 else ''
         return (
-            f'{100.0 * self.fraction:.2g} % of the environment can never be seen from the '
+            f'{_percent(self.fraction)} of the environment can never be seen from the '
             f'candidates: {"; ".join(parts)}{more}'
         )
+
+
+def _percent(share: float) -> str:
+    percent = 100.0 * share
+    if percent < 0.01:
+        return 'less than 0.01 %'
+    return f'{percent:.0f} %' if percent >= 10.0 else f'{percent:.2g} %'
 
 
 @dataclass

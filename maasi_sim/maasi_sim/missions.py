@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from maasi_sim.buildings.building_mission import BuildingMission
-from maasi_sim.buildings.scenario import check_cuboid_scenario, is_cuboid_scenario
+from maasi_sim.buildings.scenario import NAME, check_cuboid_scenario, is_cuboid_scenario
 from maasi_sim.run.mission import Mission
-from maasi_sim.scenario.layering import Key
+from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import check_scenario, find_scenario, read_scenario
 from maasi_sim.targets.mission import TargetMission
 
@@ -19,7 +19,13 @@ def load_mission(
 ) -> Mission[Any]:
     """Read a scenario file; parameters and errors as of `load_scenario`."""
     path = find_scenario(path)
-    layer = read_scenario(path, overrides)
+    layer = read_scenario(path)
     if is_cuboid_scenario(layer):
-        return BuildingMission(path.stem, check_cuboid_scenario(layer))
-    return TargetMission(path.stem, check_scenario(layer))
+        return BuildingMission(path.stem, check_cuboid_scenario(layer, overrides))
+    for origin, given in (overrides or {}).items():
+        if given == (('planner', 'name'), NAME):
+            raise ScenarioError(
+                f"{origin}: read '{NAME}', which searches buildings; {path} is a search for "
+                'targets, for which any other planner is allowed'
+            )
+    return TargetMission(path.stem, check_scenario(layer, overrides))

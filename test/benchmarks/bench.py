@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -37,13 +38,22 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog='bench', description=__doc__)
     parser.add_argument('areas', nargs='*', metavar='AREA', help=f'{", ".join(AREAS)}; all if none')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the results there as well')
+    parser.add_argument(
+        '--quick',
+        action='store_true',
+        help='a tenth of the calls: shows that all works and roughly how fast',
+    )
     options = parser.parse_args(arguments)
+    if options.json is not None and not os.access(options.json.absolute().parent, os.W_OK):
+        parser.error(f'--json: read {options.json}, allowed is a file in a folder that is there')
+    if options.json is not None and options.json.is_dir():
+        parser.error(f'--json: read {options.json}, a folder; allowed is a file')
     for area in options.areas:
         if area not in AREAS:
             parser.error(f'unknown area {area!r}, known are {", ".join(AREAS)}')
     rows: list[dict[str, Any]] = []
     for area in options.areas or AREAS:
-        for row in load(area).run():
+        for row in load(area).run(0.1 if options.quick else 1.0):
             rows.append(row)
             print(show(row), flush=True)
     if options.json is not None:

@@ -68,22 +68,26 @@ def against(name: str, solve: Callable[..., Any], title: str, number: int) -> di
     return figure(name, ratio, 'times', what, ratio)
 
 
-def run() -> list[dict[str, object]]:
-    """Return the figures: name, value, unit, baseline, ratio."""
+def run(share: float = 1.0) -> list[dict[str, object]]:
+    """Return the figures: name, value, unit, baseline, ratio; `share` of all problems."""
+
+    def few(number: int) -> int:
+        return max(1, round(share * number))
+
     rows = []
     for horizon in (3, 7, 10):
-        solver, problems = problems_of_missions(horizon, 300, seed=21)
+        solver, problems = problems_of_missions(horizon, few(300), seed=21)
         times = [1e3 * time_of(lambda p=p, s=solver: s.solve(p), 2) for p in problems]
         rows.append(figure(f'cuboid_solve_t{horizon}', float(np.median(times))))
         rows.append(figure(f'cuboid_solve_t{horizon}_p95', float(np.percentile(times, 95))))
         rows.append(figure(f'cuboid_solve_t{horizon}_max', max(times)))
     for robots in (3, 5):
-        solver, joint = joint_problems(robots, 7, 60, seed=22)
+        solver, joint = joint_problems(robots, 7, few(60), seed=22)
         times = [1e3 * time_of(lambda p=p, s=solver: solve_jointly(s, p), 1) for p in joint]
         name = f'cuboid_centralized_{robots}_7'
         rows.append(figure(name, float(np.median(times))))
         rows.append(figure(f'{name}_mean', float(np.mean(times))))
         rows.append(figure(f'{name}_max', max(times)))
-    rows.append(against('cuboid_vs_highs_t7', solve_with_highs, 'HiGHS', 15))
-    rows.append(against('cuboid_vs_scip_t7', solve_with_scip, 'SCIP', 15))
+    rows.append(against('cuboid_vs_highs_t7', solve_with_highs, 'HiGHS', few(15)))
+    rows.append(against('cuboid_vs_scip_t7', solve_with_scip, 'SCIP', few(15)))
     return rows

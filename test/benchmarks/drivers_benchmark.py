@@ -46,9 +46,14 @@ def _image(settings: CameraSettings, seed: int = 1) -> tuple[np.ndarray, Pose, C
     return renderer.render(pose, 0, 0.0), pose, renderer
 
 
-def run(repeats: int = 300) -> list[dict[str, Any]]:
+def run(share: float = 1.0) -> list[dict[str, Any]]:
     """
     Time the robust rule, beside the paper's rule on the same image, and the rendering.
+
+    Parameters
+    ----------
+    share : float
+        Of all calls.
 
     Returns
     -------
@@ -56,6 +61,7 @@ def run(repeats: int = 300) -> list[dict[str, Any]]:
         name, value, unit, baseline (what was compared with) and ratio (its time over ours).
 
     """
+    repeats = max(1, round(share * 300))
     results: list[dict[str, Any]] = []
     for width, height, focal in ((160, 120, 220.0), (640, 480, 880.0)):
         values: dict[str, Any] = {

@@ -197,22 +197,28 @@ def _entry(
     }
 
 
-def run() -> list[dict[str, Any]]:
-    """Return all figures as entries {name, value, unit, baseline, ratio}."""
+def run(share: float = 1.0) -> list[dict[str, Any]]:
+    """Return all figures as entries {name, value, unit, baseline, ratio}; `share` of all calls."""
+
+    def few(number: int) -> int:
+        return max(1, round(share * number))
+
     start = time.perf_counter()
     warm_up()
     entries = [_entry('filter_warm_up', time.perf_counter() - start)]
-    entries.append(_entry('ic_phd_step_10k', phd_step_time(10_000, 1, 200, 1)))
-    entries.append(_entry('ic_phd_step_100k', phd_step_time(100_000, 1, 30, None)))
-    entries.append(_entry('ic_phd_step_1m', phd_step_time(1_000_000, 1, 9, None)))
-    entries.append(_entry('ic_phd_step_ten_robots', phd_step_time(10_000, 10, 100, 1)))
-    ours, theirs = update_times()
+    entries.append(_entry('ic_phd_step_10k', phd_step_time(10_000, 1, few(200), 1)))
+    entries.append(_entry('ic_phd_step_100k', phd_step_time(100_000, 1, few(30), None)))
+    entries.append(_entry('ic_phd_step_1m', phd_step_time(1_000_000, 1, few(9), None)))
+    entries.append(_entry('ic_phd_step_ten_robots', phd_step_time(10_000, 10, few(100), 1)))
+    ours, theirs = update_times(repeats=few(3))
     text = f'Stone Soup SMCPHDUpdater, {1e3 * theirs:.3g} ms'
     entries.append(_entry('ic_phd_update', ours, text, theirs / ours))
-    entries.append(_entry('pmb_step_degrees', pmb_step_time(DEGREES, TARGETS, 1)))
-    entries.append(_entry('pmb_step_radians', pmb_step_time(RADIANS, TARGETS, 1)))
-    entries.append(_entry('pmb_step_100_targets', pmb_step_time(DEGREES, 100, 1, 200)))
-    entries.append(_entry('pmb_step_ten_robots', pmb_step_time(DEGREES, TARGETS, 10)))
+    entries.append(_entry('pmb_step_degrees', pmb_step_time(DEGREES, TARGETS, 1, max(12, few(60)))))
+    entries.append(_entry('pmb_step_radians', pmb_step_time(RADIANS, TARGETS, 1, max(12, few(60)))))
+    entries.append(_entry('pmb_step_100_targets', pmb_step_time(DEGREES, 100, 1, few(200))))
+    entries.append(
+        _entry('pmb_step_ten_robots', pmb_step_time(DEGREES, TARGETS, 10, max(12, few(60))))
+    )
     return entries
 
 

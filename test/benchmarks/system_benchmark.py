@@ -97,15 +97,15 @@ def latencies(bag: Path, folder: Path) -> list[float]:
     return times
 
 
-def run() -> list[dict[str, Any]]:
-    """Run the benchmarks."""
+def run(share: float = 1.0) -> list[dict[str, Any]]:
+    """Run the benchmarks; `share` of the simulated time."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         # The first run finds everything cold.
         scenario('mambo_turtlebot', folder / 'cold', 0.1)
         start = scenario('mambo_turtlebot', folder / 'start', 0.1)
-        scenario('mambo_turtlebot', folder / 'floor', SECONDS)
-        scenario('ranging_pair_3d', folder / 'space', 2.0 * SECONDS)
+        scenario('mambo_turtlebot', folder / 'floor', share * SECONDS)
+        scenario('ranging_pair_3d', folder / 'space', 2.0 * share * SECONDS)
         times = latencies(folder / 'floor' / 'bag', folder)
         return [
             row('demo_real_time_factor', real_time_factor(folder / 'floor'), 'x'),

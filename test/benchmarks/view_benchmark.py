@@ -35,14 +35,14 @@ def row(name: str, value: float, unit: str) -> dict[str, Any]:
     return {'name': name, 'value': value, 'unit': unit, 'baseline': None, 'ratio': None}
 
 
-def demo(folder: Path, watch: Callable[[str], Any] | None) -> float:
+def demo(folder: Path, watch: Callable[[str], Any] | None, seconds: float = SECONDS) -> float:
     """Run the demo, watched from its address, and return its real-time factor."""
     options = ['--view', '--port', '0'] if watch is not None else []
     process = subprocess.Popen(
         [
             *(sys.executable, '-m', 'maasi_sim.run.run_scenario', 'mambo_turtlebot'),
             *('--lockstep', '--seed', '1', '--no-record', '--out', str(folder)),
-            *('--time-limit', str(SECONDS), *options),
+            *('--time-limit', str(seconds), *options),
         ],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -148,20 +148,22 @@ def seeks(folder: Path) -> Iterator[dict[str, Any]]:
     yield row('seek_largest', float(np.max(times)), 'ms')
 
 
-def factors(folder: Path, kinds: dict[str, Callable[[str], Any] | None]) -> dict[str, float]:
+def factors(
+    folder: Path, kinds: dict[str, Callable[[str], Any] | None], seconds: float
+) -> dict[str, float]:
     """Return the largest real-time factor of each kind of run; kinds take turns."""
     best = dict.fromkeys(kinds, 0.0)
     for turn in range(RUNS):
         for kind, watch in kinds.items():
-            best[kind] = max(best[kind], demo(folder / f'{kind}_{turn}', watch))
+            best[kind] = max(best[kind], demo(folder / f'{kind}_{turn}', watch, seconds))
     return best
 
 
-def results() -> Iterator[dict[str, Any]]:
-    """Yield the results."""
+def results(share: float) -> Iterator[dict[str, Any]]:
+    """Yield the results; `share` of the simulated time."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        demo(folder / 'cold', None)
+        demo(folder / 'cold', None, share * SECONDS)
         browser = BrowserWatch()
         kinds: dict[str, Callable[[str], Any] | None] = {
             'none': None,
@@ -170,7 +172,7 @@ def results() -> Iterator[dict[str, Any]]:
         }
         if CHROMIUM is not None:
             kinds['chromium'] = browser
-        best = factors(folder, kinds)
+        best = factors(folder, kinds, share * SECONDS)
         yield row('demo_factor_without_view', best['none'], 'x')
         for kind in list(kinds)[1:]:
             yield row(f'demo_slower_with_{kind}', 100.0 * (best['none'] / best[kind] - 1.0), '%')
@@ -180,6 +182,6 @@ def results() -> Iterator[dict[str, Any]]:
             yield from seeks(folder)
 
 
-def run() -> list[dict[str, Any]]:
-    """Run the benchmarks."""
-    return list(results())
+def run(share: float = 1.0) -> list[dict[str, Any]]:
+    """Run the benchmarks; `share` of the simulated time."""
+    return list(results(share))

@@ -358,3 +358,16 @@ def test_a_file_that_cannot_be_used_is_refused_with_the_reason(tmp_path, wrong):
         running(save_file=str(file)),
     ):
         pass
+
+
+def test_a_node_says_once_which_topics_nobody_publishes(world, capfd):
+    _, _, until = world
+    said = ''
+
+    def has_said():
+        nonlocal said
+        said += capfd.readouterr().err
+        return 'active, waiting for publishers of' in said
+
+    until(has_said)
+    assert '/found_targets/kept' in said.partition('waiting for publishers of')[2].splitlines()[0]

@@ -2,6 +2,7 @@
 
 import pytest
 
+from maasi_filter.filter_node import main
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
 
@@ -59,3 +60,17 @@ def test_a_list_that_is_no_numbers_is_named():
     flat['environment.bounds'] = ['zero one']
     with pytest.raises(ValueError, match=r'environment\.bounds.*zero one'):
         unflatten(FilterNodeSettings, flat)
+
+
+def test_help_of_a_node_names_topics_and_parameters(capsys):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('sys.argv', ['filter_node', '--help'])
+        assert main() == 0
+    text = capsys.readouterr().out
+    assert text.startswith('usage: filter_node')
+    assert '`measurement_batch` (maasi_msgs/MeasurementBatch)' in text
+    assert 'lockstep/step' in text and 'environment.bounds' in text
+    assert 'robot.NAME.sensor.detection.probability' in text
+    assert 'allowed: above 0.0 and at most 10.0; default: 0.05' in text
+    # What its constructor takes is for who writes code.
+    assert 'lockstep_member' not in text

@@ -9,6 +9,7 @@ from planner_helpers import CUBE, FLOOR, floor_members
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_planner import CandidateSet, CandidateSettings, Viewer, unseen_parts
+from maasi_planner.candidates import Unseen
 
 
 def test_grid_of_the_papers():
@@ -111,3 +112,12 @@ def test_grids_of_the_paper_leave_parts_unseen():
     low, high = unseen.boxes[0][0]
     assert low == pytest.approx(-0.3, abs=0.03)
     assert high == pytest.approx(2.4, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ('share', 'text'),
+    [(0.996, '100 %'), (0.25, '25 %'), (0.0316, '3.2 %'), (1e-5, 'less than 0.01 %')],
+)
+def test_shares_are_said_in_plain_numbers(share, text):
+    unseen = Unseen(share, [np.array([[0.0, 1.0], [0.0, 1.0]])])
+    assert unseen.describe().startswith(f'{text} of the environment can never be seen')

@@ -218,3 +218,14 @@ def test_unknown_packages_and_executables_are_named(tmp_path, monkeypatch):
     executable.write_text('#!/bin/sh\n')
     executable.chmod(0o755)
     assert find_executable('maasi_here', 'some_node') == executable
+
+
+def test_a_run_says_that_the_loopback_interface_is_down():
+    code = 'from maasi_sim.run.run_scenario import main; raise SystemExit(main(["mambo"]))'
+    # A network namespace of its own has a loopback interface that is down.
+    alone = ['unshare', '--map-root-user', '--net']
+    if subprocess.run([*alone, 'true'], capture_output=True).returncode:
+        pytest.skip('no network namespaces here')
+    done = subprocess.run([*alone, sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert 'error: the loopback interface cannot be used' in done.stderr

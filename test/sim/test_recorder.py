@@ -5,6 +5,7 @@ import time
 import pytest
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -142,3 +143,17 @@ def test_a_time_that_does_not_come_is_not_waited_for_longer_than_a_moment(sessio
     session.move(5 * 10**9)
     session.until(lambda: session.bag.counts.get('/rover/odom'))
     assert len(session.odometry_in_bag()) == 1
+
+
+def test_the_share_explored_is_that_of_the_planners_diagnostics(session):
+    publisher = session.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+    session.until(
+        lambda: (
+            not session.recorder.missing(['/diagnostics']) and publisher.get_subscription_count()
+        )
+    )
+    for name, value in (('/planner_node', '0.25'), ('/planner_node', '?'), ('/camera', '0.9')):
+        values = [KeyValue(key='explored', value=value)]
+        publisher.publish(DiagnosticArray(status=[DiagnosticStatus(name=name, values=values)]))
+    session.until(lambda: '/camera' in session.recorder.heartbeats)
+    assert session.recorder.explored == 0.25

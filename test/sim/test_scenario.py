@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
+from maasi_sim.missions import load_mission
+from maasi_sim.scenario.layering import ScenarioWarning
 from maasi_sim.scenario.loading import (
     config_folder,
     find_scenario,
@@ -149,7 +151,7 @@ WRONG = [
     ([('robots.mambo.start', [0.5, 0.5])], 'robots.mambo.start', ['read 2 entries', 'at least 3']),
     ([('robots.mambo.start.1', 'x')], 'robots.mambo.start[1]', ["read 'x'", 'a number']),
     ([('robots.mambo.start', [0.5, 2.5, 1.0])], 'robots.mambo.start', ['environment.bounds']),
-    ([('robots.mambo.candidates', None)], 'robots.mambo.candidates', ['is missing']),
+    ([('seed', 2**63)], 'seed', [f'read {2**63}', f'at most {2**63 - 1}']),
     ([('robots.mambo.candidates.grid', [0, 6])], 'robots.mambo.candidates.grid[0]', ['at least 1']),
     ([('robots.mambo.candidates.grid', [6, 2.5])], 'robots.mambo.candidates.grid[1]', ['whole']),
     ([('robots.mambo.candidates.grid', [60, 6])], 'robots.mambo.candidates', ['waypoints inside']),
@@ -376,3 +378,74 @@ def test_events_in_turn_are_taken(load):
         {'at': 30.0, 'robot': 'mambo', 'do': 'leave'},
     ]
     assert len(load(changed(('events', events))).events) == 3
+
+
+@pytest.mark.parametrize(
+    'robot',
+    [
+        {'type': 'mambo'},
+        {'type': 'turtlebot3_burger'},
+        {'type': 'mambo', 'sensor': {'detection': {'kind': 'gaussian', 'size': [0.3, 0.2]}}},
+    ],
+    ids=lambda robot: '-'.join(robot),
+)
+def test_a_robot_without_candidates_gets_a_grid_that_sees_everything(load, robot):
+    content = changed(('robots', {'one': robot | {'start': [0.5, 0.5, 1.0]}}))
+    scenario = load(content)
+    assert never_seen(scenario) == ''
+    numbers = scenario.robots['one'].candidates.grid
+    assert min(numbers) >= 2 and max(numbers) <= 25
+    # It is part of the scenario that a run leaves.
+    assert load(scenario.text()).robots['one'].candidates.grid == numbers
+
+
+def test_without_candidates_other_errors_are_named(load):
+    content = changed(('robots.mambo.candidates', None), ('robots.mambo.radius', -1.0))
+    with pytest.raises(ScenarioError, match=r'^\S+:\d+: robots\.mambo\.radius: read -1'):
+        load(content)
+
+
+def test_degrees_get_a_warning_with_file_line_and_key(load):
+    load(changed(('robots.mambo.yaw', -3.0)))
+    words = r'my_scenario.yaml:\d+: robots\.mambo\.yaw: read 180, .* degrees are 3\.142'
+    with pytest.warns(ScenarioWarning, match=words):
+        load(changed(('robots.mambo.yaw', 180)))
+
+
+def test_robots_that_start_inside_each_other_get_a_warning(load):
+    content = changed()
+    content['robots']['other'] = content['robots']['mambo'] | {'start': [0.55, 0.5, 1.0]}
+    words = r'robots\.other\.start: .* 0\.05 m from the start of mambo'
+    with pytest.warns(ScenarioWarning, match=words):
+        load(content)
+
+
+def test_what_wins_over_a_file_hides_none_of_its_errors(tmp_path):
+    path = tmp_path / 'scenario.yaml'
+    path.write_text(yaml.safe_dump(changed(('seed', 'abc'), ('planner', 5))))
+    overrides = {'--seed': (('seed',), 3), '--planner': (('planner', 'name'), 'asi')}
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path, overrides)
+    assert 'scenario.yaml:' in str(caught.value) and "seed: read 'abc'" in str(caught.value)
+    assert 'planner: read 5' in str(caught.value)
+    path.write_text(yaml.safe_dump(PLAIN))
+    assert load_scenario(path, overrides).planner.name == 'asi'
+
+
+def test_planners_of_another_kind_of_search_are_refused_in_one_line():
+    with pytest.raises(ScenarioError, match=r"^--planner: read 'cuboid_mpc', which searches build"):
+        load_mission('mambo', {'--planner': (('planner', 'name'), 'cuboid_mpc')})
+    with pytest.raises(ScenarioError, match="unknown value 'maasi', known are cub") as caught:
+        load_mission('buildings_one', {'--planner': (('planner', 'name'), 'maasi')})
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_messages_name_files_not_links_to_them(tmp_path, monkeypatch):
+    share = tmp_path / 'share'
+    (share / 'robots').mkdir(parents=True)
+    for file in (config_folder() / 'robots').glob('*.yaml'):
+        (share / 'robots' / file.name).symlink_to(file)
+    monkeypatch.setattr(
+        'ament_index_python.packages.get_package_share_directory', lambda name: str(share)
+    )
+    assert config_folder() == Path(__file__).resolve().parents[2] / 'config'

@@ -44,7 +44,19 @@ class AgentDriver(RobotNode):
 
     Subscribes
     ----------
-    what link, sensor and parts do; `pose` or `tf` where the parameter `pose_source` says so
+    `/measurement_batch` (maasi_msgs/MeasurementBatch) of the team; what link and sensor need:
+    `odom` (nav_msgs/Odometry), `battery_state` (sensor_msgs/BatteryState), `camera/image_raw`,
+    `camera/camera_info` or `ranges` (maasi_msgs/RangeArray); `pose` or `tf` where the parameter
+    `pose_source` says so
+
+    Publishes
+    ---------
+    `state` (maasi_msgs/AgentState), `detections` (maasi_msgs/DetectionArray), `/tf`, `/tf_static`,
+    `robot_description`; with link topics `cmd_vel`
+
+    Actions
+    -------
+    `go_to` (maasi_msgs/GoToWaypoint): moves to a waypoint
 
     Services
     --------
@@ -324,4 +336,4 @@ def run(
 
     """
     links = link if isinstance(link, Mapping) else {'topics': link}
-    return run_node(lambda: AgentDriver(links, sensor), arguments)
+    return run_node(lambda: AgentDriver(links, sensor), arguments, AgentDriver)

@@ -10,6 +10,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Collection
 from functools import partial
+from pathlib import Path
 from typing import Any, Generic
 
 import rclpy
@@ -28,6 +29,7 @@ from maasi_filter.ros.bad_requests import survive_bad_requests
 from maasi_filter.ros.clock_watch import ClockWatch
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.node_entities import NodeEntities
+from maasi_filter.ros.node_help import node_help
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_filter.ros.stamps import stamp_problem
@@ -39,6 +41,9 @@ __all__ = ['LockstepLifecycleNode', 'SettingsError', 'run']
 _PEERS_PERIOD = 0.02
 _DIAGNOSTICS_PERIOD = 1.0
 _WARNING_PERIOD = 2.0
+# From activation until a node says what it waits for [s].
+_NOTICE_DELAY = 1.0
+_EVERYWHERE = ('/parameter_events', '/clock', '/diagnostics')
 # Period of the check for signals [s].
 _SIGNAL_PERIOD = 0.1
 
@@ -100,6 +105,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._warned: dict[str, float] = {}
         self._peers: list[Callable[[], bool]] = []
         self._peer_timer: Any = None
+        self._notice_timer: Any = None
         self.step_subscription: Subscription | None = None
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
@@ -194,6 +200,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.active = True
         self.start()
         self._peer_timer = self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers)
+        self._notice_timer = self.create_wall_timer(_NOTICE_DELAY, self._say_what_is_missing)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -305,6 +312,21 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.on_ready()
         if self._ready_publisher is not None:
             self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
+
+    def _say_what_is_missing(self) -> None:
+        """Name, once after activation, the topics that nobody publishes."""
+        if self._notice_timer is not None:
+            self.destroy_timer(self._notice_timer)
+            self._notice_timer = None
+        missing = sorted(
+            {
+                item.topic_name
+                for item in self.subscriptions
+                if item.topic_name not in _EVERYWHERE and not self.count_publishers(item.topic_name)
+            }
+        )
+        if self.active and missing:
+            self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
 
     def on_ready(self) -> None:
         """Handle that all peers are present."""
@@ -465,12 +487,27 @@ def _activate(node: LockstepLifecycleNode[Any]) -> bool:
 
 
 def run(
-    make_node: Callable[[], LockstepLifecycleNode[Any]], arguments: list[str] | None = None
+    make_node: Callable[[], LockstepLifecycleNode[Any]],
+    arguments: list[str] | None = None,
+    kind: type[LockstepLifecycleNode[Any]] | None = None,
 ) -> int:
     """Run a node until it is asked to end; return the exit code.
 
     SIGINT and SIGTERM stop all motion before the node is destroyed.
+
+    Parameters
+    ----------
+    make_node : callable
+        Makes the node; often its class.
+    arguments : list of str, optional
+        Of the command line.
+    kind : type, optional
+        The class that `--help` explains, where `make_node` is none.
     """
+    if {'-h', '--help'} & set(sys.argv[1:] if arguments is None else arguments):
+        explained = kind or (make_node if isinstance(make_node, type) else LockstepLifecycleNode)
+        print(node_help(explained, Path(sys.argv[0]).name, LockstepLifecycleNode))
+        return 0
     # The handler only sets a flag: an exception raised inside a call into rclpy's C++ surfaces as
     # a different one. A second signal raises at once.
     asked = False

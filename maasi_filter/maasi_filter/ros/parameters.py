@@ -324,5 +324,14 @@ def _model_by_name(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
+def settings_by_name(model: type[BaseModel]) -> list[str]:
+    """Return the keys of settings that hold other settings by name, as `robots`."""
+    return [
+        info.alias or name
+        for name, info in model.model_fields.items()
+        if _model_by_name(info.annotation) is not None
+    ]
+
+
 def _singular(name: str) -> str:
     return name.removesuffix('s')

@@ -22,9 +22,9 @@ from maasi_planner.buildings import (
 )
 from maasi_sim.buildings.mission import CuboidMission, SearchRobot
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.scenario.checks import check_names, event_problems
-from maasi_sim.scenario.layering import Key, Layer, ScenarioError, refuse, validate
-from maasi_sim.scenario.loading import read_scenario
+from maasi_sim.scenario.checks import check_names, doubts_about, event_problems
+from maasi_sim.scenario.layering import Key, Layer, ScenarioError, doubt, refuse, validate
+from maasi_sim.scenario.loading import read_scenario, with_overrides
 from maasi_sim.world.odometry import OdometrySettings
 from maasi_sim.world.robots import BatterySettings
 from maasi_sim.world.world import TargetSettings, World
@@ -94,10 +94,17 @@ def is_cuboid_scenario(layer: Layer) -> bool:
     return isinstance(planner, dict) and planner.get('name') == NAME
 
 
-def check_cuboid_scenario(layer: Layer) -> CuboidScenario:
+def check_cuboid_scenario(
+    layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> CuboidScenario:
     """Return the scenario of a tree of values with all layers merged."""
+    if overrides:
+        # What wins over the file hides none of its errors.
+        validate(CuboidScenario, layer)
+        layer = with_overrides(layer, overrides)
     scenario = validate(CuboidScenario, layer)
     refuse(layer, _problems(scenario))
+    doubt(layer, doubts_about(scenario.robots))
     return scenario
 
 
@@ -111,10 +118,10 @@ def load_cuboid_scenario(
     ScenarioError
         With file, line, key, what was read and what is allowed.
     """
-    layer = read_scenario(path, overrides)
+    layer = read_scenario(path)
     if not is_cuboid_scenario(layer):
         raise ScenarioError(f"{path}: planner.name: allowed is '{NAME}'")
-    return check_cuboid_scenario(layer)
+    return check_cuboid_scenario(layer, overrides)
 
 
 def _problems(scenario: CuboidScenario) -> Iterator[tuple[Key, str]]:

@@ -16,6 +16,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from maasi_sim.arguments import count, whole
 from maasi_sim.chaos.cases import Case, all_cases
 from maasi_sim.chaos.execution import execute
 from maasi_sim.chaos.verdict import judge
@@ -53,13 +54,13 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--case', nargs='+', metavar='NAME', help='only these; * stands for anything'
     )
-    parser.add_argument('--seed', type=int, default=_SEED, metavar='N', help='of all runs')
+    parser.add_argument('--seed', type=whole, default=_SEED, metavar='N', help='of all runs')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the results')
     parser.add_argument(
         '--out', type=Path, metavar='DIR', help='keep the runs (default: a temporary folder)'
     )
     parser.add_argument(
-        '--jobs', type=int, default=1, metavar='N', help='cases beside each other (default: 1)'
+        '--jobs', type=count, default=1, metavar='N', help='cases beside each other (default: 1)'
     )
     parser.add_argument(
         '--budget',
@@ -167,10 +168,6 @@ def main(arguments: list[str] | None = None) -> int:
     options = build_parser().parse_args(arguments)
     try:
         cases = chosen_cases(options.case)
-        if options.jobs < 1:
-            raise ValueError(f'--jobs: read {options.jobs}, allowed is from 1')
-        if options.seed < 0:
-            raise ValueError(f'--seed: read {options.seed}, allowed is from 0')
         if options.out is not None and options.out.exists() and any(options.out.iterdir()):
             raise ValueError(f'--out: {options.out} is not empty, allowed is a new folder')
     except (ValueError, OSError) as error:

@@ -21,6 +21,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from maasi_sim.arguments import count, whole
 from maasi_sim.experiments.campaign import (
     Cluster,
     MixedWorkers,
@@ -56,7 +57,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument('names', nargs='*', metavar='NAME', help='experiments, or "all"')
     parser.add_argument('--list', action='store_true', help='name every experiment')
     parser.add_argument(
-        '--runs', type=_count, metavar='N', help="maps of each (default: the paper's number)"
+        '--runs', type=count, metavar='N', help="maps of each (default: the paper's number)"
     )
     parser.add_argument(
         '--case',
@@ -65,7 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
         help='only this case of each experiment; may be given several times',
     )
     parser.add_argument(
-        '--workers', type=_count, metavar='N', help='processes (default: one for each core)'
+        '--workers', type=count, metavar='N', help='processes (default: one for each core)'
     )
     parser.add_argument('--cluster', metavar='ADDRESS', help='scheduler of a Dask cluster')
     parser.add_argument(
@@ -81,7 +82,7 @@ def build_parser() -> argparse.ArgumentParser:
         help='folder of the results (default: %(default)s)',
     )
     parser.add_argument(
-        '--seed', type=_whole, default=1, metavar='N', help='other maps (default: %(default)s)'
+        '--seed', type=whole, default=1, metavar='N', help='other maps (default: %(default)s)'
     )
     parser.add_argument(
         '--small',
@@ -95,20 +96,6 @@ def build_parser() -> argparse.ArgumentParser:
         help='write the page of all experiments that are in DIR, with their figures beside it',
     )
     return parser
-
-
-def _whole(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f'read {text}, allowed are whole numbers from 0')
-    return value
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= 9999:
-        raise argparse.ArgumentTypeError(f'read {text}, allowed are whole numbers from 1 to 9999')
-    return value
 
 
 def main(arguments: list[str] | None = None) -> int:

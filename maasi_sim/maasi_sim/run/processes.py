@@ -7,6 +7,7 @@ import ctypes
 import fcntl
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -52,7 +53,8 @@ class Domain:
     Raises
     ------
     ProcessError
-        If the one asked for is used by another run, is not from 0 to 101, or none is free.
+        If the one asked for is used by another run, is not from 0 to 101, or none is free, or if
+        the loopback interface is down, through which nodes find each other.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Domain:
         team: str = '',
         shared: bool = False,
     ) -> None:
+        _check_loopback()
         # A run that was just killed while starting leaves recent ports.
         remove_dead_ports(patience=LONGEST_CREATION + 1.0)
         self._folder = folder or Path('/tmp/maasi_domains')
@@ -143,6 +146,17 @@ class Domain:
     ) -> None:
         """Release it."""
         self.release()
+
+
+def _check_loopback() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(('127.0.0.1', _FIRST_PORT))
+        except OSError as error:
+            raise ProcessError(
+                f'the loopback interface cannot be used ({error.strerror}), and nodes talk '
+                'through it: sudo ip link set lo up'
+            ) from None
 
 
 def _port_used(port: int) -> bool:

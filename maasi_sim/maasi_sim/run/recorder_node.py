@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import math
 import struct
@@ -11,7 +12,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Twist, TwistStamped
 from rcl_interfaces.msg import Log
 from rclpy.context import Context
@@ -143,6 +144,8 @@ class Recorder:
         self._begun: int | None = None
         self.step: int | None = None
         self.last_seen: dict[str, float] = {}
+        #: Share of the environment explored, as planners say each second.
+        self.explored = 0.0
         #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
         self._held: list[tuple[str, bytes]] = []
@@ -328,6 +331,7 @@ class Recorder:
             elif topic == DIAGNOSTICS:
                 for status in deserialize_message(data, DiagnosticArray).status:
                     self.heartbeats[status.name] = now
+                    self._note_explored(status)
             if not self._finished or topic in self.observer.result_topics:
                 self.observer.add(topic, data)
             if self.listener is not None and topic in self._shown:
@@ -337,6 +341,13 @@ class Recorder:
             self._last_step = self.observer.end_step
             taken = self._until(taken, self._last_step)
         self._record(taken)
+
+    def _note_explored(self, status: DiagnosticStatus) -> None:
+        """Note what a planner says between its decisions."""
+        for item in status.values:
+            if item.key == 'explored' and status.name.endswith('/planner_node'):
+                with contextlib.suppress(ValueError):
+                    self.explored = max(self.explored, float(item.value))
 
     @property
     def elapsed(self) -> float:

@@ -7,6 +7,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from maasi_sim.arguments import positive, whole
+
 LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
@@ -55,22 +57,22 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--out', type=Path, metavar='DIR', help='folder of the run (default: runs/<time>)'
     )
-    parser.add_argument('--seed', type=_whole, metavar='N', help="instead of the scenario's")
+    parser.add_argument('--seed', type=whole, metavar='N', help="instead of the scenario's")
     parser.add_argument(
         '--lockstep',
         action='store_true',
         help='step by step, as fast as it goes: the same seed gives the same run',
     )
     parser.add_argument(
-        '--rate', type=_positive, metavar='X', help='simulated over wall time (default: 1)'
+        '--rate', type=positive, metavar='X', help='simulated over wall time (default: 1)'
     )
     parser.add_argument('--no-record', action='store_true', help='write no recording')
     parser.add_argument('--planner', metavar='NAME', help="instead of the scenario's")
     parser.add_argument(
-        '--time-limit', type=_positive, metavar='S', help='simulated time [s], instead of its own'
+        '--time-limit', type=positive, metavar='S', help='simulated time [s], instead of its own'
     )
     parser.add_argument(
-        '--domain-id', type=_whole, metavar='N', help='ROS domain (default: one of its own)'
+        '--domain-id', type=whole, metavar='N', help='ROS domain (default: one of its own)'
     )
     parser.add_argument(
         '--namespace',
@@ -117,17 +119,7 @@ def view_options(options: argparse.Namespace) -> ViewOptions:
 
 
 def _port(text: str) -> int:
-    number = _whole(text)
-    if number > 65535:
-        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are ports up to 65535")
-    return number
-
-
-def _whole(text: str) -> int:
-    # No sign, underscore or digits of another alphabet.
-    if not (text.isascii() and text.isdecimal()):
-        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are whole numbers from 0")
-    return int(text)
+    return whole(text, most=65535)
 
 
 def _namespace(text: str) -> str:
@@ -138,16 +130,6 @@ def _namespace(text: str) -> str:
             'and / between names'
         )
     return name
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float('nan')
-    if not 0.0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f"read '{text[:60]}', allowed are finite numbers above 0")
-    return value
 
 
 def parse(arguments: list[str] | None) -> Options:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,7 @@ from maasi_sim.run.run_page import RunPage
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
-from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning
 from maasi_sim.view.bag_events import read_events
 from maasi_sim.view.page_file import REPLAY, write_replay
 
@@ -61,7 +62,10 @@ class ScenarioRun:
             overrides['--time-limit'] = (('limits', 'time'), options.time_limit)
         if options.seed is not None:
             overrides['--seed'] = (('seed',), options.seed)
-        self.mission = load_mission(options.scenario, overrides)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter('always', ScenarioWarning)
+            self.mission = load_mission(options.scenario, overrides)
+        self._doubts = [str(item.message) for item in caught]
         # A node in the namespace of a robot belongs to that robot.
         if options.namespace.rpartition('/')[2] in self.mission.scenario.names():
             raise ScenarioError(
@@ -87,6 +91,8 @@ class ScenarioRun:
                 f'{len(self.supervisor.processes)} nodes in ROS domain {domain.number}, results in '
                 f'{short(self.folder)}'
             )
+            for text in self._doubts:
+                self.display.say(f'warning: {text}')
             # An interruption here is reported once the session starts.
             with contextlib.suppress(KeyboardInterrupt), self.interruption.at_once():
                 self.supervisor.load()

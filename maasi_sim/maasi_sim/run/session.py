@@ -303,7 +303,7 @@ class Session:
                 measurements=observer.measurements,
                 found=observer.found,
                 targets=observer.total,
-                explored=observer.explored,
+                explored=max(observer.explored, self.recorder.explored),
                 word=self.mission.found_word,
                 factor=seconds / wall if wall > 0.0 else 0.0,
             )

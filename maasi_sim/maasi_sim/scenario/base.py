@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from maasi_filter.settings import EnvironmentSettings, Settings
+from maasi_sim.arguments import LARGEST
 from maasi_sim.scenario.layering import to_yaml
 
 
@@ -59,7 +60,9 @@ class BaseScenario(Settings):
     description: str = Field(default='', description='What it shows, in words')
     environment: EnvironmentSettings = Field(description='Where the search takes place')
     step: float = Field(default=0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')
-    seed: int = Field(default=1, ge=0, description='Of all random numbers, unless given otherwise')
+    seed: int = Field(
+        default=1, ge=0, le=LARGEST, description='Of all random numbers, unless given otherwise'
+    )
     robots: Mapping[str, Any] = Field(min_length=1, description='Robots by name')
     planner: Any = Field(description='Planner')
     events: list[EventSettings] = Field(default_factory=list, description='What happens to robots')

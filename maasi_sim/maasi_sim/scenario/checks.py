@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -296,6 +298,25 @@ def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
                 ('robots', name, 'start'),
                 f'read height {robot.start[2]}, allowed is what lies {side} mavlink.ground, '
                 f'{link.ground}',
+            )
+
+
+def doubts_about(robots: Mapping[str, Any]) -> Iterator[tuple[Key, str]]:
+    """Yield what is valid and hardly meant: key and text."""
+    for name, robot in robots.items():
+        if abs(robot.yaw) > 2.0 * math.pi:
+            yield (
+                ('robots', name, 'yaw'),
+                f'read {robot.yaw:g}, more than a turn: it is in radians, and {robot.yaw:g} '
+                f'degrees are {math.radians(robot.yaw):.4g}',
+            )
+    for (first, one), (name, robot) in combinations(robots.items(), 2):
+        gap = math.dist(one.start, robot.start)
+        bodies = getattr(one, 'radius', 0.0) + getattr(robot, 'radius', 0.0)
+        if gap == 0.0 or gap < bodies:
+            yield (
+                ('robots', name, 'start'),
+                f'read {robot.start}, {gap:.3g} m from the start of {first}: their bodies overlap',
             )
 
 

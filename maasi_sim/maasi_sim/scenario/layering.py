@@ -6,6 +6,7 @@ import difflib
 import math
 import re
 import typing
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,10 @@ Model = TypeVar('Model', bound=BaseModel)
 
 class ScenarioError(ValueError):
     """Invalid input: names file, key, value and what is allowed."""
+
+
+class ScenarioWarning(UserWarning):
+    """Valid input that is hardly meant: names file, key and value."""
 
 
 # Compiled, where PyYAML was built so: writing takes a third of a second without it.
@@ -255,6 +260,12 @@ def refuse(layer: Layer, problems: Iterable[tuple[Key, str]]) -> None:
     lines = [f'{layer.origin(key)}: {dotted(key)}: {text}' for key, text in problems]
     if lines:
         raise ScenarioError('\n'.join(lines))
+
+
+def doubt(layer: Layer, problems: Iterable[tuple[Key, str]]) -> None:
+    """Issue a ScenarioWarning for each problem."""
+    for key, text in problems:
+        warnings.warn(f'{layer.origin(key)}: {dotted(key)}: {text}', ScenarioWarning, stacklevel=3)
 
 
 def describe(error: ValidationError, model: type[BaseModel], layer: Layer) -> str:

@@ -9,12 +9,14 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
-from maasi_sim.scenario.checks import problems_of
+from maasi_filter.settings import EnvironmentSettings
+from maasi_sim.scenario.checks import doubts_about, problems_of
 from maasi_sim.scenario.layering import (
     Key,
     Layer,
     ScenarioError,
     dotted,
+    doubt,
     merge,
     override,
     place,
@@ -24,6 +26,7 @@ from maasi_sim.scenario.layering import (
     validate,
 )
 from maasi_sim.scenario.schema import RobotSettings, Scenario
+from maasi_sim.scenario.visibility import covering_grid
 
 
 def config_folder() -> Path:
@@ -49,8 +52,9 @@ def config_folder() -> Path:
     places += [Path(os.path.normpath(file.locate())).parent for file in manifests]
     places.append(Path(__file__).resolve().parents[3] / 'config')
     for folder in places:
-        if (folder / 'robots').is_dir():
-            return folder
+        # Of links to the files of a repository, messages name those.
+        for file in (folder / 'robots').glob('*.yaml'):
+            return file.resolve().parent.parent
     raise ScenarioError(f'robots: no such folder in {", ".join(map(str, places))}')
 
 
@@ -92,12 +96,10 @@ def load_scenario(
     ScenarioError
         With file, line, key, what was read and what is allowed.
     """
-    return check_scenario(read_scenario(path, overrides))
+    return check_scenario(read_scenario(path), overrides)
 
 
-def read_scenario(
-    path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
-) -> Layer:
+def read_scenario(path: str | Path) -> Layer:
     """Return the values of a scenario file with its layers, not checked yet.
 
     Raises
@@ -108,9 +110,15 @@ def read_scenario(
     path = find_scenario(path)
     layer = read_layer(path)
     _lay_types_under(layer, path)
-    for origin, (key, value) in (overrides or {}).items():
-        override(layer, key, value, origin)
     return layer
+
+
+def with_overrides(layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None) -> Layer:
+    """Return a layer with the values of `load_scenario` that win over it."""
+    result = deepcopy(layer)
+    for origin, (key, value) in (overrides or {}).items():
+        override(result, key, value, origin)
+    return result
 
 
 def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
@@ -137,11 +145,40 @@ def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
     return check_scenario(Layer(content, {(): origin}))
 
 
-def check_scenario(layer: Layer) -> Scenario:
+def check_scenario(
+    layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None = None
+) -> Scenario:
     """Return the scenario of a tree of values with all layers merged."""
+    layer = _with_candidates(layer)
+    if overrides:
+        # What wins over the file hides none of its errors.
+        validate(Scenario, layer)
+        layer = with_overrides(layer, overrides)
     scenario = validate(Scenario, layer)
     refuse(layer, problems_of(scenario))
+    doubt(layer, doubts_about(scenario.robots))
     return scenario
+
+
+def _with_candidates(layer: Layer) -> Layer:
+    """Return a tree in which robots without candidates have a grid that sees everything."""
+    robots = layer.data.get('robots')
+    if not isinstance(robots, dict):
+        return layer
+    result = layer
+    for name, values in robots.items():
+        if isinstance(values, dict) and values.get('candidates') is None:
+            candidates: dict[str, Any] = {'ring': 4, 'distance': 1.0}
+            try:
+                robot = RobotSettings.model_validate({**values, 'candidates': candidates})
+                environment = EnvironmentSettings.model_validate(layer.data.get('environment'))
+                candidates = covering_grid(name, robot, environment)
+            except ValueError:
+                # The error is reported when all is validated.
+                pass
+            key: Key = ('robots', name, 'candidates')
+            result = with_overrides(result, {layer.origin(key): (key, candidates)})
+    return result
 
 
 def _lay_types_under(layer: Layer, path: Path) -> None:

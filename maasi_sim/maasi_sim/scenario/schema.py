@@ -75,7 +75,9 @@ class RobotSettings(Settings):
     )
     yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
     radius: float = Field(default=0.1, gt=0.0, description='Of a circle around the robot [m]')
-    candidates: CandidateSettings = Field(description='Waypoints to choose from')
+    candidates: CandidateSettings = Field(
+        description='Waypoints to choose from; left out: a grid from which it sees everything'
+    )
     motion: MotionSettings = Field(description='How it moves')
     sensor: SensorSettings = Field(description='What it sees, as the filter believes')
     camera: CameraSettings | None = Field(

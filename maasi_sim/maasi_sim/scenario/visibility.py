@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from maasi_filter.settings import (
-    EnvironmentSettings,
-)
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.settings import EnvironmentSettings
 from maasi_planner.candidates import CandidateSet, Viewer, unseen_parts
+from maasi_planner.settings import CandidateSettings
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 
 # Farther than any way between two waypoints [m].
 _FAR = 1e9
+# Of a grid that is chosen for a robot without candidates.
+_MOST_CANDIDATES = 1000
 
 
 def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> CandidateSet:
@@ -36,6 +41,65 @@ def never_seen(scenario: Scenario) -> str:
         for name, robot in scenario.robots.items()
     }
     return unseen_parts(bounds, moving, margin).describe()
+
+
+def covering_grid(
+    name: str, robot: RobotSettings, environment: EnvironmentSettings
+) -> dict[str, Any]:
+    """Return a grid of candidates over the bounds from which a robot sees everything.
+
+    Its spacing is at most the side of a square, or cube, as large as what the sensor sees well.
+
+    Parameters
+    ----------
+    name : str
+        Of the robot.
+    robot : RobotSettings
+        Its own candidates do not matter.
+    environment : EnvironmentSettings
+        Where it searches.
+    """
+    bounds = environment.array()
+    sides = bounds[:, 1] - bounds[:, 0]
+    sensor = robot.sensor.build(name, environment.dimension)
+    start = np.array(robot.start)
+    width = _view_width(sensor, float(sides.max()))
+    first: dict[str, Any] = {}
+    while True:
+        numbers = np.ceil(sides / width - 1e-9).astype(int)
+        if first and numbers.prod() > _MOST_CANDIDATES:
+            # Nothing helps; `never_seen` names what is not seen.
+            return first
+        spacing = sides / numbers
+        grid = {
+            'grid': numbers.tolist(),
+            'spacing': spacing.tolist(),
+            'corner': (bounds[:, 0] + 0.5 * spacing).tolist(),
+        }
+        candidates = CandidateSet(CandidateSettings.model_validate(grid), bounds, robot.start[2])
+        yaw = robot.yaw if robot.motion.heading == 'keep' else None
+        if not unseen_parts(bounds, [Viewer(candidates.at(start), start, sensor, _FAR, yaw)]):
+            return grid
+        first = first or grid
+        width *= 0.8
+
+
+def _view_width(sensor: Sensor, size: float) -> float:
+    """Return the side of a square or cube as large as where at least half of pi is reached."""
+    dimension = sensor.dimension
+    axis = np.linspace(-1.0, 1.0, 41 if dimension == 2 else 21)
+    lattice = np.stack(np.meshgrid(*[axis] * dimension, indexing='ij'), axis=-1)
+    lattice = lattice.reshape(-1, dimension)
+    pose = Pose.from_yaw(np.zeros(3), 0.0)
+    share = 0.0
+    # From the whole environment to what the sensor resolves.
+    for _ in range(20):
+        values = sensor.detection.probability(size * lattice, pose)
+        share = float((values >= 0.5 * values.max()).mean()) if values.max() > 0.0 else 0.0
+        if share > 0.1:
+            break
+        size *= 0.7
+    return 2.0 * size * max(share, 1e-3) ** (1.0 / dimension)
 
 
 def _viewer(scenario: Scenario, name: str, spacing: float) -> Viewer:

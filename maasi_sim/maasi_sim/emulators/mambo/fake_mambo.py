@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from maasi_filter.models.pose import Pose, quaternion_product
+from maasi_sim.arguments import whole
 from maasi_sim.emulators.mambo.commands import ALL_STATES, obey
 from maasi_sim.emulators.mambo.firmware import (
     CLIMB_RANGE,
@@ -386,7 +387,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--type', default='mambo', metavar='NAME', help='robot type (default: %(default)s)'
     )
-    parser.add_argument('--seed', type=int, default=1, metavar='N', help='of the noise')
+    parser.add_argument('--seed', type=whole, default=1, metavar='N', help='of the noise')
     parser.add_argument(
         '--charge', type=float, default=1.0, metavar='X', help='of the battery at the start, 0 to 1'
     )

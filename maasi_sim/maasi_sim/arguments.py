@@ -1,0 +1,41 @@
+"""Numbers on command lines: what was read and what is allowed, when one is wrong."""
+
+from __future__ import annotations
+
+from argparse import ArgumentTypeError
+
+# Largest parameter of a ROS node.
+LARGEST = 2**63 - 1
+
+
+def whole(text: str, least: int = 0, most: int = LARGEST) -> int:
+    """Return a whole number of a command line.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is none, or not within the limits.
+    """
+    # No sign, underscore or digits of another alphabet.
+    number = int(text) if text.isascii() and text.isdecimal() and len(text) < 40 else -1
+    if not least <= number <= most:
+        raise ArgumentTypeError(
+            f"read '{text[:60]}', allowed are whole numbers from {least} to {most}"
+        )
+    return number
+
+
+def count(text: str) -> int:
+    """Return a number of runs or processes; errors as of `whole`."""
+    return whole(text, 1, 9999)
+
+
+def positive(text: str) -> float:
+    """Return a finite number above 0; errors as of `whole`."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = float('nan')
+    if not 0.0 < value < float('inf'):
+        raise ArgumentTypeError(f"read '{text[:60]}', allowed are finite numbers above 0")
+    return value
