@@ -30,7 +30,7 @@ def imported(package: Path, tests: bool) -> set[str]:
     found = set() if tests else set(BY_NAME.get(package.name, ()))
     for path in package.rglob('*.py'):
         inside = path.relative_to(package)
-        if inside.parts[0] == 'setup.py' or (inside.parts[0] == 'test') != tests:
+        if inside.parts[0] in ('setup.py', 'build') or (inside.parts[0] == 'test') != tests:
             continue
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):

@@ -1,0 +1,107 @@
+"""The packages installed by pip, where ROS and what only extras need cannot be imported."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ('config', 'maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
+ROS = (
+    'ament_index_python',
+    'builtin_interfaces',
+    'geometry_msgs',
+    'maasi_msgs',
+    'rclpy',
+    'std_msgs',
+)
+EXTRAS = ('distributed', 'matplotlib', 'PIL', 'pymavlink', 'pyparrot', 'rich', 'setproctitle')
+BLOCK = 'raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)\n'
+
+
+@pytest.fixture(scope='module')
+def blocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder whose modules cannot be imported, and hide those of the same name."""
+    folder = tmp_path_factory.mktemp('blocked')
+    for name in (*ROS, *EXTRAS):
+        (folder / f'{name}.py').write_text(BLOCK)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return where pip has installed the packages, without what they require."""
+    sources = tmp_path_factory.mktemp('sources')
+    for name in PACKAGES:
+        shutil.copytree(
+            ROOT / name, sources / name, ignore=shutil.ignore_patterns('build', '*.egg-info')
+        )
+    prefix = tmp_path_factory.mktemp('prefix')
+    offline = ['--no-deps', '--no-build-isolation', '--no-index', '--prefix', str(prefix)]
+    pip = [sys.executable, '-m', 'pip', 'install', '-q', '--disable-pip-version-check', *offline]
+    # Modules of these packages in the path would be taken for installed ones.
+    environment = {key: value for key, value in os.environ.items() if key != 'PYTHONPATH'}
+    subprocess.run([*pip, *(str(sources / name) for name in PACKAGES)], check=True, env=environment)
+    return prefix
+
+
+def modules_of(prefix: Path) -> Path:
+    """Return the folder of the modules that pip installed."""
+    return next(prefix.glob('**/maasi_filter/filter_node.py')).parents[1]
+
+
+def run(command: list[str], folder: Path, *path: Path | str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder, with these folders in Python's path."""
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join(map(str, path))}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+def without_ros() -> str:
+    """Return the program in README's section about using the libraries without ROS."""
+    section = (ROOT / 'README.md').read_text().split('## Without ROS\n')[1].split('\n## ')[0]
+    block = section.split('\n\n    from ')[1]
+    return 'from ' + '\n'.join(line.removeprefix('    ') for line in block.splitlines())
+
+
+def test_pip_installs_every_file(prefix: Path) -> None:
+    modules = modules_of(prefix)
+    for package in PACKAGES[1:]:
+        for path in (ROOT / package / package).rglob('*'):
+            if path.is_file() and '__pycache__' not in path.parts:
+                assert (modules / path.relative_to(ROOT / package)).is_file()
+    for folder in ('robots', 'scenarios', 'rviz', 'foxglove'):
+        names = {path.name for path in (ROOT / 'config' / folder).iterdir()}
+        assert {path.name for path in prefix.glob(f'**/maasi_config/{folder}/*')} == names
+
+
+def test_an_installed_scenario_is_loaded_from_any_folder(
+    prefix: Path, blocked: Path, tmp_path: Path
+) -> None:
+    # All but the search itself, whose kernels would be compiled for minutes at this new place.
+    program = without_ros().split('\n\n')[0]
+    program += '\nprint(search.__module__, load_scenario.__code__.co_filename)'
+    program += "\nprint(len(load_scenario('mambo_turtlebot').robots))"
+    done = run([sys.executable, '-c', program], tmp_path, blocked, modules_of(prefix))
+    assert done.returncode == 0, done.stderr
+    assert str(prefix) in done.stdout and done.stdout.splitlines()[-1] == '2'
+
+
+def test_a_command_that_needs_ros_says_so(prefix: Path, blocked: Path, tmp_path: Path) -> None:
+    [script] = prefix.glob('**/bin/filter_node')
+    done = run([sys.executable, str(script)], tmp_path, blocked, modules_of(prefix))
+    assert done.returncode == 2
+    assert 'error: filter_node: no module rclpy: it needs ROS 2 Jazzy' in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+def test_the_program_in_the_readme_runs_as_printed(blocked: Path, tmp_path: Path) -> None:
+    path = os.environ.get('PYTHONPATH', '').split(os.pathsep)
+    ours = [item for item in path if any(name in item for name in PACKAGES)]
+    done = run([sys.executable, '-c', without_ros()], tmp_path, blocked, *ours)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith('all_found ')
