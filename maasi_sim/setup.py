@@ -47,6 +47,7 @@ setup(
             'fake_mambo = maasi_entry:maasi_sim.emulators.mambo.fake_mambo',
             'fake_mavlink_vehicle = maasi_entry:maasi_sim.emulators.mavlink.fake_mavlink_vehicle',
             'view_node = maasi_entry:maasi_sim.view.view_node',
+            'compare = maasi_entry:maasi_sim.experiments.compare',
             'run_scenario = maasi_entry:maasi_sim.run.run_scenario',
         ],
     },

@@ -10,6 +10,8 @@ import platform
 from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 
 # By key: what a difference is called.
 _NAMES = {
@@ -22,6 +24,16 @@ _NAMES = {
     'llvmlite': 'llvmlite',
     'cv2': 'OpenCV',
 }
+# What a search in one process consists of.
+_SEARCH = (
+    'maasi_filter',
+    'maasi_planner',
+    'maasi_drivers',
+    'maasi_sim.scenario',
+    'maasi_sim.world',
+    'maasi_sim.targets',
+    'maasi_sim.search',
+)
 _LIBRARIES = ('numpy', 'scipy', 'numba', 'llvmlite', 'cv2')
 
 
@@ -60,3 +72,18 @@ def machine_difference(first: Mapping[str, str], second: Mapping[str, str]) -> s
         for key in keys
         if first.get(key) != second.get(key)
     )
+
+
+@cache
+def code_digest() -> str:
+    """Return a short hash of the code of a search: searches of other code are not mixed."""
+    total = hashlib.sha256()
+    for name in _SEARCH:
+        spec = find_spec(name)
+        assert spec is not None and spec.origin is not None, name
+        origin = Path(spec.origin)
+        files = origin.parent.rglob('*.py') if spec.submodule_search_locations else [origin]
+        for path in sorted(files):
+            total.update(path.relative_to(origin.parent).as_posix().encode())
+            total.update(path.read_bytes())
+    return total.hexdigest()[:16]

@@ -517,7 +517,7 @@ def elsewhere(monkeypatch):
     """Let the workers of the command be those that are given."""
 
     def use(workers):
-        monkeypatch.setattr(reproduce, 'make_workers', lambda options, number: workers)
+        monkeypatch.setattr(reproduce, 'make_workers', lambda *_: workers)
 
     return use
 

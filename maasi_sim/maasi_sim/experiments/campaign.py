@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from maasi_sim.experiments.cases import Case
+from maasi_sim.experiments.comparison import SearchComparison
 from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.registry import find
 from maasi_sim.experiments.results import DamagedRun, Run, RunFolder, from_text, run_of, to_text
@@ -38,7 +39,10 @@ _AHEAD = 2
 
 @dataclass(frozen=True)
 class Task:
-    """One run to be made; names and numbers only, so that it can be sent anywhere."""
+    """One run to be made; plain values only, so that it can be sent anywhere.
+
+    `settings` are those of a comparison; None: the worker has the experiment by its name.
+    """
 
     experiment: str
     case: str
@@ -46,6 +50,7 @@ class Task:
     seed: int
     small: bool
     digest: str
+    settings: dict[str, Any] | None = None
 
 
 class WorkersLost(RuntimeError):
@@ -59,7 +64,11 @@ class MixedWorkers(ValueError):
 def execute(task: Task) -> tuple[str, str]:
     """Make a run and return the text of its file, or '' and what went wrong."""
     try:
-        experiment = find(task.experiment)
+        if task.settings is None:
+            experiment = find(task.experiment)
+        else:
+            own = [Case(task.case, task.settings)]
+            experiment = SearchComparison(task.experiment, own)
         case = next((c for c in experiment.cases(task.small) if c.name == task.case), None)
         if case is None or case.digest() != task.digest:
             return '', 'this worker has other settings for it: another version of the code'
@@ -177,6 +186,8 @@ class Cluster:
     ----------
     address : str
         Of its scheduler, such as 'tcp://127.0.0.1:8786'.
+    option : str
+        That gave it, for messages.
     patience : float
         How long to wait for the scheduler and a first worker [s].
 
@@ -186,20 +197,21 @@ class Cluster:
         If there is no scheduler, or it has no workers.
     """
 
-    def __init__(self, address: str, patience: float = 20.0) -> None:
+    def __init__(self, address: str, option: str = '--cluster', patience: float = 20.0) -> None:
+        self._option = option
         try:
             from distributed import Client
         except ImportError:
-            raise WorkersLost("--cluster needs the package 'dask[distributed]'") from None
+            raise WorkersLost(f"{option} needs the package 'dask[distributed]'") from None
         try:
             self._client: Any = Client(address, timeout=patience, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise WorkersLost(f'--cluster: no scheduler answers at {address}: {error}') from None
+            raise WorkersLost(f'{option}: no scheduler answers at {address}: {error}') from None
         try:
             self._client.wait_for_workers(1, timeout=patience)
         except TimeoutError:
             self._client.close()
-            raise WorkersLost(f'--cluster: the scheduler at {address} has no workers') from None
+            raise WorkersLost(f'{option}: the scheduler at {address} has no workers') from None
         self.number = sum(self._client.nthreads().values())
 
     def machines(self) -> Mapping[str, dict[str, str]]:
@@ -208,7 +220,7 @@ class Cluster:
             return dict(sorted(self._client.run(this_machine).items()))
         except Exception as error:
             self.close()
-            raise WorkersLost(f'--cluster: {type(error).__name__}: {error}') from None
+            raise WorkersLost(f'{self._option}: {type(error).__name__}: {error}') from None
 
     def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
         """See `Workers.make`."""
@@ -222,7 +234,7 @@ class Cluster:
             try:
                 result = future.result()
             except Exception as error:
-                raise WorkersLost(f'--cluster: {type(error).__name__}: {error}') from None
+                raise WorkersLost(f'{self._option}: {type(error).__name__}: {error}') from None
             yield (futures[future], *result)
             future.release()
 
@@ -266,7 +278,14 @@ class Plan:
         return Results(self.experiment, self.cases, runs)
 
 
-def plan(experiment: Experiment, out: Path, runs: int, seed: int = 1, small: bool = False) -> Plan:
+def plan(
+    experiment: Experiment,
+    out: Path,
+    runs: int,
+    seed: int = 1,
+    small: bool = False,
+    first: int = 0,
+) -> Plan:
     """Compare the stored runs with the wanted ones, and return the work plan.
 
     Parameters
@@ -281,12 +300,15 @@ def plan(experiment: Experiment, out: Path, runs: int, seed: int = 1, small: boo
         Of the campaign.
     small : bool
         Whether the small cases are meant.
+    first : int
+        Number of the first map.
     """
     folder = RunFolder(out / experiment.name, experiment.name)
     result = Plan(experiment, experiment.cases(small), {}, [], folder, [])
-    for number in range(runs):
+    sent = isinstance(experiment, SearchComparison)
+    for number in range(first, first + runs):
         for case in result.cases:
-            if case.runs is not None and number >= case.runs:
+            if case.runs is not None and number - first >= case.runs:
                 continue
             try:
                 run = folder.load(case, number, experiment.seed(number, seed))
@@ -296,8 +318,9 @@ def plan(experiment: Experiment, out: Path, runs: int, seed: int = 1, small: boo
             if run is not None:
                 result.done[case.name, number] = run
             else:
+                settings = case.settings if sent else None
                 result.tasks.append(
-                    Task(experiment.name, case.name, number, seed, small, case.digest())
+                    Task(experiment.name, case.name, number, seed, small, case.digest(), settings)
                 )
     return result
 

@@ -15,7 +15,7 @@ from maasi_sim.experiments.registry import experiments
 from maasi_sim.experiments.results import RunFolder, write_file
 from maasi_sim.experiments.tables import markdown
 
-_PICTURE_DPI = 65
+_PICTURE_DPI = 130
 _COLUMNS = 118
 
 _PAPERS = {

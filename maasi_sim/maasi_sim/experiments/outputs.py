@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import yaml
 
 from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.results import RunFolder, runs_text, steps_text, write_file
 from maasi_sim.experiments.tables import markdown, table_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def configuration_text(results: Results, seed: int) -> str:
@@ -38,12 +43,17 @@ def configuration_text(results: Results, seed: int) -> str:
 
 def picture(results: Results, dpi: int = 110) -> bytes:
     """Return the experiment's figure as PNG."""
+    return as_png(lambda figure: results.experiment.draw(figure, results), dpi)
+
+
+def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
+    """Return what is drawn on an empty figure as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 5.0), layout='constrained')
     FigureCanvasAgg(figure)
-    results.experiment.draw(figure, results)
+    draw(figure)
     stream = io.BytesIO()
     figure.savefig(stream, dpi=dpi, format='png')
     return stream.getvalue()

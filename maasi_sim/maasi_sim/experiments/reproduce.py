@@ -3,47 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
-import time
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-
 from maasi_sim.arguments import count, whole
-from maasi_sim.experiments.campaign import (
-    Cluster,
-    MixedWorkers,
-    Plan,
-    Processes,
-    SerialExecutor,
-    Workers,
-    WorkersLost,
-    carry_out,
-    one_machine,
-    plan,
-)
+from maasi_sim.experiments.campaign import MixedWorkers, Plan, WorkersLost, plan
 from maasi_sim.experiments.document import write_document
+from maasi_sim.experiments.execution import carry_out_all, make_workers
 from maasi_sim.experiments.experiment import Experiment
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.registry import UnknownExperiment, experiments, find
-from maasi_sim.experiments.results import NoRoom, Run
+from maasi_sim.experiments.results import NoRoom
 
 DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
-
-# Wall time between two lines about progress where there is no terminal [s].
-_QUIET_PERIOD = 10.0
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -174,98 +149,14 @@ def run_all(wanted: list[Experiment], options: argparse.Namespace) -> int:
         for complaint in work.complaints:
             print(f'warning: {complaint}', file=sys.stderr)
         plans.append(work)
-    number = sum(len(work.tasks) for work in plans)
-    problems: list[str] = []
-    workers: Workers | None = None
-    begin = time.monotonic()
-    try:
-        if number:
-            workers = make_workers(options, number)
-        machine = None
-        if workers is not None and not options.mixed_workers:
-            machine = one_machine(workers, plans)
-        with _Display(plans) as display:
-            for work in plans:
-                if work.tasks and workers is not None:
-                    problems += carry_out(work, workers, display.advance(work), machine)
-                write_outputs(work.folder, work.results(), options.seed)
-                display.say(f'{work.experiment.name}: {work.folder.path}/table.md')
-    finally:
-        if workers is not None:
-            workers.close()
-    used = f' by {workers.number} workers in {time.monotonic() - begin:.0f} s' if workers else ''
-    kept = sum(len(work.done) for work in plans)
-    print(f'{number - len(problems)} runs made{used}; {kept} there in all')
-    for problem in problems:
-        print(f'error: {problem}', file=sys.stderr)
+
+    def finished(work: Plan) -> str:
+        write_outputs(work.folder, work.results(), options.seed)
+        return f'{work.experiment.name}: {work.folder.path}/table.md'
+
+    hire = partial(make_workers, options.workers, options.cluster, '--cluster')
+    problems = carry_out_all(plans, hire, options.mixed_workers, finished)
     return SOME_FAILED if problems else DONE
-
-
-def make_workers(options: argparse.Namespace, number: int) -> Workers:
-    """Return who makes so many runs."""
-    if options.cluster is not None:
-        return Cluster(options.cluster)
-    wanted = min(options.workers or os.cpu_count() or 1, number)
-    return Processes(wanted) if wanted > 1 else SerialExecutor()
-
-
-class _Display:
-    """Progress and an estimate of what is left: a bar, or lines where there is no terminal."""
-
-    def __init__(self, plans: list[Plan]) -> None:
-        self._plans = plans
-        self._total = sum(len(work.tasks) for work in plans)
-        self._made = 0
-        self._begin = self._last = time.monotonic()
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
-
-    def __enter__(self) -> _Display:
-        if sys.stderr.isatty() and self._total:
-            self._bar = Progress(
-                TextColumn('{task.description}'),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TextColumn('left'),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-            )
-            self._bar.start()
-            self._task = self._bar.add_task('', total=self._total)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def advance(self, work: Plan):  # type: ignore[no-untyped-def]
-        """Return what is to be called after each run of an experiment."""
-
-        def note(run: Run | None) -> None:
-            self._made += 1
-            what = work.experiment.name if run is None else f'{run.experiment} {run.case}'
-            if self._bar is not None and self._task is not None:
-                self._bar.update(self._task, completed=self._made, description=what)
-                return
-            now = time.monotonic()
-            if now - self._last >= _QUIET_PERIOD:
-                self._last = now
-                left = (now - self._begin) * (self._total - self._made) / self._made
-                print(
-                    f'{self._made} of {self._total} runs, about {left:.0f} s left ({what})',
-                    file=sys.stderr,
-                    flush=True,
-                )
-
-        return note
-
-    def say(self, text: str) -> None:
-        """Write a line that stays."""
-        if self._bar is not None:
-            self._bar.console.print(text, markup=False, highlight=False)
-        else:
-            print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == '__main__':

@@ -96,7 +96,7 @@ def run_search(settings: dict[str, Any], seed: int) -> Outcome:
     return outcome_of(result, settings['most_measurements'], scenario.limits.time)
 
 
-def outcome_of(result: SearchResult, most_measurements: int, time_limit: float) -> Outcome:
+def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: float) -> Outcome:
     """Return what is measured of a search."""
     progress = result.progress
     complete = next(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 LEVEL = 0.95
@@ -121,6 +122,118 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     if one.shape != two.shape:
         raise ValueError(f'first, second: got shapes {one.shape}, {two.shape}, allowed are equal')
     return mean_interval(one - two)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The mean of paired differences with its bootstrap interval.
+
+    Attributes
+    ----------
+    mean, low, high : float
+        With the bounds of the 95 % interval; nan where there are too few values.
+    median : float
+        Of the differences.
+    number : int
+        Pairs.
+    needed : int or None
+        Pairs with which a difference of this size would be told from 0 in four of five cases;
+        None if that cannot be said: no difference, no spread, or more than a million.
+    """
+
+    mean: float
+    low: float
+    high: float
+    median: float
+    number: int
+    needed: int | None
+
+    @property
+    def told_from_zero(self) -> bool:
+        """Whether the interval excludes 0."""
+        return self.low > 0.0 or self.high < 0.0
+
+
+def bootstrap_difference(first: ArrayLike, second: ArrayLike) -> Difference:
+    """Return the mean of first minus second on the same maps; pairs with a nan are left out.
+
+    The interval is bias-corrected and accelerated (Efron), of resampled pairs, always with the
+    same random numbers.
+
+    Raises
+    ------
+    ValueError
+        If the lengths differ.
+    """
+    one, two = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    if one.shape != two.shape:
+        raise ValueError(f'first, second: got shapes {one.shape}, {two.shape}, allowed are equal')
+    gaps = (one - two)[~np.isnan(one - two)]
+    if not len(gaps):
+        return Difference(math.nan, math.nan, math.nan, math.nan, 0, None)
+    mean, median = float(gaps.mean()), float(np.median(gaps))
+    if len(gaps) == 1:
+        return Difference(mean, math.nan, math.nan, median, 1, None)
+    if np.ptp(gaps) == 0.0:
+        return Difference(mean, mean, mean, median, len(gaps), None)
+    low, high = _bootstrap_interval(tuple(gaps))
+    return Difference(mean, low, high, median, len(gaps), pairs_needed(gaps))
+
+
+@lru_cache
+def _bootstrap_interval(gaps: tuple[float, ...]) -> tuple[float, float]:
+    low, high = stats.bootstrap(
+        (gaps,), np.mean, confidence_level=LEVEL, random_state=np.random.default_rng(0)
+    ).confidence_interval
+    return float(low), float(high)
+
+
+def pairs_needed(gaps: ArrayLike, power: float = 0.8, most: int = 1_000_000) -> int | None:
+    """Return how many pairs a paired t test needs to find a mean difference as large as this.
+
+    Parameters
+    ----------
+    gaps : (n,) array
+        Differences found, two or more.
+    power : float
+        Probability with which it is to be found.
+    most : int
+        Above that, None.
+    """
+    values = np.asarray(gaps, dtype=float)
+    deviation = float(values.std(ddof=1))
+    if deviation == 0.0 or values.mean() == 0.0:
+        return None
+    effect = abs(float(values.mean())) / deviation
+    tail = 0.5 + 0.5 * LEVEL
+    # With the normal distribution, which needs a few less.
+    number = max(2, int(((stats.norm.ppf(tail) + stats.norm.ppf(power)) / effect) ** 2))
+    while number <= most:
+        limit = stats.t.ppf(tail, number - 1)
+        if stats.nct.sf(limit, number - 1, effect * math.sqrt(number)) >= power:
+            return number
+        number += 1
+    return None
+
+
+def survival(
+    durations: ArrayLike, finished: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return Kaplan and Meier's curve: times, and the share that is not finished from then on.
+
+    Parameters
+    ----------
+    durations : (n,) array
+        How long each took, or was tried.
+    finished : (n,) array of bool
+        Whether it is that it took.
+    """
+    times, ended = np.asarray(durations, dtype=float), np.asarray(finished, dtype=bool)
+    curve = stats.ecdf(stats.CensoredData.right_censored(times, ~ended)).sf
+    return (
+        np.concatenate([[0.0], curve.quantiles]),
+        np.concatenate([[1.0], curve.probabilities]),
+    )
 
 
 def independent_difference(first: Interval, second: Interval) -> Interval:

@@ -1,0 +1,237 @@
+"""Compare planners and filters: searches of scenarios in one process each, on the same seeds."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Sequence
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from maasi_sim.arguments import count, positive, whole
+from maasi_sim.experiments.campaign import MixedWorkers, Plan, WorkersLost, plan
+from maasi_sim.experiments.comparison import SearchComparison, compared
+from maasi_sim.experiments.comparison_tables import document, facts, table_text, verdicts
+from maasi_sim.experiments.execution import carry_out_all, make_workers
+from maasi_sim.experiments.experiment import Results
+from maasi_sim.experiments.outputs import as_png
+from maasi_sim.experiments.results import NoRoom, runs_text, write_file
+from maasi_sim.scenario.layering import ScenarioError
+
+DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
+_RUNS = Path('runs')
+
+
+class WrongRequest(ValueError):
+    """What is asked for cannot be done."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog='compare',
+        description='Compare planners and filters in whole searches on the same seeds, each '
+        'search in one process; the same command goes on where it stopped.',
+        epilog='Exit codes: 0 all searches are there, 1 some failed, 2 wrong input, 3 stopped: no '
+        'room on the disk, or the workers are gone, 130 interrupted.',
+    )
+    parser.add_argument(
+        'scenarios', nargs='+', metavar='SCENARIO', help='file, or name of one in config/scenarios'
+    )
+    parser.add_argument(
+        '--planners',
+        type=_names,
+        default=(),
+        metavar='NAME,...',
+        help="planners; differences are to the first one (default: the scenario's)",
+    )
+    parser.add_argument(
+        '--filters',
+        type=_names,
+        default=(),
+        metavar='NAME,...',
+        help="filters, each with each planner (default: the scenario's)",
+    )
+    parser.add_argument(
+        '--seeds', type=count, default=30, metavar='N', help='how many (default: %(default)s)'
+    )
+    parser.add_argument(
+        '--first-seed', type=_seed, default=1, metavar='N', help='the first (default: %(default)s)'
+    )
+    parser.add_argument(
+        '--time-limit', type=positive, metavar='S', help="of a search [s], not the scenario's"
+    )
+    parser.add_argument(
+        '--workers', type=count, metavar='N', help='processes (default: one for each core)'
+    )
+    parser.add_argument('--dask', metavar='ADDRESS', help='scheduler of a Dask cluster')
+    parser.add_argument(
+        '--mixed-workers',
+        action='store_true',
+        help='mix searches of different processors or versions, which may differ in the last bits',
+    )
+    parser.add_argument(
+        '--again',
+        action='store_true',
+        help='make searches in DIR anew that are of other settings, or of another version of the '
+        'code',
+    )
+    parser.add_argument(
+        '--out',
+        type=Path,
+        metavar='DIR',
+        help='folder of the results (default: runs/compare_<time>, or one that was interrupted)',
+    )
+    return parser
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(','))
+    if not all(names) or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(
+            f"read '{text}', allowed are different names with commas between them"
+        )
+    return names
+
+
+def _seed(text: str) -> int:
+    return whole(text, 0, 2**32)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    options = build_parser().parse_args(arguments)
+    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGINT, _interrupt)
+    try:
+        return compare(options)
+    except (ScenarioError, WrongRequest) as error:
+        return _refuse(str(error), WRONG_INPUT)
+    except MixedWorkers as error:
+        return _refuse(f'{error}; --mixed-workers allows it', WRONG_INPUT)
+    except (NoRoom, WorkersLost) as error:
+        return _refuse(f'{error}; the searches until now are kept', STOPPED)
+    except KeyboardInterrupt:
+        return _refuse('interrupted; the same command goes on from here', INTERRUPTED)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _refuse(text: str, code: int) -> int:
+    for line in text.splitlines():
+        print(f'error: {line}', file=sys.stderr)
+    return code
+
+
+def compare(options: argparse.Namespace) -> int:
+    """Make the searches that are missing, write what they come to, and return the exit code."""
+    comparisons = [
+        compared(scenario, options.planners, options.filters, options.time_limit)
+        for scenario in options.scenarios
+    ]
+    names = [item.name for item in comparisons]
+    if len(set(names)) < len(names):
+        raise WrongRequest(f'SCENARIO: read {", ".join(names)}, allowed are different names')
+    wanted = request(comparisons, options)
+    out = options.out or unfinished(wanted) or _new_folder()
+    plans = [
+        plan(item, out, options.seeds, first=options.first_seed, small=False)
+        for item in comparisons
+    ]
+    for work in plans:
+        for complaint in work.complaints:
+            print(f'warning: {complaint}', file=sys.stderr)
+    if not options.again:
+        _refuse_others(plans, out)
+    print(f'results: {out}', file=sys.stderr)
+    write_file(out / 'request.json', json.dumps(wanted, indent=2) + '\n')
+    hire = partial(make_workers, options.workers, options.dask, '--dask')
+    problems = carry_out_all(plans, hire, options.mixed_workers, lambda work: '')
+    results = [work.results() for work in plans if work.done]
+    if results:
+        seeds = range(options.first_seed, options.first_seed + options.seeds)
+        write_comparison(out, results, seeds)
+        for item in results:
+            print(f'\n{item.experiment.name}', *verdicts(item), sep='\n  ')
+        print(f'\n{out}/comparison.md')
+    return SOME_FAILED if problems else DONE
+
+
+def request(comparisons: Sequence[SearchComparison], options: argparse.Namespace) -> dict[str, Any]:
+    """Return what is asked for: seeds, and a hash of the settings of each case."""
+    return {
+        'first_seed': options.first_seed,
+        'seeds': options.seeds,
+        'scenarios': {
+            item.name: {case.name: case.digest() for case in item.cases(False)}
+            for item in comparisons
+        },
+    }
+
+
+def unfinished(wanted: dict[str, Any]) -> Path | None:
+    """Return the newest folder of an interrupted comparison that was asked for the same."""
+    for folder in sorted(_RUNS.glob('compare_*'), reverse=True):
+        try:
+            read = json.loads((folder / 'request.json').read_text(encoding='utf-8'))
+        except (OSError, ValueError):
+            continue
+        if read == wanted and not (folder / 'comparison.json').exists():
+            return folder
+    return None
+
+
+def _new_folder() -> Path:
+    stamp = datetime.now().strftime('%Y%m%d_%H%M%S')
+    folder, number = _RUNS / f'compare_{stamp}', 1
+    while folder.exists():
+        number += 1
+        folder = _RUNS / f'compare_{stamp}_{number}'
+    return folder
+
+
+def _refuse_others(plans: Sequence[Plan], out: Path) -> None:
+    """Refuse a folder with whole searches of the same names and seeds but other settings."""
+    other = 0
+    for work in plans:
+        cases = {case.name: case for case in work.cases}
+        damaged = '\n'.join(work.complaints)
+        for task in work.tasks:
+            file = work.folder.file(cases[task.case], task.number)
+            other += file.exists() and str(file) not in damaged
+    if other:
+        raise WrongRequest(
+            f'--out: {out}: {other} searches there are of other settings, or of another version '
+            'of the code; allowed is another folder, or --again to make them anew'
+        )
+
+
+def write_comparison(out: Path, results: Sequence[Results], seeds: Sequence[int]) -> None:
+    """Write tables, picture and JSON.
+
+    Raises
+    ------
+    NoRoom
+        If one cannot be written; the searches are there already.
+    """
+    from maasi_sim.experiments.comparison_figure import draw_comparison
+
+    for item in results:
+        runs = [run for name in item.names() for run in item.runs[name]]
+        write_file(out / item.experiment.name / 'runs.csv', runs_text(runs))
+    write_file(out / 'comparison.csv', table_text(results))
+    write_file(out / 'comparison.png', as_png(lambda figure: draw_comparison(figure, results)))
+    write_file(out / 'comparison.md', document(results, seeds))
+    text = json.dumps(facts(results, seeds), indent=2, allow_nan=False)
+    write_file(out / 'comparison.json', text + '\n')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,157 @@
+"""Searches of a scenario with several planners and filters on the same seeds, as an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_sim.buildings.scenario import is_cuboid_scenario
+from maasi_sim.experiments.cases import Case, Outcome
+from maasi_sim.experiments.clairvoyant import Clairvoyant
+from maasi_sim.experiments.experiment import Experiment, Results
+from maasi_sim.experiments.searches import outcome_of
+from maasi_sim.machine import code_digest
+from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.scenario.loading import (
+    find_scenario,
+    load_scenario,
+    read_scenario,
+    scenario_from_content,
+)
+from maasi_sim.scenario.schema import Scenario
+from maasi_sim.search import SearchResult, leaving, search
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class SearchComparison(Experiment):
+    """Searches that are compared; the number of a map is the seed of the search.
+
+    Parameters
+    ----------
+    name : str
+        Of the scenario, or of what is searched.
+    cases : sequence of Case
+        As `search_settings` has their settings. Differences are to the first one.
+    """
+
+    def __init__(self, name: str, cases: Sequence[Case]) -> None:
+        super().__init__(
+            name=name,
+            title='Searches on the same seeds',
+            cases=lambda small: list(cases),
+            run=run_compared,
+            quantities=(),
+            draw=_draw,
+        )
+
+    def seed(self, number: int, seed: int = 1) -> int:
+        """Return the number of the map."""
+        return number
+
+
+def _draw(figure: Figure, results: Results) -> None:
+    from maasi_sim.experiments.comparison_figure import draw_comparison
+
+    draw_comparison(figure, [results])
+
+
+def search_settings(scenario: Scenario, clairvoyant: bool = False) -> dict[str, Any]:
+    """Return the settings of a case.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What is run.
+    clairvoyant : bool
+        Whether the planner is the one that is told the true targets, not the scenario's.
+    """
+    return {
+        'scenario': scenario.content(),
+        'clairvoyant': clairvoyant,
+        'code': code_digest(),
+    }
+
+
+def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
+    """Run a search of a case and return what is measured of it.
+
+    Raises
+    ------
+    RuntimeError
+        If the code here is not that of the settings.
+    """
+    if settings['code'] != code_digest():
+        raise RuntimeError('this worker has another version of the code')
+    scenario = scenario_from_content(settings['scenario'], 'settings')
+    limit = scenario.limits.time
+    result = search(scenario, seed, planner=Clairvoyant if settings['clairvoyant'] else None)
+    outcome = outcome_of(result, None, limit)
+    times = find_times(result, limit)
+    outcome.summary['mean_time_to_find'] = float(times.mean()) if len(times) else None
+    outcome.timing['slowest_decision'] = max(result.planning_times, default=0.0)
+    return outcome
+
+
+def find_times(result: SearchResult, limit: float) -> NDArray[np.float64]:
+    """Return when the first, second and so on of the true targets was found, (n,) [s].
+
+    A target that was not found has the limit.
+    """
+    times = np.full(len(result.truth), limit)
+    for item in reversed(result.progress):
+        times[: item.true_found] = np.minimum(times[: item.true_found], item.time)
+    return times
+
+
+def compared(
+    scenario: str | Path,
+    planners: Sequence[str] = (),
+    filters: Sequence[str] = (),
+    time_limit: float | None = None,
+) -> SearchComparison:
+    """Return the comparison of planners and filters in a scenario.
+
+    Parameters
+    ----------
+    scenario : str or Path
+        File, or the name of one in `config/scenarios`.
+    planners, filters : sequence of str
+        Values of `planner.name` and `filter.method`; without any, the scenario's own.
+    time_limit : float, optional
+        Instead of the scenario's [s].
+
+    Raises
+    ------
+    ScenarioError
+        As `load_scenario`; and if the search cannot run in one process.
+    """
+    path = find_scenario(scenario)
+    if is_cuboid_scenario(read_scenario(path)):
+        raise ScenarioError(f'{path}: is a search of buildings, allowed are searches for targets')
+    cases = []
+    for method in filters or (None,):
+        for planner in planners or (None,):
+            # Many searches run beside each other; results do not depend on it.
+            overrides: dict[str, tuple[Key, Any]] = {'one process': (('filter', 'threads'), 1)}
+            if planner is not None:
+                overrides['--planners'] = ('planner', 'name'), planner
+            if method is not None:
+                overrides['--filters'] = ('filter', 'method'), method
+            if time_limit is not None:
+                overrides['--time-limit'] = ('limits', 'time'), time_limit
+            loaded = load_scenario(path, overrides)
+            try:
+                leaving(loaded)
+            except ValueError as error:
+                raise ScenarioError(f'{path}: {error}') from None
+            names = [planner or loaded.planner.name]
+            if len(filters) > 1:
+                names.append(str(method))
+            cases.append(Case(', '.join(names), search_settings(loaded)))
+    return SearchComparison(path.stem, cases)

@@ -1,0 +1,226 @@
+"""Tests of ./scripts/compare: searches that are kept, what is written, and its statistics."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import pickle
+
+import numpy as np
+import pytest
+import yaml
+from scipy import stats
+
+from maasi_sim.experiments import campaign, compare, comparison, statistics
+from maasi_sim.experiments.comparison_tables import verdict
+from maasi_sim.experiments.statistics import Difference
+
+SCENARIO = {
+    'version': 1,
+    'environment': {'bounds': [[0.0, 60.0], [0.0, 60.0]]},
+    'step': 0.1,
+    'targets': {'count': 2, 'separation': 10.0, 'margin': 5.0},
+    'robots': {
+        'drone': {
+            'type': 'ranging_drone',
+            'start': [1.0, 1.0, 1.0],
+            'candidates': {'grid': [4, 4], 'spacing': 15.0, 'corner': [7.0, 7.0]},
+        }
+    },
+    'filter': {'method': 'pmb', 'expected_targets': 2.0},
+    'planner': {'name': 'maasi'},
+    'limits': {'time': 15.0},
+}
+PLANNERS = ['nearest_widest', 'lawnmower']
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    """Return the file of a scenario whose search takes a fraction of a second."""
+    path = tmp_path / 'field.yaml'
+    path.write_text(yaml.safe_dump(SCENARIO))
+    return path
+
+
+@pytest.fixture
+def executed(monkeypatch):
+    """Return the searches made, in their order."""
+    made: list[tuple[str, int]] = []
+    original = campaign.execute
+
+    def execute(task):
+        made.append((task.case, task.number))
+        return original(task)
+
+    monkeypatch.setattr(campaign, 'execute', execute)
+    return made
+
+
+def command(scenario, out, *more, seeds=2):
+    """Return the exit code of a comparison in this process."""
+    arguments = [str(scenario), '--planners', ','.join(PLANNERS), '--seeds', str(seeds)]
+    if out is not None:
+        arguments += ['--out', str(out)]
+    return compare.main([*arguments, '--workers', '1', *more])
+
+
+def test_comparison_is_written_and_not_made_twice(scenario, tmp_path, executed, capsys):
+    out = tmp_path / 'out'
+    assert command(scenario, out, '--first-seed', '7') == 0
+    assert sorted(executed) == sorted((name, seed) for name in PLANNERS for seed in (7, 8))
+    assert 'lawnmower minus nearest_widest' in capsys.readouterr().out
+    facts = json.loads((out / 'comparison.json').read_text())
+    cases = facts['scenarios']['field']['cases']
+    assert list(cases) == PLANNERS and facts['seeds'] == [7, 8]
+    times = {name: [run['time'] for run in case['runs']] for name, case in cases.items()}
+    [gap] = [
+        item
+        for item in facts['scenarios']['field']['differences']
+        if item['quantity'] == 'time' and item['case'] == 'lawnmower'
+    ]
+    expected = np.mean(np.subtract(times['lawnmower'], times['nearest_widest']))
+    assert gap['mean'] == pytest.approx(expected) and gap['number'] == 2
+    rows = list(csv.DictReader((out / 'comparison.csv').open()))
+    [row] = [row for row in rows if row['minus'] and row['quantity'] == 'time']
+    assert float(row['mean']) == pytest.approx(expected)
+    page = (out / 'comparison.md').read_text()
+    assert '| lawnmower | 2 |' in page and 'Seeds 7 to 8' in page
+    assert (out / 'comparison.png').read_bytes().startswith(b'\x89PNG')
+    runs = list(csv.DictReader((out / 'field' / 'runs.csv').open()))
+    assert [run['seed'] for run in runs] == ['7', '8'] * 2
+    del executed[:]
+    assert command(scenario, out, '--first-seed', '7', seeds=3) == 0
+    assert sorted(executed) == [('lawnmower', 9), ('nearest_widest', 9)]
+
+
+def test_interrupted_comparison_goes_on_in_its_folder(
+    scenario, tmp_path, executed, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    counting = campaign.execute
+
+    def interrupt(task):
+        if len(executed) == 3:
+            raise KeyboardInterrupt
+        return counting(task)
+
+    monkeypatch.setattr(campaign, 'execute', interrupt)
+    assert command(scenario, None) == 130
+    assert 'the same command goes on' in capsys.readouterr().err
+    monkeypatch.setattr(campaign, 'execute', counting)
+    assert command(scenario, None) == 0
+    assert len(executed) == len(set(executed)) == 4
+    [folder] = (tmp_path / 'runs').iterdir()
+    assert (folder / 'comparison.md').exists()
+    # It is finished: the same command once more is another comparison.
+    assert command(scenario, None) == 0
+    assert len(list((tmp_path / 'runs').iterdir())) == 2
+
+
+def test_other_settings_and_other_code_are_noticed(
+    scenario, tmp_path, executed, monkeypatch, capsys
+):
+    out = tmp_path / 'out'
+    assert command(scenario, out, seeds=1) == 0
+    del executed[:]
+    assert command(scenario, out, '--time-limit', '5', seeds=1) == 2
+    said = capsys.readouterr().err
+    assert '2 searches there are of other settings' in said and '--again' in said
+    monkeypatch.setattr(comparison, 'code_digest', lambda: 'another')
+    assert command(scenario, out, seeds=1) == 2
+    assert not executed
+    assert command(scenario, out, '--again', seeds=1) == 0
+    assert len(executed) == 2
+    assert command(scenario, out, seeds=1) == 0
+    assert len(executed) == 2
+
+
+def test_worker_of_other_code_is_noticed(scenario, tmp_path, monkeypatch):
+    work = campaign.plan(comparison.compared(scenario, PLANNERS), tmp_path, 1)
+    # What a cluster sends.
+    task = pickle.loads(pickle.dumps(work.tasks[0]))
+    monkeypatch.setattr(comparison, 'code_digest', lambda: 'another')
+    text, problem = campaign.execute(task)
+    assert not text and 'another version of the code' in problem
+
+
+def test_filters_are_compared_with_each_planner(scenario):
+    cases = comparison.compared(scenario, PLANNERS, ['pmb', 'ic_phd'], 4.0).cases(False)
+    assert [case.name for case in cases] == [
+        f'{planner}, {method}' for method in ('pmb', 'ic_phd') for planner in PLANNERS
+    ]
+    settings = [case.settings['scenario'] for case in cases]
+    assert [item['filter']['method'] for item in settings] == ['pmb', 'pmb', 'ic_phd', 'ic_phd']
+    assert {item['limits']['time'] for item in settings} == {4.0}
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['nothing_like_it'], 'known are'),
+        (['field.yaml', '--planners', 'maasi,none_such'], 'none_such'),
+        (['field.yaml', '--planners', 'maasi,maasi'], 'different names'),
+        (['field.yaml', '--filters', 'kalman'], 'pmb'),
+        (['field.yaml', 'field.yaml'], 'different names'),
+        (['field.yaml', '--seeds', '0'], 'from 1 to 9999'),
+        (['field.yaml', '--first-seed', '1.5'], 'whole numbers'),
+        (['field.yaml', '--time-limit', '-1'], 'above 0'),
+        (['buildings_one'], 'searches for targets'),
+    ],
+)
+def test_bad_input(scenario, monkeypatch, arguments, words, capsys):
+    monkeypatch.chdir(scenario.parent)
+    try:
+        code = compare.main([*arguments, '--workers', '1'])
+    except SystemExit as exit_:
+        code = exit_.code
+    assert code == 2
+    assert words in capsys.readouterr().err
+    assert not (scenario.parent / 'runs').exists()
+
+
+# Statistics
+
+
+@pytest.mark.parametrize(('effect', 'expected'), [(0.2, 199), (0.5, 34), (0.8, 15)])
+def test_pairs_needed_are_those_of_cohens_tables(effect, expected):
+    values = np.array([-1.0, 1.0] * 50)
+    gaps = values / values.std(ddof=1) + effect
+    assert statistics.pairs_needed(gaps) == expected
+
+
+def test_bootstrap_interval_of_normal_differences_is_near_students():
+    generator = np.random.default_rng(1)
+    first, second = generator.normal(3.0, 1.0, 60), generator.normal(1.0, 2.0, 60)
+    low, high = stats.ttest_rel(first, second).confidence_interval(0.95)
+    gap = statistics.bootstrap_difference([*first, math.nan], [*second, 1.0])
+    assert gap.number == 60 and gap.mean == pytest.approx(np.mean(first - second))
+    assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.1)
+    assert gap.told_from_zero
+    assert statistics.bootstrap_difference(first, second) == gap
+
+
+def test_bootstrap_of_few_or_equal_values():
+    assert math.isnan(statistics.bootstrap_difference([], []).mean)
+    one = statistics.bootstrap_difference([3.0], [1.0])
+    assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
+    same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
+    assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
+
+
+def test_survival_is_that_of_freireichs_patients():
+    """Weeks in remission with 6-mercaptopurine, and the estimates that textbooks print."""
+    weeks = [6, 6, 6, 6, 7, 9, 10, 10, 11, 13, 16, 17, 19, 20, 22, 23, 25, 32, 32, 34, 35]
+    relapsed = [1, 1, 1, 0, 1, 0, 1, 0, 0, 1, 1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0]
+    times, shares = statistics.survival(weeks, np.array(relapsed, bool))
+    at = dict(zip(times, shares))
+    printed = {0: 1.0, 6: 0.857, 7: 0.807, 10: 0.753, 13: 0.690, 16: 0.627, 22: 0.538, 23: 0.448}
+    assert {week: at[week] for week in printed} == pytest.approx(printed, abs=5e-4)
+
+
+def test_verdict_says_when_the_seeds_are_too_few():
+    few = Difference(-2.0, -6.0, 2.0, -1.0, 10, 85)
+    assert 'too few' in verdict('a', 'b', few) and 'about 85' in verdict('a', 'b', few)
+    clear = Difference(-2.0, -3.0, -1.0, -2.0, 10, 7)
+    assert 'sooner' in verdict('a', 'b', clear) and 'too few' not in verdict('a', 'b', clear)
