@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from maasi_filter.plugins import OwnSettings, PluginGroup
 from maasi_filter.settings import Settings
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 PositiveInt = Annotated[int, Field(ge=1, le=10_000)]
+
+PLANNERS = PluginGroup(
+    'maasi.planners',
+    'planner',
+    'maasi_planner.planners.base:Planner',
+    {
+        'maasi': 'maasi_planner.planners.intermittent:Intermittent',
+        'asi': 'maasi_planner.planners.intermittent:Intermittent',
+        'maas': 'maasi_planner.planners.active_search:ActiveSearch',
+        'as': 'maasi_planner.planners.active_search:ActiveSearch',
+        'mutual_information': 'maasi_planner.planners.mutual_information:MutualInformation',
+        'nearest_widest': 'maasi_planner.planners.nearest_widest:NearestWidest',
+        'lawnmower': 'maasi_planner.planners.lawnmower:Lawnmower',
+    },
+)
+_PLANNER = OwnSettings(PLANNERS, 'name')
 
 MODELS = ('constant_speed', 'mambo', 'unicycle', 'quadrotor')
 
@@ -141,9 +158,12 @@ class MotionSettings(Settings):
 class PlannerSettings(Settings):
     """Choice of planner, and its parameters. None means the default of the objective."""
 
-    name: Literal[
-        'maasi', 'asi', 'maas', 'as', 'mutual_information', 'nearest_widest', 'lawnmower'
-    ] = Field(default='maasi', description='Planner')
+    name: Annotated[str, PLANNERS, AfterValidator(PLANNERS.check)] = Field(
+        default='maasi', description='Planner, or module:Class of your own'
+    )
+    settings: Annotated[Any, _PLANNER, AfterValidator(_PLANNER.check)] = Field(
+        default=None, validate_default=True, description='Settings of a planner of your own'
+    )
     objective: Literal['paper', 'information'] = Field(
         default='information',
         description='Terms T and E: as in 000 (17) to (22), (26) to (32), or information gain and '
@@ -258,6 +278,17 @@ class PlannerSettings(Settings):
         ge=0.0,
         description='lawnmower: distance of the outer lanes from the bounds; none: half a lane [m]',
     )
+
+    def renamed(self, name: str) -> PlannerSettings:
+        """Return the settings of another planner, with the same numbers.
+
+        Raises
+        ------
+        ValidationError
+            If there is none of that name, or it needs settings of its own.
+        """
+        values = {key: getattr(self, key) for key in type(self).model_fields}
+        return PlannerSettings.model_validate({**values, 'name': name, 'settings': None})
 
     @property
     def own_explorations(self) -> bool:

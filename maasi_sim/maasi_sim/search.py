@@ -40,6 +40,10 @@ from maasi_sim.world.world import World
 FloatArray = NDArray[np.float64]
 
 
+# Settings, and what returns the true targets that are not found yet.
+MakePlanner = Callable[[PlannerSettings, Callable[[], FloatArray]], Planner]
+
+
 @dataclass(frozen=True)
 class Found:
     """When a search stood how.
@@ -300,7 +304,7 @@ def search(
     scenario: Scenario,
     seed: int,
     most_measurements: int | None = None,
-    planner: Callable[[PlannerSettings, Callable[[], FloatArray]], Planner] | None = None,
+    planner: str | type[Planner] | MakePlanner | None = None,
     view: bool = False,
 ) -> SearchResult:
     """Run a scenario in this process, step by step as in lockstep.
@@ -313,8 +317,9 @@ def search(
         Of all random numbers.
     most_measurements : int, optional
         End after so many measurements of all robots.
-    planner : function, optional
-        Returns the planner of each group instead of the scenario's, from its settings and a
+    planner : str, class or function, optional
+        Instead of the scenario's: the name of a planner, also as `module:Class`; a subclass of
+        Planner; or a function that returns the planner of each group, from its settings and a
         function that returns the true targets that are not found yet, (n, 3) [m].
     view : bool
         Whether to show the search in a browser while it goes on.
@@ -322,8 +327,13 @@ def search(
     Raises
     ------
     ValueError
-        If a robot is to come back.
+        If a robot is to come back, or there is no planner of that name.
     """
+    if isinstance(planner, type):
+        planner = f'{planner.__module__}:{planner.__qualname__}'
+    if isinstance(planner, str):
+        scenario = scenario.model_copy(update={'planner': scenario.planner.renamed(planner)})
+        planner = None
     world = scenario.world(seed)
     robots = {name: _Robot(name, scenario, seed, world) for name in scenario.names()}
     departures = leaving(scenario)

@@ -384,7 +384,7 @@ def test_wrong_options_are_named(options, words, capsys):
 
 
 def test_a_wrong_planner_is_named_with_the_option():
-    with pytest.raises(ScenarioError, match=r"--planner: planner\.name: unknown value 'masi'"):
+    with pytest.raises(ScenarioError, match=r"--planner: planner\.name: unknown planner 'masi'"):
         ScenarioRun(Options('mambo', planner='masi'), interruption=False)
 
 

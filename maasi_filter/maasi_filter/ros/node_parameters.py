@@ -17,6 +17,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from maasi_filter.plugins import add_folders
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.parameters import (
     ParameterField,
@@ -64,6 +65,7 @@ class NodeParameters(Generic[SettingsT]):
             for name, item in node._parameter_overrides.items()
             if not self._is_foreign(name) and item.value is not None
         }
+        add_folders(given.get('plugin_path') or [])
         known = {item.name for item in parameter_fields(model, given)}
         #: Names of parameters that were set, by a file or at run time.
         self._given = set(given) & known

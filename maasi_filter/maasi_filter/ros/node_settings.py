@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from typing_extensions import Self
 
+from maasi_filter.plugins import add_folders
 from maasi_filter.settings import EnvironmentSettings, FilterSettings, SensorSettings, Settings
 
 # Time without asserted liveliness after which a guard considers its driver dead [s].
@@ -19,6 +20,10 @@ class NodeSettings(Settings):
     #: Parameters that can be set while the node runs.
     live: ClassVar[frozenset[str]] = frozenset()
 
+    # First: what names a class of a plugin is checked after it.
+    plugin_path: Annotated[list[str], AfterValidator(add_folders)] = Field(
+        default=[], description='Folders in which the modules of plugins (module:Class) are'
+    )
     step: float = Field(default=0.05, gt=0.0, le=10.0, description='Duration of a step [s]')
     seed: int = Field(default=1, ge=0, description='Of all random numbers')
     lockstep: bool = Field(

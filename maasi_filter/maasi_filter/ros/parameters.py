@@ -17,6 +17,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from maasi_filter.plugins import PluginGroup, own_settings
+
 ParameterValue = bool | int | float | str | list[Any]
 
 
@@ -107,7 +109,7 @@ def parameter_fields(
     for name, info in model.model_fields.items():
         key = prefix + (info.alias or name)
         by_name = _model_by_name(info.annotation)
-        nested = _nested(info.annotation)
+        nested = _nested(info.annotation) or own_settings(info, given, prefix)
         if by_name is not None:
             yield ParameterField(key, None, info.description or '', '')
             for item in given.get(key) or []:
@@ -155,6 +157,9 @@ def parameter_name(model: type[BaseModel], location: Iterable[int | str]) -> str
         if by_name is None:
             parts.append(str(key))
             current = _nested(info.annotation)
+            if info.annotation is Any:
+                # Settings of a plugin.
+                parts += [str(inner) for inner in keys if isinstance(inner, str)]
             continue
         name = next(keys, None)
         parts += [str(key)] if name is None else [_singular(str(key)), str(name)]
@@ -195,6 +200,9 @@ def _constraints(info: FieldInfo) -> str:
     for part in (info.annotation, *get_args(info.annotation)):
         if get_origin(part) is Literal:
             parts.append('one of ' + ', '.join(str(item) for item in get_args(part)))
+    for item in info.metadata:
+        if isinstance(item, PluginGroup):
+            parts.append(f'one of {", ".join(item.names())}, or module:Class')
     return ' and '.join(parts)
 
 
@@ -204,7 +212,7 @@ def _nest(model: type[BaseModel], flat: Mapping[str, Any], prefix: str) -> dict[
         key = prefix + (info.alias or name)
         target = info.alias or name
         by_name = _model_by_name(info.annotation)
-        inner = _nested(info.annotation)
+        inner = _nested(info.annotation) or own_settings(info, flat, prefix)
         if by_name is not None:
             nested[target] = {
                 item: _nest(by_name, flat, f'{prefix}{_singular(name)}.{item}.')

@@ -8,7 +8,7 @@ from maasi_planner.planners.intermittent import Intermittent
 from maasi_planner.planners.lawnmower import Lawnmower
 from maasi_planner.planners.mutual_information import MutualInformation
 from maasi_planner.planners.nearest_widest import NearestWidest
-from maasi_planner.settings import PlannerSettings
+from maasi_planner.settings import PLANNERS, PlannerSettings
 
 __all__ = [
     'ActiveSearch',
@@ -19,16 +19,6 @@ __all__ = [
     'Planner',
     'make_planner',
 ]
-
-_PLANNERS: dict[str, type[Planner]] = {
-    'maasi': Intermittent,
-    'asi': Intermittent,
-    'maas': ActiveSearch,
-    'as': ActiveSearch,
-    'mutual_information': MutualInformation,
-    'nearest_widest': NearestWidest,
-    'lawnmower': Lawnmower,
-}
 
 
 def make_planner(name: str, settings: PlannerSettings | None = None) -> Planner:
@@ -44,9 +34,10 @@ def make_planner(name: str, settings: PlannerSettings | None = None) -> Planner:
     Raises
     ------
     ValueError
-        If there is no planner of that name.
+        If there is no planner of that name, or its own settings are wrong.
     """
-    if name not in _PLANNERS:
-        raise ValueError(f'planner: got {name!r}, allowed are {", ".join(sorted(_PLANNERS))}')
     own = settings or PlannerSettings()
-    return _PLANNERS[name](own.model_copy(update={'name': name}))
+    if own.name != name:
+        own = own.renamed(name)
+    planner: Planner = PLANNERS.load(name)(own)
+    return planner

@@ -6,10 +6,12 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from maasi_filter.records import Cluster
 from maasi_planner.motion.base import Trajectories
@@ -32,12 +34,22 @@ class Planner(ABC):
     ----------
     measures_underway : bool
         Whether robots measure on their way, or only at their waypoints.
+    Settings : type or None
+        Model of the planner's own settings; with it, `settings.settings` is an instance.
+    own : BaseModel or None
+        That instance.
     """
 
     measures_underway = True
+    Settings: ClassVar[type[BaseModel] | None] = None
 
     def __init__(self, settings: PlannerSettings) -> None:
         self.settings = settings
+
+    @property
+    def own(self) -> Any:
+        """The planner's own settings."""
+        return self.settings.settings
 
     @abstractmethod
     def decide(self, team: TeamView) -> Decision:

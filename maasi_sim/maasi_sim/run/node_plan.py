@@ -45,7 +45,12 @@ class RunSettings:
 
     def common(self, scenario: BaseScenario) -> dict[str, Any]:
         """Return the parameters that all nodes have."""
-        return {'step': scenario.step, 'seed': self.seed, 'lockstep': self.lockstep}
+        return {
+            'plugin_path': scenario.plugin_path,
+            'step': scenario.step,
+            'seed': self.seed,
+            'lockstep': self.lockstep,
+        }
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from maasi_filter.plugins import add_folders
 from maasi_filter.settings import EnvironmentSettings, Settings
 from maasi_sim.arguments import LARGEST
 from maasi_sim.scenario.layering import to_yaml
@@ -57,6 +58,11 @@ class BaseScenario(Settings):
     """A whole scenario file, all layers merged."""
 
     version: Literal[1] = Field(description='Of this format')
+    plugin_path: Annotated[list[str], AfterValidator(add_folders)] = Field(
+        default=[],
+        description='Folders in which the modules of plugins (module:Class) are, relative to this '
+        'file; its own folder and the current one need not be named',
+    )
     description: str = Field(default='', description='What it shows, in words')
     environment: EnvironmentSettings = Field(description='Where the search takes place')
     step: float = Field(default=0.05, gt=0.0, le=10.0, description='Between what nodes see [s]')

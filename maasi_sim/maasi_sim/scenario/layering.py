@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from maasi_filter.plugins import own_settings
 from maasi_filter.ros.parameters import choices
 
 Key = tuple[str | int, ...]
@@ -66,6 +67,8 @@ class Layer:
 
     data: Any
     origins: dict[Key, str] = field(default_factory=dict)
+    #: Of the file.
+    folder: Path | None = None
 
     def origin(self, key: Key) -> str:
         """Return `file:line` of a key, or of the closest key above it."""
@@ -118,7 +121,7 @@ def read_layer(path: Path) -> Layer:
         if node is None:
             raise ScenarioError(f'{path}: is empty, a mapping of keys is needed')
         _check_size(node, path)
-        layer = Layer(None)
+        layer = Layer(None, folder=path.parent)
         layer.data = _build(loader, node, (), layer.origins, path)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -279,7 +282,7 @@ def describe(error: ValidationError, model: type[BaseModel], layer: Layer) -> st
             # Of a union: what went deepest is what the writer meant.
             depth = max(len(item['loc']) for item in items)
             items = [item for item in items if len(item['loc']) == depth] or items
-        texts = list(dict.fromkeys(_explain(item, key, model) for item in items))
+        texts = list(dict.fromkeys(_explain(item, key, model, layer.data) for item in items))
         read = f'read {_show(items[0]["input"])}, '
         texts[1:] = [text.removeprefix(read) for text in texts[1:]]
         origin = layer.origin(key)
@@ -302,11 +305,11 @@ def _resolve(loc: Sequence[str | int], data: Any, kind: str) -> Key:
     return tuple(key)
 
 
-def _explain(item: Any, key: Key, model: type[BaseModel]) -> str:
+def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
     kind, context = item['type'], item.get('ctx', {})
     read = f'read {_show(item["input"])}, '
     if kind == 'extra_forbidden':
-        return unknown(str(key[-1]), _known_keys(model, key[:-1]), 'key')
+        return unknown(str(key[-1]), _known_keys(model, key[:-1], data), 'key')
     if kind == 'missing':
         return 'is missing'
     if kind == 'literal_error':
@@ -358,15 +361,16 @@ def dotted(key: Key) -> str:
     return text
 
 
-def _known_keys(model: type[BaseModel], key: Key) -> list[str]:
+def _known_keys(model: type[BaseModel], key: Key, data: Any) -> list[str]:
     annotations: list[Any] = [model]
     for step in key:
         annotations = [
             inner
             for annotation in annotations
             for candidate in choices(annotation)
-            for inner in _inside(candidate, step)
+            for inner in _inside(candidate, step, data)
         ]
+        data = data[step]
     return [
         info.alias or name
         for annotation in annotations
@@ -376,11 +380,11 @@ def _known_keys(model: type[BaseModel], key: Key) -> list[str]:
     ]
 
 
-def _inside(annotation: Any, step: str | int) -> list[Any]:
+def _inside(annotation: Any, step: str | int, data: Any) -> list[Any]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for name, info in annotation.model_fields.items():
             if step in (name, info.alias):
-                return [info.annotation]
+                return [own_settings(info, data) or info.annotation]
         return []
     if typing.get_origin(annotation) in (list, dict):
         return [typing.get_args(annotation)[-1]]

@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
+from maasi_filter.plugins import is_reference
 from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.scenario.checks import doubts_about, problems_of
 from maasi_sim.scenario.layering import (
@@ -110,6 +111,7 @@ def read_scenario(path: str | Path) -> Layer:
     path = find_scenario(path)
     layer = read_layer(path)
     _lay_types_under(layer, path)
+    _name_folders(layer)
     return layer
 
 
@@ -117,8 +119,32 @@ def with_overrides(layer: Layer, overrides: Mapping[str, tuple[Key, Any]] | None
     """Return a layer with the values of `load_scenario` that win over it."""
     result = deepcopy(layer)
     for origin, (key, value) in (overrides or {}).items():
+        if key == ('planner', 'name') and isinstance(result.data.get('planner'), dict):
+            # Of the planner that this one replaces.
+            result.data['planner'].pop('settings', None)
         override(result, key, value, origin)
+    _name_folders(result)
     return result
+
+
+def _name_folders(layer: Layer) -> None:
+    """Name the folders of modules in `plugin_path`, where a plugin is given as module:Class."""
+    folder = layer.folder or Path.cwd()
+    given = layer.data.get('plugin_path', [])
+    if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
+        return
+    folders = [folder / item for item in given]
+    if _names_module(layer.data):
+        folders += [folder, Path.cwd()]
+    if folders:
+        absolute = dict.fromkeys(str(item.absolute()) for item in folders)
+        override(layer, ('plugin_path',), list(absolute), layer.origin(('plugin_path',)))
+
+
+def _names_module(data: Any) -> bool:
+    if isinstance(data, dict):
+        return any(_names_module(item) for item in data.values())
+    return is_reference(data)
 
 
 def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
@@ -204,6 +230,9 @@ def _robot_layer(path: Path, own: Layer, key: Key) -> Layer:
         raise ScenarioError(
             f'{own.origin(())}: {dotted((*key, "type"))}: is missing, known are {", ".join(known)}'
         )
+    if kind not in known and own.data.keys() >= RobotSettings.model_fields.keys():
+        # Of a run: with all layers merged, where the files of types may be missing.
+        return own
     if isinstance(kind, str):
         if kind not in known:
             raise ScenarioError(

@@ -1,0 +1,240 @@
+"""Plugins: classes found by entry point, or by `module:Class`. See `docs/plugins.md`."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+import re
+import sys
+import traceback
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from importlib.machinery import PathFinder
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationInfo
+from pydantic.fields import FieldInfo
+
+_NAME = r'[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*'
+_REFERENCE = re.compile(f'{_NAME}:{_NAME}')
+# Folders that modules named in `module:Class` are looked for in, the last added first.
+_folders: list[str] = []
+
+
+class PluginError(ValueError):
+    """A plugin is not known, cannot be imported, or is not what it should be."""
+
+
+def is_reference(text: Any) -> bool:
+    """Return whether a value is of the form `module:Class`."""
+    return isinstance(text, str) and _REFERENCE.fullmatch(text) is not None
+
+
+def add_folders(folders: Iterable[str | Path]) -> list[str]:
+    """Look for modules in these folders too, after those that are installed; return the folders."""
+    given = [str(Path(folder).absolute()) for folder in folders]
+    for folder in reversed(given):
+        if folder in _folders:
+            _folders.remove(folder)
+        _folders.insert(0, folder)
+        if folder not in sys.path:
+            sys.path.append(folder)
+    return given
+
+
+@dataclass(frozen=True)
+class PluginGroup:
+    """Classes of one kind: those of the suite, of installed packages, and `module:Class`.
+
+    Parameters
+    ----------
+    group : str
+        Name of the group of entry points.
+    what : str
+        What one of them is called in messages.
+    base : str
+        Class that all are subclasses of, as `module:Class`.
+    own : mapping
+        Those of the suite: name to `module:Class`.
+    """
+
+    group: str
+    what: str
+    base: str
+    own: Mapping[str, str] = field(hash=False)
+
+    def names(self) -> list[str]:
+        """Return all names: the suite's, then those of installed packages."""
+        return [*sorted(self.own), *sorted(set(self._installed()) - set(self.own))]
+
+    def load(self, name: str) -> type:
+        """Return a class.
+
+        Parameters
+        ----------
+        name : str
+            One of `names`, or `module:Class`; modules beside the scenario file and in the current
+            folder are found too.
+
+        Raises
+        ------
+        PluginError
+            If it is not known, cannot be imported, or is no subclass of `base`.
+        """
+        if name in self.own:
+            return _attribute(self.own[name])
+        if is_reference(name):
+            add_folders([*_folders, Path.cwd()])
+            found = _attribute(name, named=True)
+        else:
+            installed = self._installed()
+            if name not in installed:
+                raise PluginError(self._unknown(name, [*sorted(self.own), *sorted(installed)]))
+            try:
+                found = _attribute(installed[name].value.partition('[')[0].strip())
+            except PluginError as error:
+                raise PluginError(f'{self.what} {name!r}: {error}') from error
+        base = _attribute(self.base)
+        if not (isinstance(found, type) and issubclass(found, base)):
+            raise PluginError(f'{name} is no subclass of {self.base.replace(":", ".")}')
+        if inspect.isabstract(found):
+            lacking = ', '.join(sorted(found.__abstractmethods__))  # type: ignore[attr-defined]
+            raise PluginError(f'{name} lacks {lacking} of {self.base.replace(":", ".")}')
+        return found
+
+    def check(self, name: str) -> str:
+        """Return a name that can be loaded; a validator for settings."""
+        if name not in self.own:
+            self.load(name)
+        return name
+
+    def settings(self, name: str) -> type[BaseModel] | None:
+        """Return the model of a plugin's own settings: its attribute `Settings`, if it has one."""
+        if name in self.own:
+            return None
+        model = getattr(self.load(name), 'Settings', None)
+        if model is None:
+            return None
+        if not (isinstance(model, type) and issubclass(model, BaseModel)):
+            raise PluginError(f'{name}: its Settings are no pydantic model')
+        return model
+
+    def _installed(self) -> dict[str, EntryPoint]:
+        return {item.name: item for item in entry_points(group=self.group)}
+
+    def _unknown(self, name: str, known: list[str]) -> str:
+        close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+        hint = f" (did you mean '{close[0]}'?)" if close else ''
+        return (
+            f"unknown {self.what} '{name}'{hint}, known are {', '.join(known)}, and module:Class "
+            'of your own'
+        )
+
+
+@dataclass(frozen=True)
+class OwnSettings:
+    """Marks the field of settings that holds the own settings of a plugin.
+
+    Parameters
+    ----------
+    group : PluginGroup
+        Kind of the plugin.
+    selector : str
+        Field that names the plugin; it stands before the marked one.
+    """
+
+    group: PluginGroup
+    selector: str
+
+    def check(self, value: Any, info: ValidationInfo) -> BaseModel | None:
+        """Return the plugin's settings; a validator of the marked field."""
+        name = info.data.get(self.selector)
+        model = None if name is None else self.group.settings(name)
+        if model is not None:
+            return model.model_validate({} if value is None else value, strict=True)
+        if value and name is not None:
+            raise ValueError(f"{self.group.what} '{name}' has no settings of its own")
+        return None
+
+
+def own_settings(info: FieldInfo, values: Mapping[str, Any], prefix: str = '') -> Any:
+    """Return the model of a field marked with `OwnSettings`, or None.
+
+    Parameters
+    ----------
+    info : FieldInfo
+        The field.
+    values : mapping
+        Of the settings that it belongs to; keys have `prefix`.
+    """
+    for mark in info.metadata:
+        if isinstance(mark, OwnSettings):
+            name = values.get(prefix + mark.selector)
+            try:
+                return mark.group.settings(name) if isinstance(name, str) else None
+            except PluginError:
+                # Reported where the name is checked.
+                return None
+    return None
+
+
+def _attribute(reference: str, named: bool = False) -> Any:
+    """Return what `module:attribute` names; `named`: by a user, who may mean a file."""
+    name, _, attribute = reference.partition(':')
+    if named:
+        importlib.invalidate_caches()
+    try:
+        module = importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        raise PluginError(_import_problem(name, error)) from error
+    if named:
+        _check_file(name, module)
+    found: Any = module
+    for part in attribute.split('.'):
+        if not hasattr(found, part):
+            classes = [
+                key
+                for key, value in vars(module).items()
+                if isinstance(value, type) and value.__module__ == name
+            ]
+            raise PluginError(
+                f'module {name} has no {attribute}'
+                + (f', its classes are {", ".join(sorted(classes))}' if classes else '')
+            )
+        found = getattr(found, part)
+    return found
+
+
+def _import_problem(name: str, error: BaseException) -> str:
+    missing = getattr(error, 'name', None)
+    if isinstance(error, ModuleNotFoundError) and missing and f'{name}.'.startswith(f'{missing}.'):
+        return (
+            f'there is no module {missing}: it is not installed, and not in '
+            f'{", ".join(_folders) or "any folder of plugins"}'
+        )
+    place = ''
+    if isinstance(error, SyntaxError) and error.filename:
+        place = f' ({error.filename}:{error.lineno})'
+    elif frames := traceback.extract_tb(error.__traceback__):
+        place = f' ({frames[-1].filename}:{frames[-1].lineno})'
+    text = ' '.join(str(error).split())[:300]
+    return f'module {name} cannot be imported: {type(error).__name__}: {text}{place}'
+
+
+def _check_file(name: str, module: Any) -> None:
+    """Refuse a module that is another one than the file beside the scenario."""
+    top = name.partition('.')[0]
+    for folder in _folders:
+        spec = PathFinder.find_spec(top, [folder])
+        if spec is None or spec.origin is None:
+            continue
+        loaded = getattr(sys.modules.get(top), '__file__', None)
+        if loaded is not None and Path(loaded).resolve() != Path(spec.origin).resolve():
+            raise PluginError(
+                f'module {top} is {loaded} already, and {spec.origin} is another; give it another '
+                'name'
+            )
+        return

@@ -1,0 +1,227 @@
+"""Classes of a user's own: by entry point, by module:Class, with settings of their own."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from maasi_filter import plugins
+from maasi_filter.plugins import PluginError
+from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.planners import Planner, make_planner
+from maasi_planner.settings import PLANNERS, PlannerSettings
+from maasi_sim.scenario import ScenarioError, load_scenario
+from maasi_sim.search import search
+
+ONE_BY_ONE = '''
+from pydantic import BaseModel, ConfigDict, Field
+
+from maasi_planner.planners.base import Planner, options_of, waiting_places
+from maasi_planner.team import Decision, single_choice, stay
+
+
+class OneByOne(Planner):
+    """Goes from candidate to candidate."""
+
+    class Settings(BaseModel):
+        model_config = ConfigDict(extra='forbid')
+        stride: int = Field(default=1, ge=1)
+
+    def decide(self, team):
+        decision = Decision(team.step)
+        for name in team.planning():
+            option = options_of(team, name, waiting_places(team))
+            if isinstance(option, str):
+                decision.robots[name] = stay(team.robots[name], option)
+                continue
+            self.last = getattr(self, 'last', -self.own.stride) + self.own.stride
+            chosen = self.last % len(option.points)
+            while not option.allowed[chosen]:
+                chosen = (chosen + 1) % len(option.points)
+            decision.robots[name] = single_choice(option.points, option.prediction, chosen, 'next')
+        return decision
+'''
+SCENARIO = """
+version: 1
+environment: {bounds: [[0.0, 2.0], [0.0, 2.0]]}
+step: 0.1
+targets: {positions: [[1.5, 0.5]]}
+robots:
+  rover:
+    type: ranging_drone_2d
+    start: [1.0, 1.0, 0.0]
+    candidates: {grid: [2, 2], spacing: 1.0}
+filter: {method: pmb}
+planner:
+  name: one_by_one:OneByOne
+  settings: {stride: 3}
+limits: {time: 5.0}
+"""
+ROBOT = """
+driver: ranging_driver
+motion: {model: constant_speed, speed: 0.5, tolerance: 0.05}
+sensor:
+  detection: {kind: exponential, probability: 0.98, size: [1.0, 1.0]}
+  noise: {range: 0.05, bearing: 0.05}
+  period: 0.5
+camera: null
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Return a folder with a scenario and a planner beside it; imports are undone."""
+    monkeypatch.setattr(sys, 'path', list(sys.path))
+    monkeypatch.setattr(plugins, '_folders', [])
+    known = set(sys.modules)
+    (tmp_path / 'one_by_one.py').write_text(ONE_BY_ONE)
+    (tmp_path / 'search.yaml').write_text(SCENARIO)
+    (tmp_path / 'robots').mkdir()
+    (tmp_path / 'robots' / 'ranging_drone_2d.yaml').write_text(ROBOT)
+    yield tmp_path
+    for name in set(sys.modules) - known:
+        if str(tmp_path) in str(getattr(sys.modules[name], '__file__', '')):
+            del sys.modules[name]
+
+
+def change(folder: Path, before: str, after: str) -> Path:
+    """Return the scenario with a text replaced."""
+    path = folder / 'search.yaml'
+    assert before in path.read_text()
+    path.write_text(path.read_text().replace(before, after))
+    return path
+
+
+def chosen(result) -> list[int]:
+    """Return what was chosen in a search, in order."""
+    return [decision.robots['rover'].chosen for decision in result.decisions]
+
+
+def test_planner_beside_the_scenario(folder):
+    scenario = load_scenario(folder / 'search.yaml')
+    assert scenario.planner.settings.stride == 3
+    assert chosen(search(scenario, 1, most_measurements=5)) == [0]
+    # Another one instead of it: by name, and as a class.
+    other = search(scenario, 1, most_measurements=5, planner='lawnmower')
+    assert 'lane' in other.decisions[0].robots['rover'].reason
+    (folder / 'second.py').write_text(ONE_BY_ONE.replace('OneByOne', 'Second'))
+    own = search(scenario, 1, most_measurements=5, planner='second:Second')
+    assert 'next' in own.decisions[0].robots['rover'].reason
+    assert search(scenario, 1, most_measurements=5, planner=sys.modules['second'].Second).decisions
+    with pytest.raises(ValueError, match="unknown planner 'third'"):
+        search(scenario, 1, planner='third')
+
+
+def test_scenario_as_text_names_the_folder(folder, tmp_path_factory):
+    scenario = load_scenario(folder / 'search.yaml')
+    copy = tmp_path_factory.mktemp('run') / 'scenario.yaml'
+    copy.write_text(scenario.text())
+    assert load_scenario(copy).plugin_path[0] == str(folder)
+    assert load_scenario(copy).planner.settings.stride == 3
+
+
+def test_installed_planner(folder):
+    """An entry point in a dist-info folder on the path is one of an installed package."""
+    info = folder / 'walks-1.0.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: walks\nVersion: 1.0\n')
+    (info / 'entry_points.txt').write_text(
+        '[maasi.planners]\nwalk = one_by_one:OneByOne\nbroken = no_such_module:Walk\n'
+    )
+    sys.path.insert(0, str(folder))
+    assert {'walk', 'maasi'} <= set(PLANNERS.names())
+    path = change(folder, 'one_by_one:OneByOne', 'walk')
+    scenario = load_scenario(path)
+    assert scenario.planner.settings.stride == 3
+    assert scenario.plugin_path == []
+    assert isinstance(make_planner('walk', scenario.planner), Planner)
+    with pytest.raises(ValueError, match="planner 'broken': there is no module no_such_module"):
+        make_planner('broken')
+    with pytest.raises(
+        ValueError, match=r"unknown planner 'wolk' \(did you mean 'walk'\?\), .*maas"
+    ):
+        make_planner('wolk')
+
+
+@pytest.mark.parametrize(
+    ('file', 'name', 'message'),
+    [
+        ('', 'nowhere:Planner', r'there is no module nowhere: .*{folder}'),
+        ('import nowhere_too', 'mine:A', r"No module named 'nowhere_too' \({folder}/mine.py:1\)"),
+        ('a = 1\nb = a / 0', 'mine:A', r'ZeroDivisionError: .*\({folder}/mine.py:2\)'),
+        ('a = (', 'mine:A', r'SyntaxError: .*\({folder}/mine.py:1\)'),
+        ('raise SystemExit(3)', 'mine:A', 'mine cannot be imported: SystemExit'),
+        ('class B:\n    pass', 'mine:A', 'module mine has no A, its classes are B'),
+        ('class A:\n    pass', 'mine:A', 'is no subclass of maasi_planner.planners.base.Planner'),
+        (
+            'from maasi_planner.planners import Planner\nclass A(Planner):\n    pass',
+            'mine:A',
+            'mine:A lacks decide of',
+        ),
+    ],
+)
+def test_bad_plugin_is_named(folder, file, name, message):
+    (folder / 'mine.py').write_text(file)
+    path = change(folder, 'one_by_one:OneByOne', name)
+    with pytest.raises(ScenarioError, match=message.format(folder=folder)) as error:
+        load_scenario(path)
+    assert str(error.value).startswith(f'{path}:13: planner.name: ')
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'message'),
+    [
+        ('stride: 3', 'stride: 0', 'planner.settings.stride: read 0, allowed is at least 1'),
+        ('stride: 3', "stride: '3'", "planner.settings.stride: read '3', allowed is a whole"),
+        ('stride: 3', 'strid: 3', "planner.settings.strid: unknown key 'strid' .*known are stride"),
+        ('one_by_one:OneByOne', 'lawnmower', "settings: planner 'lawnmower' has no settings of"),
+    ],
+)
+def test_bad_settings_have_file_and_line(folder, before, after, message):
+    path = change(folder, before, after)
+    with pytest.raises(ScenarioError, match=message) as error:
+        load_scenario(path)
+    assert str(error.value).startswith(f'{path}:14: ')
+
+
+def test_two_modules_of_one_name_are_refused(folder, tmp_path_factory):
+    load_scenario(folder / 'search.yaml')
+    other = tmp_path_factory.mktemp('other')
+    (other / 'one_by_one.py').write_text(ONE_BY_ONE)
+    (other / 'robots').symlink_to(folder / 'robots')
+    (other / 'search.yaml').write_text(SCENARIO)
+    with pytest.raises(ScenarioError, match='give it another name'):
+        load_scenario(other / 'search.yaml')
+
+
+def test_the_command_line_replaces_a_planner_with_its_settings(folder):
+    change = {'--planner': (('planner', 'name'), 'maasi')}
+    assert load_scenario(folder / 'search.yaml', change).planner.settings is None
+    path = folder / 'search.yaml'
+    text = path.read_text().replace('  settings: {stride: 3}\n', '')
+    path.write_text(text.replace('one_by_one:OneByOne', 'maasi'))
+    change = {'--planner': (('planner', 'name'), 'one_by_one:OneByOne')}
+    assert load_scenario(path, change).plugin_path[0] == str(folder)
+
+
+def test_parameters_of_a_plugin(folder):
+    plugins.add_folders([folder])
+    given = {
+        'environment.bounds': [0.0, 1.0, 0.0, 1.0],
+        'robots': ['a'],
+        'robot.a.candidates.ring': 4,
+        'robot.a.candidates.distance': 1.0,
+        'planner.name': 'one_by_one:OneByOne',
+        'planner.settings.stride': 2,
+    }
+    fields = {item.name: item for item in parameter_fields(PlannerNodeSettings, given)}
+    assert fields['planner.settings.stride'].lowest == 1
+    settings = PlannerNodeSettings.model_validate(unflatten(PlannerNodeSettings, given))
+    assert settings.planner.settings.stride == 2
+    assert flatten(settings)['planner.settings.stride'] == 2
+    with pytest.raises(PluginError):
+        PLANNERS.load('one_by_one:Nothing')
+    assert PlannerSettings(name='one_by_one:OneByOne').settings.stride == 1
