@@ -41,19 +41,18 @@ maasi_make_venv() {
   rm -rf "$maasi_venv" "$maasi_workspace/build" "$maasi_workspace/install"
   mkdir -p "$maasi_workspace"
   if [ "$mode" = jazzy ]; then
-    echo "Setting up: virtual environment beside the sourced ROS 2 Jazzy ..." >&2
+    echo "Setting up: Python packages beside the sourced ROS 2 Jazzy (downloads about 150 MB) ..." >&2
     "$python" -m venv --system-site-packages "$maasi_venv"
     # The messages of the sourced Jazzy are compiled against its NumPy: keep that version.
     "$python" -c 'import numpy; print("numpy==" + numpy.__version__)' \
       > "$maasi_workspace/constraints.txt"
     requirements+=(-c "$maasi_workspace/constraints.txt")
   else
-    echo "Setting up: virtual environment and ROS 2 Jazzy wheels (a few minutes, once) ..." >&2
+    echo "Setting up: ROS 2 Jazzy and Python packages as wheels (downloads about 250 MB) ..." >&2
     "$python" -m venv "$maasi_venv"
     requirements+=(-r "$maasi_root/requirements-ros.txt")
   fi
-  if ! "$maasi_venv/bin/python" -m pip install --disable-pip-version-check \
-      "${requirements[@]}" > "$log" 2>&1; then
+  if ! "$maasi_venv/bin/python" "$maasi_root/scripts/install.py" "${requirements[@]}" > "$log" 2>&1; then
     tail -n 15 "$log" >&2
     maasi_fail "installing the Python packages failed; the whole log: $log"
   fi
@@ -68,9 +67,9 @@ maasi_install() {
   [ "$what" = tests ] || requirements="$maasi_root/requirements-$what.txt"
   key="$(maasi_hash < "$requirements")"
   [ "$(cat "$maasi_venv/.maasi_${what}_key" 2> /dev/null)" != "$key" ] || return 0
-  echo "Setting up: what the $what need ..." >&2
-  if ! "$maasi_venv/bin/python" -m pip install --disable-pip-version-check \
-      -r "$requirements" -c "$maasi_root/requirements.txt" > "$log" 2>&1; then
+  echo "Setting up: what the $what need, as wheels ..." >&2
+  if ! "$maasi_venv/bin/python" "$maasi_root/scripts/install.py" -r "$requirements" \
+      -c "$maasi_root/requirements.txt" > "$log" 2>&1; then
     tail -n 15 "$log" >&2
     maasi_fail "installing the $what requirements failed; the whole log: $log"
   fi
@@ -88,7 +87,7 @@ maasi_build() {
     || maasi_fail 'no C++ compiler was found' 'install one: sudo apt install build-essential'
   command -v make > /dev/null \
     || maasi_fail 'make was not found' 'install it: sudo apt install build-essential'
-  echo "Building the packages ..." >&2
+  echo "Setting up: messages and packages, by colcon and the C++ compiler (a minute or two) ..." >&2
   if ! (
     cd "$maasi_root" || exit 1
     export COLCON_LOG_PATH="$maasi_workspace/log"
@@ -98,7 +97,7 @@ maasi_build() {
       $(maasi_own_interfaces) \
       --build-base "$maasi_workspace/build" --install-base "$maasi_workspace/install" \
       --cmake-args "-DPython3_EXECUTABLE=$maasi_venv/bin/python" -DBUILD_TESTING=OFF \
-      --no-warn-unused-cli
+      -DJOIN_SOURCES=ON --no-warn-unused-cli
   ) > "$log" 2>&1; then
     tail -n 30 "$log" >&2
     maasi_fail "the build failed; the whole log: $log"
@@ -117,49 +116,88 @@ maasi_build_key() {
   ) | maasi_hash
 }
 
+# Python finds the packages in the repository, before they are built and as they are edited.
+maasi_source_path() {
+  printf '%s:' "$maasi_root"/maasi_{filter,planner,drivers,sim}
+}
+
 # Compiled kernels do not notice that a kernel they call in another file has changed, so each
-# state of the sources has a folder of its own. Compiled here, so that no node waits for it.
-maasi_compile() {
+# state of the sources has a folder of its own.
+maasi_kernels() {
   local key
   key="$(cd "$maasi_root" && grep -rl --include='*.py' njit maasi_*/maasi_* | sort \
     | xargs cat | maasi_hash)"
-  export NUMBA_CACHE_DIR="$maasi_workspace/numba/${key:0:16}"
-  [ ! -e "$NUMBA_CACHE_DIR/complete" ] && [ -z "${NUMBA_DISABLE_JIT:-}" ] || return 0
-  echo "Compiling (a few minutes, once) ..." >&2
-  if ! python "$maasi_root/scripts/compile_kernels.py" > "$maasi_workspace/compile.log" 2>&1; then
-    tail -n 15 "$maasi_workspace/compile.log" >&2
-    maasi_fail "compiling failed; the whole log: $maasi_workspace/compile.log"
-  fi
-  touch "$NUMBA_CACHE_DIR/complete"
+  echo "$maasi_workspace/numba/${key:0:16}"
 }
 
-maasi_set_up() {
-  local python mode key
-  python="$(maasi_find_python)" || exit 2
-  if maasi_has_jazzy "$python"; then mode=jazzy; else mode=wheels; fi
-  key="$( (cat "$maasi_root"/requirements.txt "$maasi_root"/requirements-build.txt \
-    "$maasi_root"/requirements-ros.txt "$maasi_root/scripts/mend_wheels.py"
-    "$python" -c 'import sys; print(sys.version, sys.base_prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
+maasi_needs_compiling() { [ ! -e "$1/complete" ] && [ -z "${NUMBA_DISABLE_JIT:-}" ]; }
+
+# Compiles all kernels, so that no node waits for it; becomes the compiling process.
+maasi_compile() {
+  echo "Setting up: numerical kernels, by Numba (a minute or two, beside the build) ..." >&2
+  export NUMBA_CACHE_DIR="$1" PYTHONPATH="$(maasi_source_path)${PYTHONPATH:-}"
+  exec "$maasi_venv/bin/python" "$maasi_root/scripts/compile_kernels.py" \
+    > "$maasi_workspace/compile.log" 2>&1
+}
+
+# Does what is missing, in a shell of its own: an error does not close the shell of a user.
+maasi_set_up() (
+  set +e
+  local python="$1" mode="$2" key compiling='' kernels
   mkdir -p "$maasi_workspace"
   exec {maasi_lock}> "$maasi_workspace/lock"
   flock "$maasi_lock"
+  key="$( (cat "$maasi_root"/requirements.txt "$maasi_root"/requirements-build.txt \
+    "$maasi_root"/requirements-ros.txt "$maasi_root/scripts/mend_wheels.py"
+    "$python" -c 'import sys; print(sys.version, sys.base_prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
   [ "$(cat "$maasi_venv/.maasi_key" 2> /dev/null)" = "$key" ] \
     || maasi_make_venv "$python" "$mode" "$key"
-  if [ "$mode" = wheels ]; then
+  maasi_use_venv "$mode"
+  kernels="$(maasi_kernels)"
+  if maasi_needs_compiling "$kernels"; then
+    maasi_compile "$kernels" &
+    compiling=$!
+    # A build that fails or is interrupted ends the compilation too.
+    trap 'kill "$compiling" 2> /dev/null' EXIT
+  fi
+  key="$(maasi_build_key "$key")"
+  [ "$(cat "$maasi_workspace/install/.maasi_key" 2> /dev/null)" = "$key" ] || maasi_build "$key"
+  [ -n "$compiling" ] || return 0
+  if ! wait "$compiling"; then
+    tail -n 15 "$maasi_workspace/compile.log" >&2
+    maasi_fail "compiling failed; the whole log: $maasi_workspace/compile.log"
+  fi
+  touch "$kernels/complete"
+)
+
+maasi_use_venv() {
+  if [ "$1" = wheels ]; then
     export AMENT_PREFIX_PATH="$maasi_venv" CMAKE_PREFIX_PATH="$maasi_venv"
     export ROS_DISTRO=jazzy MAASI_WHEELS=1
     unset PYTHONPATH
   fi
   export PATH="$maasi_venv/bin:$PATH"
-  key="$(maasi_build_key "$key")"
-  [ "$(cat "$maasi_workspace/install/.maasi_key" 2> /dev/null)" = "$key" ] || maasi_build "$key"
+  # Beside the environment, none in the repository; without them each start takes seconds longer.
+  export PYTHONPYCACHEPREFIX="$maasi_workspace/pycache"
+  unset PYTHONDONTWRITEBYTECODE
+}
+
+maasi_use() {
+  local nounset=+u
+  maasi_use_venv "$1"
   # The generated file reads unset variables.
+  case $- in *u*) nounset=-u ;; esac
   set +u
   # shellcheck disable=SC1091
   source "$maasi_workspace/install/local_setup.bash"
-  maasi_compile
-  flock -u "$maasi_lock"
-  exec {maasi_lock}>&-
+  PYTHONPATH="$(maasi_source_path)${PYTHONPATH:-}"
+  export PYTHONPATH
+  set "$nounset"
+  NUMBA_CACHE_DIR="$(maasi_kernels)"
+  export NUMBA_CACHE_DIR
 }
 
-maasi_set_up
+maasi_python="$(maasi_find_python)" || case $- in *i*) return 2 ;; *) exit 2 ;; esac
+if maasi_has_jazzy "$maasi_python"; then maasi_mode=jazzy; else maasi_mode=wheels; fi
+maasi_set_up "$maasi_python" "$maasi_mode" || case $- in *i*) return 2 ;; *) exit 2 ;; esac
+maasi_use "$maasi_mode"

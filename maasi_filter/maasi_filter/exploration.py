@@ -216,6 +216,7 @@ class Exploration:
         self._lower[: self.dimension] = self.bounds[:, 0]
         self._step = np.zeros(3)
         self._step[: self.dimension] = self.step
+        self._volumes = self._trapezoid()
 
     @property
     def values(self) -> FloatArray:
@@ -268,11 +269,7 @@ class Exploration:
             raise ValueError('positions: got a number that is not finite')
         return _interpolate_many(self._values, self._lower, self._step, array)
 
-    def cell_volumes(self) -> FloatArray:
-        """Return the volume (2D: area) each node stands for, same shape as `values`.
-
-        The trapezoid rule: half a step at the ends of each axis. They sum to the volume.
-        """
+    def _trapezoid(self) -> FloatArray:
         volumes = np.ones(())
         for axis in range(self.dimension):
             lengths = np.full(self._values.shape[axis], self._step[axis])
@@ -280,6 +277,13 @@ class Exploration:
             lengths[-1] *= 0.5
             volumes = np.multiply.outer(volumes, lengths)
         return np.asarray(volumes)
+
+    def cell_volumes(self) -> FloatArray:
+        """Return the volume (2D: area) each node stands for, same shape as `values`.
+
+        The trapezoid rule: half a step at the ends of each axis. They sum to the volume.
+        """
+        return self._volumes
 
     def unseen_fraction(self) -> float:
         """Return the mean of e over the environment, in [0, 1]."""

@@ -1,0 +1,65 @@
+"""The commands in scripts/, as a user calls them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+ENVIRONMENT = ROOT / 'scripts' / 'environment.bash'
+
+
+def call(
+    *command: str | Path, folder: Path = ROOT, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        [str(part) for part in command],
+        cwd=folder,
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def test_python_runs_a_file_from_any_folder(tmp_path: Path) -> None:
+    file = tmp_path / 'mine.py'
+    file.write_text(
+        'import sys\n'
+        'import rclpy\n'
+        'from maasi_sim.scenario import load_scenario\n'
+        "print(load_scenario('mambo').seed, rclpy.__name__, sys.argv[1:])\n"
+    )
+    result = call(ROOT / 'scripts' / 'python', 'mine.py', 'a b', folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == "1 rclpy ['a b']\n"
+
+
+def test_shell_runs_a_command_and_gives_its_exit_code(tmp_path: Path) -> None:
+    result = call(
+        ROOT / 'scripts' / 'shell', 'bash', '-c', 'echo $ROS_DISTRO; exit 7', folder=tmp_path
+    )
+    assert (result.returncode, result.stdout) == (7, 'jazzy\n')
+
+
+def test_an_interactive_shell_survives_an_environment_that_cannot_be_set_up() -> None:
+    commands = f'source {ENVIRONMENT}; echo "status $?"'
+    result = call('bash', '--norc', '-ic', commands, PYTHON='no_such_python')
+    assert 'status 2' in result.stdout
+    assert 'no Python 3.10 to 3.13 was found at PYTHON=no_such_python' in result.stderr
+
+
+def test_a_script_ends_where_the_environment_cannot_be_set_up() -> None:
+    result = call(ROOT / 'scripts' / 'run_scenario', '--help', PYTHON='no_such_python')
+    assert (result.returncode, result.stdout) == (2, '')
+    assert 'PYTHON=no_such_python' in result.stderr
+
+
+def test_no_compiled_module_is_left_in_the_repository() -> None:
+    before = set(ROOT.glob('maasi_*/**/*.pyc'))
+    result = call(ROOT / 'scripts' / 'python', '-c', 'import maasi_sim.search')
+    assert result.returncode == 0, result.stderr
+    assert set(ROOT.glob('maasi_*/**/*.pyc')) <= before
