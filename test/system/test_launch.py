@@ -147,7 +147,7 @@ def test_a_wrong_argument_ends_the_launch_with_one_clear_error(launch, argument,
     assert 'Traceback' not in output
 
 
-@pytest.mark.parametrize('name', ['lockstep', 'record', 'rviz', 'follow_clock'])
+@pytest.mark.parametrize('name', ['lockstep', 'record', 'rviz', 'view', 'follow_clock'])
 def test_what_is_neither_true_nor_false_is_refused(name):
     with pytest.raises(ValueError, match=f"{name}: read 'maybe', allowed are true and false"):
         given = {**DEFAULTS, name: 'maybe'}
@@ -174,5 +174,6 @@ def test_arguments_become_options_that_run_scenario_knows(monkeypatch):
     assert options.lockstep and options.no_record
     assert (options.log_level, options.domain_id) == ('debug', 7)
     assert (options.namespace, options.follow_clock) == ('team_a', False)
-    options = build_parser().parse_args(scenario_options({**DEFAULTS, 'follow_clock': 'true'}))
-    assert options.follow_clock
+    others = {'follow_clock': 'true', 'view': 'true', 'port': '8500'}
+    options = build_parser().parse_args(scenario_options({**DEFAULTS, **others}))
+    assert (options.follow_clock, options.view, options.port) == (True, True, 8500)

@@ -18,6 +18,8 @@ ARGUMENTS = {
     'namespace': ('', 'of all nodes and topics of the run; empty: none'),
     'follow_clock': ('false', 'whether its time is the /clock of another run; true or false'),
     'log_level': ('', 'of the nodes: debug, info, warn, error or fatal; empty: info'),
+    'view': ('false', 'whether a page in the browser shows the search; true or false'),
+    'port': ('', 'of the page; empty: 8420'),
     'rviz': ('false', 'whether RViz shows the search; true or false'),
 }
 _OPTIONS = ('out', 'seed', 'rate', 'planner', 'time_limit', 'namespace', 'log_level')
@@ -65,6 +67,10 @@ def scenario_options(given: Mapping[str, str]) -> list[str]:
         options.append('--follow-clock')
     if not is_true(given, 'record'):
         options.append('--no-record')
+    if is_true(given, 'view'):
+        options.append('--view')
+        if given['port'].strip():
+            options.append(f'--port={given["port"].strip()}')
     is_true(given, 'rviz')
     options.append(f'--domain-id={os.environ.get("ROS_DOMAIN_ID") or 0}')
     return options
