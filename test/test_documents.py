@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
+DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 COLUMNS = 120
 # Folders at the root: what begins with one of them in backticks is a path in this repository.
 FOLDERS = (
@@ -141,3 +141,21 @@ def test_names_of_the_glossary_stand_in_their_files() -> None:
         sources = '\n'.join((ROOT / path).read_text() for path in paths)
         for name in re.findall(r'`([^`]+)`', names):
             assert re.search(rf'\b{name}\b', sources), f'{name} is not in {files}'
+
+
+def test_numbers_of_the_claims_are_those_of_the_experiments() -> None:
+    whole = (ROOT / 'docs' / 'reproduction.md').read_text()
+    rows = [
+        line
+        for line in (ROOT / 'docs' / 'claims.md').read_text().splitlines()
+        if line.startswith('|') and 'reproduction.md#' in line
+    ]
+    assert len(rows) > 10
+    for row in rows:
+        measured, place = row.strip('|').split('|')[2:]
+        section = whole.split(f'\n### {place.partition("#")[2].rstrip(") ")}\n')[1]
+        section = section.partition('\n### ')[0]
+        numbers = re.findall(r'[-+]?[\d.]+ ± [\d.]+', measured)
+        assert numbers
+        for number in numbers:
+            assert f'| {number} ' in section, f'{number} is not in the section of: {row}'

@@ -123,7 +123,7 @@ def parameter_fields(
                 key,
                 _default(info),
                 info.description or '',
-                _constraints(info),
+                constraints(info),
                 _number(info.annotation),
                 _bound(info, 'ge', 'gt'),
                 _bound(info, 'le', 'lt'),
@@ -189,7 +189,8 @@ def _number(annotation: Any) -> type | None:
     return kinds[0] if len(kinds) == 1 and kinds[0] in (int, float) else None
 
 
-def _constraints(info: FieldInfo) -> str:
+def constraints(info: FieldInfo) -> str:
+    """Return in words what a field allows."""
     words = {'gt': 'above', 'ge': 'at least', 'lt': 'below', 'le': 'at most'}
     parts = [
         f'{words[key]} {getattr(item, key)}'

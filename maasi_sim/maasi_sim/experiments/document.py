@@ -51,11 +51,11 @@ Each experiment leaves in `runs/reproduction/NAME/`: `runs/` (one file per run, 
 `steps.csv` (a row per run and step), `runs.csv` (a row per run), `table.md`, `table.csv`,
 `figure.png`, and `configuration.yaml` with every setting and seed.
 
-Other machines take part through Dask. In an environment in which `maasi_sim` can be imported
-(`source .workspace/install/local_setup.bash`), on one machine and on each that is to work:
+Other machines take part through Dask: in a clone of the same version on one machine, and on each
+that is to work,
 
-    dask scheduler
-    dask worker tcp://SCHEDULER:8786
+    ./scripts/shell dask scheduler
+    ./scripts/shell dask worker tcp://SCHEDULER:8786
 
 Then `./scripts/reproduce NAME --cluster tcp://SCHEDULER:8786`. Workers of different processors or
 versions are refused, and so are runs that are there from another machine, unless `--mixed-workers`

@@ -16,7 +16,7 @@ from maasi_sim.scenario.schema import RobotSettings, Scenario
 # Farther than any way between two waypoints [m].
 _FAR = 1e9
 # Of a grid that is chosen for a robot without candidates.
-_MOST_CANDIDATES = 1000
+_MOST_CANDIDATES = 400
 
 
 def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> CandidateSet:
@@ -48,7 +48,8 @@ def covering_grid(
 ) -> dict[str, Any]:
     """Return a grid of candidates over the bounds from which a robot sees everything.
 
-    Its spacing is at most the side of a square, or cube, as large as what the sensor sees well.
+    Its spacing is at most the side of a square, or cube, as large as what the sensor sees well;
+    where that takes too many waypoints, it is a coarser grid, and `never_seen` warns.
 
     Parameters
     ----------
@@ -64,6 +65,8 @@ def covering_grid(
     sensor = robot.sensor.build(name, environment.dimension)
     start = np.array(robot.start)
     width = _view_width(sensor, float(sides.max()))
+    while np.ceil(sides / width).prod() > _MOST_CANDIDATES:
+        width *= 1.1
     first: dict[str, Any] = {}
     while True:
         numbers = np.ceil(sides / width - 1e-9).astype(int)

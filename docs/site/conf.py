@@ -1,4 +1,4 @@
-"""Sphinx: the API reference from the docstrings; built by ./scripts/docs."""
+"""Sphinx: the documentation site; built by ./scripts/docs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from pydantic import BaseModel
 project = 'MAASI'
 author = 'The MAASI developers'
 version = release = '0.1.0'
-extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon']
+extensions = ['sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'myst_parser']
+# Anchors of headings, as on GitHub.
+myst_heading_anchors = 4
+highlight_language = 'text'
 html_theme = 'alabaster'
 # Backticks in docstrings name code, as in Markdown.
 default_role = 'code'

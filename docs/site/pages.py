@@ -1,0 +1,277 @@
+"""Writes the pages of the documentation site: those of docs/, and a generated reference.
+
+Run by ./scripts/docs: pages.py FOLDER.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import shutil
+import sys
+import typing
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from maasi_filter.ros.node_help import parameters_of, settings_of
+from maasi_filter.ros.parameters import choices, constraints
+from maasi_sim.buildings.scenario import CuboidScenario
+from maasi_sim.run.launch_arguments import ending
+from maasi_sim.scenario.schema import Scenario
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / 'docs'
+# What each part of the site holds, in order; a page of docs/ that is in no part goes to the last.
+PARTS = {
+    'Start': ['README', 'first_search', 'install'],
+    'Tutorials': [
+        f'tutorials/{name}' for name in ('student', 'ros_engineer', 'researcher', 'field')
+    ],
+    'How to': [
+        *(f'how_to/{name}' for name in ('detections', 'planner', 'robot', 'bags')),
+        *('plugins', 'compare', 'view', 'robots', 'robots_mambo', 'robots_mavlink'),
+    ],
+    'Reference': [
+        *(f'reference/{name}' for name in ('scenario', 'parameters', 'messages', 'commands')),
+        *('report', 'parameters', 'messages', 'measurement_feed', 'filter_presets', 'api/api'),
+    ],
+    'Explanation': [
+        *('architecture', 'filter', 'planners', 'cuboid_mpc', 'reliability', 'repeatability'),
+        *('claims', 'reproduction'),
+    ],
+}
+LAST = 'Explanation'
+# Outside of docs/.
+SHOWN = (Path('README.md'), Path('CONTRIBUTING.md'))
+NODES = [
+    ('maasi_filter', 'filter_node', 'FilterNode'),
+    ('maasi_planner', 'planner_node', 'PlannerNode'),
+    ('maasi_planner', 'buildings.cuboid_planner_node', 'CuboidPlannerNode'),
+    ('maasi_drivers', 'agent.agent_driver', 'AgentDriver'),
+    ('maasi_drivers', 'guard_node', 'GuardNode'),
+    ('maasi_sim', 'sim_node', 'SimNode'),
+    ('maasi_sim', 'buildings.cuboid_sim_node', 'CuboidSimNode'),
+]
+PARSERS = [
+    'maasi_sim.run.run_options',
+    'maasi_sim.view.view_run',
+    'maasi_sim.experiments.reproduce',
+    'maasi_sim.experiments.compare',
+    'maasi_sim.chaos.campaign',
+    'maasi_planner.search_command',
+    'maasi_drivers.robot_command',
+    'maasi_drivers.calibrate_sensor',
+    'maasi_drivers.measure_mambo',
+    'maasi_sim.emulators.mambo.fake_mambo',
+    'maasi_sim.emulators.mavlink.fake_mavlink_vehicle',
+]
+KINDS = {
+    bool: 'true or false',
+    int: 'whole number',
+    float: 'number',
+    str: 'text',
+    list: 'list',
+    dict: 'mapping',
+}
+HOME = """# MAASI
+
+A team of robots finds an unknown number of targets: a suite for ROS 2 Jazzy in Python, and a
+library without ROS.
+
+New here: [the first search](first_search.md), then the tutorial that fits. Something particular to
+do: *How to*. A name or a number to look up: *Reference*. Why it is as it is: *Explanation*.
+"""
+
+
+def site_text(text: str, page: Path) -> str:
+    """Return a page of the repository with links as the site has them."""
+
+    def change(match: re.Match[str]) -> str:
+        mark, words, target = match.groups()
+        name, hash_, anchor = target.partition('#')
+        if not name or re.match(r'\w+:', target):
+            return match.group()
+        path = Path(os.path.normpath(page.parent / name)).relative_to(ROOT)
+        source = page.relative_to(ROOT)
+        is_page = path in SHOWN or (path.parts[0] == 'docs' and path.suffix in ('.md', '.png'))
+        if not is_page:
+            # Not a page of the site.
+            shown = words.strip('`')
+            return f'`{path}`' if shown in (name, str(path)) else f'{words} (`{path}`)'
+        here, there = (
+            Path(*item.parts[1:]) if item.parts[0] == 'docs' else item for item in (source, path)
+        )
+        return f'{mark}[{words}]({os.path.relpath(there, here.parent)}{hash_}{anchor})'
+
+    text = re.sub(r'(!?)\[([^\]]*)\]\(([^)\s]+)\)', change, text)
+    # A library that draws diagrams would need the network: they are shown as they are written.
+    return text.replace('```mermaid', '```text')
+
+
+def pages() -> list[Path]:
+    """Return the pages of the repository that the site has."""
+    found = [path for path in DOCS.rglob('*.md') if path.parent.name != 'site']
+    return [*(ROOT / path for path in SHOWN), *sorted(found)]
+
+
+def copy_pages(target: Path) -> None:
+    for page in pages():
+        place = target / (page.relative_to(DOCS) if DOCS in page.parents else page.name)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(site_text(page.read_text(), page))
+    for picture in DOCS.rglob('*.png'):
+        place = target / picture.relative_to(DOCS)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(picture, place)
+
+
+def home(names: set[str]) -> str:
+    """Return the first page, with the contents of the whole site."""
+    listed = {name for part in PARTS.values() for name in part}
+    text = [HOME]
+    for title, part in PARTS.items():
+        rows = [name for name in part if name in names]
+        if title == LAST:
+            rows += sorted(names - listed)
+        text.append(
+            '\n'.join([f'```{{toctree}}\n:caption: {title}\n:maxdepth: 1\n', *rows, '```\n'])
+        )
+    return '\n'.join(text)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ['| ' + ' | '.join(head) + ' |', '|---' * len(head) + '|']
+    for row in rows:
+        lines.append('| ' + ' | '.join(cell.replace('|', r'\|') for cell in row) + ' |')
+    return '\n'.join(lines) + '\n'
+
+
+def code(value: Any) -> str:
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return f'`{text}`' if text else "`''`"
+
+
+def settings_rows(model: type[BaseModel], prefix: str = '') -> Iterator[tuple[str, str, str, str]]:
+    """Yield key, what is allowed, default and description of settings and of those inside."""
+    for name, info in model.model_fields.items():
+        key = prefix + (info.alias or name)
+        kinds, inner = [], []
+        for choice in choices(info.annotation):
+            origin = typing.get_origin(choice) or choice
+            element = typing.get_args(choice)[-1:] if origin in (list, dict) else (choice,)
+            models = [kind for part in element for kind in choices(part) if is_model(kind)]
+            inner += [(kind, {list: '[]', dict: '.NAME'}.get(origin, '')) for kind in models]
+            kinds += [KINDS[origin]] if origin in KINDS and not models else []
+        allowed = constraints(info)
+        if not allowed.startswith('one of'):
+            allowed = ' '.join(filter(None, [' or '.join(dict.fromkeys(kinds)), allowed]))
+        default = info.default
+        if info.is_required():
+            shown = 'needed'
+        elif default is PydanticUndefined or isinstance(default, BaseModel):
+            shown = ''
+        else:
+            shown = 'none' if default is None else code(default)
+        yield code(key), allowed, shown, info.description or ''
+        for kind, step in inner:
+            yield from settings_rows(kind, f'{key}{step}.')
+
+
+def is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def scenario_page() -> str:
+    head = ('key', 'allowed', 'default', 'meaning [unit]')
+    return '\n'.join(
+        [
+            '# Keys of a scenario file\n',
+            'A robot takes what it does not say from its type, a file in `config/robots`. NAME '
+            'stands for the name of a robot, `[]` for each entry of a list.\n',
+            '## Search for targets\n',
+            table(head, settings_rows(Scenario)),
+            '## Search of buildings\n',
+            'With `planner: {name: cuboid_mpc}`.\n',
+            table(head, settings_rows(CuboidScenario)),
+        ]
+    )
+
+
+def parameters_page() -> str:
+    text = [
+        '# Parameters of the nodes\n',
+        'How they are set, and which can be changed while a node runs: '
+        '[parameters](../parameters.md). NAME stands for the name of a robot.\n',
+    ]
+    for package, module, name in NODES:
+        node = getattr(importlib.import_module(f'{package}.{module}'), name)
+        title = 'drivers' if name == 'AgentDriver' else module.rpartition('.')[2]
+        rows = [
+            (
+                code(item.name),
+                item.constraints,
+                '' if item.default is None else code(item.default),
+                item.description,
+            )
+            for item in parameters_of(settings_of(node))
+        ]
+        text += [
+            f'## {title}\n',
+            f'Package `{package}`.\n',
+            table(('parameter', 'allowed', 'default', 'meaning [unit]'), rows),
+        ]
+    return '\n'.join(text)
+
+
+def messages_page() -> str:
+    text = [
+        '# Messages and actions\n',
+        'Of the package `maasi_msgs`, with the unit of each field.\n',
+    ]
+    for kind in ('msg', 'action', 'srv'):
+        for file in sorted((ROOT / 'maasi_msgs' / kind).glob(f'*.{kind}')):
+            text.append(f'## {file.stem}\n\n```text\n{file.read_text().strip()}\n```\n')
+    return '\n'.join(text)
+
+
+def commands_page() -> str:
+    os.environ['COLUMNS'] = '100'
+    codes = [(str(number), ending(number).partition(': ')[2]) for number in (1, 2, 3, 4, 130)]
+    text = [
+        '# Commands and exit codes\n',
+        'Of `run_scenario`:\n',
+        table(('exit code', 'meaning'), [('0', 'ended as intended'), *codes]),
+    ]
+    for module in PARSERS:
+        parser = importlib.import_module(module).build_parser()
+        text.append(f'## {parser.prog}\n\n```text\n{parser.format_help().strip()}\n```\n')
+    return '\n'.join(text)
+
+
+REFERENCE = {
+    'scenario': scenario_page,
+    'parameters': parameters_page,
+    'messages': messages_page,
+    'commands': commands_page,
+}
+
+
+def main() -> None:
+    target = Path(sys.argv[1])
+    copy_pages(target)
+    (target / 'reference').mkdir(exist_ok=True)
+    for name, make in REFERENCE.items():
+        (target / 'reference' / f'{name}.md').write_text(make())
+    names = {path.relative_to(target).with_suffix('').as_posix() for path in target.rglob('*.md')}
+    if (target / 'api').is_dir():
+        names.add('api/api')
+    (target / 'index.md').write_text(home(names))
+
+
+if __name__ == '__main__':
+    main()
