@@ -15,6 +15,7 @@ setup(
         ('share/maasi_config/rviz', glob('rviz/*.rviz')),
     ],
     python_requires='>=3.10,<3.14',
+    extras_require={'test': ['pytest>=7.4', 'PyYAML>=6.0.1']},
     zip_safe=True,
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',

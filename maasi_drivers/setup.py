@@ -26,6 +26,7 @@ setup(
         'calibration': ['rosbags>=0.11.5'],
         'mambo': ['pyparrot>=1.5.20', 'zeroconf>=0.131'],
         'mavlink': ['pymavlink>=2.4.41'],
+        'test': ['pytest>=7.4'],
     },
     zip_safe=True,
     maintainer='The MAASI developers',

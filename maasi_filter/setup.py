@@ -19,6 +19,7 @@ setup(
         'scipy>=1.11.4',
         'typing_extensions>=4.10',
     ],
+    extras_require={'test': ['hypothesis>=6.98', 'pytest>=7.4']},
     zip_safe=True,
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',

@@ -34,6 +34,7 @@ setup(
         'experiments': ['distributed>=2024.1', 'matplotlib>=3.6.3', 'rich>=13'],
         'reports': ['matplotlib>=3.6.3', 'Pillow>=10'],
         'runs': ['matplotlib>=3.6.3', 'rich>=13', 'setproctitle>=1.3'],
+        'test': ['pytest>=7.4'],
     },
     zip_safe=True,
     maintainer='The MAASI developers',

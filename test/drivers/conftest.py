@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +15,6 @@ import yaml
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from robot_team import KINDS, TURTLEBOT, Team, parameters_of
 
 from maasi_drivers.agent.driver_settings import DriverSettings

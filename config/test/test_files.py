@@ -1,0 +1,29 @@
+"""Files that are read at run time: each can be read, and names only what is there."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+TYPES = {path.stem for path in (ROOT / 'robots').glob('*.yaml')} - {'all'}
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'scenarios').glob('*.yaml')), ids=lambda x: x.stem)
+def test_robots_of_a_scenario_have_a_type(path):
+    robots = yaml.safe_load(path.read_text())['robots']
+    assert robots
+    assert {robot['type'] for robot in robots.values()} <= TYPES
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'robots').glob('*.yaml')), ids=lambda x: x.stem)
+def test_a_robot_type_is_a_mapping(path):
+    assert isinstance(yaml.safe_load(path.read_text()), dict)
+
+
+def test_views_can_be_read():
+    views = [yaml.safe_load(path.read_text()) for path in (ROOT / 'rviz').glob('*.rviz')]
+    assert views and all(view['Visualization Manager']['Displays'] for view in views)
+    layouts = [json.loads(path.read_text()) for path in (ROOT / 'foxglove').glob('*.json')]
+    assert layouts and all(layout['configById'] for layout in layouts)
