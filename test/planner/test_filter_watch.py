@@ -68,7 +68,7 @@ def test_robots_are_held_until_the_filter_answers_again(silent):
             server.register_cancel_callback(cancel)
         beats = team.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         beat = DiagnosticArray(status=[DiagnosticStatus(name='/team')])
-        until(lambda: '/team' in node._filter_names and beats.get_subscription_count())
+        until(lambda: '/team' in node._guard.names and beats.get_subscription_count())
         begin(node, team, until)
         until(lambda: team.batches)
 

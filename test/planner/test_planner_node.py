@@ -357,7 +357,7 @@ def test_destinations_that_are_wrong_are_dropped(world):
         message.header.frame_id = 'map'
         team.destination.publish(changed(message, changes))
         until(lambda number=number: node.dropped['bad destination'] == number)
-    assert node._taken(0, None)[0][0].tolist() == [0.2, 1.8, 0.0]
+    assert node._others.taken(0, None)[0][0].tolist() == [0.2, 1.8, 0.0]
 
 
 def test_a_search_of_no_finite_time_is_refused(world):

@@ -28,7 +28,7 @@ NAMES = ('maasi', 'asi', 'maas', 'as', 'mutual_information', 'nearest_widest', '
 
 
 def test_unknown_planner_is_refused():
-    with pytest.raises(ValueError, match='allowed are'):
+    with pytest.raises(ValueError, match='known are'):
         make_planner('best')
 
 

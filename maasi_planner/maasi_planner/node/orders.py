@@ -1,0 +1,166 @@
+"""Goals of the robots: those of decisions, the way home, and those of other clients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from std_msgs.msg import Header
+
+from maasi_filter.ros.conversions import point_to_ros
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_msgs.action import GoToWaypoint
+from maasi_planner.coordinator import Coordinator
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.search_control.search_modes import Mode, SearchModes
+from maasi_planner.search_control.team_goals import Course, HeardState, TeamGoals
+
+
+class Orders:
+    """Sends goals, and tells which robot can take one.
+
+    Parameters
+    ----------
+    node : LockstepLifecycleNode
+        The planner node.
+    coordinator : Coordinator
+        Whose decisions are carried out.
+    modes : SearchModes
+        Which robots search.
+    """
+
+    def __init__(
+        self,
+        node: LockstepLifecycleNode[PlannerNodeSettings],
+        coordinator: Coordinator,
+        modes: SearchModes,
+    ) -> None:
+        self._node = node
+        self._modes = modes
+        self.reset(coordinator)
+
+    def reset(self, coordinator: Coordinator) -> None:
+        """Begin anew."""
+        self._coordinator = coordinator
+        #: Robots that follow a goal of another client, with its number.
+        self.lent: dict[str, int] = {}
+        # Robots on their way to their start, with the number of that goal; 0: arrived.
+        self._homing: dict[str, int] = {}
+
+    def set_up(self, names: Sequence[str], answered: Callable[[], None]) -> TeamGoals:
+        """Create the clients of the robots; `answered` is called after an answer to a goal."""
+        node = self._node
+        self._answered = answered
+        self.goals = TeamGoals(
+            node,
+            {name: node.team_topic(f'{name}/go_to') for name in names},
+            node.settings.lockstep,
+            self._on_answer,
+        )
+        for client in self.goals.clients.values():
+            node.expect(client.server_is_ready)
+        return self.goals
+
+    # ---- commands ----------------------------------------------------------------------------
+
+    def stop(self, names: Iterable[str]) -> None:
+        """Cancel the goals of robots, and discard their plans."""
+        for name in names:
+            self.goals.cancel(name)
+            self._coordinator.leave(name)
+
+    def hold(self, names: Iterable[str]) -> None:
+        """Stop robots where they are, but for those on their way home; they get new goals."""
+        for name in names:
+            if name not in self._homing:
+                self.goals.cancel(name)
+                self._coordinator.refuse(name)
+
+    def begin_homing(self, names: Iterable[str]) -> None:
+        """Send robots to their starts as soon as they are free."""
+        self._homing.update(dict.fromkeys(names, -1))
+
+    def end_homing(self, names: Iterable[str] | None = None) -> None:
+        """Send robots (None: all) to their starts no more."""
+        for name in list(self._homing) if names is None else names:
+            self._homing.pop(name, None)
+
+    def leave(self, name: str) -> None:
+        """Forget the goals of a robot that takes part no more."""
+        self.goals.cancel(name)
+        self.lent.pop(name, None)
+        if name in self._homing:
+            self._homing[name] = -1
+        self._coordinator.leave(name)
+
+    # ---- goals -------------------------------------------------------------------------------
+
+    def send(self, name: str, number: int, waypoint: NDArray[np.float64], header: Header) -> None:
+        """Send a goal to a robot."""
+        goal = GoToWaypoint.Goal(goal_id=number, step=self._node.step)
+        goal.waypoint.header = header
+        goal.waypoint.pose.position = point_to_ros(waypoint)
+        goal.waypoint.pose.orientation.w = 1.0
+        self.goals.send(name, goal)
+
+    def send_home(self, name: str, header: Header) -> None:
+        """Send a free robot to its start, if it has to go there."""
+        if name not in self._homing:
+            return
+        number = self._homing[name] = self._coordinator.next_number(name)
+        self.send(name, number, np.array(self._node.settings.robots[name].start), header)
+
+    def _on_answer(self, name: str, number: int, accepted: bool) -> None:
+        if not accepted:
+            self.refuse(name)
+            self._node.warn_throttled(f'{name} refused', f'{name} refused goal {number}')
+        self._answered()
+
+    def refuse(self, name: str) -> None:
+        """Note that a robot did not take its goal: it gets another one."""
+        self.goals.forget(name)
+        self._coordinator.refuse(name)
+
+    def is_free(self, name: str, heard: HeardState, step: int) -> bool:
+        """Return whether a robot can take a goal: it has none, from any client."""
+        coordinator, logger = self._coordinator, self._node.get_logger()
+        if not coordinator.is_idle(name):
+            number = coordinator.decision_index(name) + 1
+            course = self.goals.course(name, number, heard)
+            if course is Course.UNDER_WAY:
+                return False
+            if course is Course.ENDED:
+                self.goals.forget(name)
+                return True
+            self.goals.forget(name)
+            if course is Course.LOST:
+                logger.warning(f'{name} has not taken goal {number}, or lost it')
+                self.refuse(name)
+        number = self._homing.get(name, -1)
+        if number > 0:
+            course = self.goals.course(name, number, heard)
+            if course is Course.REPLACED:
+                self._homing[name] = -1
+            elif course is not Course.UNDER_WAY:
+                self._homing[name] = 0
+        if number >= 0:
+            return False
+        if self.goals.driven(heard):
+            if not self.goals.ends(name, heard):
+                self._lend(name, heard, step)
+            return False
+        if self.lent.pop(name, None) is not None:
+            logger.info(f'{name} takes goals of the planner again')
+        return True
+
+    def _lend(self, name: str, heard: HeardState, step: int) -> None:
+        new = self.lent.get(name) != heard.goal
+        self.lent[name] = heard.goal
+        if self._modes.of[name] is Mode.SEARCHING and self._coordinator.destined(name):
+            self._coordinator.lend(name, step)
+        if new:
+            self._node.get_logger().warning(
+                f'{name} follows goal {heard.goal} of another client: it measures, and gets no '
+                'goal of the planner until that one has ended'
+            )

@@ -1,0 +1,147 @@
+"""Destinations that planners of single robots tell each other (002, section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from functools import partial
+
+import numpy as np
+from geometry_msgs.msg import PointStamped
+from numpy.typing import NDArray
+from rclpy.publisher import Publisher
+from std_msgs.msg import Header
+
+from maasi_filter.ros.conversions import point_to_ros, stamp_from_ros
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_filter.ros.qos import RELIABLE
+from maasi_filter.ros.silence import Silence
+from maasi_planner.node_settings import PlannerNodeSettings
+
+FloatArray = NDArray[np.float64]
+
+
+class OtherPlanners:
+    """Exchanges destinations with the planners of other robots; they plan in the order of names.
+
+    Subscribes
+    ----------
+    `<robot>/destination` (geometry_msgs/PointStamped) of robots that plan for themselves
+
+    Publishes
+    ---------
+    `<robot>/destination` (geometry_msgs/PointStamped) of its own robots, each step
+
+    Parameters
+    ----------
+    node : LockstepLifecycleNode
+        The planner node.
+    names : sequence of str
+        Its own robots.
+    heard : callable
+        Called after a destination was received.
+    """
+
+    def __init__(
+        self,
+        node: LockstepLifecycleNode[PlannerNodeSettings],
+        names: Collection[str],
+        heard: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._own = sorted(names)
+        self._heard = heard
+        self._publishers: dict[str, Publisher] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew, from the starts of the others."""
+        others = self._node.settings.others
+        # By step: the last two received.
+        self._destinations: dict[str, dict[int, FloatArray]] = {
+            name: {-1: np.array(others[name].start)} for name in sorted(others)
+        }
+        self._silence: dict[str, Silence] = {}
+        self._before: set[str] = set()
+
+    def set_up(self) -> None:
+        """Create publishers and subscriptions, where there are others."""
+        node = self._node
+        others = sorted(node.settings.others)
+        for name in self._own if others else ():
+            publisher = node.create_publisher(
+                PointStamped, node.team_topic(f'{name}/destination'), RELIABLE
+            )
+            node.expect_subscribers(publisher, len(others))
+            self._publishers[name] = publisher
+        for name in others:
+            topic = node.team_topic(f'{name}/destination')
+            node.create_subscription(PointStamped, topic, partial(self._on_point, name), RELIABLE)
+            node.expect_publisher(topic)
+
+    def _on_point(self, name: str, message: PointStamped) -> None:
+        node = self._node
+        if not node.active:
+            return
+        point = np.array([message.point.x, message.point.y, message.point.z])
+        frame = message.header.frame_id
+        if frame != node.settings.frame or not np.isfinite(point).all():
+            node.drop(
+                'bad destination',
+                f'{name}/destination: read {point.tolist()} in {frame!r}, allowed are finite '
+                f'numbers in {node.settings.frame!r}',
+            )
+            return
+        known = self._destinations[name]
+        known[round(stamp_from_ros(message.header.stamp) * 1e-9 / node.settings.step)] = point
+        while len(known) > 2:
+            del known[min(known)]
+        self._silence[name] = Silence(node)
+        self._heard()
+
+    def missing(self, step: int, robots: Collection[str]) -> bool:
+        """Return whether destinations of other planners have not come yet, in lockstep.
+
+        Needed are those of this step from planners earlier by name, and of the previous step from
+        later ones.
+        """
+        for name, known in self._destinations.items():
+            if name not in robots:
+                continue
+            if name < self._own[0]:
+                if max(known) < step:
+                    return True
+            elif name in self._before and max(known) < step - 1:
+                return True
+        return False
+
+    def planned(self, robots: Iterable[str]) -> None:
+        """Note who took part in a step, in lockstep."""
+        self._before = set(robots)
+
+    def taken(self, step: int, robots: Collection[str] | None) -> list[tuple[FloatArray, float]]:
+        """Return the known destinations of robots with their own planner, and their radii.
+
+        Those of `robots` at a step in lockstep; with None those that were heard of late.
+        """
+        settings = self._node.settings
+        taken = []
+        for name, known in self._destinations.items():
+            if robots is None:
+                silence = self._silence.get(name)
+                there = silence is None or silence.length <= settings.state_timeout
+                last = max(known)
+            else:
+                there = name in robots
+                last = max(
+                    (k for k in known if k < step or name < self._own[0]), default=max(known)
+                )
+            if there:
+                taken.append((known[last], settings.others[name].radius))
+        return taken
+
+    def publish(self, header: Header, destination: Callable[[str], FloatArray | None]) -> None:
+        """Publish where the own robots go; None: the robot takes no part."""
+        for name, publisher in self._publishers.items():
+            point = destination(name)
+            if point is not None:
+                publisher.publish(PointStamped(header=header, point=point_to_ros(point)))

@@ -1,0 +1,78 @@
+"""What the planner node publishes for viewers, at a limited rate."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from nav_msgs.msg import OccupancyGrid
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
+
+from maasi_filter.ros.conversions import particles_to_ros
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_filter.ros.marker_board import MarkerBoard
+from maasi_filter.ros.qos import LATCHED
+from maasi_planner.conversions import exploration_to_ros, planner_markers
+from maasi_planner.coordinator import Coordinator, PresentRobot
+from maasi_planner.node_settings import PlannerNodeSettings
+
+
+class PlannerViews:
+    """The exploration function, and markers of robots and their ways.
+
+    Publishes
+    ---------
+    `exploration` (latched; 2D: nav_msgs/OccupancyGrid, 3D: sensor_msgs/PointCloud2),
+    `markers` (visualization_msgs/MarkerArray)
+
+    Parameters
+    ----------
+    node : LockstepLifecycleNode
+        The planner node.
+    """
+
+    def __init__(self, node: LockstepLifecycleNode[PlannerNodeSettings]) -> None:
+        self._node = node
+        bounds = node.settings.environment.array()
+        self._size = 0.02 * float((bounds[:, 1] - bounds[:, 0]).max())
+        self._flat = node.settings.environment.dimension == 2
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._board = MarkerBoard()
+        self._at = -math.inf
+
+    def set_up(self) -> None:
+        """Create the publishers."""
+        self._markers = self._node.create_publisher(MarkerArray, 'markers', 10)
+        kind = OccupancyGrid if self._flat else PointCloud2
+        self._exploration = self._node.create_publisher(kind, 'exploration', LATCHED)
+
+    def publish(
+        self,
+        coordinator: Coordinator,
+        robots: dict[str, PresentRobot],
+        header: Header,
+        now: float,
+    ) -> None:
+        """Publish what is due at the time `now` [s]."""
+        rate = self._node.settings.views_rate
+        if rate <= 0.0 or abs(now - self._at) < 1.0 / rate:
+            return
+        self._at = now
+        exploration = coordinator.exploration
+        if self._flat:
+            self._exploration.publish(exploration_to_ros(exploration, header))
+        else:
+            self._exploration.publish(
+                particles_to_ros(exploration.nodes(), np.ravel(exploration.values), header)
+            )
+        shown = {}
+        for name, robot in robots.items():
+            path = coordinator.path(name)
+            place = np.asarray(robot.state.pose.position)
+            shown[name] = (place, path[-1] if len(path) else place, path)
+        self._markers.publish(self._board.replace(planner_markers(shown, header, self._size)))
