@@ -8,7 +8,7 @@ setup(
     packages=find_packages(),
     package_data={
         'maasi_sim.experiments': ['published/*.yaml'],
-        'maasi_sim.run': ['discovery.xml'],
+        'maasi_sim.run': ['discovery.xml', 'report.schema.json'],
         'maasi_sim.view': ['page/*'],
     },
     data_files=[
@@ -26,6 +26,7 @@ setup(
         'numpy>=1.26,<3',
         'opencv-python-headless>=4.7',
         'pydantic>=2.7',
+        'pymap3d>=2.9',
         'PyYAML>=6.0.1',
         'rosbags>=0.11.5',
         'scipy>=1.11.4',

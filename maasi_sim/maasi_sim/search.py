@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +27,13 @@ from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import Planner
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision
+from maasi_sim.scenario.base import OriginSettings
 from maasi_sim.scenario.schema import (
     Scenario,
     planner_settings,
     steps_of,
 )
+from maasi_sim.targets.data_frames import data_frame
 from maasi_sim.targets.scoring import score, scoring_radius
 from maasi_sim.view.live_view import open_view
 from maasi_sim.view.search_trace import SearchTrace
@@ -106,6 +109,10 @@ class SearchResult:
         Wall time of each filter step and of each decision [s].
     trace : SearchTrace or None
         What a replay shows.
+    pairs : list of (int, int)
+        Index of a found target, and of the true one that it is.
+    origin : OriginSettings or None
+        Where the map lies on the earth.
     """
 
     end_reason: str
@@ -122,6 +129,8 @@ class SearchResult:
     filter_times: list[float] = field(default_factory=list)
     planning_times: list[float] = field(default_factory=list)
     trace: SearchTrace | None = field(default=None, repr=False, compare=False)
+    pairs: list[tuple[int, int]] = field(default_factory=list)
+    origin: OriginSettings | None = None
 
     def save_replay(self, path: str | Path) -> None:
         """Write a page that shows the search, one HTML file.
@@ -133,6 +142,24 @@ class SearchResult:
         """
         assert self.trace is not None, 'a result that `search` returned has a trace'
         self.trace.save_replay(Path(path))
+
+    def to_dataframe(self, table: str = 'found_targets') -> Any:
+        """Return a pandas data frame.
+
+        Parameters
+        ----------
+        table : str
+            'found_targets': a row for each, with the columns of `found_targets.csv`. 'progress': a
+            row for each measurement batch, with the fields of `Found` and the places of robots.
+
+        Raises
+        ------
+        ImportError
+            If pandas is not installed.
+        ValueError
+            If there is no such table.
+        """
+        return data_frame(self, table)
 
     @property
     def total_measurements(self) -> int:
@@ -453,6 +480,8 @@ def search(
         trace=trace,
         filter_times=[item for group in groups for item in group.filter_times],
         planning_times=[item for group in groups for item in group.planning_times],
+        pairs=scores.match.pairs,
+        origin=scenario.environment.origin,
     )
 
 

@@ -65,12 +65,12 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
     search, simulated = read_back(plans['/filter_node'], FilterNodeSettings)
     assert simulated
     assert (search.step, search.seed, search.lockstep) == (scenario.step, 4, lockstep)
-    assert search.environment == scenario.environment
+    assert search.environment == scenario.environment.of_nodes()
     # With what the preset stands for.
     assert search.filter == scenario.filter.resolved()
     planner, simulated = read_back(plans['/planner_node'], PlannerNodeSettings)
     assert simulated
-    assert planner.environment == scenario.environment
+    assert planner.environment == scenario.environment.of_nodes()
     assert planner.planner == scenario.planner
     for robot, settings in scenario.robots.items():
         assert search.robots[robot].sensor == settings.sensor
@@ -80,7 +80,7 @@ def test_nodes_read_the_scenario_back_from_their_parameter_files(name):
         assert simulated
         for key in ('start', 'yaw', 'radius', 'motion', 'sensor', 'camera', 'link', 'mambo'):
             assert getattr(driver, key) == getattr(settings, key)
-        assert driver.environment == scenario.environment
+        assert driver.environment == scenario.environment.of_nodes()
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ import sys
 import time
 from pathlib import Path
 
+from report_check import check_report
+
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.recording import plain
 
@@ -24,7 +26,7 @@ class Run:
 
     @property
     def report(self):
-        return json.loads((self.folder / 'report.json').read_text())
+        return check_report(json.loads((self.folder / 'report.json').read_text()))
 
     @property
     def bag(self):

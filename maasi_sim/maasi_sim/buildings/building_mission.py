@@ -64,6 +64,10 @@ class BuildingMission:
         """See `Mission.report`."""
         return build_cuboid_report(record)
 
+    def tables(self, record: CuboidRecord) -> dict[str, str]:
+        """See `Mission.tables`."""
+        return {}
+
     def summary(self, report: dict[str, Any]) -> str:
         """See `Mission.summary`."""
         return cuboid_summary(report)

@@ -28,7 +28,7 @@ def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -
     settings = CuboidPlannerSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment,
+            'environment': scenario.environment.of_nodes(),
             'start': robot.start,
             'yaw': robot.yaw,
             'dynamics': robot.dynamics,

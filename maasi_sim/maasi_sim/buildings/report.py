@@ -31,7 +31,7 @@ def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
     )
     complete = record.completed
     return {
-        **identity(record),
+        **identity(record, 'buildings'),
         'cuboids': {
             'total': total,
             'visited': len(first),

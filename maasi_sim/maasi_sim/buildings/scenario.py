@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from maasi_filter.settings import EnvironmentSettings, Finite, Settings
+from maasi_filter.settings import Finite, Settings
 from maasi_planner.buildings import (
     CuboidSettings,
     Dynamics,
@@ -21,7 +21,7 @@ from maasi_planner.buildings import (
     plan_mission,
 )
 from maasi_sim.buildings.mission import CuboidMission, SearchRobot
-from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
 from maasi_sim.scenario.checks import check_names, doubts_about, event_problems
 from maasi_sim.scenario.layering import Key, Layer, ScenarioError, doubt, refuse, validate
 from maasi_sim.scenario.loading import read_scenario, with_overrides
@@ -70,7 +70,7 @@ class CuboidPlanner(CuboidSettings):
 class CuboidScenario(BaseScenario):
     """A scenario file of a search of buildings, all layers merged."""
 
-    environment: EnvironmentSettings = Field(description='Where robots may be, in 3D')
+    environment: ScenarioEnvironment = Field(description='Where robots may be, in 3D')
     step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT [s]')
     robots: dict[str, SearchRobotSettings] = Field(min_length=1, description='Robots by name')
     planner: CuboidPlanner = Field(description='Planner of each robot, and what is searched')

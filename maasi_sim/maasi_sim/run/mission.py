@@ -134,6 +134,9 @@ class Mission(Protocol[Record]):
     def report(self, record: Record) -> dict[str, Any]:
         """Return the report as plain values."""
 
+    def tables(self, record: Record) -> dict[str, str]:
+        """Return further files of the report: their text by name."""
+
     def summary(self, report: dict[str, Any]) -> str:
         """Return a report in a few lines."""
 

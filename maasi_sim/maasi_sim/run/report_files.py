@@ -16,6 +16,9 @@ from maasi_sim.run.mission import Mission
 from maasi_sim.run.run_folder import ResultsError, remove, write_text, write_whole
 from maasi_sim.run.run_record import FloatArray, RunRecord
 
+# Of the format of `report.json`, see `report.schema.json`.
+REPORT_VERSION = 1
+
 END_REASONS = {
     'all_found': 'all targets found',
     'planner_done': 'nothing is left to gain, says the planner',
@@ -50,9 +53,11 @@ class StoredReport:
     problem: str = ''
 
 
-def identity(record: RunRecord) -> dict[str, Any]:
-    """Return the first entries of a report: what was run."""
+def identity(record: RunRecord, mission: str) -> dict[str, Any]:
+    """Return the first entries of a report: what was run; `mission` as in the schema."""
     return {
+        'version': REPORT_VERSION,
+        'mission': mission,
         'scenario': record.name,
         'seed': record.seed,
         'planner': record.scenario.planner.name,
@@ -93,10 +98,12 @@ def path_length(trajectory: FloatArray) -> float:
 
 
 def write_report(mission: Mission[Any], record: RunRecord, folder: Path) -> dict[str, Any]:
-    """Write `report.json` and `report.png` into a folder and return the report."""
+    """Write report, picture and further files into a folder and return the report."""
     report = mission.report(record)
     text = json.dumps(report, indent=2, allow_nan=False)
     write_text(folder / 'report.json', text + '\n')
+    for name, content in mission.tables(record).items():
+        write_text(folder / name, content)
     figure = mission.figure(record)
     write_whole(folder / 'report.png', lambda path: figure.savefig(path, dpi=110))
     return report

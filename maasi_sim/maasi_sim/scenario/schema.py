@@ -207,7 +207,7 @@ def planner_settings(
     return PlannerNodeSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment,
+            'environment': scenario.environment.of_nodes(),
             'planner': scenario.planner,
             # As the filter has it.
             'exploration_spacing': scenario.filter.exploration_spacing,

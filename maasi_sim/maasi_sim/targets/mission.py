@@ -11,6 +11,7 @@ from maasi_sim.emulators.linked_robots import with_addresses
 from maasi_sim.run.node_plan import NodePlan, RunSettings
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.scenario.visibility import never_seen
+from maasi_sim.targets.found_table import csv_text, found_rows, geojson_text
 from maasi_sim.targets.nodes import plan_nodes
 from maasi_sim.targets.observer import TargetObserver
 from maasi_sim.targets.report import build_report, summary
@@ -74,6 +75,15 @@ class TargetMission:
     def report(self, record: TargetRecord) -> dict[str, Any]:
         """See `Mission.report`."""
         return build_report(record)
+
+    def tables(self, record: TargetRecord) -> dict[str, str]:
+        """See `Mission.tables`."""
+        origin = self.scenario.environment.origin
+        rows = found_rows(record.found, record.truth, record.scores().match.pairs, origin)
+        files = {'found_targets.csv': csv_text(rows, record.scenario.dimension, origin)}
+        if origin is not None:
+            files['found_targets.geojson'] = geojson_text(rows)
+        return files
 
     def summary(self, report: dict[str, Any]) -> str:
         """See `Mission.summary`."""

@@ -39,7 +39,7 @@ def _team_plans(
     filter_settings = FilterNodeSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment,
+            'environment': scenario.environment.of_nodes(),
             'filter': scenario.filter,
             'robots': {name: {'sensor': scenario.robots[name].sensor} for name in names},
             'share_with': others,
@@ -73,7 +73,7 @@ def _robot_plans(
     settings = DriverSettings.model_validate(
         {
             **common,
-            'environment': scenario.environment,
+            'environment': scenario.environment.of_nodes(),
             'start': robot.start,
             'yaw': robot.yaw,
             'radius': robot.radius,

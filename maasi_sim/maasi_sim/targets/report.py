@@ -19,11 +19,12 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
     """Return the report of a run as plain values; nothing in it is infinite or not a number."""
     scores = record.scores()
     complete = _completion(record)
+    true = dict(scores.match.pairs)
     distances = {
         name: _number(path_length(trajectory)) for name, trajectory in record.trajectories.items()
     }
     return {
-        **identity(record),
+        **identity(record, 'targets'),
         'targets': [_numbers(position) for position in record.truth],
         'found': [
             {
@@ -36,8 +37,9 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
                 'class_id': target.label.class_id,
                 'score': target.label.score,
                 'identity': target.label.identity,
+                'target': true.get(index),
             }
-            for target in record.found
+            for index, target in enumerate(record.found)
         ],
         'true_found': scores.match.true_found,
         'missed': scores.match.missed,

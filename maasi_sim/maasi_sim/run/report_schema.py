@@ -1,0 +1,67 @@
+"""The JSON Schema of `report.json`, and its page in the documents: docs/report.md."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+BEGIN, END = '<!-- fields: begin -->', '<!-- fields: end -->'
+
+
+def schema() -> dict[str, Any]:
+    """Return the schema."""
+    text = files('maasi_sim.run').joinpath('report.schema.json').read_text(encoding='utf-8')
+    loaded: dict[str, Any] = json.loads(text)
+    return loaded
+
+
+def with_fields(page: str) -> str:
+    """Return a page in Markdown with tables of all fields between its marks."""
+    before, rest = page.split(BEGIN)
+    parts = []
+    for kind in schema()['oneOf']:
+        parts.append(f'### {kind["description"]}\n\n| field | type | meaning |\n|---|---|---|')
+        parts += [
+            f'| `{name}` | {_type(part)} | {part.get("description", "")} |'
+            for name, part in _fields(kind, '')
+        ]
+        parts.append('')
+    tables = '\n'.join(parts)
+    return f'{before}{BEGIN}\n{tables}{END}{rest.split(END)[1]}'
+
+
+def _fields(part: dict[str, Any], prefix: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the fields of an object with those inside of it, by their paths."""
+    for name, inner in part.get('properties', {}).items():
+        path = prefix + name
+        yield path, inner
+        choices = inner.get('oneOf', [inner])
+        for choice in choices:
+            yield from _fields(choice, f'{path}.')
+            yield from _fields(choice.get('items', {}), f'{path}[].')
+
+
+def _type(part: dict[str, Any]) -> str:
+    if 'const' in part:
+        return json.dumps(part['const'])
+    if 'enum' in part:
+        return ', '.join(part['enum'])
+    if 'oneOf' in part:
+        return ' or '.join(_type(choice) for choice in part['oneOf'])
+    kind = part['type']
+    if isinstance(kind, list):
+        return ' or '.join(kind)
+    if kind == 'array':
+        return f'array of {_type(part["items"])}'
+    if kind == 'object' and isinstance(part.get('additionalProperties'), dict):
+        return f'object: name to {_type(part["additionalProperties"])}'
+    return str(kind)
+
+
+if __name__ == '__main__':
+    file = Path(sys.argv[1])
+    file.write_text(with_fields(file.read_text(encoding='utf-8')), encoding='utf-8')

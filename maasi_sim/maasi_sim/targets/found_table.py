@@ -1,0 +1,119 @@
+"""Found targets as rows of a table: for CSV, GeoJSON and data frames."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maasi_sim.scenario.base import OriginSettings
+
+FloatArray = NDArray[np.float64]
+Row = dict[str, Any]
+
+
+def found_rows(
+    found: Sequence[Any],
+    truth: FloatArray,
+    pairs: Iterable[tuple[int, int]],
+    origin: OriginSettings | None,
+) -> list[Row]:
+    """Return a row for each found target, with the columns of `columns`.
+
+    Parameters
+    ----------
+    found : sequence of Found or FoundTarget
+        With positions (d,) [m, map].
+    truth : (n, d) array
+        True targets [m].
+    pairs : iterable of (int, int)
+        Index of a found target, and of the true one that it is.
+    origin : OriginSettings or None
+        Where the map lies; None: rows have no geodetic coordinates.
+    """
+    true = dict(pairs)
+    rows = []
+    for index, item in enumerate(found):
+        target = true.get(index)
+        error = None if target is None else float(np.linalg.norm(item.position - truth[target]))
+        row: Row = {
+            'id': item.id,
+            'agent': item.agent if hasattr(item, 'agent') else item.robot,
+            'time': float(item.time),
+            'measurement': item.measurement,
+            **{axis: float(value) for axis, value in zip('xyz', item.position)},
+        }
+        if origin is not None:
+            row |= geodetic(item.position, origin)
+        for i, first in enumerate('xyz'[: len(item.position)]):
+            for j, second in enumerate('xyz'[: i + 1]):
+                row[second + first] = float(item.covariance[j, i])
+        row |= {
+            'class_id': item.label.class_id,
+            'score': float(item.label.score),
+            'identity': item.label.identity,
+            'target': target,
+            'error': error,
+        }
+        rows.append(row)
+    return rows
+
+
+def columns(dimension: int, origin: OriginSettings | None) -> list[str]:
+    """Return the columns of the table; dimension is 2 or 3."""
+    names = ['id', 'agent', 'time', 'measurement', *'xyz'[:dimension]]
+    if origin is not None:
+        names += ['latitude', 'longitude', 'altitude']
+    names += [b + a for i, a in enumerate('xyz'[:dimension]) for b in 'xyz'[: i + 1]]
+    return [*names, 'class_id', 'score', 'identity', 'target', 'error']
+
+
+def geodetic(position: FloatArray, origin: OriginSettings) -> Row:
+    """Return latitude, longitude [degrees] and altitude [m] on WGS 84 of a place [m, map]."""
+    # Deferred: only scenarios with an origin need it.
+    import pymap3d
+
+    east, north, up = [*map(float, position), 0.0][:3]
+    latitude, longitude, altitude = pymap3d.enu2geodetic(
+        east, north, up, origin.latitude, origin.longitude, origin.altitude
+    )
+    return {
+        'latitude': float(latitude),
+        'longitude': float(longitude),
+        'altitude': float(altitude),
+    }
+
+
+def csv_text(rows: Sequence[Row], dimension: int, origin: OriginSettings | None) -> str:
+    """Return the table as CSV; empty cells for what there is not."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, columns(dimension, origin), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def geojson_text(rows: Sequence[Row]) -> str:
+    """Return rows with geodetic coordinates as GeoJSON (RFC 7946): a point each."""
+    features = []
+    for row in rows:
+        properties = dict(row)
+        place = [properties.pop(name) for name in ('longitude', 'latitude', 'altitude')]
+        features.append(
+            {
+                'type': 'Feature',
+                # To a millimetre.
+                'geometry': {
+                    'type': 'Point',
+                    'coordinates': [round(place[0], 8), round(place[1], 8), round(place[2], 3)],
+                },
+                'properties': properties,
+            }
+        )
+    content = {'type': 'FeatureCollection', 'features': features}
+    return json.dumps(content, indent=1, allow_nan=False) + '\n'

@@ -1,0 +1,37 @@
+"""Checks a report against the schema that is shipped, strictly: no field that it does not know."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import jsonschema
+
+from maasi_sim.run.report_schema import schema
+
+
+def _strict(part: Any) -> Any:
+    if isinstance(part, list):
+        return [_strict(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    closed = {key: _strict(item) for key, item in part.items()}
+    if 'properties' in closed and 'required' in closed:
+        closed['additionalProperties'] = False
+    return closed
+
+
+@cache
+def _validators() -> dict[str, jsonschema.Draft202012Validator]:
+    whole = schema()
+    jsonschema.Draft202012Validator.check_schema(whole)
+    return {
+        kind['properties']['mission']['const']: jsonschema.Draft202012Validator(_strict(kind))
+        for kind in whole['oneOf']
+    }
+
+
+def check_report(report: dict[str, Any]) -> dict[str, Any]:
+    """Return the report if it is as the schema says."""
+    _validators()[report['mission']].validate(report)
+    return report

@@ -1,0 +1,139 @@
+"""Results that leave the suite: tables of found targets, data frames, the page of the report."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from maasi_filter.models.label import Label
+from maasi_filter.records import FoundTarget
+from maasi_sim.run import report_schema
+from maasi_sim.run.node_plan import RunSettings
+from maasi_sim.scenario.base import OriginSettings
+from maasi_sim.scenario.layering import ScenarioError
+from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.search import search
+from maasi_sim.targets.found_table import csv_text, found_rows, geodetic, geojson_text
+from maasi_sim.targets.nodes import plan_nodes
+
+ORIGIN = OriginSettings(latitude=46.0, longitude=23.5, altitude=350.0)
+COVARIANCE = np.array([[0.04, 0.01, 0.02], [0.01, 0.09, 0.03], [0.02, 0.03, 0.16]])
+
+
+def rows_of(dimension, origin=None):
+    """Return the rows of a true and a false target."""
+    found = [
+        FoundTarget(number, place[:dimension], COVARIANCE[:dimension, :dimension], 'drone', 3, 7.5)
+        for number, place in enumerate(np.array([[1.0, 2.0, 3.0], [9.0, 9.0, 9.0]]), 1)
+    ]
+    found[0].label = Label('cup', 0.75, 'tag, 3')
+    return found_rows(found, np.array([[1.0, 2.0, 3.5]])[:, :dimension], [(0, 0)], origin)
+
+
+def test_csv_holds_what_was_found():
+    true, false = csv.DictReader(io.StringIO(csv_text(rows_of(3), 3, None)))
+    assert [float(true[axis]) for axis in 'xyz'] == [1.0, 2.0, 3.0]
+    assert {key: float(true[key]) for key in ('xx', 'xy', 'yy', 'xz', 'yz', 'zz')} == {
+        'xx': 0.04, 'xy': 0.01, 'yy': 0.09, 'xz': 0.02, 'yz': 0.03, 'zz': 0.16,
+    }  # fmt: skip
+    assert (true['target'], float(true['error']), true['identity']) == ('0', 0.5, 'tag, 3')
+    assert (false['target'], false['error'], false['agent']) == ('', '', 'drone')
+    flat = next(csv.DictReader(io.StringIO(csv_text(rows_of(2), 2, None))))
+    assert not {'z', 'zz', 'latitude'} & flat.keys()
+
+
+def test_places_on_the_earth():
+    """A degree of the meridian at the equator is 110.574 km, one of the equator 111.320 km."""
+    equator = OriginSettings(latitude=0.0, longitude=10.0)
+    north = geodetic(np.array([0.0, 110.574]), equator)
+    assert north['latitude'] == pytest.approx(1e-3, rel=1e-5)
+    east = geodetic(np.array([111.320, 0.0, 5.0]), equator)
+    assert east['longitude'] == pytest.approx(10.001, abs=1e-8)
+    assert (east['latitude'], east['altitude']) == pytest.approx((0.0, 5.0), abs=2e-3)
+
+
+def test_geojson_has_longitude_first():
+    content = json.loads(geojson_text(rows_of(2, ORIGIN)))
+    assert content['type'] == 'FeatureCollection'
+    first, second = content['features']
+    assert first['geometry']['type'] == 'Point'
+    longitude, latitude, altitude = first['geometry']['coordinates']
+    assert (longitude, latitude, altitude) == pytest.approx((23.5, 46.0, 350.0), abs=1e-4)
+    assert latitude > 46.0 and longitude > 23.5
+    assert first['properties']['class_id'] == 'cup' and second['properties']['target'] is None
+
+
+@pytest.fixture
+def field(tmp_path):
+    """Return a function that loads a small scenario with an origin."""
+
+    def load(**origin):
+        content = {
+            'version': 1,
+            'environment': {'bounds': [[0.0, 60.0], [0.0, 60.0]], 'origin': origin},
+            'step': 0.1,
+            'targets': {'count': 2, 'separation': 10.0, 'margin': 5.0},
+            'robots': {
+                'drone': {
+                    'type': 'ranging_drone',
+                    'start': [1.0, 1.0, 1.0],
+                    'candidates': {'grid': [4, 4], 'spacing': 15.0, 'corner': [7.0, 7.0]},
+                }
+            },
+            'filter': {'method': 'pmb', 'expected_targets': 2.0},
+            'planner': {'name': 'nearest_widest'},
+            'limits': {'time': 15.0},
+        }
+        path = tmp_path / 'field.yaml'
+        path.write_text(yaml.safe_dump(content))
+        return load_scenario(path)
+
+    return load
+
+
+def test_nodes_are_not_told_the_origin(field):
+    scenario = field(latitude=46.0, longitude=23.5)
+    plans = plan_nodes(scenario, RunSettings(1, True, None, True, Path('/s.yaml')))
+    assert not any('environment.origin' in name for plan in plans for name in plan.parameters)
+
+
+def test_wrong_origin_is_refused(field):
+    with pytest.raises(ScenarioError, match=r'field.yaml:.*environment.origin.latitude'):
+        field(latitude=146.0, longitude=23.5)
+
+
+def test_data_frames_of_a_search(field):
+    result = search(field(latitude=46.0, longitude=23.5, altitude=350.0), 2)
+    frame = result.to_dataframe()
+    assert len(frame) == len(result.found_targets) > 0
+    found = result.found_targets[0]
+    assert frame.x[0] == found.position[0] and frame.xy[0] == found.covariance[0, 1]
+    assert frame.target.notna().sum() == len(result.truth) - result.missed
+    assert frame.error.max() < 5.0 and frame.latitude.between(46.0, 46.001).all()
+    progress = result.to_dataframe('progress')
+    assert len(progress) == len(result.progress)
+    assert progress.true_found.iloc[-1] == len(result.truth) - result.missed
+    assert progress.drone_measures.sum() == result.total_measurements
+    assert math.isfinite(progress.drone_x.iloc[-1])
+    with pytest.raises(ValueError, match="'progress'"):
+        result.to_dataframe('decisions')
+
+
+def test_data_frame_without_pandas_says_what_is_missing(field, monkeypatch):
+    result = search(field(latitude=46.0, longitude=23.5), 2, most_measurements=1)
+    monkeypatch.setitem(sys.modules, 'pandas', None)
+    with pytest.raises(ImportError, match='pip install pandas'):
+        result.to_dataframe()
+
+
+def test_page_of_the_report_is_that_of_the_schema():
+    page = (Path(__file__).parents[2] / 'docs' / 'report.md').read_text()
+    assert report_schema.with_fields(page) == page
