@@ -522,9 +522,49 @@ def test_picture_in_space(types, tmp_path):
     run.update(0.5, ['drone1', 'drone2'])
     record = run.observer.record(RunEnd('time_limit', 1.0, 1.0))
     figure = plot_report(record)
-    (world,) = [axes for axes in figure.axes if axes.name == '3d']
-    labels = [text.get_text() for text in world.get_legend().get_texts()]
-    assert {'drone1', 'drone2', 'true target', 'found target', '3 sigma'} <= set(labels)
+    assert {'drone1', 'drone2', 'true target', 'found target'} <= set(labels_of(figure))
+    views = [(axes.get_xlabel()[:1], axes.get_ylabel()[:1]) for axes in figure.axes[:3]]
+    assert views == [('x', 'y'), ('x', 'z'), ('z', 'y')]
+
+
+def labels_of(figure):
+    """Return the labels of a figure's legend, which must be whole."""
+    figure.canvas.draw()
+    (legend,) = [axes.get_legend() for axes in figure.axes if not axes.axison and axes.get_legend()]
+    box, whole = legend.get_window_extent(), figure.bbox
+    assert whole.x0 <= box.x0 and box.x1 <= whole.x1
+    assert whole.y0 <= box.y0 and box.y1 <= whole.y1
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(run):
+    run.state(0.5, 'mambo', [0.5, 0.5, 1.0])
+    run.declare(0.5, [0.51, 0.5], deviation=1e-6)
+    run.declare(0.5, [1.0, 1.0], deviation=0.1)
+    run.update(0.5)
+    figure = plot_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0)))
+    labels = labels_of(figure)
+    assert {'missed', 'false target'} <= set(labels)
+    (sigma,) = [label for label in labels if 'sigma' in label]
+    assert 'drawn at least' in sigma
+    world = figure.axes[0]
+    widths = sorted(
+        patch.width for patch in world.patches if hasattr(patch, 'angle') and 'Ell' in repr(patch)
+    )
+    assert widths == pytest.approx([2 * 0.012 * 2.0, 2 * 3 * 0.1])
+    (missed,) = [line for line in world.lines if line.get_label() == 'missed']
+    assert sorted(zip(*missed.get_data())) == [(1.0, 1.5), (1.5, 0.5)]
+
+
+def test_legend_of_many_robots_is_whole(types, tmp_path):
+    robot = {'type': 'mambo', 'radius': 0.05, 'candidates': {'grid': [6, 6], 'spacing': 0.34}}
+    robots = {
+        f'a_robot_with_a_long_name_{n}': {**robot, 'start': [0.1 + 0.18 * n, 0.5, 1.0]}
+        for n in range(10)
+    }
+    run = Run(scenario_of(tmp_path, TARGETS, robots=robots), types)
+    labels = labels_of(plot_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0))))
+    assert set(robots) <= set(labels)
 
 
 def test_picture_with_obstacles_names_them(types, tmp_path):
@@ -532,8 +572,7 @@ def test_picture_with_obstacles_names_them(types, tmp_path):
     environment = {'bounds': [[0.0, 2.0], [0.0, 2.0]], 'obstacles': obstacles}
     run = Run(scenario_of(tmp_path, TARGETS, environment=environment), types)
     figure = plot_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0)))
-    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert 'obstacle' in labels
+    assert 'obstacle' in labels_of(figure)
 
 
 def test_summary_says_what_matters(run):

@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 
 # Palette for colour-blind readers (Okabe and Ito).
 COLOURS = ('#CC79A7', '#D62728', '#009E73', '#0072B2', '#E69F00', '#56B4E9', '#8C564B')
-_OBJECT, _OBSTACLE, _OPEN, _VISITED = '#B9B9C9', '#8A8478', '#D55E00', '#56B4E9'
+OBJECT, OBSTACLE, OPEN, VISITED = '#B9B9C9', '#8A8478', '#D55E00', '#56B4E9'
 _SIDES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
@@ -50,16 +50,16 @@ def draw_mission(
         Predicted positions of each robot, (T + 1, 3) [m].
     """
     for box in mission.objects:
-        draw_box(axes, box, _OBJECT, 0.35, 'object')
+        draw_box(axes, box, OBJECT, 0.35, 'object')
     for box in mission.obstacles:
-        draw_box(axes, box, _OBSTACLE, 0.6, 'obstacle')
+        draw_box(axes, box, OBSTACLE, 0.6, 'obstacle')
     seen = set(visited)
     for number, box in enumerate(mission.boxes):
         done = number in seen
         draw_box(
             axes,
             box,
-            _VISITED if done else _OPEN,
+            VISITED if done else OPEN,
             0.12 if done else 0.35,
             'cuboid, visited' if done else 'cuboid, not visited',
         )

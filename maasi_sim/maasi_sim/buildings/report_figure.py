@@ -1,57 +1,132 @@
-"""The figure of a search of buildings: the mission in 3D, and cuboids visited over time."""
+"""The figure of a search of buildings: from above and the sides, and its course."""
 
 from __future__ import annotations
 
-import math
-
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
 from maasi_sim.buildings.observer import CuboidRecord
-from maasi_sim.buildings.picture import draw_mission, legend
+from maasi_sim.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours_of
 from maasi_sim.buildings.report import build_cuboid_report
-from maasi_sim.run.report_files import title
+from maasi_sim.run.report_files import END_REASONS, title
+from maasi_sim.run.report_panels import (
+    View,
+    add_legend,
+    draw_start_and_end,
+    draw_times,
+    draw_way,
+    make_panels,
+    step_plot,
+    write_rows,
+)
+
+FloatArray = NDArray[np.float64]
 
 
 def plot_cuboid_report(record: CuboidRecord) -> Figure:
-    """Return a picture: the mission in 3D, and cuboids visited and robots over time."""
-    figure = Figure(figsize=(12.5, 7.2), layout='constrained')
+    """Return a picture: the mission from above and the sides, cuboids visited over time."""
+    figure = Figure(figsize=(13.0, 8.0), layout='constrained')
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(3, 2, width_ratios=[1.9, 1.0])
-    space = figure.add_subplot(grid[:, 0], projection='3d')
+    colours = colours_of(record.scenario.names())
+    bands = 0.12 + 0.1 * min(len(colours), 8)
+    panels = make_panels(figure, _area(record), [1.0, bands, 0.7, 1.4])
     visited = {shot.cuboid for shot in record.snapshots}
-    paths = {name: path[:, 1:] for name, path in record.trajectories.items()}
-    draw_mission(space, record.mission, paths, visited)
-    legend(space)
-    over = figure.add_subplot(grid[0, 1])
+    for view in panels.views:
+        _draw_mission(view, record, visited)
+        for name, colour in colours.items():
+            draw_way(view, record.trajectories[name], colour, record.end_time, name)
+    draw_start_and_end(panels.views[0])
+    add_legend(figure, panels)
+    over, times, active, words = panels.plots
+    step_plot(over, '', lambda axes: _draw_visited(axes, record))
+    over.sharex(times)
+    over.tick_params(labelbottom=False)
+    over.set_title('Cuboids visited', fontsize=11)
+    draw_times(times, colours, record.end_time)
+    times.set_xlim(0.0, max(record.end_time, 1e-9))
+    step_plot(active, 'time [s]', lambda axes: _draw_active(axes, record))
+    write_rows(words, _rows(record))
+    figure.suptitle(title(record), fontsize=13, fontweight='bold')
+    return figure
+
+
+def _area(record: CuboidRecord) -> FloatArray:
+    """Return the part of the area with everything in it, (3, 2) [m]."""
+    mission = record.mission
+    boxes = [*mission.objects, *mission.obstacles, *mission.boxes]
+    corners = [np.asarray(box, dtype=float).T for box in boxes]
+    points = np.concatenate([*corners, *(path[:, 1:] for path in record.trajectories.values())])
+    area = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
+    area[2, 0] = min(area[2, 0], mission.area[2, 0])
+    return area
+
+
+def _draw_mission(view: View, record: CuboidRecord, visited: set[int]) -> None:
+    mission = record.mission
+    done = [box for number, box in enumerate(mission.boxes) if number in visited]
+    missed = [box for number, box in enumerate(mission.boxes) if number not in visited]
+    kinds = (
+        (mission.objects, OBJECT, 0.5, 'object', 0.6),
+        (mission.obstacles, OBSTACLE, 0.6, 'obstacle', 0.6),
+        (done, VISITED, 0.25, 'cuboid, visited', 0.6),
+        (missed, OPEN, 0.55, 'cuboid, missed', 2.0),
+    )
+    for boxes, colour, alpha, label, width in kinds:
+        for box in np.asarray(boxes, dtype=float).reshape(-1, 3, 2):
+            low, high = box[list(view.plane)].T
+            view.axes.add_patch(
+                Rectangle(
+                    (low[0], low[1]),
+                    *(high - low),
+                    fc=to_rgba(colour, alpha),
+                    ec=colour,
+                    lw=width,
+                    label=label,
+                )
+            )
+
+
+def _draw_visited(axes: Axes, record: CuboidRecord) -> None:
     seen: set[int] = set()
     times, counts = [0.0], [0]
     for shot in record.snapshots:
         seen.add(shot.cuboid)
         times.append(shot.time)
         counts.append(len(seen))
-    over.step(times, counts, where='post', color='#0072B2')
-    over.axhline(len(record.mission.cells), color='#222222', lw=1.0, ls='--')
-    over.set_ylabel('cuboids visited')
-    active = figure.add_subplot(grid[1, 1], sharex=over)
-    active.step(record.active[:, 0], record.active[:, 1], where='post', color='#009E73')
-    active.set_ylim(0, len(record.scenario.robots) + 0.5)
-    active.set_ylabel('robots that search')
-    active.set_xlabel('time [s]')
-    words = figure.add_subplot(grid[2, 1])
-    words.set_axis_off()
+    axes.step(
+        [*times, record.end_time], [*counts, counts[-1]], where='post', color='#D62728', lw=2.0
+    )
+    axes.axhline(len(record.mission.cells), color='#222222', lw=1.0, ls='--')
+    axes.set_ylabel('cuboids')
+
+
+def _draw_active(axes: Axes, record: CuboidRecord) -> None:
+    axes.step(record.active[:, 0], record.active[:, 1], where='post', color='#009E73', lw=2.0)
+    axes.set_xlim(0.0, max(record.end_time, 1e-9))
+    axes.set_ylim(0.0, len(record.scenario.robots) + 0.5)
+    axes.set_ylabel('robots that search')
+
+
+def _rows(record: CuboidRecord) -> list[tuple[str, str]]:
     report = build_cuboid_report(record)
-    lines = [
-        f'visited: {report["cuboids"]["visited"]} of {report["cuboids"]["total"]}, '
-        f'at {report["time_to_find_all"] or math.nan:.0f} s',
-        f'least p_d of a snapshot: {report["least_detection_probability"] or math.nan:.3g}',
-        f'collisions: {report["collisions"]}',
-        *(f'{key}: {number} decisions' for key, number in report['choices'].items()),
-        *(
-            f'{e["time"]:.0f} s: {e.get("agent", e.get("node"))} {e["event"]}'
-            for e in record.events[:4]
-        ),
+    least, complete = report['least_detection_probability'], report['time_to_find_all']
+    reason = END_REASONS.get(report['end_reason'], report['end_reason'])
+    if report['end_reason'] == 'all_found':
+        reason = 'all cuboids visited'
+    rows = [
+        ('visited', f'{report["cuboids"]["visited"]} of {report["cuboids"]["total"]}'),
+        ('all visited after', '-' if complete is None else f'{complete:.0f} s'),
+        ('least p_d', '-' if least is None else f'{least:.3g} of a snapshot'),
+        ('collisions', str(report['collisions'])),
+        *((key, f'{number} decisions') for key, number in report['choices'].items()),
+        ('ended', f'{reason}, at {record.end_time:.1f} s'),
     ]
-    words.text(0.0, 1.0, '\n'.join(lines), va='top', fontsize=9)
-    figure.suptitle(title(record), fontsize=13, fontweight='bold')
-    return figure
+    for event in record.events[:4]:
+        who = event.get('agent', event.get('node', ''))
+        rows.append((f'{event["time"]:.0f} s', f'{who} {event["event"]}'))
+    return rows

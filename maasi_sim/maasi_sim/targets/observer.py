@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys.store import Typestore
 
+from maasi_filter.models.pose import Pose
 from maasi_sim.run.run_record import RunEnd, TeamLog, rows
 from maasi_sim.run.topics import DECISIONS, FOUND, STEP, UPDATE, seconds, within
 from maasi_sim.scenario.schema import Scenario
@@ -239,8 +240,8 @@ class TargetObserver:
                 lost += _absences(name, states)
         for topic, name in self._detection_topics.items():
             arrays = self._until(topic, 'DetectionArray', end_time)
-            places = [_point(item.pose.pose.position) for item in arrays if item.batch_id]
-            record.measured_at[name] = rows(places, 3)
+            poses = [_pose(item.pose.pose) for item in arrays if item.batch_id]
+            record.measured_from[name] = [pose for pose in poses if pose is not None]
         record.add_events(self._team.events, lost, end.events)
         return record
 
@@ -270,6 +271,15 @@ class TargetObserver:
 
 def _point(point: Any) -> tuple[float, float, float]:
     return float(point.x), float(point.y), float(point.z)
+
+
+def _pose(message: Any) -> Pose | None:
+    """Return a pose; None for one that is none."""
+    turn = message.orientation
+    try:
+        return Pose(np.array(_point(message.position)), np.array([turn.w, turn.x, turn.y, turn.z]))
+    except ValueError:
+        return None
 
 
 def _absences(name: str, states: list[Any]) -> list[dict[str, Any]]:

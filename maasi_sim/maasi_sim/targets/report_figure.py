@@ -1,4 +1,4 @@
-"""The figure of a search for targets: the search, and targets found over measurements."""
+"""The figure of a search for targets: where, when, and what was found."""
 
 from __future__ import annotations
 
@@ -8,188 +8,188 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Rectangle
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from maasi_filter.exploration import Exploration
 from maasi_sim.run.report_files import END_REASONS, title
+from maasi_sim.run.report_panels import (
+    COLOURS,
+    PALE,
+    UNSEEN,
+    View,
+    add_legend,
+    draw_start_and_end,
+    draw_times,
+    draw_way,
+    make_panels,
+    step_plot,
+    write_rows,
+)
 from maasi_sim.targets.report import build_report
 from maasi_sim.targets.target_record import TargetRecord
 
 FloatArray = NDArray[np.float64]
 
-# Palette for colour-blind readers (Okabe and Ito).
-_COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')
-_TRUE, _FOUND, _FALSE, _PALE = '#222222', '#D62728', '#7B3294', '#9A9A9A'
+_TRUE, _FOUND, _MISSED, _FALSE = '#222222', '#D62728', '#D55E00', '#7B3294'
 _SIGMAS = 3.0
+# Of the longest side: half axes of an ellipse are drawn at least so long.
+_LEAST = {2: 0.012, 3: 0.022}
+# Points on each axis where a field of view is evaluated.
+_VIEW_GRID = 160
 
 
 def plot_report(record: TargetRecord) -> Figure:
-    """Return a picture: map or 3D view of the search, and targets found over measurements."""
-    figure = Figure(figsize=(12.5, 7.2), layout='constrained')
+    """Return a picture: the search from above, in 3D from the sides too, and its course."""
+    figure = Figure(figsize=(13.0, 8.0), layout='constrained')
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2, 2, width_ratios=[1.65, 1.0], height_ratios=[1.5, 1.0])
-    if record.scenario.dimension == 2:
-        world = figure.add_subplot(grid[:, 0])
-        _plot_map(world, record)
-    else:
-        world = figure.add_subplot(grid[:, 0], projection='3d')
-        _plot_space(world, record)
-    handles, labels = world.get_legend_handles_labels()
-    unique = dict(zip(labels, handles))
-    world.legend(
-        unique.values(),
-        unique.keys(),
-        loc='upper center',
-        bbox_to_anchor=(0.5, -0.06),
-        ncols=4,
-        fontsize=9,
-        frameon=False,
+    bounds = record.scenario.environment.array()
+    names = record.scenario.names()
+    colours = {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(names)}
+    bands = 0.12 + 0.1 * min(len(names), 8)
+    panels = make_panels(figure, bounds, [1.0, bands, 1.0, 1.5])
+    explored = _explored(record)
+    for view in panels.views:
+        _draw_explored(view, explored, bounds)
+        _draw_obstacles(view, record, bounds)
+        for name, colour in colours.items():
+            path = record.trajectories[name]
+            draw_way(view, path, colour, record.end_time, name)
+            view.axes.plot(*view.points(record.waypoints[name]), '+', color=colour, ms=8, mew=1.3)
+            _draw_field(view, record, name, colour, bounds)
+        _draw_targets(view, record, bounds)
+    first = panels.views[0]
+    first.axes.plot([], [], '+', color=PALE, ms=8, label='waypoint')
+    draw_start_and_end(first)
+    first.axes.plot([], [], ':', color=PALE, lw=1.5, label='field of view at the end')
+    add_legend(figure, panels)
+    over_time, times, over_measurements, words = panels.plots
+    step_plot(over_time, '', lambda axes: _draw_progress(axes, record, True))
+    over_time.sharex(times)
+    over_time.tick_params(labelbottom=False)
+    over_time.set_title('Targets found', fontsize=11)
+    draw_times(times, colours, record.end_time)
+    times.set_xlim(0.0, max(record.end_time, 1e-9))
+    step_plot(
+        over_measurements,
+        'measurements, all robots',
+        lambda axes: _draw_progress(axes, record, False),
     )
-    _plot_progress(figure.add_subplot(grid[0, 1]), record)
-    _write_summary(figure.add_subplot(grid[1, 1]), record)
+    write_rows(words, _rows(record))
     figure.suptitle(title(record), fontsize=13, fontweight='bold')
     return figure
 
 
-def _colours(record: TargetRecord) -> dict[str, str]:
-    names = record.scenario.names()
-    return {name: _COLOURS[index % len(_COLOURS)] for index, name in enumerate(names)}
+def _explored(record: TargetRecord) -> Exploration:
+    """Return what the robots have explored from where they measured."""
+    scenario = record.scenario
+    explored = Exploration(scenario.environment.array(), scenario.filter.exploration_spacing)
+    for name, poses in record.measured_from.items():
+        detection = scenario.robots[name].sensor.build(name, scenario.dimension).detection
+        for pose in poses:
+            explored.update(detection, pose)
+    return explored
 
 
-def _pairs(record: TargetRecord) -> tuple[FloatArray, list[int], list[int]]:
-    positions = np.array([target.position for target in record.found], dtype=float)
-    right = sorted(found for found, _ in record.scores().match.pairs)
-    wrong = [index for index in range(len(record.found)) if index not in right]
-    return positions.reshape(-1, record.scenario.dimension), right, wrong
-
-
-def _plot_map(axes: Axes, record: TargetRecord) -> None:
-    bounds = record.scenario.environment.array()
-    low, size = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
-    axes.add_patch(Rectangle((low[0], low[1]), size[0], size[1], fc='#FAFAF7', ec='#B0B0B0', lw=1))
-    for obstacle in record.scenario.environment.obstacles:
-        axes.add_patch(
-            Circle(
-                (obstacle.centre[0], obstacle.centre[1]),
-                obstacle.radius,
-                fc='#C9C3B8',
-                ec='#8A8478',
-                label='obstacle',
-            )
-        )
-    for name, colour in _colours(record).items():
-        path = record.trajectories[name]
-        axes.plot(path[:, 1], path[:, 2], '-', color=colour, lw=1.3, alpha=0.85, label=name)
-        places = record.measured_at[name]
-        axes.plot(places[:, 0], places[:, 1], '.', color=colour, ms=3, alpha=0.45)
-        points = record.waypoints[name]
-        axes.plot(points[:, 0], points[:, 1], '+', color=colour, ms=8, mew=1.2)
-        if len(path):
-            axes.plot(path[0, 1], path[0, 2], 's', color=colour, ms=8, mec='white')
-            axes.plot(path[-1, 1], path[-1, 2], 'o', color=colour, ms=8, mec='white')
-    axes.plot([], [], '+', color=_PALE, ms=8, label='waypoint')
-    axes.plot([], [], '.', color=_PALE, ms=5, label='measurement')
-    axes.plot([], [], 's', color=_PALE, ms=7, label='start')
-    axes.plot([], [], 'o', color=_PALE, ms=7, label='end')
-    if len(record.truth):
-        axes.plot(
-            record.truth[:, 0],
-            record.truth[:, 1],
-            'D',
-            mfc='none',
-            mec=_TRUE,
-            ms=10,
-            mew=1.4,
-            label='true target',
-        )
-    positions, right, wrong = _pairs(record)
-    axes.plot(
-        positions[right, 0], positions[right, 1], 'D', color=_FOUND, ms=5, label='found target'
+def _draw_explored(view: View, explored: Exploration, bounds: FloatArray) -> None:
+    """Shade what is unseen: e, in 3D its mean along the line of sight."""
+    hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
+    values = explored.values.mean(axis=hidden) if hidden else explored.values
+    if view.plane[0] < view.plane[1]:
+        values = values.T
+    right, up = (explored.axes()[axis] for axis in view.plane)
+    shades = LinearSegmentedColormap.from_list('unseen', ['#FFFFFF', UNSEEN])
+    view.axes.pcolormesh(
+        right, up, values, cmap=shades, vmin=0.0, vmax=1.0, shading='gouraud', zorder=0
     )
-    if wrong:
-        axes.plot(
-            positions[wrong, 0], positions[wrong, 1], 'X', color=_FALSE, ms=9, label='false target'
+    low, high = bounds[list(view.plane)].T
+    view.axes.add_patch(Rectangle((low[0], low[1]), *(high - low), fc='none', ec='#B0B0B0', lw=1.0))
+    view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not explored')
+
+
+def _draw_obstacles(view: View, record: TargetRecord, bounds: FloatArray) -> None:
+    style: dict[str, Any] = {'fc': '#C9C3B8', 'ec': '#8A8478', 'zorder': 1, 'label': 'obstacle'}
+    for obstacle in record.scenario.environment.obstacles:
+        centre, radius = obstacle.centre, obstacle.radius
+        if max(view.plane) < len(centre):
+            place = (centre[view.plane[0]], centre[view.plane[1]])
+            view.axes.add_patch(Circle(place, radius, **style))
+            continue
+        # An upright cylinder from the side.
+        low, high = bounds[2]
+        if view.plane[0] == 2:
+            corner, size = (low, centre[1] - radius), (high - low, 2.0 * radius)
+        else:
+            corner, size = (centre[0] - radius, low), (2.0 * radius, high - low)
+        view.axes.add_patch(Rectangle(corner, *size, **style))
+
+
+def _draw_field(
+    view: View, record: TargetRecord, name: str, colour: str, bounds: FloatArray
+) -> None:
+    """Draw where a robot's probability of detection is half its largest, from its last pose."""
+    if not record.measured_from.get(name):
+        return
+    pose = record.measured_from[name][-1]
+    dimension = record.scenario.dimension
+    detection = record.scenario.robots[name].sensor.build(name, dimension).detection
+    right, up = (np.linspace(bounds[axis, 0], bounds[axis, 1], _VIEW_GRID) for axis in view.plane)
+    places = np.tile(pose.position[:dimension], (_VIEW_GRID**2, 1))
+    grid = np.meshgrid(right, up)
+    for axis, values in zip(view.plane, grid):
+        places[:, axis] = values.ravel()
+    values = detection.probability(places, pose).reshape(grid[0].shape)
+    if values.max() > 0.0:
+        view.axes.contour(
+            *grid,
+            values,
+            levels=[0.5 * values.max()],
+            colors=[colour],
+            linewidths=1.5,
+            linestyles='dotted',
+            zorder=2,
         )
-    for target in record.found:
-        lengths, turn = _axes_of(target.covariance)
+
+
+def _draw_targets(view: View, record: TargetRecord, bounds: FloatArray) -> None:
+    axes, width = view.axes, record.scenario.dimension
+    positions = np.array([item.position for item in record.found], float).reshape(-1, width)
+    pairs = record.scores().match.pairs
+    right = [found for found, _ in pairs]
+    wrong = np.setdiff1d(np.arange(len(positions)), right)
+    missed = np.setdiff1d(np.arange(len(record.truth)), [true for _, true in pairs])
+    least = _LEAST[width] * float(np.ptp(bounds, axis=1).max())
+    enlarged = False
+    for number, target in enumerate(record.found):
+        plane = np.ix_(view.plane, view.plane)
+        lengths, turn = _axes_of(target.covariance[plane])
+        enlarged |= bool((lengths < least).any())
+        drawn = 2.0 * np.maximum(lengths, least)
         axes.add_patch(
             Ellipse(
-                (target.position[0], target.position[1]),
-                2 * lengths[0],
-                2 * lengths[1],
+                (target.position[view.plane[0]], target.position[view.plane[1]]),
+                *drawn,
                 angle=math.degrees(math.atan2(turn[1, 0], turn[0, 0])),
                 fc='none',
-                ec=_FOUND,
-                lw=1.2,
-                label=f'{_SIGMAS:g} sigma',
+                ec=_FALSE if number in wrong else _FOUND,
+                lw=1.3,
+                zorder=5,
             )
         )
-    margin = 0.03 * size.max()
-    axes.set_xlim(bounds[0, 0] - margin, bounds[0, 1] + margin)
-    axes.set_ylim(bounds[1, 0] - margin, bounds[1, 1] + margin)
-    axes.set_aspect('equal')
-    axes.set_xlabel('x [m]')
-    axes.set_ylabel('y [m]')
-    axes.spines[['top', 'right']].set_visible(False)
-
-
-def _plot_space(axes: Any, record: TargetRecord) -> None:
-    bounds = record.scenario.environment.array()
-    for name, colour in _colours(record).items():
-        path = record.trajectories[name]
-        axes.plot(*path[:, 1:].T, '-', color=colour, lw=1.3, alpha=0.85, label=name)
-        axes.plot(*record.measured_at[name].T, '.', color=colour, ms=3, alpha=0.5)
-        axes.plot(*record.waypoints[name].T, '+', color=colour, ms=8, mew=1.2)
-        if len(path):
-            axes.plot(*path[:1, 1:].T, 's', color=colour, ms=7, mec='white')
-            axes.plot(*path[-1:, 1:].T, 'o', color=colour, ms=7, mec='white')
-    axes.plot([], [], [], '+', color=_PALE, ms=8, label='waypoint')
-    axes.plot([], [], [], '.', color=_PALE, ms=5, label='measurement')
-    axes.plot([], [], [], 's', color=_PALE, ms=7, label='start')
-    axes.plot([], [], [], 'o', color=_PALE, ms=7, label='end')
-    floor = bounds[2, 0]
-    for point in record.truth:
-        # A vertical line to the floor shows the position in depth.
-        axes.plot([point[0]] * 2, [point[1]] * 2, [floor, point[2]], '-', color=_PALE, lw=0.6)
-    if len(record.truth):
-        axes.plot(*record.truth.T, 'D', mfc='none', mec=_TRUE, ms=9, mew=1.4, label='true target')
-    positions, right, wrong = _pairs(record)
-    axes.plot(*positions[right].T, 'D', color=_FOUND, ms=5, label='found target')
-    if wrong:
-        axes.plot(*positions[wrong].T, 'X', color=_FALSE, ms=9, label='false target')
-    for target in record.found:
-        lengths, turn = _axes_of(target.covariance)
-        for length, direction in zip(lengths, turn.T):
-            ends = target.position + np.outer([-length, length], direction)
-            axes.plot(*ends.T, '-', color=_FOUND, lw=1.2, label=f'{_SIGMAS:g} sigma')
-    for obstacle in record.scenario.environment.obstacles:
-        _plot_obstacle(axes, np.array(obstacle.centre), obstacle.radius, bounds)
-    axes.set_xlim(*bounds[0])
-    axes.set_ylim(*bounds[1])
-    axes.set_zlim(*bounds[2])
-    axes.set_box_aspect(bounds[:, 1] - bounds[:, 0], zoom=0.92)
-    axes.set_xlabel('x [m]')
-    axes.set_ylabel('y [m]')
-    axes.set_zlabel('z [m]')
-    axes.view_init(elev=24, azim=-58)
-
-
-def _plot_obstacle(axes: Any, centre: FloatArray, radius: float, bounds: FloatArray) -> None:
-    """Draw a sphere, or an upright cylinder for a centre of two coordinates."""
-    around = np.linspace(0.0, 2.0 * math.pi, 25)[:, None]
-    if len(centre) == 2:
-        heights = bounds[2][None, :]
-        x = centre[0] + radius * np.cos(around) + 0.0 * heights
-        y = centre[1] + radius * np.sin(around) + 0.0 * heights
-        z = heights + 0.0 * around
-    else:
-        down = np.linspace(0.0, math.pi, 13)[None, :]
-        x = centre[0] + radius * np.cos(around) * np.sin(down)
-        y = centre[1] + radius * np.sin(around) * np.sin(down)
-        z = centre[2] + radius * np.cos(down) + 0.0 * around
-    axes.plot_surface(x, y, z, color='#C9C3B8', alpha=0.5, linewidth=0)
+    sigmas = f'{_SIGMAS:g} sigma' + (f', drawn at least {least:.2g} m' if enlarged else '')
+    marks: tuple[tuple[FloatArray, str, dict[str, Any], str], ...] = (
+        (record.truth, 'D', {'mfc': 'none', 'mec': _TRUE, 'ms': 11, 'mew': 1.2}, 'true target'),
+        (positions[right], 'D', {'color': _FOUND, 'ms': 3.5}, 'found target'),
+        (positions[:0], 'o', {'mfc': 'none', 'mec': _FOUND, 'ms': 9}, sigmas),
+        (record.truth[missed], 'o', {'mfc': 'none', 'mec': _MISSED, 'ms': 20, 'mew': 3}, 'missed'),
+        (positions[wrong], 'X', {'color': _FALSE, 'ms': 14, 'mec': 'white'}, 'false target'),
+    )
+    for places, marker, style, label in marks:
+        if len(places) or label == sigmas:
+            points = view.points(places, width)
+            axes.plot(*points, marker, ls='none', zorder=7, label=label, **style)
 
 
 def _axes_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -198,27 +198,26 @@ def _axes_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     return _SIGMAS * np.sqrt(np.maximum(values, 0.0)), directions
 
 
-def _plot_progress(axes: Axes, record: TargetRecord) -> None:
-    counts = [0, *(item.measurements for item in record.progress)]
-    right = [0, *(item.true_found for item in record.progress)]
-    every = [0, *(item.found for item in record.progress)]
+def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
+    """Draw targets found over time, or over measurements."""
+    progress = record.progress
+    places = [0.0, *(item.time if by_time else item.measurements for item in progress)]
+    right = [0, *(item.true_found for item in progress)]
+    every = [0, *(item.found for item in progress)]
+    if by_time:
+        places, right, every = [*places, record.end_time], [*right, right[-1]], [*every, every[-1]]
     if any(number > true for number, true in zip(every, right)):
-        axes.step(counts, every, where='post', color=_FALSE, lw=1.0, label='declared')
-    axes.step(counts, right, where='post', color=_FOUND, lw=2.0, label='found')
+        axes.step(places, every, where='post', color=_FALSE, lw=1.0, label='with false ones')
+    axes.step(places, right, where='post', color=_FOUND, lw=2.0, label='found')
     axes.axhline(len(record.truth), color=_TRUE, lw=1.0, ls='--', label='true targets')
-    axes.set_xlim(0, max(counts[-1], 1))
-    axes.set_ylim(0, max(len(record.truth), max(every), 1) * 1.08)
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel('measurements, all robots')
+    axes.set_xlim(0.0, max(places[-1], 1.0))
+    axes.set_ylim(0.0, max(len(record.truth), max(every), 1) * 1.08)
     axes.set_ylabel('targets')
-    axes.set_title('Targets found over measurements', fontsize=11)
-    axes.grid(color='#E6E6E6', lw=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[['top', 'right']].set_visible(False)
-    axes.legend(loc='lower right', fontsize=9, frameon=False)
+    if by_time:
+        axes.legend(loc='lower right', fontsize=8.5, frameon=False)
 
 
-def _write_summary(axes: Axes, record: TargetRecord) -> None:
+def _rows(record: TargetRecord) -> list[tuple[str, str]]:
     report = build_report(record)
     rmse = '-' if report['rmse'] is None else f'{report["rmse"]:.3g} m'
     complete = '-'
@@ -226,9 +225,9 @@ def _write_summary(axes: Axes, record: TargetRecord) -> None:
         complete = (
             f'{report["measurements_to_find_all"]} measurements, {report["time_to_find_all"]:.1f} s'
         )
+    found = f'{report["true_found"]} of {len(report["targets"])}'
     rows = [
-        ('found', f'{report["true_found"]} of {len(report["targets"])}'),
-        ('false', str(report['false_found'])),
+        ('found', f'{found}, {report["missed"]} missed, {report["false_found"]} false'),
         ('RMSE', rmse),
         ('GOSPA', f'{report["gospa"]["total"]:.3g} m (c = {report["scoring"]["c"]:.3g} m)'),
         ('all found after', complete),
@@ -243,8 +242,4 @@ def _write_summary(axes: Axes, record: TargetRecord) -> None:
     for event in record.events[:3]:
         who = event.get('agent', event.get('node', ''))
         rows.append((f'{event["time"]:.1f} s', f'{who} {event["event"]}'))
-    axes.set_axis_off()
-    for index, (key, value) in enumerate(rows):
-        height = 1.0 - (index + 0.5) / max(len(rows), 10)
-        axes.text(0.0, height, key, color='#666666', fontsize=10, va='center')
-        axes.text(0.34, height, value, fontsize=10, va='center')
+    return rows

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.models.pose import Pose
 from maasi_sim.run.run_record import RunRecord
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.targets.tally import Found, Progress
@@ -32,8 +33,8 @@ class TargetRecord(RunRecord):
         Waypoints chosen, of all robots.
     waypoints : dict
         By robot: chosen ones in order, (n, 3) [m].
-    measured_at : dict
-        By robot: where it measured, (n, 3) [m].
+    measured_from : dict
+        By robot: poses at which it measured, in order.
     explored, expected_number : float
         Share of the environment, and targets believed not yet found, at the end.
     """
@@ -44,7 +45,7 @@ class TargetRecord(RunRecord):
     measurements: dict[str, int] = field(default_factory=dict)
     decisions: int = 0
     waypoints: dict[str, FloatArray] = field(default_factory=dict)
-    measured_at: dict[str, FloatArray] = field(default_factory=dict)
+    measured_from: dict[str, list[Pose]] = field(default_factory=dict)
     explored: float = 0.0
     expected_number: float = 0.0
 

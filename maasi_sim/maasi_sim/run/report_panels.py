@@ -1,0 +1,217 @@
+"""Parts of the figures of reports: views from above and the side, ways over time, legend."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec, SubplotSpec
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+# Palette for colour-blind readers (Okabe and Ito).
+COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')
+PALE, GRID, UNSEEN = '#9A9A9A', '#E6E6E6', '#CFCFCF'
+_NAMES = 'xyz'
+# A side view is at least this share of the size of the view from above.
+_THINNEST = 0.22
+_CORNER = 0.6
+# Sizes of a legend [inch]: beside a text, of a letter, of a row; and what the corner holds.
+_HANDLE, _LETTER, _ROW = 0.75, 0.068, 0.2
+_CORNER_WIDTH, _CORNER_ROWS = 3.2, 15
+
+
+@dataclass(frozen=True)
+class View:
+    """Axes that show two of the map's axes.
+
+    Attributes
+    ----------
+    axes : Axes
+        Where.
+    plane : (int, int)
+        Which map axes lie to the right and upwards: 0, 1, 2 for x, y, z.
+    """
+
+    axes: Axes
+    plane: tuple[int, int]
+
+    def points(self, places: ArrayLike, width: int = 3) -> FloatArray:
+        """Return places (n, d) [m, map] in this view, (2, n)."""
+        array = np.asarray(places, dtype=float).reshape(-1, width)
+        return array[:, list(self.plane)].T
+
+
+@dataclass
+class Panels:
+    """The axes of a figure.
+
+    Attributes
+    ----------
+    views : list of View
+        The map in 2D; in 3D from above, from the south, and from the east.
+    plots : list of Axes
+        Beside them, from top to bottom.
+    grid : GridSpec
+        Of two rows; the second one, of no height yet, is for a legend.
+    corner : SubplotSpec or None
+        Between the views, if there is room for a legend.
+    """
+
+    views: list[View]
+    plots: list[Axes]
+    grid: GridSpec
+    corner: SubplotSpec | None
+
+
+def make_panels(figure: Figure, area: FloatArray, heights: Sequence[float]) -> Panels:
+    """Return the axes of a figure with constrained layout.
+
+    Parameters
+    ----------
+    figure : Figure
+        Empty.
+    area : (d, 2) array
+        That the views show [m, map].
+    heights : sequence of float
+        Relative heights of the plots beside the views.
+    """
+    size = area[:, 1] - area[:, 0]
+    outer = GridSpec(2, 2, figure, width_ratios=[1.5, 1.0], height_ratios=[1.0, 1e-6])
+    views = []
+    corner = None
+    if len(area) == 2:
+        views.append(View(figure.add_subplot(outer[0, 0]), (0, 1)))
+    else:
+        deep = max(float(size[2]), _THINNEST * float(size[:2].max()))
+        inner = outer[0, 0].subgridspec(
+            2, 2, width_ratios=[size[0], deep], height_ratios=[size[1], deep]
+        )
+        above = figure.add_subplot(inner[0, 0])
+        views = [
+            View(above, (0, 1)),
+            View(figure.add_subplot(inner[1, 0], sharex=above), (0, 2)),
+            View(figure.add_subplot(inner[0, 1], sharey=above), (2, 1)),
+        ]
+        # Unless the side views are thin.
+        corner = inner[1, 1] if deep > _CORNER * float(size[:2].max()) else None
+    for view in views:
+        right, up = view.plane
+        margin = 0.035 * float(size.max())
+        view.axes.set_xlim(area[right, 0] - margin, area[right, 1] + margin)
+        view.axes.set_ylim(area[up, 0] - margin, area[up, 1] + margin)
+        view.axes.set_aspect('equal', adjustable='box', anchor='NW')
+        view.axes.set_xlabel(f'{_NAMES[right]} [m]')
+        view.axes.set_ylabel(f'{_NAMES[up]} [m]')
+        view.axes.spines[['top', 'right']].set_visible(False)
+    beside = outer[0, 1].subgridspec(len(heights), 1, height_ratios=list(heights))
+    plots = [figure.add_subplot(beside[row]) for row in range(len(heights))]
+    return Panels(views, plots, outer, corner)
+
+
+def fade(colour: str) -> LinearSegmentedColormap:
+    """Return the shades of a robot's colour, from light at the beginning to dark at the end."""
+    middle = np.array(to_rgb(colour))
+    return LinearSegmentedColormap.from_list(
+        colour, [0.4 * middle + 0.6, middle, 0.6 * middle], N=64
+    )
+
+
+def draw_way(view: View, path: FloatArray, colour: str, end: float, label: str) -> None:
+    """Draw a way of rows time [s], x, y, z [m], darker with time up to `end` [s]."""
+    if len(path):
+        places = view.points(path[:, 1:]).T
+        lines = LineCollection(
+            np.stack([places[:-1], places[1:]], axis=1),  # type: ignore[arg-type]
+            cmap=fade(colour),
+            linewidths=1.6,
+            capstyle='round',
+            zorder=3,
+        )
+        lines.set_array(path[:-1, 0])
+        lines.set_clim(0.0, max(end, 1e-9))
+        view.axes.add_collection(lines)
+        for place, marker in ((places[0], 's'), (places[-1], 'o')):
+            view.axes.plot(*place, marker, color=colour, ms=8, mec='white', zorder=6)
+    view.axes.plot([], [], '-', color=colour, lw=2.0, label=label)
+
+
+def draw_start_and_end(view: View) -> None:
+    """Add start and end of ways to the legend."""
+    view.axes.plot([], [], 's', color=PALE, ms=7, label='start')
+    view.axes.plot([], [], 'o', color=PALE, ms=7, label='end')
+
+
+def draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
+    """Draw a band for each robot: which shade of its way is which time [s]."""
+    for row, (_, colour) in enumerate(colours.items()):
+        axes.imshow(
+            np.linspace(0.0, 1.0, 256)[None, :],
+            cmap=fade(colour),
+            aspect='auto',
+            extent=(0.0, max(end, 1e-9), row + 0.4, row - 0.4),
+        )
+    axes.set_ylim(len(colours) - 0.5, -0.5)
+    axes.set_yticks(range(len(colours)), list(colours), fontsize=8)
+    axes.tick_params(axis='y', length=0)
+    axes.set_xlabel('time [s], and the shades of the ways')
+    axes.spines[['top', 'right', 'left']].set_visible(False)
+
+
+def add_legend(figure: Figure, panels: Panels) -> None:
+    """Add a legend of all views with each label once, in axes that are large enough for it."""
+    unique: dict[str, Any] = {}
+    for view in panels.views:
+        handles, labels = view.axes.get_legend_handles_labels()
+        unique |= dict(zip(labels, handles))
+    width, height = figure.get_size_inches()
+    widest = _HANDLE + _LETTER * max(map(len, unique))
+    if panels.corner is not None and widest < _CORNER_WIDTH and len(unique) <= _CORNER_ROWS:
+        place, columns = panels.corner, 1
+    else:
+        columns = max(1, int(0.95 * width / widest))
+        share = (_ROW * -(-len(unique) // columns) + 0.1) / height
+        panels.grid.set_height_ratios([1.0 - share, share])
+        place = panels.grid[1, :]
+    axes = figure.add_subplot(place)
+    axes.set_axis_off()
+    legend = axes.legend(
+        list(unique.values()),
+        list(unique),
+        loc='center',
+        ncol=columns,
+        fontsize=8.5,
+        markerscale=0.7,
+        labelspacing=0.6,
+        frameon=False,
+    )
+    # Else the layout would make room for it a second time.
+    legend.set_in_layout(False)
+
+
+def write_rows(axes: Axes, rows: Sequence[tuple[str, str]], least: int = 10) -> None:
+    """Write names and values below each other; room is left for at least so many."""
+    axes.set_axis_off()
+    for index, (key, value) in enumerate(rows):
+        height = 1.0 - (index + 0.5) / max(len(rows), least)
+        axes.text(0.0, height, key, color='#666666', fontsize=9.5, va='center')
+        axes.text(0.3, height, value, fontsize=9.5, va='center')
+
+
+def step_plot(axes: Axes, label: str, draw: Callable[[Axes], None]) -> None:
+    """Draw a plot of counts with whole numbers upwards."""
+    from matplotlib.ticker import MaxNLocator
+
+    draw(axes)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel(label)
+    axes.grid(color=GRID, lw=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[['top', 'right']].set_visible(False)
