@@ -145,6 +145,28 @@ def test_worker_of_other_code_is_noticed(scenario, tmp_path, monkeypatch):
     assert not text and 'another version of the code' in problem
 
 
+def test_planner_of_ones_own_is_compared_and_its_changes_are_noticed(
+    scenario, tmp_path, executed, monkeypatch
+):
+    name = 'own_planner_to_compare'
+    module = tmp_path / f'{name}.py'
+    text = (
+        'from maasi_planner.planners import NearestWidest\n\nclass Mine(NearestWidest):\n    pass\n'
+    )
+    module.write_text(text)
+    arguments = [str(scenario), '--planners', f'lawnmower,{name}:Mine', '--seeds', '1']
+    arguments += ['--workers', '1', '--out', str(tmp_path / 'out')]
+    assert compare.main(arguments) == 0
+    assert executed == [('lawnmower', 1), (f'{name}:Mine', 1)]
+    facts = json.loads((tmp_path / 'out' / 'comparison.json').read_text())
+    assert facts['scenarios']['field']['cases'][f'{name}:Mine']['planner'] == f'{name}:Mine'
+    module.write_text(f'# Another one.\n{text}')
+    assert compare.main(arguments) == 2
+    assert compare.main([*arguments, '--again']) == 0
+    # The other planner's search is kept.
+    assert executed[2:] == [(f'{name}:Mine', 1)]
+
+
 def test_filters_are_compared_with_each_planner(scenario):
     cases = comparison.compared(scenario, PLANNERS, ['pmb', 'ic_phd'], 4.0).cases(False)
     assert [case.name for case in cases] == [

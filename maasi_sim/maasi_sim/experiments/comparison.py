@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_planner.settings import PLANNERS
 from maasi_sim.buildings.scenario import is_cuboid_scenario
 from maasi_sim.experiments.cases import Case, Outcome
 from maasi_sim.experiments.clairvoyant import Clairvoyant
@@ -74,8 +77,18 @@ def search_settings(scenario: Scenario, clairvoyant: bool = False) -> dict[str, 
     return {
         'scenario': scenario.content(),
         'clairvoyant': clairvoyant,
-        'code': code_digest(),
+        'code': code_of(scenario),
     }
+
+
+def code_of(scenario: Scenario) -> str:
+    """Return a hash of the code of a search, the file of a planner of the user's own included."""
+    name = scenario.planner.name
+    if name in PLANNERS.own:
+        return code_digest()
+    file = inspect.getsourcefile(PLANNERS.load(name))
+    own = Path(file).read_bytes() if file is not None else b''
+    return f'{code_digest()} {hashlib.sha256(own).hexdigest()[:16]}'
 
 
 def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
@@ -86,9 +99,9 @@ def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
     RuntimeError
         If the code here is not that of the settings.
     """
-    if settings['code'] != code_digest():
-        raise RuntimeError('this worker has another version of the code')
     scenario = scenario_from_content(settings['scenario'], 'settings')
+    if settings['code'] != code_of(scenario):
+        raise RuntimeError('this worker has another version of the code')
     limit = scenario.limits.time
     result = search(scenario, seed, planner=Clairvoyant if settings['clairvoyant'] else None)
     outcome = outcome_of(result, None, limit)
