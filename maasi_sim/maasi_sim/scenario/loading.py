@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from copy import deepcopy
 from importlib.metadata import PackageNotFoundError, distribution
@@ -16,6 +17,7 @@ from maasi_sim.scenario.layering import (
     Key,
     Layer,
     ScenarioError,
+    ScenarioWarning,
     dotted,
     doubt,
     merge,
@@ -150,6 +152,8 @@ def _names_module(data: Any) -> bool:
 def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
     """Return the scenario of values as a scenario file has them: types come from config/robots.
 
+    What a program made gets no warnings.
+
     Raises
     ------
     ScenarioError
@@ -157,7 +161,7 @@ def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
     """
     layer = Layer(deepcopy(values), {(): origin})
     _lay_types_under(layer, config_folder() / 'scenarios' / origin)
-    return check_scenario(layer)
+    return _without_warnings(layer)
 
 
 def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
@@ -168,7 +172,13 @@ def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
     ScenarioError
         As `load_scenario`.
     """
-    return check_scenario(Layer(content, {(): origin}))
+    return _without_warnings(Layer(content, {(): origin}))
+
+
+def _without_warnings(layer: Layer) -> Scenario:
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', ScenarioWarning)
+        return check_scenario(layer)
 
 
 def check_scenario(
