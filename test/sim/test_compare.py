@@ -244,5 +244,7 @@ def test_survival_is_that_of_freireichs_patients():
 def test_verdict_says_when_the_seeds_are_too_few():
     few = Difference(-2.0, -6.0, 2.0, -1.0, 10, 85)
     assert 'too few' in verdict('a', 'b', few) and 'about 85' in verdict('a', 'b', few)
+    none = Difference(0.0, 0.0, 0.0, 0.0, 10, None)
+    assert 'no difference on any of 10 seeds' in verdict('a', 'b', none)
     clear = Difference(-2.0, -3.0, -1.0, -2.0, 10, 7)
     assert 'sooner' in verdict('a', 'b', clear) and 'too few' not in verdict('a', 'b', clear)

@@ -135,6 +135,8 @@ def verdict(case: str, other: str, gap: Difference) -> str:
     who = f'{case} minus {other}: '
     if gap.number < 2:
         return f'{who}{gap.number} seed on which both ran, too few for an interval.'
+    if gap.low == gap.high == 0.0:
+        return f'{who}no difference on any of {gap.number} seeds.'
     span = f'{gap.mean:+.1f} s, 95 % from {gap.low:+.1f} to {gap.high:+.1f} s'
     if gap.told_from_zero:
         word = 'sooner' if gap.mean < 0.0 else 'later'
