@@ -6,6 +6,8 @@ import os
 import subprocess
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = ROOT / 'scripts' / 'environment.bash'
 
@@ -63,3 +65,10 @@ def test_no_compiled_module_is_left_in_the_repository() -> None:
     result = call(ROOT / 'scripts' / 'python', '-c', 'import maasi_sim.search')
     assert result.returncode == 0, result.stderr
     assert set(ROOT.glob('maasi_*/**/*.pyc')) <= before
+
+
+@pytest.mark.parametrize('name', ['demo', 'test'])
+def test_help_says_what_a_command_is_before_anything_is_set_up(name: str) -> None:
+    result = call(ROOT / 'scripts' / name, '--help', PYTHON='no_such_python')
+    assert result.returncode == 0
+    assert result.stdout.startswith(f'usage: {name} [')
