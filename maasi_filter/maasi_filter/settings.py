@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from maasi_filter.models.detection import (
     BoxDetection,
@@ -18,6 +18,7 @@ from maasi_filter.models.detection import (
 )
 from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.plugins import OwnSettings, PluginGroup
 from maasi_filter.pmb.settings import PmbSettings
 
 FloatArray = NDArray[np.float64]
@@ -34,15 +35,36 @@ class Settings(BaseModel):
     )
 
 
+DETECTIONS = PluginGroup(
+    'maasi.detection_models',
+    'kind of detection',
+    'maasi_filter.models.own_detection:OwnDetection',
+    {
+        'exponential': 'maasi_filter.models.detection:ExponentialDetection',
+        'gaussian': 'maasi_filter.models.detection:GaussianDetection',
+        'box': 'maasi_filter.models.detection:BoxDetection',
+    },
+)
+_DETECTION = OwnSettings(DETECTIONS, 'kind')
+
+
 class DetectionSettings(Settings):
     """Probability of detection pi(x, q)."""
 
-    kind: Literal['exponential', 'gaussian', 'box'] = Field(
+    kind: Annotated[str, DETECTIONS, AfterValidator(DETECTIONS.check)] = Field(
         default='exponential',
-        description='Form of pi: G exp(-|zeta|/2), G exp(-|zeta|^2/2), or G inside a box',
+        description='Form of pi: G exp(-|zeta|/2), G exp(-|zeta|^2/2), G inside a box, or '
+        'module:Class of your own',
+    )
+    settings: Annotated[Any, _DETECTION, AfterValidator(_DETECTION.check)] = Field(
+        default=None, validate_default=True, description='Settings of a form of your own'
     )
     probability: float = Field(
-        default=0.98, ge=0.0, le=1.0, description='G, the largest probability of detection [1]'
+        default=0.98,
+        ge=0.0,
+        le=1.0,
+        description='G, the largest probability of detection; a form of your own is multiplied '
+        'with it [1]',
     )
     size: list[Positive] = Field(
         default=[25.0, 25.0, 25.0],
@@ -82,8 +104,18 @@ class DetectionSettings(Settings):
             )
         return self
 
-    def build(self) -> DetectionModel:
-        """Return the model."""
+    def build(self, dimension: int = 3) -> DetectionModel:
+        """Return the model.
+
+        Raises
+        ------
+        ValueError
+            If a model of a user's own is wrong.
+        """
+        if self.kind not in DETECTIONS.own:
+            found = DETECTIONS.load(self.kind)(self.settings, self.probability, dimension)
+            assert isinstance(found, DetectionModel)
+            return found
         if self.kind == 'box':
             return BoxDetection(self.lower, self.upper, self.probability, self.frame, self.edge)
         model = ExponentialDetection if self.kind == 'exponential' else GaussianDetection
@@ -159,7 +191,7 @@ class SensorSettings(Settings):
             raise ValueError(f'dimension: got {dimension}, allowed are 2 and 3')
         return Sensor(
             name=name,
-            detection=self.detection.build(),
+            detection=self.detection.build(dimension),
             measurement=RangeBearing() if dimension == 2 else RangeBearingElevation(),
             covariance=self.noise.covariance(dimension),
             clutter=self.clutter,

@@ -1,6 +1,7 @@
 """Probability that a sensor detects a target, pi(x, q).
 
-Every model has a kernel that other numba kernels evaluate inline, except a user's own function.
+Every model has a kernel that other numba kernels evaluate inline, except a user's own function,
+which they call (`OwnDetection`).
 Arrays of the sensor's parameters always have PARAMETERS entries, so that one compiled kernel
 serves all kinds.
 """
@@ -14,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from maasi_filter.models.custom_kernel import CUSTOM, custom_probability
 from maasi_filter.models.pose import Pose
 from maasi_filter.vector_math import exponential
 
@@ -58,7 +60,7 @@ def detection_probability_at(
     """Return pi for a target at offset (dx, dy, dz) [m, map axes] from the sensor.
 
     `kind` is EXPONENTIAL (000, eq. (3), (4)), GAUSSIAN (003, section 2.2) or BOX (000, eq. (25)
-    and (34)); `parameters` come from the model's `kernel()`.
+    and (34)), or CUSTOM, a user's own function; `parameters` come from the model's `kernel()`.
     """
     if kind == BOX:
         x = dx
@@ -77,6 +79,8 @@ def detection_probability_at(
                 return 0.0
             return parameters[0] * 0.5 * (1.0 + inside / edge)
         return parameters[0] if inside >= 0.0 else 0.0
+    if kind == CUSTOM:
+        return custom_probability(parameters, dx, dy, dz, cos_yaw, sin_yaw)
     square = (dx * parameters[1]) ** 2 + (dy * parameters[2]) ** 2 + (dz * parameters[3]) ** 2
     if kind == GAUSSIAN:
         return parameters[0] * math.exp(-0.5 * square)
@@ -88,7 +92,7 @@ def fill_probabilities(  # type: ignore[no-untyped-def]
     kind, parameters, x, y, z, number, cos_yaw, sin_yaw, out
 ):
     """Fill pi for the first `number` offsets (x, y, z) [m, map axes] from the sensor."""
-    if kind == BOX:
+    if kind == BOX or kind == CUSTOM:
         for i in range(number):
             out[i] = detection_probability_at(kind, parameters, x[i], y[i], z[i], cos_yaw, sin_yaw)
         return

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_filter.models.custom_kernel import renew_addresses
 from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.density import Density
-from maasi_filter.pmb.factors import FIRST, HEAD, TERM, TERMS
+from maasi_filter.pmb.factors import FIRST, HEAD, KIND, MODEL, TERM, TERMS
 from maasi_filter.pmb.noise_scale import NoiseScale
 from maasi_filter.pmb.offset_state import OFFSET_ARRAYS
 from maasi_filter.records import FoundTarget
@@ -152,7 +153,9 @@ def components_of(
     # Share one array between the components of one scan, as before saving.
     shared = list(grids)
     empty = np.empty((0, 0, 0))
-    heads = np.split(state['heads'], np.cumsum(state['head_counts'])[:-1])
+    every = state['heads'].copy()
+    renew_addresses(every[:, KIND], every[:, MODEL:])
+    heads = np.split(every, np.cumsum(state['head_counts'])[:-1])
     terms = np.split(state['terms'], np.cumsum(state['term_counts'])[:-1])
     labels = _labels_of(state, len(targets))
     components = []

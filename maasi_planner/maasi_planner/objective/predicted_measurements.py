@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from maasi_filter.models.custom_kernel import CUSTOM, REACH
 from maasi_filter.models.detection import (
     BOX,
 )
@@ -147,6 +148,8 @@ def first_row(item: Events) -> Events:
 
 def reach_of(kind: int, parameters: FloatArray) -> float:
     """Return the horizontal distance beyond which pi is 0, metres; inf if there is none."""
+    if kind == CUSTOM:
+        return float(parameters[REACH])
     if kind != BOX:
         return math.inf
     offsets = np.abs(parameters[[1, 2, 4, 5]])

@@ -330,7 +330,7 @@ class TeamObjective:
         values, lower, step = exploration.kernel()
         volumes = exploration.cell_volumes().reshape(values.shape)
         # A field of view with hard edges needs every node: omitted nodes would never be seen.
-        hard = any(kernel[0] == BOX for kernel in kernels)
+        hard = any(kernel[0] >= BOX for kernel in kernels)
         stride = 1
         if not hard:
             while np.prod([-(-size // stride) for size in values.shape]) > (

@@ -30,7 +30,7 @@ def is_vectorised(kind: int) -> bool:
 
     That is where pi does not depend on the heading and is nowhere 0.
     """
-    return kind != BOX
+    return kind < BOX
 
 
 @njit(cache=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from maasi_filter.settings import DETECTIONS
 from maasi_sim.scenario.base import EventSettings, LimitSettings
 from maasi_sim.scenario.layering import Key, unknown
 from maasi_sim.scenario.schema import RobotSettings, Scenario
@@ -170,6 +171,13 @@ def check_names(name: str) -> Iterator[str]:
 def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
     detection = robot.sensor.detection
     used = ('lower', 'upper') if detection.kind == 'box' else ('size',)
+    if detection.kind not in DETECTIONS.own:
+        used = ()
+        try:
+            detection.build(scenario.dimension)
+        except Exception as error:
+            # Somebody else's code: whatever it raises, it is said before anything starts.
+            yield ('sensor', 'detection'), f'{type(error).__name__}: {error}'
     for name in used:
         length = len(getattr(detection, name))
         if length < scenario.dimension:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from maasi_filter.settings import DETECTIONS
 from maasi_sim.buildings.scenario import NAME as BUILDINGS
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.scenario.base import BaseScenario
@@ -85,6 +86,9 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
     view: dict[str, Any] = {'kind': detection.kind, 'turns': detection.frame == 'robot'}
     if detection.kind == 'box':
         view |= {'lower': list(detection.lower), 'upper': list(detection.upper)}
+    elif detection.kind not in DETECTIONS.own:
+        _, parameters = detection.build(scenario.dimension).kernel()
+        view['size'] = [1.0 / float(parameters[1])] * scenario.dimension
     else:
         view['size'] = list(detection.size)[: scenario.dimension]
     deviations = [float(value) for value in robot.sensor.noise.deviations(scenario.dimension)]

@@ -1,0 +1,167 @@
+"""Detection models of a user's own: pi as a compiled function, or as one of NumPy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from maasi_filter.models.custom_kernel import ADDRESS, CUSTOM, NUMBER, REACH, register
+from maasi_filter.models.detection import PARAMETERS, DetectionModel
+
+FloatArray = NDArray[np.float64]
+
+# Cells from the robot to the reach, on each axis, by dimension.
+_CELLS = {2: 256, 3: 48}
+# Places at which a compiled function is tried.
+_TRIALS = 64
+
+
+class OwnDetection(DetectionModel):
+    """pi(x, q) by a function of one's own, of where a target is as seen from the robot.
+
+    A subclass has `reach`, and either `compiled` with `values`, or `evaluate`. The result is
+    multiplied with `probability` of the settings, and 0 beyond the reach. In two dimensions `up`
+    is 0.
+
+    `compiled` is called for every place, and is about as fast as a model of the suite. `evaluate`
+    is called once, for the nodes of a grid up to the reach (in 2D 513 on each axis, in 3D 97);
+    between them pi is interpolated, so that a step becomes a ramp of a 256th (3D: a 48th) of the
+    reach.
+
+    Parameters
+    ----------
+    settings : BaseModel, optional
+        Instance of `Settings`.
+    probability : float
+        G, what the function is multiplied with, in [0, 1].
+    dimension : int
+        2 or 3.
+
+    Attributes
+    ----------
+    Settings : type or None
+        Model of the settings that a scenario may give.
+    compiled : function or None
+        pi(forward, left, up, values) of floats [m] and the array `values`, for Numba: decorated
+        with `numba.njit`, or plain.
+    own : BaseModel or None
+        The settings.
+
+    Raises
+    ------
+    ValueError
+        If the function returns something else than finite numbers in [0, 1].
+    """
+
+    Settings: ClassVar[type[BaseModel] | None] = None
+    compiled: ClassVar[Callable[..., float] | None] = None
+    _kind = CUSTOM
+
+    def __init__(
+        self, settings: Any = None, probability: float = 1.0, dimension: int = 3
+    ) -> None:
+        if settings is None and self.Settings is not None:
+            settings = self.Settings()
+        self.own = settings
+        self.gain = float(probability)
+        self.dimension = dimension
+        reach = float(self.reach())
+        if not (math.isfinite(reach) and reach > 0.0):
+            raise ValueError(f'{self._name}: reach: got {reach}, allowed are finite numbers above 0')
+        function = type(self).compiled
+        if function is None:
+            function, values = _interpolated, self._table(reach)
+        else:
+            values = np.array([float(value) for value in self.values()])
+            self._try(function, values, reach)
+        self._parameters = np.zeros(PARAMETERS)
+        self._parameters[0] = self.gain
+        # As of the radial models: the inverse of half the width of the view.
+        self._parameters[1 : 1 + dimension] = 2.0 / reach
+        self._parameters[REACH] = reach
+        self._parameters[NUMBER], self._parameters[ADDRESS] = register(function, values)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Build it anew in another process: the function is elsewhere there."""
+        return type(self), (self.own, self.gain, self.dimension)
+
+    def reach(self) -> float:
+        """Return the distance beyond which nothing is detected, metres."""
+        raise NotImplementedError(f'{self._name} lacks reach')
+
+    def values(self) -> Sequence[float]:
+        """Return what the compiled function needs to know."""
+        return ()
+
+    def evaluate(self, forward: FloatArray, left: FloatArray, up: FloatArray) -> FloatArray:
+        """Return pi, (n,), of targets at offsets (n,) each in the robot's axes, metres."""
+        raise NotImplementedError(f'{self._name} lacks compiled or evaluate')
+
+    @property
+    def _name(self) -> str:
+        return f'{type(self).__module__}:{type(self).__qualname__}'
+
+    def _checked(self, result: Any, shape: tuple[int, ...]) -> FloatArray:
+        found = np.asarray(result, dtype=float)
+        if found.shape != shape:
+            raise ValueError(f'{self._name}: got shape {found.shape}, allowed is {shape}')
+        wrong = found[~((found >= 0.0) & (found <= 1.0))]
+        if wrong.size:
+            raise ValueError(
+                f'{self._name}: got a probability of {wrong[0]}, allowed are numbers in [0, 1]'
+            )
+        return found
+
+    def _table(self, reach: float) -> FloatArray:
+        """Return half the number of cells on each axis, cells per metre, and pi at the nodes."""
+        cells = _CELLS[self.dimension]
+        axis = np.linspace(-reach, reach, 2 * cells + 1)
+        height = axis if self.dimension == 3 else np.zeros(1)
+        grids = [grid.ravel() for grid in np.meshgrid(axis, axis, height, indexing='ij')]
+        table = self._checked(self.evaluate(*grids), grids[0].shape)
+        return np.concatenate([[cells, cells / reach, self.dimension], table])
+
+    def _try(self, function: Callable[..., float], values: FloatArray, reach: float) -> None:
+        """Call a function at some places, where an exception would still be seen."""
+        generator = np.random.default_rng(1)
+        places = generator.uniform(-reach, reach, (_TRIALS, 3))
+        places[:, self.dimension :] = 0.0
+        places[0] = 0.0
+        results = [function(*place, values) for place in places.tolist()]
+        self._checked(results, (_TRIALS,))
+
+
+@njit(cache=True, error_model='numpy')
+def _interpolated(  # type: ignore[no-untyped-def]
+    forward, left, up, values
+):
+    """Return pi between the nodes of a table of `OwnDetection`."""
+    cells = np.int64(values[0])
+    scale = values[1]
+    solid = values[2] > 2.5
+    width = 2 * cells + 1
+    depth = width if solid else 1
+    u = min(max(forward * scale + cells, 0.0), 2.0 * cells)
+    v = min(max(left * scale + cells, 0.0), 2.0 * cells)
+    w = min(max(up * scale + cells, 0.0), 2.0 * cells) if solid else 0.0
+    i = min(np.int64(u), width - 2)
+    j = min(np.int64(v), width - 2)
+    k = min(np.int64(w), width - 2) if solid else 0
+    u -= i
+    v -= j
+    w -= k
+    total = 0.0
+    for a in range(2):
+        for b in range(2):
+            share = (u if a else 1.0 - u) * (v if b else 1.0 - v)
+            node = 3 + ((i + a) * width + j + b) * depth + k
+            total += share * (1.0 - w) * values[node]
+            if solid:
+                total += share * w * values[node + 1]
+    return total
