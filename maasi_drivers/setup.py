@@ -37,6 +37,7 @@ setup(
         'console_scripts': [
             'mambo_driver = maasi_entry:maasi_drivers.mambo_driver',
             'turtlebot_driver = maasi_entry:maasi_drivers.turtlebot_driver',
+            'plugin_driver = maasi_entry:maasi_drivers.plugin_driver',
             'ranging_driver = maasi_entry:maasi_drivers.ranging_driver',
             'measurement_feed_sender = maasi_entry:maasi_drivers.measurement_feed_sender',
             'mavlink_driver = maasi_entry:maasi_drivers.mavlink_driver',

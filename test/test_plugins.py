@@ -5,16 +5,22 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter import plugins
+from maasi_filter.models.pose import Pose
 from maasi_filter.plugins import PluginError
 from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners import Planner, make_planner
 from maasi_planner.settings import PLANNERS, PlannerSettings
+from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.scenario import ScenarioError, load_scenario
 from maasi_sim.search import search
+from maasi_sim.targets.nodes import plan_nodes
 
 ONE_BY_ONE = '''
 from pydantic import BaseModel, ConfigDict, Field
@@ -225,3 +231,123 @@ def test_parameters_of_a_plugin(folder):
     with pytest.raises(PluginError):
         PLANNERS.load('one_by_one:Nothing')
     assert PlannerSettings(name='one_by_one:OneByOne').settings.stride == 1
+
+
+STEP_MODEL = '''
+import numpy as np
+from pydantic import BaseModel, Field
+
+from maasi_drivers.vision.detector import Detector, blobs_at
+from maasi_filter.models.pose import Pose
+from maasi_planner.motion.base import Body, MotionModel, RobotState
+
+
+class Settings(BaseModel):
+    gain: float = Field(default=1.0, gt=0.0)
+
+
+class Cart(Body):
+    def __init__(self, state):
+        self.state = state
+
+    def step(self, velocity_command, dt):
+        place = self.state.pose.position + dt * np.asarray(velocity_command)[:3]
+        self.state = RobotState(Pose.from_yaw(place, 0.0), np.asarray(velocity_command)[:3])
+
+    def robot_state(self):
+        return self.state
+
+
+class Straight(MotionModel):
+    Settings = Settings
+
+    def command(self, state, waypoint):
+        way = np.asarray(waypoint, float) - state.pose.position
+        length = np.linalg.norm(way)
+        speed = min(self.settings.speed, self.settings.settings.gain * length)
+        return np.array([*(speed * way / max(length, 1e-9)), 0.0])
+
+    def body(self, state):
+        return Cart(state)
+
+
+class Brightest(Detector):
+    """Takes the brightest pixel for a target."""
+
+    def detect(self, image):
+        v, u = np.unravel_index(image.sum(axis=2).argmax(), image.shape[:2])
+        return blobs_at([[u, v]], deviation=0.3)
+'''
+
+
+def test_motion_model_of_ones_own(folder):
+    (folder / 'cart.py').write_text(STEP_MODEL)
+    changes = {
+        'model': (('robots', 'rover', 'motion', 'model'), 'cart:Straight'),
+        'gain': (('robots', 'rover', 'motion', 'settings'), {'gain': 2.0}),
+    }
+    scenario = load_scenario(folder / 'search.yaml', changes)
+    result = search(scenario, 1)
+    assert result.distance['rover'] > 0.8
+    assert result.decisions[1].robots['rover'].lengths.max() > 10
+    changes['gain'] = (('robots', 'rover', 'motion', 'settings'), {'gain': -2.0})
+    with pytest.raises(ScenarioError, match=r'motion\.settings\.gain: read -2'):
+        load_scenario(folder / 'search.yaml', changes)
+
+
+def test_detector_of_ones_own(folder):
+    (folder / 'cart.py').write_text(STEP_MODEL)
+    plugins.add_folders([folder])
+    settings = CameraSettings.model_validate({'segmentation': {'rule': 'cart:Brightest'}})
+    image = np.zeros((120, 160, 3), np.uint8)
+    image[40, 100] = 255
+    seen = MarkerDetector(settings).detect(image, Pose.from_yaw([1.0, 1.0, 1.0], 0.0))
+    assert len(seen) == 1
+    # The camera looks down from 1 m, the image's top to the front (260 px focal length).
+    assert seen.positions[0] == pytest.approx([1.0 + 19.5 / 260, 1.0 - 20.5 / 260], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('body', 'message'),
+    [
+        ('def reach(self): return 2.0', 'NotImplementedError: .* lacks compiled or evaluate'),
+        ('def reach(self): return 0.0', 'reach: got 0.0, allowed are finite numbers above 0'),
+        (
+            'def reach(self): return 1.0\n    def evaluate(self, x, y, z): return x',
+            r'got a probability of -1.0, allowed are numbers in \[0, 1\]',
+        ),
+        (
+            'def reach(self): return 1.0\n    def evaluate(self, x, y, z): return 0.5',
+            'got shape',
+        ),
+        (
+            'def reach(self): return 1.0\n    def compiled(x, y, z, values): return 1.0 + x * x',
+            'got a probability of 1.',
+        ),
+    ],
+)
+def test_wrong_detection_models_are_refused_before_anything_starts(folder, body, message):
+    (folder / 'mine.py').write_text(
+        'from maasi_filter.models.own_detection import OwnDetection\n'
+        f'class Mine(OwnDetection):\n    {body}\n'
+    )
+    changes = {'kind': (('robots', 'rover', 'sensor', 'detection', 'kind'), 'mine:Mine')}
+    with pytest.raises(ScenarioError, match=message):
+        load_scenario(folder / 'search.yaml', changes)
+
+
+def test_driver_of_ones_own_is_tried_before_anything_starts(folder):
+    (folder / 'mine.py').write_text('import nowhere_too\n')
+    changes = {'driver': (('robots', 'rover', 'driver'), 'mine:Driver')}
+    scenario = load_scenario(folder / 'search.yaml', changes)
+    run = RunSettings(1, True, None, False, folder / 'search.yaml')
+    with pytest.raises(ScenarioError, match=r"robots\.rover\.driver: .*'nowhere_too'"):
+        plan_nodes(scenario, run)
+    (folder / 'mine.py').write_text(
+        'from maasi_drivers.ranging_driver import RangingDriver\n'
+        'class Driver(RangingDriver):\n    pass\n'
+    )
+    (plan,) = [plan for plan in plan_nodes(scenario, run) if plan.drives]
+    assert plan.command(Path('x'), Path('y'))[:3] == ['x', 'mine:Driver', str(folder)]
+    with pytest.raises(ScenarioError, match=r"unknown driver 'mambo_drive' .*mean 'mambo_d"):
+        load_scenario(folder / 'search.yaml', {'d': (('robots', 'rover', 'driver'), 'mambo_drive')})

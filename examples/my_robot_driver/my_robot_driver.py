@@ -9,7 +9,7 @@ it was switched on, and takes `{"forward": m/s, "turn": rad/s}`. Its images are 
 import json
 import socket
 
-from maasi_drivers.agent.agent_driver import run
+from maasi_drivers.agent.agent_driver import AgentDriver, run
 from maasi_drivers.agent.odometry import MapOdometry
 from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.vision.camera_input import CameraInput
@@ -72,6 +72,13 @@ class RoverLink(RobotLink):
 
     def drive(self, forward, turn):
         self.socket.sendto(json.dumps({'forward': forward, 'turn': turn}).encode(), ROVER)
+
+
+class RoverDriver(AgentDriver):
+    """For a scenario: `driver: my_robot_driver:RoverDriver`."""
+
+    def __init__(self, **options):
+        super().__init__({'topics': RoverLink}, CameraInput, **options)
 
 
 if __name__ == '__main__':

@@ -92,7 +92,7 @@ class PluginGroup:
         else:
             installed = self._installed()
             if name not in installed:
-                raise PluginError(self._unknown(name, [*sorted(self.own), *sorted(installed)]))
+                raise PluginError(self._unknown(name, self.names()))
             try:
                 found = _attribute(installed[name].value.partition('[')[0].strip())
             except PluginError as error:
@@ -109,6 +109,12 @@ class PluginGroup:
         """Return a name that can be loaded; a validator for settings."""
         if name not in self.own:
             self.load(name)
+        return name
+
+    def check_known(self, name: str) -> str:
+        """Return a name that stands for something, without importing it; a validator."""
+        if name not in self.own and not is_reference(name) and name not in self._installed():
+            raise PluginError(self._unknown(name, self.names()))
         return name
 
     def settings(self, name: str) -> type[BaseModel] | None:

@@ -30,7 +30,18 @@ PLANNERS = PluginGroup(
 )
 _PLANNER = OwnSettings(PLANNERS, 'name')
 
-MODELS = ('constant_speed', 'mambo', 'unicycle', 'quadrotor')
+MOTIONS = PluginGroup(
+    'maasi.motion_models',
+    'motion model',
+    'maasi_planner.motion.base:MotionModel',
+    {
+        'constant_speed': 'maasi_planner.motion.constant_speed:ConstantSpeed',
+        'mambo': 'maasi_planner.motion.mambo:Mambo',
+        'unicycle': 'maasi_planner.motion.unicycle:Unicycle',
+        'quadrotor': 'maasi_planner.motion.quadrotor:Quadrotor',
+    },
+)
+_MOTION = OwnSettings(MOTIONS, 'model')
 
 
 class CandidateSettings(Settings):
@@ -84,8 +95,12 @@ class CandidateSettings(Settings):
 class MotionSettings(Settings):
     """How a robot moves to a waypoint: model, limits and controller."""
 
-    model: Literal['constant_speed', 'mambo', 'unicycle', 'quadrotor'] = Field(
-        default='constant_speed', description='Motion model and controller'
+    model: Annotated[str, MOTIONS, AfterValidator(MOTIONS.check)] = Field(
+        default='constant_speed',
+        description='Motion model and controller, or module:Class of your own',
+    )
+    settings: Annotated[Any, _MOTION, AfterValidator(_MOTION.check)] = Field(
+        default=None, validate_default=True, description='Settings of a model of your own'
     )
     speed: float = Field(default=0.4, gt=0.0, le=100.0, description='Largest speed [m/s]')
     acceleration: float | None = Field(

@@ -9,17 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
-from robot_team import TURTLEBOT, Team, parameters_of, rendered, stamped
+from robot_team import Team, parameters_of, rendered, stamped
 
 from maasi_drivers.agent.agent_driver import AgentDriver
+from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.vision.camera_input import CameraInput
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros
+from maasi_filter.ros.parameters import unflatten
 from maasi_msgs.msg import AgentState
 
 FILE = Path(__file__).parents[2] / 'examples' / 'my_robot_driver' / 'my_robot_driver.py'
+PARAMETERS = yaml.safe_load(FILE.with_name('rover.yaml').read_text())['/**']['ros__parameters']
 
 
 class Rover:
@@ -65,7 +69,7 @@ def rover_and_team(context):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     executor = SingleThreadedExecutor(context=context)
-    settings = TURTLEBOT | {'odometry_timeout': 1.0}
+    settings = unflatten(DriverSettings, PARAMETERS)
     driver = AgentDriver(
         {'topics': module.RoverLink},
         CameraInput,

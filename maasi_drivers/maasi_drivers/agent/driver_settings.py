@@ -10,6 +10,7 @@ from maasi_drivers.agent.ranging_mount import RangingSettings
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_filter.plugins import PluginGroup
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE, NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
 from maasi_planner.settings import MotionSettings
@@ -19,6 +20,23 @@ LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink']
 # The same in lockstep, where robots wait for their drivers: a busy machine may delay
 # a driver, and zeros in between would change the run [s].
 LOCKSTEP_LEASE = 20.0
+
+
+DRIVERS = PluginGroup(
+    'maasi.drivers',
+    'driver',
+    'maasi_drivers.agent.agent_driver:AgentDriver',
+    {
+        name: f'maasi_drivers.{name}:main'
+        for name in (
+            'mambo_driver',
+            'turtlebot_driver',
+            'ranging_driver',
+            'mavlink_driver',
+            'mavlink_camera_driver',
+        )
+    },
+)
 
 
 class ScanSettings(Settings):

@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from maasi_filter.plugins import OwnSettings, PluginGroup
 from maasi_filter.settings import Finite, Settings
 
 # Of a calibration: beyond these the camera cannot be one [px, px, -].
 _LARGEST_IMAGE, _LARGEST_INTRINSIC, _LARGEST_DISTORTION = 32_768, 1e6, 1e4
 
 
+DETECTORS = PluginGroup(
+    'maasi.detectors',
+    'segmentation rule',
+    'maasi_drivers.vision.detector:Detector',
+    {
+        'robust': 'maasi_drivers.vision.segmentation:segment_robust',
+        'paper': 'maasi_drivers.vision.segmentation:segment_paper',
+        'aruco': 'maasi_drivers.vision.fiducials:segment_fiducials',
+    },
+)
+_DETECTOR = OwnSettings(DETECTORS, 'rule')
+
+
 class SegmentationSettings(Settings):
     """How marker pixels are separated from the floor; see `maasi_drivers.vision.segmentation`."""
 
-    rule: Literal['robust', 'paper', 'aruco'] = Field(
+    rule: Annotated[str, DETECTORS, AfterValidator(DETECTORS.check)] = Field(
         default='robust',
         description="'paper': fixed blue excess (001, eq. (16)), blobs of any size from "
         "minimum_area on; 'robust': adapts to light, and gates on size and shape; 'aruco': "
-        'fiducial markers, whose ids are the identities of targets',
+        'fiducial markers, whose ids are the identities of targets; or module:Class of your own',
+    )
+    settings: Annotated[Any, _DETECTOR, AfterValidator(_DETECTOR.check)] = Field(
+        default=None, validate_default=True, description='Settings of a detector of your own'
     )
     dictionary: Literal[
         '4X4_50', '4X4_250', '5X5_50', '5X5_250', '6X6_50', '6X6_250', 'APRILTAG_36h11'

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.vision.camera_settings import DETECTORS, CameraSettings
+from maasi_drivers.vision.detector import Detector
 from maasi_drivers.vision.projection import propagate, range_bearing
 from maasi_drivers.vision.segmentation import segment
 from maasi_filter.models.pose import Pose
@@ -77,6 +78,10 @@ class MarkerDetector:
         self.camera = Camera.from_settings(settings)
         self.dimension = dimension
         self.floor_height = floor_height
+        rule = settings.segmentation.rule
+        self._own: Detector | None = None
+        if rule not in DETECTORS.own:
+            self._own = DETECTORS.load(rule)(settings.segmentation.settings)
         self._pose_covariance: Array | None = None
         if settings.position_noise > 0 or settings.orientation_noise > 0:
             self._pose_covariance = np.diag(
@@ -108,9 +113,22 @@ class MarkerDetector:
             If the image has another size than the calibrated one, or the covariance is not finite.
 
         """
+        return self.locate(self.segment(image), pose, pose_covariance)
+
+    def segment(self, image: NDArray[np.uint8]) -> Blobs:
+        """
+        Return where markers are in an image, by the rule of the settings.
+
+        Raises
+        ------
+        ValueError
+            If the image has another size than the calibrated one.
+
+        """
         self.check_size(image)
-        blobs = segment(image, self.settings.segmentation)
-        return self.locate(blobs, pose, pose_covariance)
+        if self._own is not None:
+            return self._own.detect(image)
+        return segment(image, self.settings.segmentation)
 
     def check_size(self, image: NDArray[np.uint8]) -> None:
         """Raise `ValueError` for an image of another size than the calibrated one."""

@@ -9,7 +9,6 @@ from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.sensor_reading import SensorReading
 from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_drivers.vision.segmentation import segment
 from maasi_filter.models.label import Label
 from maasi_filter.models.sensor import Sensor
 
@@ -43,8 +42,7 @@ def read_markers(
 
     """
     if not isinstance(picture, Blobs):
-        detector.check_size(picture)
-        picture = segment(picture, detector.settings.segmentation)
+        picture = detector.segment(picture)
     covariance = pose.covariance if pose.covariance.any() else None
     markers = detector.locate(picture, pose.pose, covariance)
     # On the floor, z = 0.

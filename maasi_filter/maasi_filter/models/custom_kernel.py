@@ -68,9 +68,10 @@ def custom_probability(  # type: ignore[no-untyped-def]
     reach = parameters[REACH]
     if dx * dx + dy * dy + dz * dz > reach * reach:
         return 0.0
-    value = parameters[0] * _call(
-        np.int64(parameters[ADDRESS]), cos_yaw * dx + sin_yaw * dy, cos_yaw * dy - sin_yaw * dx, dz
-    )
+    forward = cos_yaw * dx + sin_yaw * dy
+    left = cos_yaw * dy - sin_yaw * dx
+    address = np.int64(parameters[ADDRESS])
+    value = parameters[0] * _call(address, forward, left, dz)  # type: ignore[call-arg]
     # What is not a number is not above 0 either.
     return min(value, 1.0) if value > 0.0 else 0.0
 

@@ -92,7 +92,7 @@ def fill_probabilities(  # type: ignore[no-untyped-def]
     kind, parameters, x, y, z, number, cos_yaw, sin_yaw, out
 ):
     """Fill pi for the first `number` offsets (x, y, z) [m, map axes] from the sensor."""
-    if kind == BOX or kind == CUSTOM:
+    if kind >= BOX:
         for i in range(number):
             out[i] = detection_probability_at(kind, parameters, x[i], y[i], z[i], cos_yaw, sin_yaw)
         return

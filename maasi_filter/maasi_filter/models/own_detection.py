@@ -63,9 +63,7 @@ class OwnDetection(DetectionModel):
     compiled: ClassVar[Callable[..., float] | None] = None
     _kind = CUSTOM
 
-    def __init__(
-        self, settings: Any = None, probability: float = 1.0, dimension: int = 3
-    ) -> None:
+    def __init__(self, settings: Any = None, probability: float = 1.0, dimension: int = 3) -> None:
         if settings is None and self.Settings is not None:
             settings = self.Settings()
         self.own = settings
@@ -73,7 +71,9 @@ class OwnDetection(DetectionModel):
         self.dimension = dimension
         reach = float(self.reach())
         if not (math.isfinite(reach) and reach > 0.0):
-            raise ValueError(f'{self._name}: reach: got {reach}, allowed are finite numbers above 0')
+            raise ValueError(
+                f'{self._name}: reach: got {reach}, allowed are finite numbers above 0'
+            )
         function = type(self).compiled
         if function is None:
             function, values = _interpolated, self._table(reach)

@@ -224,7 +224,9 @@ class BatchAssembly:
             # Its batch may still arrive.
             return None
         else:
-            earliest, latest = last, max(self.last_stamp, last) + _STAMP_AHEAD
+            # The first one, where no planner sends batches, may have any stamp up to now.
+            now = self._node.get_clock().now().nanoseconds
+            earliest, latest = last, max(self.last_stamp, last, now) + _STAMP_AHEAD
         if earliest <= stamp <= latest:
             return None
         return (
@@ -258,9 +260,10 @@ class BatchAssembly:
         measurement = self._measurement(message)
         if measurement is None:
             return None
-        self._node.warn_throttled(
-            'late', f'{name}/detections: batch {message.batch_id} came late: a batch of its own'
-        )
+        if message.batch_id:
+            self._node.warn_throttled(
+                'late', f'{name}/detections: batch {message.batch_id} came late: a batch of its own'
+            )
         return PendingBatch(
             int(message.batch_id),
             int(message.step),

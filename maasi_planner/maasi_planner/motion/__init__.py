@@ -8,7 +8,7 @@ from maasi_planner.motion.mambo import Mambo, MamboBody
 from maasi_planner.motion.quadrotor import Quadrotor, QuadrotorBody
 from maasi_planner.motion.unicycle import Unicycle, UnicycleBody
 from maasi_planner.obstacles import Obstacles
-from maasi_planner.settings import MotionSettings
+from maasi_planner.settings import MOTIONS, MotionSettings
 
 __all__ = [
     'Body',
@@ -25,13 +25,6 @@ __all__ = [
     'UnicycleBody',
     'make_motion',
 ]
-
-_MODELS: dict[str, type[MotionModel]] = {
-    'constant_speed': ConstantSpeed,
-    'mambo': Mambo,
-    'unicycle': Unicycle,
-    'quadrotor': Quadrotor,
-}
 
 
 def make_motion(
@@ -50,4 +43,5 @@ def make_motion(
     radius : float
         Of the robot, metres.
     """
-    return _MODELS[settings.model](settings, obstacles, radius)
+    model: MotionModel = MOTIONS.load(settings.model)(settings, obstacles, radius)
+    return model

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel
 
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion.steering import Surroundings
@@ -141,9 +142,12 @@ class MotionModel(ABC):
     ----------
     rate : float
         Speed per distance left, near the waypoint [1/s].
+    Settings : type or None
+        Model of the settings of a user's own model; `settings.settings` is an instance.
     """
 
-    rate: float
+    rate: float = 1.0
+    Settings: ClassVar[type[BaseModel] | None] = None
 
     def __init__(
         self,
@@ -185,15 +189,31 @@ class MotionModel(ABC):
         self.roll_out(state, goals, dt, out)
         return trimmed(out)
 
-    @abstractmethod
     def roll_out(
         self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
     ) -> None:
         """Run controller and body against each other to each waypoint, and fill `out`.
 
         Its rows are filled as far as each trajectory goes; one that does not arrive within the
-        room there is gets a length that does not fit.
+        room there is gets a length that does not fit. The models of the suite do this compiled;
+        here it is done with `command` and `body`, some ten microseconds for each step.
         """
+        limit = out.positions.shape[1] - 1
+        for w, waypoint in enumerate(waypoints):
+            body, now = self.body(state), state
+            cost, k = 0.0, 0
+            while True:
+                out.positions[w, k] = now.pose.position
+                out.yaws[w, k] = now.pose.yaw
+                if k == limit or self.arrived(now.pose.position, waypoint):
+                    break
+                command = self.command(now, waypoint)
+                body.step(command, step)
+                now = body.robot_state()
+                cost += float(command @ command)
+                k += 1
+            out.lengths[w] = k if self.arrived(now.pose.position, waypoint) else limit + 1
+            out.control_cost[w] = cost
 
     @abstractmethod
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:

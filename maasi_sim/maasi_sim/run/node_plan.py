@@ -77,6 +77,8 @@ class NodePlan:
         Whether it commands a robot, which is stopped when the node dies.
     remaps : dict
         Remapped topic names.
+    arguments : tuple of str
+        Before those of ROS.
     given : dict
         Parameters passed on the command line, as the file must not start a search on real robots.
     """
@@ -93,6 +95,7 @@ class NodePlan:
     drives: bool = False
     remaps: Mapping[str, str] = field(default_factory=dict)
     given: Mapping[str, Any] = field(default_factory=dict)
+    arguments: tuple[str, ...] = ()
 
     @property
     def full_name(self) -> str:
@@ -115,6 +118,7 @@ class NodePlan:
         """Return the command line of its process."""
         return [
             str(executable),
+            *self.arguments,
             '--ros-args',
             '--disable-external-lib-logs',
             '--remap',

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from maasi_drivers.agent.driver_settings import DRIVERS
 from maasi_filter.settings import DETECTIONS
 from maasi_sim.scenario.base import EventSettings, LimitSettings
 from maasi_sim.scenario.layering import Key, unknown
@@ -170,7 +171,7 @@ def check_names(name: str) -> Iterator[str]:
 
 def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
     detection = robot.sensor.detection
-    used = ('lower', 'upper') if detection.kind == 'box' else ('size',)
+    used: tuple[str, ...] = ('lower', 'upper') if detection.kind == 'box' else ('size',)
     if detection.kind not in DETECTIONS.own:
         used = ()
         try:
@@ -199,7 +200,7 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple
             yield key, f'is every {time:g} s, allowed are whole multiples of step, {scenario.step}'
     if robot.driver in _RANGING and robot.camera is not None:
         yield ('camera',), f"read one, but driver '{robot.driver}' has none; allowed is null"
-    if robot.driver not in _RANGING and robot.camera is None:
+    if robot.driver in DRIVERS.own and robot.driver not in _RANGING and robot.camera is None:
         yield ('camera',), f"is missing, driver '{robot.driver}' needs it"
 
 

@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from maasi_drivers.agent.driver_settings import DRIVERS
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_drivers.vision.camera_settings import CameraSettings
@@ -38,13 +39,9 @@ class RobotSettings(Settings):
 
     type: str = Field(description='Name of the type: a file in config/robots')
     description: str = Field(default='', description='What it is, in words')
-    driver: Literal[
-        'mambo_driver',
-        'turtlebot_driver',
-        'ranging_driver',
-        'mavlink_driver',
-        'mavlink_camera_driver',
-    ] = Field(description='Executable of maasi_drivers that drives it')
+    driver: Annotated[str, DRIVERS, AfterValidator(DRIVERS.check_known)] = Field(
+        description='Executable of maasi_drivers that drives it, or module:Class of your own'
+    )
     guard: bool | None = Field(
         default=None,
         description='Whether a guard stops it when its driver dies or hangs; none: where it is '

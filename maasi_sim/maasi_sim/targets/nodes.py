@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from importlib.util import find_spec
 from typing import Any
 
-from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.agent.driver_settings import DRIVERS, DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
 from maasi_sim.run.topics import BATCH, DECISIONS, FOUND, UPDATE, within
+from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.schema import RobotSettings, Scenario, planner_settings
 
 
@@ -66,6 +69,25 @@ def _team_plans(
     ]
 
 
+def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
+    """Return the arguments of `plugin_driver` for a driver of a user's own.
+
+    Raises
+    ------
+    ScenarioError
+        If it cannot be loaded. Another process tries: rclpy starts threads, and this one forks.
+    """
+    if driver in DRIVERS.own:
+        return ()
+    arguments = (driver, *scenario.plugin_path)
+    command = [sys.executable, '-m', 'maasi_drivers.plugin_driver', '--check', *arguments]
+    tried = subprocess.run(command, capture_output=True, text=True, check=False)
+    if tried.returncode:
+        lines = tried.stderr.strip().splitlines() or ['it cannot be loaded']
+        raise ScenarioError(f'robots.{name}.driver: {lines[-1].removeprefix("error: ")}')
+    return arguments
+
+
 def _robot_plans(
     name: str, robot: RobotSettings, scenario: Scenario, common: dict[str, Any]
 ) -> list[NodePlan]:
@@ -95,7 +117,7 @@ def _robot_plans(
     plans = [
         NodePlan(
             'maasi_drivers',
-            robot.driver,
+            robot.driver if robot.driver in DRIVERS.own else 'plugin_driver',
             'driver',
             name,
             {**flatten(settings), **SIMULATED},
@@ -103,6 +125,7 @@ def _robot_plans(
             remaps={BATCH: within(name, BATCH)} if own else {},
             topics=(*(f'/{name}/{topic}' for topic in topics), *shared),
             drives=True,
+            arguments=_plugin(name, robot.driver, scenario),
         )
     ]
     guarded = robot.link == 'topics' if robot.guard is None else robot.guard

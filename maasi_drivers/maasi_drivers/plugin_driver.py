@@ -1,0 +1,42 @@
+"""Runs a driver of a user's own: `plugin_driver module:Class`, or the name of an installed one."""
+
+from __future__ import annotations
+
+import sys
+
+from maasi_drivers.agent.driver_settings import DRIVERS
+from maasi_filter.plugins import PluginError, add_folders
+
+_USAGE = """usage: plugin_driver [--check] NAME [FOLDER ...] [--ros-args ...]
+
+Run a driver of your own as a node: a subclass of maasi_drivers.agent.agent_driver.AgentDriver.
+  NAME      module:Class, or the name of an installed plugin
+  FOLDER    where modules are looked for, too; the current folder is one
+  --check   only look whether it can be loaded"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the driver; exit code 2 if it cannot be loaded."""
+    words = sys.argv[1:] if arguments is None else arguments
+    end = words.index('--ros-args') if '--ros-args' in words else len(words)
+    own = [word for word in words[:end] if not word.startswith('-')]
+    if not own:
+        print(_USAGE, file=sys.stdout if {'-h', '--help'} & set(words) else sys.stderr)
+        return 0 if {'-h', '--help'} & set(words) else 2
+    name, *folders = own
+    add_folders(folders)
+    try:
+        driver = DRIVERS.load(name)
+    except PluginError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    if '--check' in words[:end]:
+        return 0
+    from maasi_filter.ros.lifecycle_node import run
+
+    helping = [word for word in ('-h', '--help') if word in words[:end]]
+    return run(driver, [*helping, *words[end:]])
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

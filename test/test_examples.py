@@ -1,0 +1,147 @@
+"""The examples: each is run, as a user would."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+import yaml
+
+from maasi_filter import plugins
+from maasi_sim.run.processes import Domain, find_executable
+from maasi_sim.scenario import load_scenario
+from maasi_sim.search import search
+
+EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
+# Far more than anything takes, on a machine that is busy with something else [s].
+PATIENCE = 400.0
+
+
+@pytest.fixture(autouse=True)
+def imports(monkeypatch):
+    """Undo what is imported from the folders of examples."""
+    monkeypatch.setattr(sys, 'path', list(sys.path))
+    monkeypatch.setattr(plugins, '_folders', [])
+    yield
+    for name, module in list(sys.modules.items()):
+        if str(EXAMPLES) in str(getattr(module, '__file__', '')):
+            del sys.modules[name]
+
+
+def test_the_notebook_runs_and_has_no_outputs(monkeypatch, capsys):
+    matplotlib.use('Agg')
+    monkeypatch.chdir(EXAMPLES)
+    notebook = json.loads((EXAMPLES / 'search.ipynb').read_text())
+    names: dict[str, object] = {}
+    for cell in notebook['cells']:
+        if cell['cell_type'] == 'code':
+            assert cell['outputs'] == []
+            exec(''.join(cell['source']), names)
+    printed = capsys.readouterr().out
+    assert 'all_found' in printed
+    assert re.search(r'random_planner:RandomPlanner: \d+ measurements', printed)
+
+
+@pytest.mark.parametrize('method', ['pmb', 'ic_phd'])
+@pytest.mark.parametrize('kind', ['Cone', 'CompiledCone'])
+def test_a_robot_with_a_sensor_of_its_own_finds_targets(kind, method):
+    changes = {
+        'sensor': (('robots', 'scout', 'sensor', 'detection', 'kind'), f'cone_sensor:{kind}'),
+        'filter': (('filter',), {'method': method, 'found_radius': 0.15, 'jitter_deviation': 0.03}),
+    }
+    if method == 'ic_phd':
+        changes['filter'][1]['removal_distance'] = 0.3
+    result = search(load_scenario(EXAMPLES / 'own_sensor' / 'search.yaml', changes), seed=1)
+    assert result.missed == 0, result.end_reason
+    assert result.rmse < 0.1
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    """Return the folder of a run with a planner and a sensor of one's own, and its scenario."""
+    folder = tmp_path_factory.mktemp('examples')
+    content = yaml.safe_load((EXAMPLES / 'own_sensor' / 'search.yaml').read_text())
+    content['plugin_path'] = [str(EXAMPLES / name) for name in ('own_planner', 'own_sensor')]
+    content['planner'] = {'name': 'random_planner:RandomPlanner', 'settings': {'seed': 5}}
+    content['limits'] = {'time': 20.0}
+    (folder / 'robots').symlink_to(EXAMPLES / 'robots')
+    (folder / 'search.yaml').write_text(yaml.safe_dump(content))
+    command = [sys.executable, '-m', 'maasi_sim.run.run_scenario', str(folder / 'search.yaml')]
+    done = subprocess.run(
+        [*command, '--lockstep', '--out', str(folder / 'out')],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode in (0, 1), done.stdout + done.stderr
+    return folder
+
+
+def test_nodes_run_planner_and_sensor_as_one_process_does(run):
+    result = search(load_scenario(run / 'search.yaml'), seed=1)
+    report = json.loads((run / 'out' / 'report.json').read_text())
+    found = [item['position'] for item in report['found_targets']]
+    assert result.total_measurements > 20
+    assert report['measurements'] == result.total_measurements
+    positions = [item.position for item in result.found_targets]
+    assert np.allclose(found, positions, atol=1e-6)
+
+
+def test_a_recording_is_read_without_our_packages(run):
+    done = subprocess.run(
+        # Isolated: neither PYTHONPATH nor the current folder.
+        [
+            sys.executable,
+            '-I',
+            str(EXAMPLES / 'read_bag' / 'read_bag.py'),
+            str(run / 'out' / 'bag'),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r'/scout/state: \d+ poses, from 0.0', done.stdout)
+    report = json.loads((run / 'out' / 'report.json').read_text())
+    assert done.stdout.count('target ') == len(report['found_targets'])
+
+
+def test_detections_of_ones_own_are_found_without_a_warning():
+    folder = EXAMPLES / 'own_detections'
+    with Domain() as domain:
+        environment = {**os.environ, **domain.environment()}
+        node = subprocess.Popen(
+            [
+                str(find_executable('maasi_filter', 'filter_node')),
+                *('--ros-args', '--params-file', str(folder / 'filter.yaml')),
+            ],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        try:
+            done = subprocess.run(
+                [sys.executable, str(folder / 'own_detections.py')],
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=PATIENCE,
+                check=False,
+            )
+        finally:
+            node.terminate()
+            log, _ = node.communicate(timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+    match = re.match(r'found a target at \((.*), (.*)\) m after', done.stdout)
+    assert match and np.allclose([float(part) for part in match.groups()], [3.0, 2.0], atol=0.1)
+    assert 'came late' not in log and 'allowed is' not in log, log
