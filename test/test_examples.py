@@ -88,9 +88,9 @@ def run(tmp_path_factory):
 def test_nodes_run_planner_and_sensor_as_one_process_does(run):
     result = search(load_scenario(run / 'search.yaml'), seed=1)
     report = json.loads((run / 'out' / 'report.json').read_text())
-    found = [item['position'] for item in report['found_targets']]
+    found = [item['position'] for item in report['found']]
     assert result.total_measurements > 20
-    assert report['measurements'] == result.total_measurements
+    assert report['measurements'] == result.measurements
     positions = [item.position for item in result.found_targets]
     assert np.allclose(found, positions, atol=1e-6)
 
@@ -112,7 +112,7 @@ def test_a_recording_is_read_without_our_packages(run):
     assert done.returncode == 0, done.stderr
     assert re.search(r'/scout/state: \d+ poses, from 0.0', done.stdout)
     report = json.loads((run / 'out' / 'report.json').read_text())
-    assert done.stdout.count('target ') == len(report['found_targets'])
+    assert done.stdout.count('target ') == len(report['found'])
 
 
 def test_detections_of_ones_own_are_found_without_a_warning():

@@ -288,8 +288,8 @@ def test_motion_model_of_ones_own(folder):
     }
     scenario = load_scenario(folder / 'search.yaml', changes)
     result = search(scenario, 1)
-    assert result.distance['rover'] > 0.8
-    assert result.decisions[1].robots['rover'].lengths.max() > 10
+    assert result.distance['rover'] > 0.1
+    assert result.decisions[0].robots['rover'].lengths.max() > 10
     changes['gain'] = (('robots', 'rover', 'motion', 'settings'), {'gain': -2.0})
     with pytest.raises(ScenarioError, match=r'motion\.settings\.gain: read -2'):
         load_scenario(folder / 'search.yaml', changes)
