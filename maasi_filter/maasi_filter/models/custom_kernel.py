@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import carray, cfunc, njit, types
+from numba.core import cgutils
 from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
 from numpy.typing import NDArray
@@ -47,13 +47,11 @@ def _call(typing_context, address, forward, left, up):  # type: ignore[no-untype
     """Return the function of a block at an offset."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        integer, number = ir.IntType(64), ir.DoubleType()
+        integer, number = (context.get_value_type(kind) for kind in (types.int64, types.float64))
         block = builder.inttoptr(arguments[0], integer.as_pointer())
-        entries = [
-            builder.load(builder.gep(block, [ir.Constant(integer, index)])) for index in range(3)
-        ]
+        entries = [builder.load(builder.gep(block, [integer(index)])) for index in range(3)]
         values = builder.inttoptr(entries[1], number.as_pointer())
-        kind = ir.FunctionType(number, [number] * 3 + [number.as_pointer(), integer])
+        kind = cgutils.ir.FunctionType(number, [number] * 3 + [number.as_pointer(), integer])
         function = builder.inttoptr(entries[0], kind.as_pointer())
         return builder.call(function, [*arguments[1:], values, entries[2]])
 
