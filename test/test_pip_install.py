@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -65,7 +66,8 @@ def without_ros() -> str:
     """Return the program in README's section about using the libraries without ROS."""
     section = (ROOT / 'README.md').read_text().split('## Without ROS\n')[1].split('\n## ')[0]
     block = section.split('\n\n    from ')[1]
-    return 'from ' + '\n'.join(line.removeprefix('    ') for line in block.splitlines())
+    lines = takewhile(lambda line: not line or line.startswith('    '), block.splitlines()[1:])
+    return '\n'.join(['from ' + block.splitlines()[0], *(line[4:] for line in lines)])
 
 
 def test_pip_installs_every_file(prefix: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from maasi_filter.models.detection import BoxDetection
 from maasi_planner.settings import PlannerSettings
-from maasi_sim.experiments.clairvoyant import Clairvoyant, _expected_end, _Robots
+from maasi_sim.experiments.clairvoyant import Clairvoyant, _expected_end, _Robots, clairvoyant
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
@@ -49,7 +49,7 @@ def test_it_finds_all_sooner_than_the_planner(name):
     ours, known = 0, 0
     for seed in (20_000, 20_003):
         ours += search(scenario, seed).steps
-        result = search(scenario, seed, planner=Clairvoyant)
+        result = search(scenario, seed, planner=clairvoyant)
         assert result.complete
         known += result.steps
     assert known < 0.9 * ours

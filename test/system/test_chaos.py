@@ -72,7 +72,9 @@ def test_every_node_is_killed_and_hung_in_every_mode():
 def test_wrong_arguments_are_refused(tmp_path, capsys):
     assert main(['--case', 'nothing*']) == WRONG_INPUT
     assert "read 'nothing*'" in capsys.readouterr().err
-    assert main(['--jobs', '0']) == WRONG_INPUT
+    with pytest.raises(SystemExit) as refused:
+        main(['--jobs', '0'])
+    assert refused.value.code == WRONG_INPUT
     (tmp_path / 'file').touch()
     assert main(['--out', str(tmp_path)]) == WRONG_INPUT
     assert main(['--list', '--case', 'buildings-*']) == PASSED

@@ -301,3 +301,8 @@ def _robots(team: TeamView, targets: FloatArray) -> _Robots:
         parameters=parameters,
         yaw=np.array(yaws),
     )
+
+
+def clairvoyant(settings: PlannerSettings, missing: Callable[[], FloatArray]) -> Clairvoyant:
+    """Return the clairvoyant of a group, for `search(planner=clairvoyant)`."""
+    return Clairvoyant(settings, missing)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from maasi_planner.settings import PLANNERS
 from maasi_sim.buildings.scenario import is_cuboid_scenario
 from maasi_sim.experiments.cases import Case, Outcome
-from maasi_sim.experiments.clairvoyant import Clairvoyant
+from maasi_sim.experiments.clairvoyant import clairvoyant
 from maasi_sim.experiments.experiment import Experiment, Results
 from maasi_sim.experiments.searches import outcome_of
 from maasi_sim.machine import code_digest
@@ -103,7 +103,7 @@ def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
     if settings['code'] != code_of(scenario):
         raise RuntimeError('this worker has another version of the code')
     limit = scenario.limits.time
-    result = search(scenario, seed, planner=Clairvoyant if settings['clairvoyant'] else None)
+    result = search(scenario, seed, planner=clairvoyant if settings['clairvoyant'] else None)
     outcome = outcome_of(result, None, limit)
     times = find_times(result, limit)
     outcome.summary['mean_time_to_find'] = float(times.mean()) if len(times) else None
