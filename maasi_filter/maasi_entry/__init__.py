@@ -47,7 +47,7 @@ def _is_of_ros(module: str) -> bool:
 
 
 def __getattr__(package: str) -> _Script:
-    # Whoever looks for other names, as pytest does, does not start anything.
+    # Other attributes, which pytest asks for, start nothing.
     if not package.startswith('maasi_'):
         raise AttributeError(package)
     return _Script(package)

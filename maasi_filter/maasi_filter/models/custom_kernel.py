@@ -86,7 +86,7 @@ def register(function: Callable[..., float], values: FloatArray) -> tuple[int, i
     block = _blocks.get(number)
     if block is None or block.function is not function:
         if block is not None:
-            # Defined anew, as in a notebook; somebody may still use the old one.
+            # Redefined, as in a notebook; the old one may still be in use.
             _retired.append(block)
         if function not in _compiled:
             _compiled[function] = _compile(function)

@@ -36,7 +36,7 @@ class FilterGuard:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Reset for a new search."""
         self.watch = FilterWatch(self._node.settings.filter_timeout)
         self.names: set[str] = set()
         self._names_at = -math.inf

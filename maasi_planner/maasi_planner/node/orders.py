@@ -41,7 +41,7 @@ class Orders:
         self.reset(coordinator)
 
     def reset(self, coordinator: Coordinator) -> None:
-        """Begin anew."""
+        """Reset for a new search."""
         self._coordinator = coordinator
         #: Robots that follow a goal of another client, with its number.
         self.lent: dict[str, int] = {}

@@ -54,7 +54,7 @@ class OtherPlanners:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, from the starts of the others."""
+        """Reset for a new search, from the starts of the others."""
         others = self._node.settings.others
         # By step: the last two received.
         self._destinations: dict[str, dict[int, FloatArray]] = {
@@ -121,7 +121,7 @@ class OtherPlanners:
     def taken(self, step: int, robots: Collection[str] | None) -> list[tuple[FloatArray, float]]:
         """Return the known destinations of robots with their own planner, and their radii.
 
-        Those of `robots` at a step in lockstep; with None those that were heard of late.
+        Those of `robots` at a step in lockstep; with None those heard recently.
         """
         settings = self._node.settings
         taken = []

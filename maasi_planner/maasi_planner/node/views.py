@@ -41,7 +41,7 @@ class PlannerViews:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Reset for a new search."""
         self._board = MarkerBoard()
         self._at = -math.inf
 
