@@ -1,6 +1,5 @@
 """State estimation of the team: sensors, exploration, filters and found targets."""
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.metrics import (
@@ -38,6 +37,7 @@ from maasi_filter.settings import (
     SensorSettings,
 )
 from maasi_filter.state_file import StateFileError
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_filter.warm_up import warm_up
 
 __all__ = [
@@ -47,7 +47,6 @@ __all__ = [
     'DetectionModel',
     'DetectionSettings',
     'EnvironmentSettings',
-    'Exploration',
     'ExponentialDetection',
     'FilterResult',
     'FilterSettings',
@@ -67,6 +66,7 @@ __all__ = [
     'Sensor',
     'SensorSettings',
     'StateFileError',
+    'UnexploredMap',
     'compose',
     'detection_probability',
     'gospa',

@@ -9,9 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
+from maasi_filter.unexplored_map import UnexploredMap
 
 FloatArray = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class SearchFilter(Protocol):
         Of the environment, metres.
     dimension : int
         2 or 3.
-    exploration : Exploration
+    exploration : UnexploredMap
         e, updated with every measurement.
     clusters : list of Cluster
         Potential targets that are not found, heaviest first.
@@ -36,7 +36,7 @@ class SearchFilter(Protocol):
     settings: FilterSettings
     bounds: FloatArray
     dimension: int
-    exploration: Exploration
+    exploration: UnexploredMap
     clusters: list[Cluster]
 
     @property

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.label import Label
 from maasi_filter.records import Cluster, FoundTarget
 from maasi_filter.settings import FilterSettings
@@ -25,6 +24,7 @@ from maasi_filter.state_file import (
     text,
     untext,
 )
+from maasi_filter.unexplored_map import UnexploredMap
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -58,7 +58,7 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def common_arrays(
-    settings: FilterSettings, generator: np.random.Generator, exploration: Exploration
+    settings: FilterSettings, generator: np.random.Generator, exploration: UnexploredMap
 ) -> dict[str, NDArray[Any]]:
     """Return settings, generator and exploration as arrays."""
     return {
@@ -79,7 +79,7 @@ def construction(state: Arrays) -> tuple[FilterSettings, NDArray[Any], np.random
     )
 
 
-def exploration_of(state: Arrays) -> Exploration:
+def exploration_of(state: Arrays) -> UnexploredMap:
     """Return the exploration function of a state.
 
     Raises
@@ -87,7 +87,7 @@ def exploration_of(state: Arrays) -> Exploration:
     ValueError
         If its values do not fit its nodes, or are not from 0 to 1.
     """
-    exploration = Exploration(state['bounds'], float(state['spacing']))
+    exploration = UnexploredMap(state['bounds'], float(state['spacing']))
     values, shape = state['exploration'], exploration.values.shape
     if values.shape != shape or values.dtype.kind != 'f':
         raise ValueError(

@@ -10,10 +10,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.exploration import Exploration, check_bounds
 from maasi_filter.models.detection import detection_probability_at
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.unexplored_map import UnexploredMap, check_bounds
 from maasi_planner.objective.predicted_measurements import reach_of
 from maasi_planner.settings import CandidateSettings
 
@@ -221,7 +221,7 @@ def unseen_parts(
     box = check_bounds(bounds)
     box = np.stack([box[:, 0] + margin, box[:, 1] - margin], axis=1)
     size = float((box[:, 1] - box[:, 0]).max())
-    grid = Exploration(box, size / (cells if len(box) == 2 else min(cells, 40)))
+    grid = UnexploredMap(box, size / (cells if len(box) == 2 else min(cells, 40)))
     nodes = grid.nodes()
     seen = np.zeros(len(nodes), dtype=np.bool_)
     members = list(viewers.values()) if isinstance(viewers, Mapping) else list(viewers)
@@ -348,7 +348,7 @@ def _turns(viewer: Viewer, size: float) -> bool:
     )
 
 
-def _parts(grid: Exploration, seen: NDArray[np.bool_], nodes: FloatArray) -> Unseen:
+def _parts(grid: UnexploredMap, seen: NDArray[np.bool_], nodes: FloatArray) -> Unseen:
     """Return the connected parts of nodes not seen."""
     hidden = ~seen.reshape(grid.values.shape)
     volumes = grid.cell_volumes()

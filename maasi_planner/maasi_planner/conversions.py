@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.ros.conversions import FASTEST, bounded, colour, point_to_ros, pose_from_ros
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_msgs.msg import AgentState, Candidate, PlanDecision
 from maasi_msgs.msg import RobotDecision as RobotDecisionMessage
 from maasi_planner.motion import RobotState
@@ -131,7 +131,7 @@ def path_to_ros(positions: FloatArray, header: Header, most: int = 50) -> Path:
     return Path(header=header, poses=poses)
 
 
-def exploration_to_ros(exploration: Exploration, header: Header) -> OccupancyGrid:
+def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyGrid:
     """Return e in 2D as a grid: 100 is unseen, 0 explored; cells are centred on the nodes."""
     values = np.asarray(exploration.values)
     step = [float(axis[1] - axis[0]) for axis in exploration.axes()]

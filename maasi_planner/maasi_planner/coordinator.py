@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import Exploration, default_spacing
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap, default_spacing
 from maasi_planner.arrival import arrival_radius
 from maasi_planner.candidates import CandidateSet
 from maasi_planner.measurement_trigger import MeasurementTrigger
@@ -63,7 +63,7 @@ class _Plan:
     radius: float
     # Distance from a waypoint at which the next one is decided [m]; 0: it stops at each.
     arrival_radius: float
-    exploration: Exploration | None = None
+    exploration: UnexploredMap | None = None
     decision: int = -1
     decided_at: int | None = None
     waypoint: FloatArray = field(default_factory=lambda: np.zeros(3))
@@ -91,7 +91,7 @@ class Coordinator:
 
     Attributes
     ----------
-    exploration : Exploration
+    exploration : UnexploredMap
         e after the last measurements.
     clusters : list of Cluster
         Potential targets after the last measurements.
@@ -107,7 +107,7 @@ class Coordinator:
         spacing = settings.exploration_spacing
         if spacing is None:
             spacing = default_spacing(bounds)
-        self.exploration = Exploration(bounds, spacing)
+        self.exploration = UnexploredMap(bounds, spacing)
         self.obstacles = Obstacles.from_settings(environment.obstacles)
         self.clusters: list[Cluster] = []
         self.finished: str | None = None

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.settings import PlannerSettings
 
 
@@ -18,7 +18,7 @@ def expected_use(
     sensor: Sensor,
     pose: Pose,
     clusters: Sequence[Cluster],
-    exploration: Exploration,
+    exploration: UnexploredMap,
     gamma: float,
 ) -> float:
     """Return the left side of 000, eq. (24) and (33): the sum of pi at centres plus gamma e.
@@ -31,7 +31,7 @@ def expected_use(
         Pose of the measurement.
     clusters : sequence of Cluster
         After the last measurement.
-    exploration : Exploration
+    exploration : UnexploredMap
         e after the last measurement.
     gamma : float
         Weight of e at the robot's position.
@@ -71,7 +71,7 @@ class MeasurementTrigger:
         yaws: ArrayLike,
         period_steps: int,
         clusters: Sequence[Cluster],
-        exploration: Exploration,
+        exploration: UnexploredMap,
     ) -> None:
         """Store a new trajectory; call at each decision of the robot.
 
@@ -107,7 +107,7 @@ class MeasurementTrigger:
         sensor: Sensor,
         pose: Pose,
         clusters: Sequence[Cluster],
-        exploration: Exploration,
+        exploration: UnexploredMap,
     ) -> bool:
         """Return whether the robot measures now.
 

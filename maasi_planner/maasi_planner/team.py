@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 from maasi_planner.obstacles import Obstacles
 
@@ -50,7 +50,7 @@ class RobotView:
         that plans measures now.)
     radius : float
         Radius of a circle around the robot, metres; separates waypoints of different robots.
-    exploration : Exploration, optional
+    exploration : UnexploredMap, optional
         e after the robot's own measurements only, iota of 002, eq. (12). None: that of the team.
     """
 
@@ -64,7 +64,7 @@ class RobotView:
     tail_yaws: FloatArray | None = None
     phase: int = 0
     radius: float = 0.0
-    exploration: Exploration | None = None
+    exploration: UnexploredMap | None = None
 
 
 @dataclass
@@ -81,7 +81,7 @@ class TeamView:
         By name; always processed in the order of names.
     clusters : list of Cluster
         Potential targets now.
-    exploration : Exploration
+    exploration : UnexploredMap
         e after the last measurements.
     found_targets : sequence
         Not used by the objective; for planners that avoid them.
@@ -97,7 +97,7 @@ class TeamView:
     step_time: float
     robots: dict[str, RobotView]
     clusters: list[Cluster]
-    exploration: Exploration
+    exploration: UnexploredMap
     found_targets: Sequence[FoundTarget] = ()
     obstacles: Obstacles | None = None
     particles: FloatArray | None = None

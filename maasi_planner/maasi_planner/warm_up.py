@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
@@ -49,7 +49,7 @@ def warm_up() -> None:
         (3, ('constant_speed', 'quadrotor')),
     )
     for dimension, models in pairs:
-        exploration = Exploration(np.array([[0.0, 2.0]] * dimension), 0.25)
+        exploration = UnexploredMap(np.array([[0.0, 2.0]] * dimension), 0.25)
         clusters = [Cluster(np.full(dimension, 0.6), 0.01 * np.eye(dimension), 0.1, 0.5)]
         noise = np.diag([0.02, 0.05, 0.05][:dimension]) ** 2
         size = [0.2] * dimension

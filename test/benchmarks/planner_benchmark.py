@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.detection import ExponentialDetection
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,
@@ -45,9 +45,9 @@ def median_time(function: Callable[[], object], repeats: int) -> float:
     return float(np.median(times))
 
 
-def half_explored(bounds: np.ndarray, spacing: float, seed: int = 0) -> Exploration:
+def half_explored(bounds: np.ndarray, spacing: float, seed: int = 0) -> UnexploredMap:
     """Return an exploration function in the middle of a search."""
-    exploration = Exploration(bounds, spacing)
+    exploration = UnexploredMap(bounds, spacing)
     exploration.values[...] = np.random.default_rng(seed).uniform(size=exploration.values.shape)
     return exploration
 

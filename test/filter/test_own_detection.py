@@ -10,7 +10,6 @@ import pytest
 from numba import njit
 from pydantic import BaseModel
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.make_filter import filter_from_state, make_filter
 from maasi_filter.models import custom_kernel
 from maasi_filter.models.detection import ExponentialDetection
@@ -20,6 +19,7 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import AgentMeasurement
 from maasi_filter.settings import FilterSettings
 from maasi_filter.state_file import StateFileError
+from maasi_filter.unexplored_map import UnexploredMap
 
 BOUNDS = {2: [[0.0, 10.0], [0.0, 10.0]], 3: [[0.0, 10.0]] * 3}
 
@@ -74,7 +74,7 @@ def test_probabilities_are_those_of_the_same_model_of_the_suite(kind, error, dim
     )
     explored = []
     for model in (own, suite):
-        exploration = Exploration(BOUNDS[dimension])
+        exploration = UnexploredMap(BOUNDS[dimension])
         exploration.update(model, pose)
         explored.append(exploration.values)
     assert explored[0] == pytest.approx(explored[1], abs=error)

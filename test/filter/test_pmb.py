@@ -5,7 +5,7 @@ import pytest
 from exact_pmbm import ExactPmbm
 from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, plane_sensor
 
-from maasi_filter import Exploration, FilterSettings, Pose
+from maasi_filter import FilterSettings, Pose, UnexploredMap
 from maasi_filter.clutter import LEAST_PER_SCAN, measurement_space
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.pmb.births import draw_births
@@ -76,7 +76,7 @@ def test_existence_after_misses_is_that_of_bayes():
 def test_unseen_targets_are_thinned_as_the_exploration_function_says():
     sensor = plane_sensor()
     search = plane_filter()
-    other = Exploration(PLANE, 2.0)
+    other = UnexploredMap(PLANE, 2.0)
     for step, place in enumerate(PLACES):
         search.step([measured(sensor, place, [], step)], 1, step)
         other.update(sensor.detection, Pose(np.array(place)))

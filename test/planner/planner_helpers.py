@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection, GaussianDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,
@@ -65,7 +65,7 @@ class SmallSearch:
     def __init__(self, planner, members, bounds, spacing, step_time, obstacles=None):
         self.planner = planner
         self.members = members
-        self.exploration = Exploration(bounds, spacing)
+        self.exploration = UnexploredMap(bounds, spacing)
         self.step_time = step_time
         self.clusters: list[Cluster] = []
         self.obstacles = obstacles
@@ -205,7 +205,7 @@ def random_team(
     """Return a team of random robots in all situations, with clusters and half-seen places."""
     size = 2.0 if dimension == 2 else 200.0
     bounds = np.array([[0.0, size]] * dimension)
-    exploration = Exploration(bounds, spacing or size / 9.7)
+    exploration = UnexploredMap(bounds, spacing or size / 9.7)
     exploration.values[...] = rng.uniform(size=exploration.values.shape)
     exploration.values[rng.uniform(size=exploration.values.shape) < 0.2] = 0.0
 

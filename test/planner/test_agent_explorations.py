@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.pose import Pose
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
@@ -48,7 +48,7 @@ def make(**planner):
 
 def literal_explorations(measured, names):
     """Return iota of each name (12); all of them together for one list of all names."""
-    grid = Exploration(np.array(BOUNDS), 0.25)
+    grid = UnexploredMap(np.array(BOUNDS), 0.25)
     nodes = grid.nodes()
     values = np.ones(len(nodes))
     for name, place in measured:

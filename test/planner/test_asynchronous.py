@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
     MotionSettings,
     PlannerSettings,
@@ -46,7 +46,7 @@ def robot(x, planning, period, goals=(), tail=None, phase=0):
 
 def explore(robots, settings=PAPER):
     """Return E of each robot's candidates."""
-    exploration = Exploration([[0.0, 10.0], [0.0, 4.0]], 0.5)
+    exploration = UnexploredMap([[0.0, 10.0], [0.0, 4.0]], 0.5)
     team = TeamView(0, 1.0, robots, [], exploration)
     return {
         name: decision.exploration
@@ -120,7 +120,7 @@ def test_joint_decision_of_unequal_lengths():
 
 def test_joint_choice_spreads():
     """Two robots at one place do not both go where the first one alone would."""
-    exploration = Exploration([[0.0, 10.0], [0.0, 4.0]], 0.5)
+    exploration = UnexploredMap([[0.0, 10.0], [0.0, 4.0]], 0.5)
     robots = {
         'a': robot(5.0, True, 1, [3.0, 7.0]),
         'b': robot(5.0, True, 1, [3.0, 7.0]),
@@ -130,7 +130,7 @@ def test_joint_choice_spreads():
 
 
 def test_one_of_two_plans_and_keeps_away_from_the_other_ones_way():
-    exploration = Exploration([[0.0, 10.0], [0.0, 4.0]], 0.5)
+    exploration = UnexploredMap([[0.0, 10.0], [0.0, 4.0]], 0.5)
     robots = {
         'a': robot(5.0, True, 1, [3.0, 7.0]),
         'b': robot(5.0, False, 1, tail=[5.0, 4.5, 4.0, 3.5, 3.0]),

@@ -7,8 +7,8 @@ import pytest
 from plain_objective import all_choices, plain_information_terms, plain_terms
 from planner_helpers import random_team
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.detection import BoxDetection
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import PlannerSettings, RobotState, make_planner
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import free_of_robots, waiting_places
@@ -214,7 +214,7 @@ def test_unexplored_corner_draws_the_robot():
     team = random_team(rng, dimension=2, planning=1, waiting=0, candidates=2, kinds=('box',))
     name = team.planning()[0]
     team.clusters = []
-    team.exploration = Exploration(team.bounds, 0.1)
+    team.exploration = UnexploredMap(team.bounds, 0.1)
     team.exploration.values[...] = 0.0
     team.exploration.values[-3:, -3:] = 1.0
     view = team.robots[name]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from planner_helpers import CUBE, FLOOR, SmallSearch, drone, floor_members, random_team
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,
@@ -133,7 +133,7 @@ def test_finished_when_no_candidate_can_show_more():
     team.clusters = []
     team.exploration.values[...] = 0.0
     # A corner that is out of reach of every candidate.
-    team.exploration = Exploration(team.bounds, 0.1)
+    team.exploration = UnexploredMap(team.bounds, 0.1)
     team.exploration.values[...] = 0.0
     team.exploration.values[-4:, -4:] = 1.0
     view = team.robots[name]

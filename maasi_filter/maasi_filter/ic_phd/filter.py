@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.clutter import least_clutter
 from maasi_filter.dropped import count_dropped, count_unexplained, within_range
-from maasi_filter.exploration import Exploration
 from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
     MeasurementBirths,
@@ -41,6 +40,7 @@ from maasi_filter.state_check import (
 )
 from maasi_filter.state_check import clusters_of as saved_clusters
 from maasi_filter.state_file import write_state
+from maasi_filter.unexplored_map import UnexploredMap
 
 FloatArray = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class IcPhdFilter:
         They sum to the expected number of targets that are not found yet.
     clusters : list of Cluster
         Potential targets, heaviest first.
-    exploration : Exploration
+    exploration : UnexploredMap
         e, updated with every measurement.
     """
 
@@ -80,7 +80,7 @@ class IcPhdFilter:
         self.settings = settings
         self._settings = settings.resolved()
         self._numbers = IcPhdNumbers.of(self._settings)
-        self.exploration = Exploration(bounds, settings.exploration_spacing)
+        self.exploration = UnexploredMap(bounds, settings.exploration_spacing)
         self.bounds = self.exploration.bounds
         self.dimension = self.exploration.dimension
         self.generator = generator

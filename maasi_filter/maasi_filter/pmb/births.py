@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import (
     FIRST,
@@ -20,6 +19,7 @@ from maasi_filter.pmb.factors import (
     TERMS,
     Scan,
 )
+from maasi_filter.unexplored_map import UnexploredMap
 
 FloatArray = NDArray[np.float64]
 
@@ -87,7 +87,7 @@ class Births:
 
 def draw_births(
     scan: Scan,
-    exploration: Exploration,
+    exploration: UnexploredMap,
     expected_targets: float,
     number: int,
     generator: np.random.Generator,

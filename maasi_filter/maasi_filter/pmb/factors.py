@@ -17,7 +17,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import interpolate_at
 from maasi_filter.models.detection import (
     PARAMETERS,
     DetectionModel,
@@ -27,6 +26,7 @@ from maasi_filter.models.detection import (
 from maasi_filter.models.measurement import TWO_PI
 from maasi_filter.models.measurement_set import MeasurementSet
 from maasi_filter.models.pose import Pose
+from maasi_filter.unexplored_map import interpolate_at
 from maasi_filter.vector_math import arctan2, exponential
 
 FloatArray = NDArray[np.float64]

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.clutter import measurement_space
 from maasi_filter.dropped import count_unexplained, within_range
-from maasi_filter.exploration import Exploration
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
@@ -53,6 +52,7 @@ from maasi_filter.state_check import (
     naming,
 )
 from maasi_filter.state_file import write_state
+from maasi_filter.unexplored_map import UnexploredMap
 
 FloatArray = NDArray[np.float64]
 
@@ -87,7 +87,7 @@ class PmbFilter:
         In the order of being found.
     clusters : list of Cluster
         Potential targets that are not found, most probable first, with mass r.
-    exploration : Exploration
+    exploration : UnexploredMap
         e, updated with every measurement.
     """
 
@@ -97,7 +97,7 @@ class PmbFilter:
         self.settings = settings
         self._numbers = settings.resolved()
         self._expected_targets = self._numbers.expected_targets
-        self.exploration = Exploration(bounds, settings.exploration_spacing)
+        self.exploration = UnexploredMap(bounds, settings.exploration_spacing)
         self.bounds = self.exploration.bounds
         self.dimension = self.exploration.dimension
         self.generator = generator

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.pmb.density import Density
+from maasi_filter.unexplored_map import UnexploredMap
 
 
 def diffuse(density: Density, variance: float, generator: np.random.Generator) -> None:
@@ -28,7 +28,7 @@ def diffuse(density: Density, variance: float, generator: np.random.Generator) -
     density.condense()
 
 
-def diffuse_unexplored(exploration: Exploration, variance: float) -> None:
+def diffuse_unexplored(exploration: UnexploredMap, variance: float) -> None:
     """Diffuse e as for targets in a random walk, with reflecting bounds."""
     values = exploration.values
     for axis in range(exploration.dimension):

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.models.pose import Pose
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.experiments.cases import Case, Outcome, Quantity
 from maasi_sim.scenario.loading import scenario_from_content, scenario_from_values
 from maasi_sim.search import SearchResult, search
@@ -153,7 +153,7 @@ def add_explored_share(settings: dict[str, Any], outcome: Outcome) -> Outcome:
     """
     scenario = scenario_from_content(settings['scenario'], 'settings')
     bounds = scenario.environment.array()
-    exploration = Exploration(bounds, float((bounds[:, 1] - bounds[:, 0]).max()) / 26.0)
+    exploration = UnexploredMap(bounds, float((bounds[:, 1] - bounds[:, 0]).max()) / 26.0)
     columns = {name: np.asarray(values, float) for name, values in outcome.columns.items()}
     detections = {
         name: robot.sensor.build(name, scenario.dimension).detection

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Rectangle
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import Exploration
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import END_REASONS, title
 from maasi_sim.run.report_panels import (
     COLOURS,
@@ -82,10 +82,10 @@ def plot_report(record: TargetRecord) -> Figure:
     return figure
 
 
-def _explored(record: TargetRecord) -> Exploration:
+def _explored(record: TargetRecord) -> UnexploredMap:
     """Return what the robots have explored from where they measured."""
     scenario = record.scenario
-    explored = Exploration(scenario.environment.array(), scenario.filter.exploration_spacing)
+    explored = UnexploredMap(scenario.environment.array(), scenario.filter.exploration_spacing)
     for name, poses in record.measured_from.items():
         detection = scenario.robots[name].sensor.build(name, scenario.dimension).detection
         for pose in poses:
@@ -93,7 +93,7 @@ def _explored(record: TargetRecord) -> Exploration:
     return explored
 
 
-def _draw_explored(view: View, explored: Exploration, bounds: FloatArray) -> None:
+def _draw_explored(view: View, explored: UnexploredMap, bounds: FloatArray) -> None:
     """Shade what is unseen: e, in 3D its mean along the line of sight."""
     hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
     values = explored.values.mean(axis=hidden) if hidden else explored.values

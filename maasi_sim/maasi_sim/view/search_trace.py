@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.exploration import Exploration
 from maasi_filter.records import AgentMeasurement, FilterResult, FoundTarget
+from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion.base import RobotState
 from maasi_planner.team import Decision
 from maasi_sim.scenario.schema import Scenario
@@ -79,7 +79,7 @@ class SearchTrace:
         self._add(time, '', dict(states))
 
     def decision(
-        self, time: float, space: str, decision: Decision, exploration: Exploration
+        self, time: float, space: str, decision: Decision, exploration: UnexploredMap
     ) -> None:
         """Add a joint decision."""
         for name in decision.robots:

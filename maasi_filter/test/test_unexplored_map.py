@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from maasi_filter import BoxDetection, Exploration, ExponentialDetection, Pose
+from maasi_filter import BoxDetection, ExponentialDetection, Pose, UnexploredMap
 
 BOUNDS = np.array([[0.0, 100.0], [-20.0, 50.0], [0.0, 30.0]])
 MODEL = ExponentialDetection(0.98, [25.0, 25.0, 25.0])
 
 
 def test_nodes_stand_on_both_bounds():
-    exploration = Exploration(BOUNDS, 12.0)
+    exploration = UnexploredMap(BOUNDS, 12.0)
     for axis, bounds in zip(exploration.axes(), BOUNDS):
         assert axis[0] == bounds[0]
         assert axis[-1] == pytest.approx(bounds[1])
@@ -21,7 +21,7 @@ def test_nodes_stand_on_both_bounds():
 
 
 def test_update_is_equation_20_at_every_node():
-    exploration = Exploration(BOUNDS, 12.0)
+    exploration = UnexploredMap(BOUNDS, 12.0)
     poses = [Pose([10.0, 10.0, 10.0]), Pose([90.0, 0.0, 5.0])]
     expected = np.ones(len(exploration.nodes()))
     for pose in poses:
@@ -31,7 +31,7 @@ def test_update_is_equation_20_at_every_node():
 
 
 def test_a_function_of_the_user_updates_alike():
-    compiled = Exploration(BOUNDS, 12.0)
+    compiled = UnexploredMap(BOUNDS, 12.0)
     pose = Pose([10.0, 10.0, 10.0])
     compiled.update(MODEL, pose)
     missed = 1.0 - MODEL.probability(compiled.nodes(), pose)
@@ -41,7 +41,7 @@ def test_a_function_of_the_user_updates_alike():
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_interpolation_is_multilinear_and_clamped(dimension):
     generator = np.random.default_rng(0)
-    exploration = Exploration(BOUNDS[:dimension], 9.0)
+    exploration = UnexploredMap(BOUNDS[:dimension], 9.0)
     exploration.values[...] = generator.random(exploration.values.shape)
     reference = RegularGridInterpolator(exploration.axes(), exploration.values)
     positions = generator.uniform(-50.0, 150.0, (300, dimension))
@@ -50,7 +50,7 @@ def test_interpolation_is_multilinear_and_clamped(dimension):
 
 
 def test_expected_unseen_goes_down_from_all_targets():
-    exploration = Exploration(BOUNDS, 5.0)
+    exploration = UnexploredMap(BOUNDS, 5.0)
     assert exploration.expected_unseen(12.0) == pytest.approx(12.0)
     assert exploration.explored_fraction() == pytest.approx(0.0)
     pose = Pose([50.0, 10.0, 15.0])
@@ -61,7 +61,7 @@ def test_expected_unseen_goes_down_from_all_targets():
 
 
 def test_expected_new_of_several_measurements_counts_each_place_once():
-    exploration = Exploration(BOUNDS[:2], 5.0)
+    exploration = UnexploredMap(BOUNDS[:2], 5.0)
     box = BoxDetection([-20.0, -20.0], [20.0, 20.0])
     once = exploration.expected_new(box, [[50.0, 15.0, 1.0]], [0.0], 12.0)
     twice = exploration.expected_new(box, [[50.0, 15.0, 1.0]] * 2, [0.0, 0.0], 12.0)
@@ -69,7 +69,7 @@ def test_expected_new_of_several_measurements_counts_each_place_once():
 
 
 def test_a_copy_is_independent():
-    exploration = Exploration(BOUNDS, 12.0)
+    exploration = UnexploredMap(BOUNDS, 12.0)
     other = exploration.copy()
     exploration.update(MODEL, Pose([10.0, 10.0, 10.0]))
     assert (other.values == 1.0).all()
@@ -87,9 +87,9 @@ def test_a_copy_is_independent():
 )
 def test_bad_grids_are_refused(bounds, spacing, word):
     with pytest.raises(ValueError, match=word):
-        Exploration(bounds, spacing)
+        UnexploredMap(bounds, spacing)
 
 
 def test_positions_that_are_not_finite_are_refused():
     with pytest.raises(ValueError, match='finite'):
-        Exploration(BOUNDS, 12.0).at([[0.0, np.nan, 0.0]])
+        UnexploredMap(BOUNDS, 12.0).at([[0.0, np.nan, 0.0]])

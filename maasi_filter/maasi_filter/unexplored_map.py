@@ -167,8 +167,8 @@ def default_spacing(bounds: FloatArray) -> float:
     return float(np.prod(size)) ** (1.0 / len(bounds)) / CELLS[len(bounds)]
 
 
-class Exploration:
-    """Exploration function on a grid.
+class UnexploredMap:
+    """The exploration function e on a grid: 1 is unseen, 0 is explored.
 
     Parameters
     ----------
@@ -336,8 +336,8 @@ class Exploration:
         )
         return float(expected_targets) * total / float(volumes.sum())
 
-    def copy(self) -> Exploration:
+    def copy(self) -> UnexploredMap:
         """Return an independent copy."""
-        other = Exploration(self.bounds, self.spacing)
+        other = UnexploredMap(self.bounds, self.spacing)
         other._values[...] = self._values
         return other
