@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from functools import partial
 from typing import Any
 
@@ -24,7 +25,6 @@ from maasi_msgs.action import SearchTargets
 from maasi_msgs.msg import (
     AgentState,
     BatchMember,
-    DetectionArray,
     FilterUpdate,
     LockstepStep,
     MeasurementBatch,
@@ -37,11 +37,10 @@ from maasi_planner.conversions import (
 )
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.found_keeper import FoundKeeper
-from maasi_planner.node.checks import checked_pose, checked_state, checked_update
+from maasi_planner.node.checks import checked_state, checked_update
 from maasi_planner.node.filter_guard import FilterGuard
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
-from maasi_planner.node.update_queue import UpdateQueue
 from maasi_planner.node.views import PlannerViews
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.search_control.search_action import Progress, SearchAction
@@ -56,6 +55,8 @@ _LOOK_PERIOD = 0.1
 _LAST_TASKS = 5
 # Period of republishing a batch without an update [s].
 _ANSWER_PATIENCE = 1.0
+# Measurements that are remembered, to recognise duplicate updates.
+_MEASUREMENTS_KEPT = 1000
 
 
 class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
@@ -67,8 +68,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     Subscribes
     ----------
-    `<robot>/state` (maasi_msgs/AgentState), `<robot>/detections` (maasi_msgs/DetectionArray),
-    `filter_update` (maasi_msgs/FilterUpdate);
+    `<robot>/state` (maasi_msgs/AgentState), `filter_update` (maasi_msgs/FilterUpdate);
     `<robot>/destination` (geometry_msgs/PointStamped) of robots that plan for themselves
 
     Publishes
@@ -110,7 +110,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._heard: dict[str, HeardState] = {}
         self._gates: dict[str, StampGate] = {}
         self._away: set[str] = set(self.coordinator.names)
-        self._updates = UpdateQueue(None if self.settings.lockstep else self.settings.state_timeout)
+        # Robot and index of the last measurements whose update was processed.
+        self._processed: deque[tuple[str, int]] = deque(maxlen=_MEASUREMENTS_KEPT)
         self._taken_step = -1
         self._expected: LockstepStep | None = None
         self._waiting_batch = 0
@@ -150,12 +151,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 AgentState,
                 self.team_topic(f'{name}/state'),
                 partial(self._on_state, name),
-                RELIABLE,
-            )
-            self.create_subscription(
-                DetectionArray,
-                self.team_topic(f'{name}/detections'),
-                partial(self._on_detections, name),
                 RELIABLE,
             )
         self._others.set_up()
@@ -334,17 +329,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._join_or_leave(name, message.goal_status, message.reason)
             self._try_free_step()
 
-    def _on_detections(self, name: str, message: DetectionArray) -> None:
-        if not self.active:
-            return
-        try:
-            pose = checked_pose(name, message, self.settings)
-        except ValueError as error:
-            self.drop('bad detections', f'{name}/detections.{error}')
-            return
-        self._updates.add_pose(name, int(message.measurement), pose)
-        self._take_updates()
-
     def _on_destination(self) -> None:
         if self.settings.lockstep:
             self._try_step()
@@ -353,7 +337,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if not self.active:
             return
         try:
-            clusters = checked_update(message, self.coordinator.names, self.settings, self._batch)
+            clusters, poses = checked_update(
+                message, self.coordinator.names, self.settings, self._batch
+            )
         except ValueError as error:
             self.drop('bad update', f'filter_update.{error}')
             return
@@ -365,27 +351,19 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 self.coordinator.skip_measurements(member.robot, int(member.measurement) + 1)
             return
         self._guard.watch.answered(int(message.batch_id))
-        self._updates.add(message, clusters, Silence(self))
-        self._take_updates()
-
-    def _take_updates(self) -> None:
-        """Process in order the updates whose detections have arrived as well."""
-        for item in self._updates.take():
-            if item.unknown:
-                self.drop(
-                    'bad update',
-                    f'filter_update.members: read {item.unknown}, allowed are measurements whose '
-                    f'detections come as well: none for {item.silence:.1f} s',
-                )
-                continue
-            self.coordinator.absorb(item.poses, item.clusters)
-            self._used_batch = max(self._used_batch, int(item.message.batch_id))
-            self._found = int(item.message.found)
-            self._expected_number = float(item.message.expected_number)
-            self._measurements += len(item.message.members)
-            if int(item.message.batch_id) == self._waiting_batch:
-                self._waiting_batch = 0
-                self._try_done()
+        measured = [(member.robot, int(member.measurement)) for member in message.members]
+        if measured and all(item in self._processed for item in measured):
+            # Duplicate, from a restarted filter.
+            return
+        self._processed.extend(measured)
+        self.coordinator.absorb(poses, clusters)
+        self._used_batch = max(self._used_batch, int(message.batch_id))
+        self._found = int(message.found)
+        self._expected_number = float(message.expected_number)
+        self._measurements += len(message.members)
+        if int(message.batch_id) == self._waiting_batch:
+            self._waiting_batch = 0
+            self._try_done()
 
     # ---- availability of robots and filter ---------------------------------------------------
 
@@ -413,7 +391,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 silent = self._heard[name].silence.length
                 if silent > self.settings.state_timeout:
                     self._leave(name, f'no {name}/state for {silent:.1f} s')
-            self._take_updates()
             self._watch_filter(now)
             self._try_free_step()
         elif time.monotonic() - self._batch_at > _ANSWER_PATIENCE:

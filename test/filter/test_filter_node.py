@@ -140,6 +140,7 @@ def test_a_target_seen_again_and_again_is_found(world):
     assert target.position.y == pytest.approx(1.0 + 0.3 * math.sin(0.5), abs=0.02)
     assert [update.batch_id for update in team.updates] == list(range(1, 9))
     assert [item.robot for item in team.updates[0].members] == ['a', 'b']
+    assert {item.pose.position.x for item in team.updates[-1].members} == {1.0}
     assert not node.dropped
 
 

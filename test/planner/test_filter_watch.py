@@ -74,9 +74,7 @@ def test_robots_are_held_until_the_filter_answers_again(silent):
 
         def answer():
             last = team.batches[-1]
-            for member in last.members:
-                team.detect(member.robot, member.measurement)
-            team.update(last.id, [], members=list(last.members))
+            team.update(last.id, last.members)
 
         if silent == 'heartbeat':
             beats.publish(beat)

@@ -12,9 +12,7 @@ def test_every_planner_sends_all_robots_and_measures_again_after_their_measureme
         assert {decision.planner for decision in team.decisions} == {name}
         until(lambda: team.batches)
         batch = team.batches[-1]
-        for member in batch.members:
-            team.detect(member.robot, member.measurement)
-        team.update(batch.id, [], members=list(batch.members))
+        team.update(batch.id, batch.members)
         for step in (20, 30):
             for robot in ROBOTS:
                 team.state(robot, step)

@@ -69,7 +69,7 @@ class MeasurementResponder:
         driver.create_subscription(
             MeasurementBatch, driver.team_topic('measurement_batch'), self._on_batch, RELIABLE
         )
-        driver.expect_subscribers(self._publisher, names={'filter_node', 'planner_node'})
+        driver.expect_subscribers(self._publisher, names={'filter_node'})
 
     @property
     def open_batches(self) -> int:

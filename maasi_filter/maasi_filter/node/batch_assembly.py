@@ -254,6 +254,8 @@ class BatchAssembly:
             pending.failed.add(message.robot)
         else:
             pending.measurements[message.robot] = measurement
+            member = next(item for item in pending.members if item.robot == message.robot)
+            member.pose = message.pose.pose
 
     def _late(self, name: str, message: DetectionArray) -> PendingBatch | None:
         """Return a late measurement, or one that was not asked for, as a batch of its own."""
@@ -268,6 +270,6 @@ class BatchAssembly:
             int(message.batch_id),
             int(message.step),
             stamp_from_ros(message.header.stamp),
-            [BatchMember(robot=name, measurement=message.measurement)],
+            [BatchMember(robot=name, measurement=message.measurement, pose=message.pose.pose)],
             {name: measurement},
         )

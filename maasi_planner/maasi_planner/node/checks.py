@@ -13,16 +13,11 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
 from maasi_filter.ros.conversions import cluster_from_ros, pose_from_ros
 from maasi_filter.ros.stamps import LAST_STAMP, batch_id_limit
-from maasi_msgs.msg import AgentState, DetectionArray, FilterUpdate
+from maasi_msgs.msg import AgentState, FilterUpdate
 from maasi_planner.conversions import robot_state_from_ros
 from maasi_planner.motion import RobotState
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planners.base import check_clusters
-
-
-def _check_robot(robot: str, name: str) -> None:
-    if robot != name:
-        raise ValueError(f'robot: read {robot!r}, allowed is {name!r}')
 
 
 def _check_frame(header: Header, frame: str) -> None:
@@ -32,7 +27,8 @@ def _check_frame(header: Header, frame: str) -> None:
 
 def checked_state(name: str, message: AgentState, settings: PlannerNodeSettings) -> RobotState:
     """Return the state in a message that came on the topic of a robot."""
-    _check_robot(message.robot, name)
+    if message.robot != name:
+        raise ValueError(f'robot: read {message.robot!r}, allowed is {name!r}')
     _check_frame(message.header, settings.frame)
     state = robot_state_from_ros(message)
     if message.step * settings.step >= LAST_STAMP:
@@ -40,20 +36,12 @@ def checked_state(name: str, message: AgentState, settings: PlannerNodeSettings)
     return state
 
 
-def checked_pose(name: str, message: DetectionArray, settings: PlannerNodeSettings) -> Pose:
-    """Return the pose in a message that came on the topic of a robot's detections."""
-    _check_robot(message.robot, name)
-    _check_frame(message.header, settings.frame)
-    try:
-        return pose_from_ros(message.pose.pose)
-    except ValueError as error:
-        raise ValueError(f'pose.{error}') from None
-
-
 def checked_update(
     message: FilterUpdate, names: Collection[str], settings: PlannerNodeSettings, batch: int
-) -> list[Cluster]:
-    """Return the clusters of an update about these robots, when `batch` was the last batch.
+) -> tuple[list[Cluster], dict[str, Pose]]:
+    """Return the clusters of an update and the poses of its members, by name.
+
+    Members may be robots of `names`; `batch` is the id of the last batch.
 
     Ids and indices so large that the planner could not continue from them are refused.
     """
@@ -68,10 +56,15 @@ def checked_update(
     if message.batch_id > limit:
         raise ValueError(f'batch_id: read {message.batch_id}, allowed is up to {limit}')
     limit = batch_id_limit(0)
+    poses = {}
     for member in message.members:
         if member.measurement > limit:
             raise ValueError(
                 f'members: {member.robot}: measurement: read {member.measurement}, allowed is '
                 f'up to {limit}'
             )
-    return clusters
+        try:
+            poses[member.robot] = pose_from_ros(member.pose)
+        except ValueError as error:
+            raise ValueError(f'members: {member.robot}: pose.{error}') from None
+    return clusters, poses
