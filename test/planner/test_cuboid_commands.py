@@ -2,6 +2,7 @@
 
 import time
 
+import pytest
 import rclpy
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
@@ -15,7 +16,7 @@ from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import RELIABLE
-from maasi_msgs.msg import AgentState, SearchLink, SearchLinkArray
+from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
 from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
 from maasi_planner.buildings.node_settings import CuboidPlannerSettings
 from maasi_sim.run.processes import Domain
@@ -47,11 +48,12 @@ class Flight:
         self.own = executor_of(self.planner, context)
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
-        self.commands, self.states, self.links = [], [], []
+        self.commands, self.states, self.links, self.decisions = [], [], [], []
         node = self.node
         node.create_subscription(TwistStamped, 'rover/cmd_vel', self.commands.append, RELIABLE)
         node.create_subscription(AgentState, 'rover/state', self.states.append, RELIABLE)
         node.create_subscription(SearchLink, 'rover/link/tx', self.links.append, RELIABLE)
+        node.create_subscription(CuboidDecision, 'rover/decision', self.decisions.append, RELIABLE)
         self.odometry = node.create_publisher(Odometry, 'rover/odom', RELIABLE)
         self.heard = node.create_publisher(SearchLinkArray, 'rover/link/rx', RELIABLE)
         self.step, self.place = 0, [0.0, 0.0, 0.0]
@@ -62,6 +64,7 @@ class Flight:
                 and self.node.count_publishers('rover/cmd_vel') == 1
                 and self.node.count_publishers('rover/state') == 1
                 and self.node.count_publishers('rover/link/tx') == 1
+                and self.node.count_publishers('rover/decision') == 1
             )
         )
 
@@ -72,21 +75,25 @@ class Flight:
             self.own.spin_once(0.005)
             self.executor.spin_once(timeout_sec=0.005)
 
+    def move(self):
+        """Do a step with the last command, until the robot has told its state to the others."""
+        self.step += 1
+        message = Odometry()
+        message.header.stamp = stamp_to_ros(self.step * 1_000_000_000)
+        velocity = self.command
+        self.place = [place + speed for place, speed in zip(self.place, velocity, strict=True)]
+        point, twist = message.pose.pose.position, message.twist.twist.linear
+        point.x, point.y, point.z = self.place
+        twist.x, twist.y, twist.z = velocity
+        message.pose.pose.orientation.w = 1.0
+        self.odometry.publish(message)
+        self.until(lambda: self.links and self.links[-1].step == self.step)
+
     def fly(self, steps):
-        """Do steps with the last command; return the commands that came in them."""
+        """Do steps, also hearing that nobody is in range; return the commands that came in them."""
         given = []
         for _ in range(steps):
-            self.step += 1
-            message = Odometry()
-            message.header.stamp = stamp_to_ros(self.step * 1_000_000_000)
-            velocity = self.command
-            self.place = [place + speed for place, speed in zip(self.place, velocity, strict=True)]
-            point, twist = message.pose.pose.position, message.twist.twist.linear
-            point.x, point.y, point.z = self.place
-            twist.x, twist.y, twist.z = velocity
-            message.pose.pose.orientation.w = 1.0
-            self.odometry.publish(message)
-            self.until(lambda: self.links and self.links[-1].step == self.step)
+            self.move()
             self.heard.publish(SearchLinkArray(step=self.step))
             self.until(lambda: self.states and self.states[-1].step == self.step)
             self.until(lambda: self.commands[-1].header.stamp.sec == self.step)
@@ -109,38 +116,58 @@ class Flight:
         return future.result()
 
 
-def test_a_robot_among_buildings_moves_only_while_it_searches():
-    still = [0.0, 0.0, 0.0]
+@pytest.fixture
+def flight():
     with Domain(None) as domain:
         context = Context()
         rclpy.init(context=context, domain_id=domain.number)
         flight = Flight(context)
-        try:
-            assert flight.fly(3) == [still] * 3
-            assert flight.states[-1].goal_status == AgentState.IDLE
-            assert flight.states[-1].reason == 'waiting for start'
-            assert not flight.call('pause').success
-            home = flight.call('home')
-            assert not home.success and 'no home' in home.message
-            assert flight.call('start').success
-            assert any(command != still for command in flight.fly(3))
-            assert flight.states[-1].goal_status == AgentState.MOVING
-            known = len(flight.commands)
-            assert flight.call('pause').success
-            # At once, not with the next step.
-            flight.until(lambda: len(flight.commands) > known)
-            assert flight.command == still
-            assert flight.fly(2) == [still] * 2
-            assert flight.states[-1].reason == 'paused'
-            assert flight.call('resume').success
-            assert any(command != still for command in flight.fly(3))
-            assert flight.call('stop').success
-            flight.until(lambda: flight.command == still)
-            assert flight.fly(2) == [still] * 2
-            assert not flight.call('resume').success
-        finally:
-            flight.own.shutdown()
-            flight.executor.shutdown()
-            flight.planner.destroy_node()
-            flight.node.destroy_node()
-            rclpy.shutdown(context=context)
+        yield flight
+        flight.own.shutdown()
+        flight.executor.shutdown()
+        flight.planner.destroy_node()
+        flight.node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_a_robot_among_buildings_moves_only_while_it_searches(flight):
+    still = [0.0, 0.0, 0.0]
+    assert flight.fly(3) == [still] * 3
+    assert flight.states[-1].goal_status == AgentState.IDLE
+    assert flight.states[-1].reason == 'waiting for start'
+    assert not flight.call('pause').success
+    home = flight.call('home')
+    assert not home.success and 'no home' in home.message
+    assert flight.call('start').success
+    assert any(command != still for command in flight.fly(3))
+    assert flight.states[-1].goal_status == AgentState.MOVING
+    known = len(flight.commands)
+    assert flight.call('pause').success
+    # At once, not with the next step.
+    flight.until(lambda: len(flight.commands) > known)
+    assert flight.command == still
+    assert flight.fly(2) == [still] * 2
+    assert flight.states[-1].reason == 'paused'
+    assert flight.call('resume').success
+    assert any(command != still for command in flight.fly(3))
+    assert flight.call('stop').success
+    flight.until(lambda: flight.command == still)
+    assert flight.fly(2) == [still] * 2
+    assert not flight.call('resume').success
+
+
+def test_a_snapshot_of_a_step_without_decision_is_in_the_next_decision(flight):
+    assert flight.call('start').success
+    flight.fly(1)
+    centre = flight.planner.agent.mission.centres[0]
+    flight.place = list(centre - SETTINGS.start - flight.command)  # odom begins at the start
+    flight.move()
+    assert flight.links[-1].visited[0]
+    assert flight.decisions[-1].step < flight.step
+    flight.fly(1)
+    flight.until(lambda: flight.decisions[-1].step == flight.step)
+    assert 0 in [shot.cuboid for shot in flight.decisions[-1].snapshots]
+    assert [shot.cuboid for decision in flight.decisions[:-1] for shot in decision.snapshots] == []
+    flight.fly(1)
+    flight.until(lambda: flight.decisions[-1].step == flight.step)
+    assert 0 not in [shot.cuboid for shot in flight.decisions[-1].snapshots]

@@ -119,6 +119,8 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._command: TwistStamped | None = None
         self._told_at = 0.0
         self._solve_time = 0.0
+        # Snapshots of the agent that were published. A step may pass without a decision.
+        self._published_shots = 0
 
     # ---- life cycle --------------------------------------------------------------------------
 
@@ -309,7 +311,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
     def _tell(self, step: int) -> None:
         assert self._state is not None
         _, pose, velocity = self._state
-        self._shots = len(self.agent.snapshots)
         self._observed = self._searching
         broadcast = self.agent.observe(step, pose.position, velocity) if self._observed else None
         if broadcast is None:
@@ -361,10 +362,11 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._command.header.frame_id = f'{self.name}/base_link'
         self._command.twist.linear = vector_to_ros(turned)
         names = [message.robot for message in heard]
-        shots = agent.snapshots[self._shots :]
+        shots = agent.snapshots[self._published_shots :]
         self._decision_publisher.publish(
             choice_to_ros(agent, choice, shots, names, self._solve_time, header)
         )
+        self._published_shots = len(agent.snapshots)
         self._publish_state(step, header)
         self._path_publisher.publish(path_to_ros(choice.plan.positions, header))
         self._markers_publisher.publish(self._board.replace(agent_markers(agent, choice, header)))
