@@ -147,14 +147,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         lockstep = self.settings.lockstep
         self.simulation.warm_up()
         qos = sensor_writer(lockstep)
-        self._clock_publisher: Publisher | None = None
-        if self._follows:
-            self.create_subscription(Clock, '/clock', self._on_clock, sensor_reader(False))
-        else:
-            self._clock_publisher = self.create_publisher(Clock, '/clock', qos)
-            self._entities.append(self._clock_publisher)
-        self._step_publisher = self.create_publisher(LockstepStep, 'lockstep/step', qos)
-        self._entities.append(self._step_publisher)
         self._robots = {
             name: RobotTopics(self, self.simulation, name, qos) for name in self.simulation.robots
         }
@@ -164,7 +156,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             name: self.team_topic(f'{name}/{self.robot_node}') for name in self._robots
         }
         self._robot_of = {node: name for name, node in self._driver_of.items()}
-        step_topics = [self._step_publisher.topic_name] if lockstep else []
+        step_topics = [self.resolve_topic_name('lockstep/step')] if lockstep else []
         self._expected = {
             self._driver_of[name]: [
                 *step_topics,
@@ -199,6 +191,15 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
                 )
             )
         self._entities += self.connect()
+        # After all other publishers, which the recorder then knows: it waits for these.
+        self._clock_publisher: Publisher | None = None
+        if self._follows:
+            self.create_subscription(Clock, '/clock', self._on_clock, sensor_reader(False))
+        else:
+            self._clock_publisher = self.create_publisher(Clock, '/clock', qos)
+            self._entities.append(self._clock_publisher)
+        self._step_publisher = self.create_publisher(LockstepStep, 'lockstep/step', qos)
+        self._entities.append(self._step_publisher)
         if lockstep:
             self._entities.append(
                 self.create_subscription(LockstepDone, 'lockstep/done', self._on_done, RELIABLE)

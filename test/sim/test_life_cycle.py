@@ -86,6 +86,10 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     until(lambda: is_known(node))
     configured = made_by(node), in_graph(node)
     assert configured[0]['publishers'] > unconfigured[0]['publishers']
+    # The recorder looks for topics after it has heard the last publisher of each node.
+    *_, step, ready = [item.topic_name for item in node.publishers]
+    assert ready.endswith('lockstep/ready')
+    assert step.endswith('lockstep/step') or 'sim' not in kind
     for _ in range(CYCLES):
         for step in ('activate', 'deactivate', 'cleanup', 'configure'):
             assert getattr(node, f'trigger_{step}')().name == 'SUCCESS', (step, node.problem)

@@ -182,9 +182,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.step = -1
         self._prepared = True
         self.prepare()
-        self._ready_publisher = self.create_publisher(
-            LockstepDone, self.team_topic('lockstep/ready'), LATCHED
-        )
         if self.settings.lockstep and self._lockstep_member:
             self._done_publisher = self.create_publisher(
                 LockstepDone, self.team_topic('lockstep/done'), RELIABLE
@@ -194,6 +191,10 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
                 LockstepStep, self.team_topic('lockstep/step'), self._hear_step, RELIABLE
             )
         self.set_up()
+        # Last: publishers are discovered in this order, so who hears it knows all others.
+        self._ready_publisher = self.create_publisher(
+            LockstepDone, self.team_topic('lockstep/ready'), LATCHED
+        )
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start operation."""

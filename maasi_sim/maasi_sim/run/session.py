@@ -191,10 +191,11 @@ class Session:
             ending = self._check()
             if ending is not None:
                 return ending
+            # Before the look for topics: those of a node that has reported are known.
+            ready = set(recorder.take_ready())
             recorder.discover()
             # What the nodes send while they start is recorded as it comes.
             recorder.drain()
-            ready = recorder.take_ready()
             self._arming.call(ready)
             late = [name for name in expected if name not in ready]
             missing = recorder.missing(needed)
