@@ -186,6 +186,26 @@ def test_scenes_are_the_same_from_a_scenario_and_from_what_a_recording_says_of_i
     assert len(scene['cuboids']) == 32 and len(scene['objects']) == 2
 
 
+def test_the_scene_has_the_geofences_that_drivers_keep_to():
+    changes = {
+        'given': (('robots', 'mambo', 'mambo', 'geofence'), [[0.0, 2.0], [0.0, 2.0], [0.5, 1.5]]),
+    }
+    scene = scene_of('wifi', load_mission('mambo_turtlebot_wifi', changes).scenario)
+    assert scene['robots']['mambo']['fence'] == [[0.0, 2.0], [0.0, 2.0], [0.5, 1.5]]
+    assert 'fence' not in scene['robots']['turtlebot']
+    changes = {
+        'link': (('robots', 'drone', 'link'), 'mavlink'),
+        'arm': (('robots', 'drone', 'mavlink', 'arm'), True),
+    }
+    scenario = load_mission('drone_rov', changes).scenario
+    drone = scenario.robots['drone']
+    x, y, z = scene_of('sea', scenario)['robots']['drone']['fence']
+    reach = [-drone.radius, drone.radius]
+    for side, bounds in zip((x, y), scenario.environment.array()):
+        assert side == pytest.approx([bound + more for bound, more in zip(bounds, reach)])
+    assert z[0] <= drone.start[2] < z[1]
+
+
 @pytest.fixture(scope='module')
 def result():
     scenario = load_mission('ranging_drone_3d').scenario

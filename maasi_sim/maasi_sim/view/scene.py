@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from maasi_drivers.agent.geofence import make_fence, make_vehicle_fence
+from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_filter.settings import DETECTIONS
 from maasi_sim.buildings.scenario import NAME as BUILDINGS
 from maasi_sim.buildings.scenario import CuboidScenario
@@ -92,6 +95,7 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
     else:
         view['size'] = list(detection.size)[: scenario.dimension]
     deviations = [float(value) for value in robot.sensor.noise.deviations(scenario.dimension)]
+    fence = _fence(robot, scenario)
     return {
         'type': robot.type,
         'description': robot.description,
@@ -99,7 +103,19 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
         'clearance': robot.motion.clearance,
         'view': view,
         'deviations': [*deviations, 0.0][:3],
+        **({} if fence is None else {'fence': rounded(fence)}),
     }
+
+
+def _fence(robot: RobotSettings, scenario: Scenario) -> NDArray[np.float64] | None:
+    """Return the geofence (3, 2) of a robot as its driver makes it [m]; None: it has none."""
+    if robot.link == 'topics':
+        return None
+    flies = robot.link == 'mambo_wifi'
+    settings = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
+    make = make_fence if flies else make_vehicle_fence
+    bounds = scenario.environment.array()
+    return make(settings.geofence, bounds, robot.radius, settings.ground, robot.start[2])
 
 
 def _buildings(scenario: CuboidScenario) -> Scene:

@@ -44,6 +44,7 @@ export class MapView {
     this.drawGround(log);
     if (this.layers.unseen) this.drawUnseen(log, time);
     this.drawObstacles(log);
+    this.drawFences(log);
     if (log.isOfBuildings || log.scene.objects) drawBuildings(this, log, time);
     if (this.layers.ways) this.drawWays(log, time);
     if (this.layers.clusters) this.drawClusters(log, time);
@@ -194,6 +195,31 @@ export class MapView {
       }
       context.globalAlpha = 1;
     }
+  }
+
+  // Geofences that robots keep to, in their colours.
+  drawFences(log) {
+    const { context, camera } = this;
+    context.setLineDash([8, 3, 2, 3]);
+    context.globalAlpha = 0.7;
+    for (const name of this.names) {
+      const { fence } = log.scene.robots[name] || {};
+      if (!fence) continue;
+      context.strokeStyle = robotColour(this.names, name);
+      const [[left, right], [low, high], heights] = fence;
+      const corners = [[left, low], [right, low], [right, high], [left, high]];
+      for (const z of camera.spatial ? heights : [this.floor]) {
+        path(context, camera, corners.map(([x, y]) => [x, y, z]), true);
+        context.stroke();
+      }
+      if (!camera.spatial) continue;
+      for (const [x, y] of corners) {
+        path(context, camera, heights.map((z) => [x, y, z]));
+        context.stroke();
+      }
+    }
+    context.setLineDash([]);
+    context.globalAlpha = 1;
   }
 
   drawWays(log, time) {

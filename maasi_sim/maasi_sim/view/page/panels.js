@@ -114,5 +114,6 @@ export function showLegend(parent, log) {
     }),
   );
   if (!log.isOfBuildings) parent.append(element('span', '', '✕ true target'), element('span', '', '□ waypoint'));
+  if (Object.values(log.scene.robots).some((robot) => robot.fence)) parent.append(element('span', '', '-·- geofence'));
   if (log.scene.thinned) parent.append(element('span', '', `thinned: one state per ${log.scene.thinned} s`));
 }
