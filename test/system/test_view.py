@@ -228,6 +228,17 @@ def test_a_page_is_made_of_a_bag(run, tmp_path, capsys):
     assert (tmp_path / 'page.html').read_text() == (run.folder / REPLAY).read_text()
 
 
+def test_without_a_name_the_newest_run_is_shown(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match='2'):
+        main(['--no-open'])
+    assert 'there is no run in runs' in capsys.readouterr().err
+    (tmp_path / 'runs').mkdir()
+    (tmp_path / 'runs' / 'mine').symlink_to(run.folder)
+    assert main(['--no-open', '--out', 'page.html']) == 0
+    assert (tmp_path / 'page.html').stat().st_size > 10_000
+
+
 def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
     types = load_types()
     writer = BagWriter(tmp_path / 'bag', types)

@@ -23,7 +23,11 @@ def build_parser() -> argparse.ArgumentParser:
         epilog='Exit codes: 0 done, 2 no recording of a search, 4 it could not be written.',
     )
     parser.add_argument(
-        'recording', type=Path, metavar='BAG_OR_RUN', help='recording, or folder of a run'
+        'recording',
+        type=Path,
+        nargs='?',
+        metavar='BAG_OR_RUN',
+        help='recording, or folder of a run (default: the newest in runs)',
     )
     parser.add_argument(
         '--out', type=Path, metavar='FILE', help=f'page (default: {REPLAY} beside the recording)'
@@ -46,8 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--video: read '{options.video}', allowed are FILE.mp4 and FILE.gif")
     if not 0.0 < options.speed < 1e4:
         parser.error(f"--speed: read '{options.speed:g}', allowed are numbers above 0, below 1e4")
+    recording = options.recording or _newest()
+    if recording is None:
+        parser.error('there is no run in runs: name a recording')
     try:
-        log = read_events(options.recording)
+        log = read_events(recording)
         if options.video is not None:
             # Deferred: Matplotlib takes long to import.
             from maasi_sim.view.video import write_video
@@ -55,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
             write_video(log, options.video, options.speed)
             print(options.video)
             return DONE
-        file = options.out or _beside(options.recording)
+        file = options.out or _beside(recording)
         write_replay(log, file)
     except BagError as error:
         print(f'error: {error}', file=sys.stderr)
@@ -67,6 +74,13 @@ def main(arguments: list[str] | None = None) -> int:
     if not options.no_open:
         open_browser(file.resolve().as_uri())
     return DONE
+
+
+def _newest() -> Path | None:
+    """Return the folder of the newest recorded run in the current folder."""
+    bags = Path('runs').glob('*/bag/metadata.yaml')
+    newest = max(bags, key=lambda item: item.stat().st_mtime, default=None)
+    return None if newest is None else newest.parents[1]
 
 
 def _beside(recording: Path) -> Path:
