@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.records import FoundTarget
+from maasi_filter.vector_math import squared_distance
 
 FloatArray = NDArray[np.float64]
 
@@ -18,8 +19,7 @@ SAME_TARGET = 16.0
 
 def distance(position: FloatArray, covariance: FloatArray, target: FoundTarget) -> float:
     """Return the squared normalised distance between an estimate and a found target."""
-    offset = position - target.position
-    return float(offset @ np.linalg.solve(covariance + target.covariance, offset))
+    return float(squared_distance(position - target.position, covariance + target.covariance))
 
 
 class FoundTargets:

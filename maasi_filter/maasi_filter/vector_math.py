@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
@@ -170,3 +171,26 @@ def exponential(x: float) -> float:
     value = value * r + 1.0
     scaled = value * _float_of((_bits_of(shifted) + 1023) << 52)
     return scaled if x >= LEAST_EXPONENT else 0.0
+
+
+@njit(cache=True, error_model='numpy')
+def squared_distance(offset, covariance):  # type: ignore[no-untyped-def]
+    """Return the squared normalised distance x' C^-1 x, by the Cholesky factor of C (d, d)."""
+    d = len(offset)
+    root = np.zeros((d, d))
+    scaled = np.empty(d)
+    total = 0.0
+    for i in range(d):
+        rest = offset[i]
+        for j in range(i + 1):
+            value = covariance[i, j]
+            for k in range(j):
+                value -= root[i, k] * root[j, k]
+            if i == j:
+                root[i, i] = math.sqrt(max(value, 1e-300))
+            else:
+                root[i, j] = value / root[j, j]
+                rest -= root[i, j] * scaled[j]
+        scaled[i] = rest / root[i, i]
+        total += scaled[i] * scaled[i]
+    return total

@@ -6,7 +6,7 @@ from searches import CUBE, cube_sensor
 
 from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose
 from maasi_filter.measurement_check import check_measurements
-from maasi_filter.pmb.noise_scale import MOST_FACTOR, NoiseScale, squared_innovation
+from maasi_filter.pmb.noise_scale import MOST_FACTOR, NoiseScale, innovations
 
 TARGET = np.array([[130.0, 130.0, 130.0]])
 POSE = Pose([112.0, 120.0, 125.0])
@@ -27,7 +27,7 @@ def drawn(generator, factor, number):
 @pytest.mark.parametrize('factor', [0.5, 1.0, 2.25])
 def test_the_innovation_of_a_target_known_exactly_tells_the_factor(factor):
     member = checked(drawn(np.random.default_rng(0), factor, 4000))
-    squares = [squared_innovation(member, j, TARGET[0], np.zeros((3, 3))) for j in range(4000)]
+    squares = innovations(member, TARGET, np.zeros((1, 3, 3))).squares / 3.0
     assert np.mean(squares) == pytest.approx(factor, rel=0.05)
 
 
@@ -40,7 +40,7 @@ def test_errors_of_the_position_that_are_told_are_no_noise():
         noise = generator.multivariate_normal(np.zeros(3), sensor.covariance)
         values = sensor.measurement.measure(TARGET, true) + noise
         member = checked(values, position_covariance=np.eye(3))
-        squares.append(squared_innovation(member, 0, TARGET[0], np.zeros((3, 3))))
+        squares.append(innovations(member, TARGET, np.zeros((1, 3, 3))).squares[0, 0] / 3.0)
     assert np.mean(squares) == pytest.approx(1.0, rel=0.1)
 
 

@@ -17,8 +17,8 @@ from maasi_filter.pmb.factors import (
     MOST_PROBABLE,
     SCALE,
     TERMS,
-    Scan,
 )
+from maasi_filter.pmb.scan import Scan
 from maasi_filter.unexplored_map import UnexploredMap
 
 FloatArray = NDArray[np.float64]
@@ -29,16 +29,15 @@ LEAST_SUPPORT = 10.0
 
 @njit(cache=True, error_model='numpy')
 def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    values, cartesian, centres, roots, volume, sensor_position, particles, jacobian
+    origins, cartesian, roots, volume, sensor_position, particles, jacobian
 ):
     """Turn standard normal numbers (m, n, d) into positions, and fill |dx/dz| at each (m, n)."""
-    d = values.shape[1]
+    d = origins.shape[1]
     z = np.zeros(3)
     for m in range(particles.shape[0]):
-        origin = centres[m] if cartesian[m] else values[m]
         for i in range(particles.shape[1]):
             for a in range(d):
-                z[a] = origin[a]
+                z[a] = origins[m, a]
                 for b in range(a + 1):
                     z[a] += roots[m, a, b] * particles[m, i, b]
             if cartesian[m]:
@@ -101,16 +100,14 @@ def draw_births(
     number : int
         Draws for each detection.
     """
-    measurements = scan.measurements
-    count, d = measurements.values.shape
+    count, d = scan.origins.shape
     particles = generator.standard_normal((count, number, d))
     volume = np.empty((count, number))
     _draw(
-        measurements.values,
-        measurements.cartesian,
-        measurements.centres,
-        measurements.roots,
-        measurements.volume,
+        scan.origins,
+        scan.cartesian,
+        scan.roots,
+        scan.volume,
         scan.pose.position,
         particles,
         volume,

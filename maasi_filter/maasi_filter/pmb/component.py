@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb.births import LEAST_SUPPORT, Births
 from maasi_filter.pmb.density import Density
-from maasi_filter.pmb.factors import (
-    LEAST_FACTOR,
-    MISS,
-    SCALE,
-    Scan,
-    likelihoods,
-)
+from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
+from maasi_filter.pmb.scan import Scan
 from maasi_filter.records import FoundTarget
+from maasi_filter.vector_math import squared_distance
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -88,6 +84,8 @@ class Component:
         The reported target, if it is found.
     labels : LabelTally
         Its class and identity.
+    stale : bool
+        Whether `density` has changed since `target` was estimated.
     """
 
     existence: float
@@ -99,6 +97,7 @@ class Component:
     robot: str = ''
     target: FoundTarget | None = None
     labels: LabelTally = field(default_factory=LabelTally)
+    stale: bool = False
 
     @property
     def foreign(self) -> bool:
@@ -110,12 +109,12 @@ class Component:
         one, two = self.labels.identity, other.labels.identity
         return bool(one and two and one != two)
 
-    def view(self, scan: Scan, births: Births) -> View:
-        """Return the likelihoods of this component in a scan."""
+    def view(self, scan: Scan, gated: IntArray, births: Births) -> View:
+        """Return the likelihoods of this component in a scan, of the detections in its gate."""
         density = self.density
-        gated = self._gated(scan)
         probability = np.empty(len(density.weights))
         seen = np.empty((len(gated), len(probability)))
+        sums = np.empty((2, len(gated)))
         detected = likelihoods(
             scan.head,
             scan.terms[gated],
@@ -123,10 +122,13 @@ class Component:
             density.weights,
             probability,
             seen,
+            sums,
         )
-        view = View(probability, detected, gated, seen, seen @ density.weights)
+        view = View(probability, detected, gated, seen, sums[0])
         for k in range(len(gated)):
-            self._support(view, k, births)
+            total, squares = sums[:, k]
+            if not (total > 0.0 and total * total >= LEAST_SUPPORT * squares):
+                self._support(view, k, births)
         return view
 
     def odds(self, view: View) -> FloatArray:
@@ -149,49 +151,40 @@ class Component:
         r, detected = self.existence, view.detected
         nothing = missed * r * (1.0 - detected) / (1.0 - r * detected)
         own = caused[view.gated]
-        self.existence = min(nothing + float(own.sum()), 1.0)
+        detections = float(own.sum())
+        self.existence = min(nothing + detections, 1.0)
         if self.foreign or not self.existence > 0.0:
             return False
-        self.hits += float(own.sum()) / self.existence
+        self.hits += detections / self.existence
         share = own / self.existence
-        taken = np.flatnonzero(share > LEAST_SHARE)
+        taken = (share > LEAST_SHARE).nonzero()[0]
         head = scan.head.copy()
         head[MISS] = nothing / ((1.0 - detected) * self.existence)
         scale = share[taken] / view.likelihood[taken]
         terms = scan.terms[view.gated[taken]]
         terms[:, SCALE] += np.log(scale)
-        factor = head[MISS] * (1.0 - view.probability) + scale @ view.seen[taken]
-        logs = np.log(np.maximum(factor, LEAST_FACTOR))
+        logs = np.empty(len(view.probability))
+        spread = log_factor(head[MISS], view.probability, scale, view.seen[taken], logs)
         drawn = [k for k in taken.tolist() if k in view.drawn and share[k] > 0.05]
         if drawn:
-            self._restart(head, terms, factor, view, drawn, share, births, generator)
-        elif len(taken) or np.ptp(logs) > LEAST_CHANGE:
+            self._restart(head, terms, view, drawn, share, births, generator)
+        elif len(taken) or spread > LEAST_CHANGE:
             self.density.absorb(head, terms, logs, generator)
         else:
             return False
         most = MOST_FACTORS if self.target is None else MOST_FACTORS_FOUND
         if len(self.density.heads) > most:
             self.density.condense()
+        self.stale = True
         return True
 
-    def _gated(self, scan: Scan) -> IntArray:
-        measurements = scan.measurements
-        mean = self.density.mean
-        offset = mean - scan.pose.position[: len(mean)]
-        reach = GATE * (np.sqrt(measurements.covariances[:, 0, 0]) + self.density.radius)
-        near = np.abs(measurements.values[:, 0] - math.sqrt(float(offset @ offset))) < reach
-        return np.flatnonzero(near)
-
     def _support(self, view: View, k: int, births: Births) -> None:
-        """Estimate a likelihood from draws of the detection if particles are too sparse."""
-        shares = view.seen[k] * self.density.weights
-        total = view.likelihood[k]
-        if total > 0.0 and total * total >= LEAST_SUPPORT * float(shares @ shares):
-            return
+        """Estimate a likelihood from draws of the detection, as particles are too sparse."""
         j = view.gated[k]
         offset = births.means[j] - self.density.mean
-        covariance = self.density.covariance + births.covariances[j]
-        if float(offset @ np.linalg.solve(covariance, offset)) > SUPPORT_DISTANCE:
+        if squared_distance(offset, self.density.covariance + births.covariances[j]) > (
+            SUPPORT_DISTANCE
+        ):
             return
         logs = self.density.log_at(births.particles[j, :SUPPORT_DRAWS])
         drawn = np.exp(np.minimum(logs, 600.0)) * births.volume[j, :SUPPORT_DRAWS]
@@ -204,7 +197,6 @@ class Component:
         self,
         head: FloatArray,
         terms: FloatArray,
-        factor: FloatArray,
         view: View,
         drawn: list[int],
         share: FloatArray,
@@ -213,14 +205,26 @@ class Component:
     ) -> None:
         """Draw the posterior from particles and, for some detections, from draws of these."""
         density = self.density
-        for k in drawn:
-            factor = factor - share[k] / view.likelihood[k] * view.seen[k]
-        particles = [density.particles]
-        weights = [density.weights * np.maximum(factor, 0.0)]
+        others = [k for k in np.flatnonzero(share > LEAST_SHARE).tolist() if k not in drawn]
+        factor = head[MISS] * (1.0 - view.probability)
+        factor += (share[others] / view.likelihood[others]) @ view.seen[others]
+        particles, weights = [density.particles], [density.weights * factor]
         for k in drawn:
             particles.append(births.particles[view.gated[k], :SUPPORT_DRAWS])
             weights.append(share[k] * view.drawn[k] / view.drawn[k].sum())
         density.restart(head, terms, np.concatenate(particles), np.concatenate(weights), generator)
+
+
+def views(components: Sequence[Component], scan: Scan, births: Births) -> list[View]:
+    """Return the likelihoods of components in a scan."""
+    d = scan.origins.shape[1]
+    means = np.array([item.density.mean for item in components]).reshape(-1, d)
+    radii = np.array([item.density.radius for item in components])[:, None]
+    apart = np.sqrt(np.square(means - scan.pose.position[:d]).sum(axis=1))[:, None]
+    gates = np.abs(scan.ranges - apart) < GATE * (scan.deviations + radii)
+    owners, detections = np.nonzero(gates)
+    gated = np.split(detections, np.searchsorted(owners, np.arange(1, len(components))))
+    return [item.view(scan, own, births) for item, own in zip(components, gated)]
 
 
 def same_place(one: Component, other: Component, distance: float) -> bool:
@@ -233,7 +237,7 @@ def same_place(one: Component, other: Component, distance: float) -> bool:
         return False
     offset = one.density.mean - other.density.mean
     total = one.density.covariance + other.density.covariance
-    return float(offset @ np.linalg.solve(total, offset)) < distance
+    return bool(squared_distance(offset, total) < distance)
 
 
 def merge(components: list[Component], distance: float) -> list[Component]:

@@ -85,6 +85,15 @@ def _reweigh(weights, logs, exponent):  # type: ignore[no-untyped-def]  # pragma
 
 
 @njit(cache=True, error_model='numpy')
+def _reweigh_if(weights, logs, least_effective):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Multiply weights by f if that leaves enough effective particles; return whether it does."""
+    enough = _effective(weights, logs, 1.0) >= least_effective
+    if enough:
+        _reweigh(weights, logs, 1.0)
+    return enough
+
+
+@njit(cache=True, error_model='numpy')
 def _systematic(weights, number, start):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Return indices of a systematic resampling; `start` is uniform in [0, 1)."""
     index = np.empty(number, np.int64)
@@ -133,8 +142,9 @@ def _sweep(heads, terms, grid, frame, exponent, particles, products, last, draws
 
 @njit(cache=True, error_model='numpy')
 def _moments(particles, weights, mean, covariance):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Fill mean and covariance."""
+    """Fill mean and covariance; return the root mean square distance from the mean."""
     number, d = particles.shape
+    trace = 0.0
     for a in range(d):
         mean[a] = 0.0
         for i in range(number):
@@ -146,6 +156,12 @@ def _moments(particles, weights, mean, covariance):  # type: ignore[no-untyped-d
                 total += weights[i] * (particles[i, a] - mean[a]) * (particles[i, b] - mean[b])
             covariance[a, b] = total
             covariance[b, a] = total
+        trace += covariance[a, a]
+    # Particles in one plane still have a covariance that can be inverted.
+    least = LEAST_EIGENVALUE * trace / d + 1e-18
+    for a in range(d):
+        covariance[a, a] += least
+    return math.sqrt(trace + d * least)
 
 
 class Density:
@@ -168,6 +184,8 @@ class Density:
     ----------
     mean, covariance : (d,) and (d, d) arrays
         Of the particles.
+    radius : float
+        Root mean square distance from the mean, metres.
     """
 
     def __init__(
@@ -188,6 +206,7 @@ class Density:
         d = particles.shape[1]
         self.mean: FloatArray = np.empty(d)
         self.covariance: FloatArray = np.empty((d, d))
+        self.radius = 0.0
         self._measure()
 
     @classmethod
@@ -209,11 +228,6 @@ class Density:
         weights = np.full(number, 1.0 / number)
         return cls(particles, weights, head[None], terms, np.empty((0, 0, 0)), frame)
 
-    @property
-    def radius(self) -> float:
-        """Root mean square distance from the mean [m]."""
-        return math.sqrt(float(np.trace(self.covariance)))
-
     def log_at(self, positions: FloatArray) -> FloatArray:
         """Return the log density at positions (n, d); its constant is that of the factors."""
         products, last = self._logs(positions)
@@ -224,9 +238,7 @@ class Density:
     ) -> None:
         """Multiply by a factor, whose log at the particles is `logs`."""
         self._append(head, terms)
-        if _effective(self.weights, logs, 1.0) >= LEAST_EFFECTIVE * len(self.weights):
-            _reweigh(self.weights, logs, 1.0)
-        else:
+        if not _reweigh_if(self.weights, logs, LEAST_EFFECTIVE * len(self.weights)):
             self._temper(generator)
         self._measure()
 
@@ -318,8 +330,4 @@ class Density:
                 break
 
     def _measure(self) -> None:
-        _moments(self.particles, self.weights, self.mean, self.covariance)
-        # Particles in one plane still have a covariance that can be inverted.
-        d = len(self.mean)
-        least = LEAST_EIGENVALUE * float(np.trace(self.covariance)) / d + 1e-18
-        self.covariance[np.arange(d), np.arange(d)] += least
+        self.radius = _moments(self.particles, self.weights, self.mean, self.covariance)

@@ -11,21 +11,13 @@ Factors are rows of numbers, so that one kernel evaluates the product of all of 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.models.detection import (
-    PARAMETERS,
-    DetectionModel,
-    fill_probabilities,
-    offsets,
-)
+from maasi_filter.models.detection import PARAMETERS, fill_probabilities, offsets
 from maasi_filter.models.measurement import TWO_PI
-from maasi_filter.models.measurement_set import MeasurementSet
-from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import interpolate_at
 from maasi_filter.vector_math import arctan2, exponential
 
@@ -48,71 +40,36 @@ SCALE, CARTESIAN, CENTRE, INFORMATION = 0, 1, 2, 5
 TERM = INFORMATION + 9
 
 
-@dataclass(frozen=True)
-class Scan:
-    """What one robot measured, as rows of numbers.
+def gaussian_terms(
+    centres: FloatArray, covariances: FloatArray, cartesian: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray]:
+    """Return normal densities as terms (m, TERM), and Cholesky factors of their covariances.
 
     Parameters
     ----------
-    head : (HEAD,) array
-        Sensor and its pi; c_0 is 1.
-    terms : (m, TERM) array
-        Detections; c_j is 1.
-    measurements : MeasurementSet
-        The same with what draws need.
-    pose : Pose
-        Of the sensor.
-    detection : DetectionModel
-        pi.
+    centres : (m, d) array
+        Means: positions if `cartesian` (m,), else range and angles.
+    covariances : (m, d, d) array
+        In the same space.
     """
-
-    head: FloatArray
-    terms: FloatArray
-    measurements: MeasurementSet
-    pose: Pose
-    detection: DetectionModel
-
-
-def make_scan(measurements: MeasurementSet, pose: Pose, detection: DetectionModel) -> Scan:
-    """Return a scan as rows of numbers."""
-    kind, parameters = detection.kernel()
-    head = np.zeros(HEAD)
-    head[SENSOR : SENSOR + 3] = pose.position
-    head[COS], head[SIN] = math.cos(pose.yaw), math.sin(pose.yaw)
-    head[KIND] = kind
-    head[MISS] = 1.0
-    head[TERMS] = len(measurements)
-    head[MODEL:] = parameters
-    terms = np.zeros((len(measurements), TERM))
-    d = measurements.values.shape[1]
-    cartesian = measurements.cartesian
-    terms[:, SCALE] = measurements.log_norm
+    number, d = centres.shape
+    roots: FloatArray = np.asarray(np.linalg.cholesky(covariances), float)
+    information = np.zeros((number, 3, 3))
+    information[:, :d, :d] = np.linalg.inv(covariances)
+    terms = np.zeros((number, TERM))
+    log_roots = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
+    terms[:, SCALE] = -0.5 * d * math.log(2.0 * math.pi) - log_roots
     terms[:, CARTESIAN] = cartesian
-    terms[:, CENTRE : CENTRE + d] = np.where(
-        cartesian[:, None], measurements.centres, measurements.values
-    )
-    for a in range(d):
-        for b in range(d):
-            terms[:, INFORMATION + 3 * a + b] = measurements.information[:, a, b]
-    return Scan(head, terms, measurements, pose, detection)
+    terms[:, CENTRE : CENTRE + d] = centres
+    terms[:, INFORMATION:] = information.reshape(number, 9)
+    return terms, roots
 
 
 def gaussian_factor(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return head and term of a normal density."""
-    d = len(mean)
+    """Return head and term of a normal density of positions."""
     head = np.zeros(HEAD)
-    head[COS] = 1.0
-    head[KIND] = ALWAYS
-    head[TERMS] = 1
-    terms = np.zeros((1, TERM))
-    _, log_determinant = np.linalg.slogdet(covariance)
-    terms[0, SCALE] = -0.5 * (d * math.log(2.0 * math.pi) + log_determinant)
-    terms[0, CARTESIAN] = 1.0
-    terms[0, CENTRE : CENTRE + d] = mean
-    information = np.linalg.inv(covariance)
-    for a in range(d):
-        for b in range(d):
-            terms[0, INFORMATION + 3 * a + b] = information[a, b]
+    head[COS], head[KIND], head[TERMS] = 1.0, ALWAYS, 1
+    terms, _ = gaussian_terms(mean[None], covariance[None], np.ones(1, np.bool_))
     return head, terms
 
 
@@ -226,8 +183,11 @@ def log_products(heads, terms, grid, frame, positions, products, last):  # type:
 
 
 @njit(cache=True, error_model='numpy')
-def likelihoods(head, terms, positions, weights, probability, seen):  # type: ignore[no-untyped-def]
-    """Fill pi (n,) and pi g_j (m, n) at particles; return p_D = sum w pi."""
+def likelihoods(head, terms, positions, weights, probability, seen, sums):  # type: ignore[no-untyped-def]
+    """Fill pi (n,) and pi g_j (m, n) at particles; return p_D = sum w pi.
+
+    `sums` (2, m) becomes sum w pi g_j, and the sum of the squares of w pi g_j.
+    """
     number, d = positions.shape
     offset = np.empty((3, number))
     measured = np.empty((3, number))
@@ -238,7 +198,30 @@ def likelihoods(head, terms, positions, weights, probability, seen):  # type: ig
         origin = offset if terms[j, CARTESIAN] > 0.5 else measured
         seen[j] = 0.0
         _add_term(terms[j], head[SENSOR : SENSOR + 3], origin, probability, seen[j])
+        sums[:, j] = 0.0
+        for i in range(number):
+            share = weights[i] * seen[j, i]
+            sums[0, j] += share
+            sums[1, j] += share * share
     total = 0.0
     for i in range(number):
         total += weights[i] * probability[i]
     return total
+
+
+@njit(cache=True, error_model='numpy')
+def log_factor(miss, probability, scale, seen, logs):  # type: ignore[no-untyped-def]
+    """Fill log(c_0 (1 - pi) + sum c_j pi g_j) (n,) at particles; return its range.
+
+    `probability` is pi (n,), `scale` c_j (m,), and `seen` pi g_j (m, n).
+    """
+    least = np.inf
+    most = -np.inf
+    for i in range(len(logs)):
+        factor = miss * (1.0 - probability[i])
+        for j in range(len(scale)):
+            factor += scale[j] * seen[j, i]
+        logs[i] = math.log(max(factor, LEAST_FACTOR))
+        least = min(least, logs[i])
+        most = max(most, logs[i])
+    return most - least

@@ -27,19 +27,18 @@ from maasi_filter.measurement_check import (
 )
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.label import LabelTally
-from maasi_filter.models.measurement_set import prepare_measurements
 from maasi_filter.pmb import state as pmb_state
-from maasi_filter.pmb.association import associate
-from maasi_filter.pmb.births import born, draw_births
+from maasi_filter.pmb.association import Marginals, associate
+from maasi_filter.pmb.births import Births, born, draw_births
 from maasi_filter.pmb.clutter import ClutterEstimate
-from maasi_filter.pmb.component import Component, merge
+from maasi_filter.pmb.component import Component, View, merge, views
 from maasi_filter.pmb.density import Density
-from maasi_filter.pmb.factors import Scan, make_scan
 from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest
 from maasi_filter.pmb.identity import associate_by_identity, learn_labels, new_label
-from maasi_filter.pmb.noise_scale import NoiseScale, squared_innovation
+from maasi_filter.pmb.noise_scale import NoiseScale, innovations
 from maasi_filter.pmb.offset_state import offset_arrays, restore_offsets
 from maasi_filter.pmb.offsets import Offsets
+from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
@@ -167,12 +166,13 @@ class PmbFilter:
         changed = self._predict(time)
         for member in members:
             changed |= self._correct(member, newly_found, dropped, time)
+        self._estimate_found()
         self._reduce()
         self._cluster()
         return FilterResult(
             clusters=list(self.clusters),
             newly_found=newly_found,
-            found_changed=changed or bool(newly_found),
+            found_changed=changed,
             expected_number=self.expected_number,
             dropped=dropped,
         )
@@ -201,9 +201,9 @@ class PmbFilter:
             self.generator,
         )
         # p_D = int f pi dx, L_j = int f pi g_j dx.
-        views = [item.view(scan, births) for item in self.components]
-        odds = np.zeros((len(views), len(scan.terms)))
-        for i, (item, view) in enumerate(zip(self.components, views)):
+        seen = views(self.components, scan, births)
+        odds = np.zeros((len(seen), len(scan.terms)))
+        for i, (item, view) in enumerate(zip(self.components, seen)):
             odds[i, view.gated] = item.odds(view)
         # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         other = kappa + births.intensity
@@ -212,22 +212,9 @@ class PmbFilter:
         learn_labels(member.labels, self.components, marginals.caused)
         self._learn_noise(member, marginals.caused)
         alone = (births.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
-        count_unexplained(scan.measurements.centres[alone], self.bounds, dropped)
+        count_unexplained(scan.centres[alone], self.bounds, dropped)
         changed = self._offsets.active and bool(self.own_found_targets())
-        for i, (item, view) in enumerate(zip(self.components, views)):
-            # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
-            moved = item.update(
-                view, marginals.missed[i], marginals.caused[i], scan, births, self.generator
-            )
-            if marginals.caused[i].sum() > 0.5 and not item.foreign:
-                item.pose_error = member.pose_error
-                item.found_radius = self._found_radius(member)
-            sure = moved and can_be_found(item, self._numbers.pmb.found_probability)
-            if sure and not is_known(i, self.components, marginals.caused):
-                newly_found.append(self._find(item, member, time))
-                changed = True
-            else:
-                changed |= self._report(item, moved)
+        changed |= self._update(member, scan, births, seen, marginals, newly_found, time)
         # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
         real = np.where(named, 0.0, births.intensity / (kappa + births.intensity))
         existence = marginals.new * real
@@ -244,6 +231,37 @@ class PmbFilter:
         self.exploration.update(scan.detection, member.pose)
         return changed
 
+    def _update(
+        self,
+        member: CheckedMeasurement,
+        scan: Scan,
+        births: Births,
+        seen: Sequence[View],
+        marginals: Marginals,
+        newly_found: list[FoundTarget],
+        time: float,
+    ) -> bool:
+        """Update all components, mark and withdraw; return whether what is found changed."""
+        changed = False
+        radius = self._found_radius(member)
+        detected = (marginals.caused.sum(axis=1) > 0.5).tolist()
+        for i, (item, view) in enumerate(zip(self.components, seen)):
+            caused = marginals.caused[i]
+            # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
+            moved = item.update(view, marginals.missed[i], caused, scan, births, self.generator)
+            if detected[i] and not item.foreign:
+                item.pose_error, item.found_radius = member.pose_error, radius
+            if item.target is not None:
+                changed |= self._keep_or_withdraw(item, moved)
+            elif (
+                moved
+                and can_be_found(item, self._numbers.pmb.found_probability)
+                and not is_known(i, self.components, marginals.caused)
+            ):
+                newly_found.append(self._find(item, member, time))
+                changed = True
+        return changed
+
     def _localised(self, member: CheckedMeasurement, kappa: float) -> CheckedMeasurement:
         """Return a scan at the robot's estimated pose, and move found targets with their errors."""
         if not self._offsets.active:
@@ -252,19 +270,21 @@ class PmbFilter:
         density = self._expected_targets / self.exploration.volume
         member = self._offsets.localise(member, self.components, kappa, density)
         for item in self.components:
-            if item.target is not None and not item.foreign:
-                item.target = self._estimate(item.target, item)
+            item.stale = True
         return member
 
     def _learn_noise(self, member: CheckedMeasurement, caused: FloatArray) -> None:
         """Count the innovations of the detections that found targets caused."""
-        for i, item in enumerate(self.components):
-            if item.target is None or item.foreign:
-                continue
-            for j in np.flatnonzero(caused[i] > 0.5).tolist():
-                density = item.density
-                square = squared_innovation(member, j, density.mean, density.covariance)
-                self._noise.count(member.robot, float(caused[i, j]), square)
+        own = [i for i, item in enumerate(self.components) if item.target and not item.foreign]
+        rows = [i for i in own if caused[i].max(initial=0.0) > 0.5]
+        if not rows:
+            return
+        densities = [self.components[i].density for i in rows]
+        means = np.array([density.mean for density in densities])
+        covariances = np.array([density.covariance for density in densities])
+        squares = innovations(member, means, covariances).squares / self.dimension
+        for row, j in np.argwhere(caused[rows] > 0.5).tolist():
+            self._noise.count(member.robot, float(caused[rows[row], j]), float(squares[row, j]))
 
     def _scan(self, member: CheckedMeasurement) -> Scan:
         """Return a member's detections for the kernels, with the noise that was learnt."""
@@ -272,14 +292,7 @@ class PmbFilter:
         if isinstance(detection, BoxDetection):
             # The position error of the robot blurs the edge of a box-shaped field of view.
             detection = detection.softened(2.0 * member.pose_error)
-        prepared = prepare_measurements(
-            member.values,
-            member.covariances * self._noise.factor(member.robot),
-            member.pose,
-            member.pose_error,
-            cartesian_near=member.own,
-        )
-        return make_scan(prepared, member.pose, detection)
+        return make_scan(member, self._noise.factor(member.robot), detection)
 
     def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
         """Mark a component as found."""
@@ -292,19 +305,14 @@ class PmbFilter:
         item.target = self._estimate(target, item)
         return item.target
 
-    def _report(self, item: Component, moved: bool) -> bool:
-        """Update the estimate of a found component, or withdraw it; return whether it changed."""
-        target = item.target
-        if target is None:
-            return False
+    def _keep_or_withdraw(self, item: Component, moved: bool) -> bool:
+        """Withdraw a found component that hardly exists; return whether its target changed."""
         if item.foreign:
             item.existence = CERTAIN
             return False
         if item.existence < self._numbers.pmb.withdrawn_probability:
             item.target = None
             return True
-        if moved:
-            item.target = self._estimate(target, item)
         return moved
 
     def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
@@ -316,6 +324,13 @@ class PmbFilter:
             covariance=item.density.covariance + error,
             label=item.labels.label,
         )
+
+    def _estimate_found(self) -> None:
+        """Estimate the found targets whose densities have changed in this step."""
+        for item in self.components:
+            if item.target is not None and item.stale and not item.foreign:
+                item.target = self._estimate(item.target, item)
+            item.stale = False
 
     def _predict(self, time: float) -> bool:
         """Predict the random walk since the last step; return whether a found target changed."""
@@ -330,9 +345,8 @@ class PmbFilter:
             if item.foreign:
                 continue
             diffuse(item.density, variance, self.generator)
-            if item.target is not None:
-                item.target = self._estimate(item.target, item)
-        return any(item.target is not None for item in self.components)
+            item.stale = True
+        return any(item.target is not None and item.stale for item in self.components)
 
     def _reduce(self) -> None:
         """Prune components with low existence probability, and merge those of one target."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from maasi_filter.found_targets import SAME_TARGET, distance
 from maasi_filter.pmb.component import Component
 from maasi_filter.records import FoundTarget
+from maasi_filter.vector_math import squared_distance
 
 # Least expected number of detections of a found target: one precise detection is not enough.
 LEAST_HITS = 1.5
@@ -52,7 +53,7 @@ def is_known(i: int, components: Sequence[Component], caused: NDArray[np.float64
             continue
         offset = density.mean - other.density.mean
         total = density.covariance + other.density.covariance
-        if float(offset @ np.linalg.solve(total, offset)) < SAME_TARGET:
+        if squared_distance(offset, total) < SAME_TARGET:
             return True
     return False
 

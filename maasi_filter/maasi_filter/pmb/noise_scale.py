@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,31 +18,46 @@ LEAST_FACTOR = 0.2
 MOST_FACTOR = 10.0
 
 
-def squared_innovation(
-    member: CheckedMeasurement, j: int, mean: FloatArray, covariance: FloatArray
-) -> float:
-    """Return e' (H P H' + R)^-1 e / d of detection j and a target known to (mean, covariance).
-
-    R is the believed one. Its expectation is the variance's factor where R outweighs H P H', and
-    nearer to 1 where it does not: what is learnt is too little rather than too much.
+class Innovations(NamedTuple):
+    """Detections minus what n targets lead to expect.
 
     Parameters
     ----------
-    member : CheckedMeasurement
-        The robot's detections.
-    mean, covariance : (d,), (d, d) arrays
-        Of the target before the scan, metres.
+    errors : (n, m, d) array
+        e: metres and radians.
+    jacobians : (n, d, d) array
+        H, at the targets.
+    covariances : (n, m, d, d) array
+        H P H' + R, of the errors; P includes the position error of the robot.
+    squares : (n, m) array
+        Squared normalised errors.
     """
+
+    errors: FloatArray
+    jacobians: FloatArray
+    covariances: FloatArray
+    squares: FloatArray
+
+
+def innovations(
+    member: CheckedMeasurement, means: FloatArray, covariances: FloatArray
+) -> Innovations:
+    """Return the innovations of all detections by targets with moments (n, d) and (n, d, d)."""
     model, pose = member.sensor.measurement, member.pose
-    error = model.residual(member.values[j], model.measure(mean[None], pose)[0])
-    jacobian = model.jacobian(mean[None], pose)[0]
-    position = covariance + member.pose_error**2 * np.eye(len(mean))
-    total = jacobian @ position @ jacobian.T + member.covariances[j]
-    return float(error @ np.linalg.solve(total, error)) / len(mean)
+    errors = model.residual(member.values, model.measure(means, pose)[:, None])
+    jacobians = model.jacobian(means, pose)
+    positions = covariances + member.pose_error**2 * np.eye(means.shape[1])
+    expected = jacobians @ positions @ jacobians.swapaxes(1, 2)
+    totals = expected[:, None] + member.covariances
+    solved = np.linalg.solve(totals, errors[..., None])[..., 0]
+    return Innovations(errors, jacobians, totals, (errors * solved).sum(axis=2))
 
 
 class NoiseScale:
     """Factor of the variances of each robot's detections, with a prior of mean 1.
+
+    Learnt from squared normalised innovations / d with the configured R: their mean is the factor
+    if R outweighs H P H', and nearer to 1 otherwise.
 
     Attributes
     ----------

@@ -20,6 +20,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.association import associate
 from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.factors import MOST_PROBABLE
+from maasi_filter.pmb.noise_scale import innovations
 from maasi_filter.pmb.settings import OffsetSettings
 
 FloatArray = NDArray[np.float64]
@@ -159,16 +160,12 @@ class Offsets:
         if not m or max(map(np.trace, apart), default=0.0) < LEAST_DIFFERENCE**2:
             return
         means = np.array([item.density.mean for item in likely])
-        model, pose = member.sensor.measurement, member.pose
-        errors = model.residual(member.values[None], model.measure(means, pose)[:, None])
-        jacobians = model.jacobian(means, pose)
         spread = np.array([item.density.covariance for item in likely]) + apart
-        spread[:, np.arange(d), np.arange(d)] += member.pose_error**2
-        totals = (jacobians @ spread @ jacobians.swapaxes(1, 2))[:, None] + member.covariances
-        solved = np.linalg.solve(totals, errors[..., None])[..., 0]
-        squares = (errors * solved).sum(axis=2)
+        errors, jacobians, totals, squares = innovations(member, means, spread)
         # r L / (1 - r p_D) with a normal density and pi at its mean.
-        probability = np.minimum(member.sensor.detection.probability(means, pose), MOST_PROBABLE)
+        probability = np.minimum(
+            member.sensor.detection.probability(means, member.pose), MOST_PROBABLE
+        )
         detected = probability * [item.existence for item in likely]
         peaks = np.sqrt(np.linalg.det(2.0 * math.pi * totals))
         odds = np.exp(-0.5 * squares) / peaks * (detected / (1.0 - detected))[:, None]
