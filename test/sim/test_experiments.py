@@ -9,7 +9,6 @@ import math
 import os
 import subprocess
 import sys
-import types
 from pathlib import Path
 
 import numpy as np
@@ -65,10 +64,8 @@ def toy(monkeypatch):
         comparisons=(Comparison('first', 'second', 'steps'),),
         runs=4,
     )
-    module = types.ModuleType('maasi_sim.experiments.toy')
-    module.experiments = lambda: [experiment]
-    monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr(registry, 'PAPERS', ('toy',))
+    monkeypatch.setattr(registry, 'paper_experiments', lambda number: [experiment])
     return experiment
 
 
@@ -291,7 +288,7 @@ def test_folder_that_cannot_be_made_is_said(toy, tmp_path, capsys):
 def test_run_that_fails_leaves_the_others(toy, tmp_path, monkeypatch, capsys):
     cases = [Case('first', {'bias': 1}), Case('second', {'bias': 5, 'fails': True})]
     failing = Experiment(**{**toy.__dict__, 'cases': lambda small: cases})
-    sys.modules['maasi_sim.experiments.toy'].experiments = lambda: [failing]
+    monkeypatch.setattr(registry, 'paper_experiments', lambda number: [failing])
     assert reproduce.main(['000-toy', '--out', str(tmp_path), '--workers', '1']) == 1
     said = capsys.readouterr().err
     assert 'second, map' in said and 'lost its way' in said

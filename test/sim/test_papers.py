@@ -215,14 +215,14 @@ def test_explored_share_is_that_of_the_planner():
                 'start': [1.0, 1.0, 0.0],
                 'candidates': {'points': [[1.0, 1.0]]},
                 'sensor': {'period': 1.0, 'detection': detection},
-                'odometry': searches.PERFECT_ODOMETRY,
+                'odometry': {'position_noise': 0.0, 'position_drift': 0.0},
             }
         },
         'stop': 'planner_done',
         'limits': {'time': 3.0},
     }
     case = searches.search_case('one', values, 1)
-    outcome = searches.add_explored_share(case.settings, searches.run_search(case.settings, 1))
+    outcome = searches.run_exploring(case.settings, 1)
     axis = np.linspace(0.0, 2.0, 401)
     distance = np.hypot(axis[:, None] - 1.0, axis[None, :] - 1.0)
     expected = (0.9 * np.exp(-distance)).mean()

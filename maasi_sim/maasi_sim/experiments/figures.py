@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import getitem
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_sim.experiments.cases import Quantity
 from maasi_sim.experiments.experiment import Results
 from maasi_sim.experiments.results import Run
 from maasi_sim.experiments.statistics import mean_interval
@@ -54,29 +55,37 @@ def over(run: Run, grid: FloatArray, column: str = 'true_found', by: str = 'meas
     return np.where(index >= 0, run.columns[column][np.maximum(index, 0)], 0.0)
 
 
-def curves(
-    axes: Axes,
+def draw_curves(
+    figure: Figure,
     results: Results,
     styles: Mapping[str, str],
+    path: str | None = None,
     by: str = 'measurements',
     label: str = 'measurements',
     end: float | None = None,
 ) -> None:
     """Draw the mean number of targets found, of four or more runs with its 95 % confidence.
 
+    Over measurements, triangles mark where the paper's methods have found all.
+
     Parameters
     ----------
-    axes : Axes
-        Where.
+    figure : Figure
+        Empty.
     results : Results
         Of searches.
     styles : mapping
         Which cases, and the key in `STYLES` of each; an unknown key takes another colour.
+    path : str, optional
+        Case whose first run is drawn beside the curves.
     by, label : str
         Column of the horizontal axis and its name.
     end : float, optional
         Of the horizontal axis; none: the longest run.
     """
+    if path is not None:
+        figure.set_size_inches(10.5, 4.6)
+    axes = figure.add_subplot(1, 1 if path is None else 2, 1)
     targets = 0.0
     longest = max(
         (
@@ -110,38 +119,44 @@ def curves(
     axes.grid(color='#E6E6E6', lw=0.8)
     axes.set_axisbelow(True)
     axes.spines[['top', 'right']].set_visible(False)
+    if by == 'measurements':
+        _mark_published(axes, results, styles)
     axes.legend(loc='lower right', fontsize=8, frameon=False)
+    runs = [] if path is None else results.runs.get(path, [])
+    if runs:
+        _draw_path(figure, (1, 2, 2), results, runs[0])
 
 
-def published_marks(axes: Axes, results: Results, styles: Mapping[str, str]) -> None:
+def _mark_published(axes: Axes, results: Results, styles: Mapping[str, str]) -> None:
     """Mark on the top line when the paper's methods have found all, with its confidence."""
-    shown_label = False
+    label: str | None = "all found, the paper's"
+    published = {
+        item.case: item
+        for item in results.experiment.published
+        if item.quantity == 'measurements_to_find_all'
+    }
     for name, key in styles.items():
-        for item in results.experiment.published:
-            if (item.case, item.quantity) != (name, 'measurements_to_find_all'):
-                continue
-            colour, _ = STYLES.get(key, (_PALE, '-'))
+        if name in published:
             axes.errorbar(
-                item.value,
+                published[name].value,
                 axes.get_ylim()[1] * 0.985,
-                xerr=item.half_width,
+                xerr=published[name].half_width,
                 fmt='v',
-                color=colour,
+                color=STYLES.get(key, (_PALE, '-'))[0],
                 mec=_TRUE,
                 ms=7,
                 capsize=3,
-                label=None if shown_label else "all found, the paper's",
+                label=label,
             )
-            shown_label = True
-    if shown_label:
-        axes.legend(loc='lower right', fontsize=8, frameon=False)
+            label = None
 
 
-def path(axes: Any, results: Results, run: Run, title: str = '') -> None:
+def _draw_path(figure: Figure, place: tuple[int, int, int], results: Results, run: Run) -> None:
     """Draw where the robots measured, the true targets, and those found, in 2D or 3D."""
     scenario = results.case(run.case).settings['scenario']
     bounds = np.array(scenario['environment']['bounds'], dtype=float)
     dimension = len(bounds)
+    axes: Any = figure.add_subplot(*place, projection='3d' if dimension == 3 else None)
     if 'heights' in run.details:
         heights = np.array(run.details['heights'], float)
         sides = [
@@ -170,7 +185,7 @@ def path(axes: Any, results: Results, run: Run, title: str = '') -> None:
         axes.set_zlim(*bounds[2])
     else:
         axes.set_aspect('equal')
-    axes.set_title(title or run.case, fontsize=9)
+    axes.set_title(run.case, fontsize=9)
 
 
 def _obstacle(axes: Any, centre: FloatArray, radius: float, dimension: int) -> None:
@@ -191,41 +206,23 @@ def _obstacle(axes: Any, centre: FloatArray, radius: float, dimension: int) -> N
     )
 
 
-def paths(figure: Figure, results: Results, cases: Sequence[str], number: int = 0) -> None:
-    """Draw the paths of several cases on one map, side by side."""
-    listed = [run for name in cases for run in results.runs.get(name, []) if run.number == number]
+def draw_paths(figure: Figure, results: Results, cases: Sequence[str] | None = None) -> None:
+    """Draw the paths of several cases, or all, on the first map, side by side."""
+    shown_cases = [case.name for case in results.cases] if cases is None else cases
+    listed = [run for name in shown_cases for run in results.runs.get(name, []) if run.number == 0]
     columns = min(3, max(len(listed), 1))
     rows = -(-max(len(listed), 1) // columns)
     figure.set_size_inches(3.4 * columns, 3.3 * rows)
     for index, run in enumerate(listed):
-        bounds = results.case(run.case).settings['scenario']['environment']['bounds']
-        projection = '3d' if len(bounds) == 3 else None
-        axes = figure.add_subplot(rows, columns, index + 1, projection=projection)
-        path(axes, results, run)
+        _draw_path(figure, (rows, columns, index + 1), results, run)
 
 
-def curves_and_path(
-    figure: Figure, results: Results, styles: Mapping[str, str], shown_case: str, **options: Any
-) -> None:
-    """Draw the curves, and beside them the path of one case on the first map."""
-    figure.set_size_inches(10.5, 4.6)
-    axes = figure.add_subplot(1, 2, 1)
-    curves(axes, results, styles, **options)
-    if options.get('by', 'measurements') == 'measurements':
-        published_marks(axes, results, styles)
-    runs = results.runs.get(shown_case, [])
-    if runs:
-        bounds = results.case(shown_case).settings['scenario']['environment']['bounds']
-        projection = '3d' if len(bounds) == 3 else None
-        path(figure.add_subplot(1, 2, 2, projection=projection), results, runs[0])
-
-
-def against(
+def draw_against(
     figure: Figure,
     results: Results,
-    names: Mapping[str, float],
+    setting: Sequence[str],
     label: str,
-    quantities: Sequence[Quantity],
+    quantities: Sequence[str],
 ) -> None:
     """Draw means of quantities with their 95 % confidence against a number that cases differ in.
 
@@ -235,20 +232,22 @@ def against(
         Empty.
     results : Results
         Of which.
-    names : mapping
-        Cases, and the number of each.
+    setting : sequence of str
+        Keys of the number in the scenario.
     label : str
         What the number is.
-    quantities : sequence of Quantity
+    quantities : sequence of str
         One picture each, side by side.
     """
     figure.set_size_inches(4.6 * len(quantities), 3.8)
-    for index, quantity in enumerate(quantities):
+    for index, quantity in enumerate(map(results.experiment.quantity, quantities)):
         axes = figure.add_subplot(1, len(quantities), index + 1)
         found = [
-            (value, interval(results, name, quantity))
-            for name, value in names.items()
-            if results.runs.get(name)
+            (
+                reduce(getitem, setting, results.case(name).settings['scenario']),
+                interval(results, name, quantity),
+            )
+            for name in results.names()
         ]
         places = [value for value, _ in found]
         means = [span.mean for _, span in found]
@@ -261,14 +260,8 @@ def against(
         axes.spines[['top', 'right']].set_visible(False)
 
 
-def table_of(
-    figure: Figure,
-    results: Results,
-    names: FloatArray | Sequence[Sequence[str]],
-    rows: Sequence[str],
-    columns: Sequence[str],
-    corner: str,
-    quantity: str,
+def draw_table(
+    figure: Figure, results: Results, axes: Sequence[Sequence[str]], quantity: str
 ) -> None:
     """Draw a table of means as the papers print theirs, the paper's number below ours.
 
@@ -278,26 +271,25 @@ def table_of(
         Empty.
     results : Results
         Of which.
-    names : nested sequence of str
-        Case of each row and column.
-    rows, columns : sequence of str
-        Their heads.
-    corner : str
-        What stands in the corner.
+    axes : one or two sequences of str
+        Heads of the rows and of the columns; joined by ', ' they name the cases.
     quantity : str
         What is shown.
     """
-    figure.set_size_inches(1.3 + 1.45 * len(columns), 0.8 + 0.62 * len(rows))
-    axes = figure.add_subplot()
-    axes.axis('off')
     measured = results.experiment.quantity(quantity)
+    rows = axes[0]
+    columns = axes[1] if len(axes) > 1 else [measured.label]
+    figure.set_size_inches(1.3 + 1.45 * len(columns), 0.8 + 0.62 * len(rows))
+    plot = figure.add_subplot()
+    plot.axis('off')
     published = {
         item.case: item for item in results.experiment.published if item.quantity == quantity
     }
     cells, means = [], np.full((len(rows), len(columns)), np.nan)
-    for i, row in enumerate(names):
+    for i, row in enumerate(rows):
         line = []
-        for j, name in enumerate(row):
+        for j, column in enumerate(columns):
+            name = f'{row}, {column}' if len(axes) > 1 else row
             if not results.runs.get(name):
                 line.append('-')
                 continue
@@ -310,9 +302,9 @@ def table_of(
                 text += f'\npaper {item.value:g}{spread}'
             line.append(text)
         cells.append(line)
-    table = axes.table(
+    table = plot.table(
         cells,
-        rowLabels=[f'{corner} {row}' if i == 0 else row for i, row in enumerate(rows)],
+        rowLabels=list(rows),
         colLabels=list(columns),
         cellLoc='center',
         loc='center',

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import difflib
-import importlib
 
 from maasi_sim.experiments.experiment import Experiment
+from maasi_sim.experiments.papers import paper_experiments
 
-# Modules of this package that hold experiments, in the order in which they are listed. Each has
-# a function `experiments()` that returns a list of Experiment.
-PAPERS = ('paper_000', 'paper_001', 'paper_002', 'paper_003', 'paper_004')
+PAPERS = ('000', '001', '002', '003', '004')
 
 
 class UnknownExperiment(ValueError):
@@ -18,13 +16,7 @@ class UnknownExperiment(ValueError):
 
 def experiments() -> dict[str, Experiment]:
     """Return all experiments by name, in the order of the papers."""
-    known: dict[str, Experiment] = {}
-    for module in PAPERS:
-        for item in importlib.import_module(f'maasi_sim.experiments.{module}').experiments():
-            if item.name in known:
-                raise ValueError(f'{item.name}: two experiments have this name')
-            known[item.name] = item
-    return known
+    return {item.name: item for number in PAPERS for item in paper_experiments(number)}
 
 
 def find(name: str) -> Experiment:

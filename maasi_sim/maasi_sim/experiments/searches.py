@@ -25,22 +25,12 @@ RMSE = Quantity('rmse', 'RMSE', 'm')
 STEP_TIME = Quantity('step_time', 'computation per measurement', 's')
 FILTER_TIME = Quantity('filter_time', 'filter step', 's')
 PLANNING_TIME = Quantity('planning_time', 'decision', 's')
-DISTANCE = Quantity('distance', 'way of all robots', 'm')
+EXPLORED = Quantity('explored', 'share explored in the end')
+CLEARANCE = Quantity('clearance', 'smallest distance to an obstacle', 'm')
 
 # Measurements, and particles, of a small case.
 _SMALL = 12
 _SMALL_PARTICLES = 1000
-
-# Poses are known, as the papers have it.
-PERFECT_ODOMETRY = {
-    'position_noise': 0.0,
-    'heading_noise': 0.0,
-    'velocity_noise': 0.0,
-    'position_drift': 0.0,
-    'heading_drift': 0.0,
-}
-# Runs end when all is found or the cap is reached, not when the planner says that nothing is left.
-NEVER_DONE = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
 
 
 def merged(*layers: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,11 +136,12 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
     )
 
 
-def add_explored_share(settings: dict[str, Any], outcome: Outcome) -> Outcome:
-    """Add to a search which share of the environment is explored, 1 - e averaged over it.
+def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
+    """Run a search and measure which share of the environment is explored, the mean of 1 - e.
 
     Column 'explored' has it after each measurement batch, and the summary in the end.
     """
+    outcome = run_search(settings, seed)
     scenario = scenario_from_content(settings['scenario'], 'settings')
     bounds = scenario.environment.array()
     exploration = UnexploredMap(bounds, float((bounds[:, 1] - bounds[:, 0]).max()) / 26.0)
@@ -168,4 +159,22 @@ def add_explored_share(settings: dict[str, Any], outcome: Outcome) -> Outcome:
         explored.append(exploration.explored_fraction())
     outcome.columns = {**outcome.columns, 'explored': explored}
     outcome.summary['explored'] = explored[-1] if explored else 0.0
+    return outcome
+
+
+def run_among_obstacles(settings: dict[str, Any], seed: int) -> Outcome:
+    """Run a search and measure the clearance, straight from one measurement to the next."""
+    outcome = run_search(settings, seed)
+    scenario = settings['scenario']
+    nearest = []
+    for name, robot in scenario['robots'].items():
+        places = np.stack([np.asarray(outcome.columns[f'{name}_{axis}']) for axis in 'xyz'], axis=1)
+        places = np.vstack([np.asarray(robot['start'], float), places])
+        share = np.linspace(0.0, 1.0, 25)[:, None, None]
+        way = (places[:-1] + share * np.diff(places, axis=0)).reshape(-1, 3)
+        nearest += [
+            float(np.linalg.norm(way - item['centre'], axis=1).min()) - item['radius']
+            for item in scenario['environment']['obstacles']
+        ]
+    outcome.summary['clearance'] = min(nearest) if nearest else None
     return outcome

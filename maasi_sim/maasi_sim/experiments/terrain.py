@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from maasi_sim.experiments.cases import Outcome
+from maasi_sim.experiments.searches import run_search
+from maasi_sim.world.noise_streams import noise_stream
 
 FloatArray = NDArray[np.float64]
 
@@ -112,3 +119,16 @@ def littered(
             found = ndimage.map_coordinates(heights, index.T, order=1)
             targets.append(places[int(np.argmin(sign * found))])
     return np.array(targets)
+
+
+def run_on_terrain(settings: dict[str, Any], seed: int) -> Outcome:
+    """Run a search for 14 targets at a low and a high place of terrain made from the seed."""
+    generator = noise_stream(seed, purpose='terrain')
+    bounds = np.array(settings['scenario']['environment']['bounds'], float)
+    heights = chunk(generator, float(bounds[0, 1] - bounds[0, 0]), 57)
+    targets = littered(heights, bounds, 14, 15.0, 10.0, generator)
+    content = deepcopy(settings)
+    content['scenario']['targets'] = {'positions': targets.tolist()}
+    outcome = run_search(content, seed)
+    outcome.details['heights'] = heights[::2, ::2].round(2).tolist()
+    return outcome

@@ -1,0 +1,145 @@
+"""Draws what can be laid beside the figures of 004."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from maasi_planner.buildings import plan_mission
+from maasi_sim.buildings.picture import draw_mission, legend
+from maasi_sim.experiments.building_runs import mission_settings
+from maasi_sim.experiments.experiment import Results
+from maasi_sim.experiments.results import Run
+from maasi_sim.experiments.statistics import array, mean_interval
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PAPER_COLOUR = '#D62728'
+
+
+def draw_missions(
+    figure: Figure, results: Results, case: str | None = None, step: int | None = None
+) -> None:
+    """Draw the first run of each case; with `step` that of one case, at that step and whole."""
+    names = results.names()
+    if step is None:
+        panels: list[tuple[str, int | None]] = [(name, None) for name in names]
+    else:
+        name = case if case in names else names[0]
+        panels = [(name, step), (name, None)]
+    grid = figure.add_gridspec(1, len(panels))
+    for index, (name, until) in enumerate(panels):
+        _draw_run(figure, grid[index], results.runs[name][0], results, until)
+
+
+def _draw_run(figure: Figure, place: Any, run: Run, results: Results, step: int | None) -> None:
+    axes = figure.add_subplot(place, projection='3d')
+    settings = results.case(run.case).settings
+    mission = plan_mission(mission_settings(settings), settings['area'])
+    end = None if step is None else step + 1
+    paths = {
+        name[:-2]: np.stack([run.columns[f'{name[:-2]}_{axis}'] for axis in 'xyz'], axis=1)[:end]
+        for name in run.columns
+        if name.endswith('_x')
+    }
+    shots = {s['cuboid'] for s in run.details['snapshots'] if step is None or s['step'] <= step}
+    plans = None if step is None else run.details['plans'].get(str(step))
+    draw_mission(axes, mission, paths, shots, plans)
+    when = run.columns['step'][-1] if step is None else step
+    axes.set_title(f'{run.case}, step {when:.0f}', fontsize=9)
+    legend(axes)
+
+
+def draw_batteries_and_ranges(figure: Figure, results: Results) -> None:
+    """Draw mission time against the number of agents, and robots that search over time."""
+    places = figure.subplots(1, 3)
+    for axes, profile in zip(places, (1, 2)):
+        for reach in (50, 100, 250):
+            points = []
+            for agents in (3, 5, 7, 9, 11):
+                runs = results.runs.get(f'profile {profile}, C_R {reach} m, {agents} agents')
+                if runs:
+                    # A mission that did not get there counts with the limit.
+                    times = [run.value('steps') or run.value('limit') or 0.0 for run in runs]
+                    points.append((agents, float(np.mean(times))))
+            if points:
+                axes.plot(*zip(*points), 'o-', ms=4, label=f'C_R = {reach} m')
+        _label(axes, 'agents', 'mission time [s]', f'battery profile {profile}')
+        axes.set_ylim(bottom=0.0)
+        for agents, line in ((3, '--'), (11, '-')):
+            runs = results.runs.get(f'profile {profile}, C_R 50 m, {agents} agents')
+            if runs:
+                searching = [run.columns['active'] for run in runs]
+                table = np.full((len(runs), max(map(len, searching))), np.nan)
+                for row, values in zip(table, searching):
+                    row[: len(values)] = values
+                label = f'profile {profile}, {agents} agents'
+                places[2].plot(np.nanmean(table, axis=0), line, label=label)
+    _label(places[2], 'step', 'robots that search')
+
+
+def draw_visits_over_time(figure: Figure, results: Results) -> None:
+    """Draw the share of visited cuboids and the robots that search, over time."""
+    left, right = figure.subplots(1, 2)
+    for name in results.names():
+        runs = results.runs[name]
+        length = max(len(run.columns['visited']) for run in runs)
+        share = [
+            np.pad(run.columns['visited'], (0, length - len(run.columns['visited'])), mode='edge')
+            / float(run.summary['cuboids'] or 1)
+            for run in runs
+        ]
+        left.plot(100.0 * np.mean(share, axis=0), label=name)
+        right.step(range(len(runs[0].columns['active'])), runs[0].columns['active'])
+    _label(left, 'step', 'cuboids visited [%]')
+    right.set_xlabel('step')
+    right.set_ylabel('robots that search, first map')
+
+
+def draw_mission_times(figure: Figure, results: Results) -> None:
+    """Draw the mission time of each case as a bar, the paper's of 3 agents as lines."""
+    axes = figure.subplots()
+    names = results.names()
+    times = [mean_interval(array(results.values(name, 'steps'))) for name in names]
+    places = np.arange(len(names))
+    errors = np.nan_to_num([time.half_width for time in times])
+    axes.barh(places, [time.mean for time in times], xerr=errors, color='#56B4E9')
+    axes.set_yticks(places, names, fontsize=8)
+    axes.invert_yaxis()
+    for item in results.experiment.published:
+        if item.case.count(',') == 1:
+            label = f'paper, {item.case}'
+            axes.axvline(item.value, color=_PAPER_COLOUR, lw=0.8, ls='--', label=label)
+    _label(axes, 'mission time [s]')
+
+
+def draw_decision_times(figure: Figure, results: Results) -> None:
+    """Draw the time of a decision of both controllers beside the paper's."""
+    axes = figure.subplots()
+    names = results.names()
+    places = np.arange(len(names))
+    for offset, quantity in ((-0.2, 'centralized'), (0.2, 'distributed')):
+        ours = [float(np.mean(array(results.values(name, quantity)))) for name in names]
+        axes.bar(places + offset, ours, 0.35, label=f'{quantity}, ours')
+        theirs = {p.case: p.value for p in results.experiment.published if p.quantity == quantity}
+        axes.plot(
+            places + offset,
+            [theirs.get(name, np.nan) for name in names],
+            '_',
+            ms=22,
+            color=_PAPER_COLOUR,
+            label=f'{quantity}, paper',
+        )
+    axes.set_yscale('log')
+    axes.set_xticks(places, names)
+    _label(axes, '', 'mean time of a decision [s]')
+
+
+def _label(axes: Any, across: str, up: str = '', title: str = '') -> None:
+    axes.set_xlabel(across)
+    axes.set_ylabel(up)
+    if title:
+        axes.set_title(title, fontsize=10)
+    axes.legend(fontsize=8, frameon=False)

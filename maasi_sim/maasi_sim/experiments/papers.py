@@ -1,0 +1,133 @@
+"""Experiments of the papers, from the YAML files in `papers/`, one per paper.
+
+A case is what its layers give, merged one over the other, and its own values over them. The layers
+are those of the experiment, that with the name of its preset if there is one, and those of the
+case. Several mappings of cases stand for all combinations of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache, partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from maasi_sim.experiments import building_figures, building_runs, figures, searches
+from maasi_sim.experiments.building_runs import run_mission, run_timing
+from maasi_sim.experiments.cases import Case, Choice, Comparison, Published, Quantity
+from maasi_sim.experiments.experiment import Experiment
+from maasi_sim.experiments.searches import (
+    merged,
+    run_among_obstacles,
+    run_exploring,
+    run_search,
+    search_case,
+)
+from maasi_sim.experiments.terrain import run_on_terrain
+
+QUANTITIES = {
+    item.name: item
+    for module in (searches, building_runs)
+    for item in vars(module).values()
+    if isinstance(item, Quantity)
+}
+RUNS = {
+    'search': run_search,
+    'exploring': run_exploring,
+    'among_obstacles': run_among_obstacles,
+    'on_terrain': run_on_terrain,
+    'mission': run_mission,
+    'timing': run_timing,
+}
+FIGURES = {
+    'curves': figures.draw_curves,
+    'paths': figures.draw_paths,
+    'against': figures.draw_against,
+    'table': figures.draw_table,
+    'missions': building_figures.draw_missions,
+    'batteries_and_ranges': building_figures.draw_batteries_and_ranges,
+    'visits_over_time': building_figures.draw_visits_over_time,
+    'mission_times': building_figures.draw_mission_times,
+    'decision_times': building_figures.draw_decision_times,
+}
+_FOLDER = Path(__file__).with_name('papers')
+
+
+@cache
+def _paper(number: str) -> dict[str, Any]:
+    text = (_FOLDER / f'{number}.yaml').read_text(encoding='utf-8')
+    content: dict[str, Any] = yaml.safe_load(text)
+    return content
+
+
+def paper_experiments(number: str) -> list[Experiment]:
+    """Return the experiments of a paper, such as '000'."""
+    paper = _paper(number)
+    return [_experiment(name, entry, paper) for name, entry in paper['experiments'].items()]
+
+
+def _experiment(name: str, content: Mapping[str, Any], paper: Mapping[str, Any]) -> Experiment:
+    entry = dict(content)
+    for key in ('cases', 'layers', 'preset', 'most_measurements', 'only', 'small'):
+        entry.pop(key, None)
+    figure = dict(entry.pop('figure'))
+    draw = FIGURES[figure.pop('kind')]
+    if draw is figures.draw_curves:
+        shown = figure.pop('cases', None) or _combined(content['cases'])
+        figure['styles'] = {case: paper['styles'].get(case, '') for case in shown}
+    if draw is figures.draw_table:
+        figure['axes'] = [list(axis) for axis in _axes(content['cases'])]
+    return Experiment(
+        name=name,
+        cases=lambda small: _cases(content, paper.get('layers', {}), small),
+        run=RUNS[entry.pop('run', 'search')],
+        quantities=[QUANTITIES[item] for item in entry.pop('quantities')],
+        draw=partial(draw, **figure),
+        published=[Published(**row) for row in entry.pop('published', [])],
+        comparisons=[
+            Comparison(*names)
+            for row in entry.pop('comparisons', [])
+            for names in product(row['first'], row['second'], row['quantities'])
+        ],
+        choices=[Choice(**paper['choices'][key]) for key in entry.pop('choices')],
+        **entry,
+    )
+
+
+def _axes(cases: Any) -> list[dict[str, dict[str, Any]]]:
+    return cases if isinstance(cases, list) else [cases]
+
+
+def _combined(cases: Any) -> dict[str, dict[str, Any]]:
+    """Return the values of each case by its name."""
+    return {
+        ', '.join(name for name, _ in items): merged(*(values for _, values in items))
+        for items in product(*(axis.items() for axis in _axes(cases)))
+    }
+
+
+def _cases(entry: Mapping[str, Any], layers: Mapping[str, Any], small: bool) -> list[Case]:
+    change = dict(entry.get('small', {})) if small else {}
+    only = [names for names in (entry.get('only'), change.pop('only', None)) if names]
+    listed = []
+    for name, content in _combined(entry['cases']).items():
+        if not all(name in names for names in only):
+            continue
+        preset = content.pop('preset', entry.get('preset', 'paper'))
+        runs = content.pop('runs', None)
+        cap = content.pop('most_measurements', entry.get('most_measurements'))
+        own = content.pop('layers', [])
+        used = [*entry['layers'], *([preset] if preset in layers else []), *own]
+        values = merged(*(layers[key] for key in used), content, change)
+        common = values.pop('every_robot', None)
+        if common is not None:
+            robots = values['robots'].items()
+            values['robots'] = {robot: merged(common, its) for robot, its in robots}
+        if cap is None:
+            listed.append(Case(name, values, preset, runs))
+        else:
+            listed.append(search_case(name, values, cap, preset, small, runs))
+    return listed
