@@ -1,4 +1,4 @@
-"""The simulation node: the clock, and the far end of every robot's topics."""
+"""The simulation node: publishes the clock, and simulates every robot behind its topics."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.emulators.linked_robots import LinkedRobot, linked_robot
+from maasi_sim.ros.connections import Connections
 from maasi_sim.ros.ground_truth import publish_truth
 from maasi_sim.ros.robot_topics import RobotTopics
 from maasi_sim.scenario.layering import Key
@@ -48,16 +49,16 @@ _FAREWELL = 1.0
 
 class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     """
-    Plays the robots of a scenario, and the time.
+    Simulates the robots of a scenario, and publishes the time.
 
-    The time starts when the driver of each robot, the filter, the planner and, if it is to be
-    awaited, the recorder have said that they are ready. In lockstep a step ends when all of them
-    have said that they are done with it and each robot has its command; a node that says again
-    that it is ready gets the step anew, so that a step can come twice.
+    The time starts when the driver of each robot, the filter, the planner and, with parameter
+    `recorder`, the recorder have reported that they are ready. In lockstep a step ends when all of
+    them have reported that they are done with it and each robot has its command. The step is
+    republished for a restarted node that reports ready, so that a step can be received twice.
 
-    With `follow_clock`, or where another program moves a robot, the time is that of a `/clock` that
-    somebody else publishes: the robots stand until all are ready, and the first step is that of the
-    time then.
+    With `follow_clock`, or where another program moves a robot, the time is that of a `/clock`
+    published elsewhere: the robots stand until all nodes are ready, and the first step is that of
+    the time then.
 
     Publishes
     ---------
@@ -115,7 +116,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         # Topics that each expected node subscribes to.
         self._expected: dict[str, list[str]] = {}
         self._ready: set[str] = set()
-        self._endpoints: dict[tuple[str, str], set[bytes]] = {}
         self._returned: dict[str, float] = {}
         self._ready_since: float | None = None
         # In lockstep: nodes that are not done, and command topics without a message yet.
@@ -169,6 +169,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
                 self._expected[self.team_topic(f'{namespace}/{node}'.strip('/'))] = step_topics
         if self.settings.recorder:
             self._expected[self.team_topic(RECORDER)] = step_topics
+        self._connections = Connections(self, self._expected)
         truth = publish_truth(self, self.simulation.world, self.settings.frame)
         self._entities += truth
         for name, topics in self._robots.items():
@@ -214,12 +215,12 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self.create_wall_timer(1.0, self._watch)
 
     def start(self) -> None:
-        """Wait for the nodes, or go on where it was stopped."""
+        """Wait for the nodes, or resume."""
         if self.step < 0:
             self._wall_start = time.monotonic()
             self._look_timer.reset()
         elif self.settings.lockstep:
-            self._go_on_if_complete()
+            self._advance_if_complete()
         elif not self._follows:
             self._step_timer.reset()
 
@@ -233,7 +234,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._close_links()
 
     def destroy_node(self) -> None:
-        """Shut down, once linked robots have been told to stop."""
+        """Shut down, once linked robots have been stopped."""
         until = time.monotonic() + _FAREWELL
         while any(robot.obeys for robot in self._linked.values()) and time.monotonic() < until:
             time.sleep(_LOOK_PERIOD)
@@ -246,7 +247,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._linked.clear()
 
     def stamp_of_diagnostics(self) -> Time:
-        """Return the time that it publishes: its own clock is that of the wall."""
+        """Return the simulated time: the clock of the node is wall time."""
         return stamp_to_ros(self._stamp)
 
     def status(self) -> dict[str, Any]:
@@ -269,7 +270,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         if self.step >= 0 and self.settings.lockstep and node in self._ready:
             robot = self._robot_of.get(node)
             if robot is None or robot not in self.simulation.away:
-                self.get_logger().info(f'{node} was started again: step {self.step} anew')
+                self.get_logger().info(f'{node} was restarted: step {self.step} is republished')
                 self._returned[node] = time.monotonic()
                 self._await(node)
                 if self.active:
@@ -296,17 +297,17 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             return
         if self._ready_since is None:
             self._ready_since = now
-        unheard = [topic for node in self._expected for topic in self._unheard(node)]
-        unheard += self._unmatched()
+        unheard = [topic for node in self._expected for topic in self._connections.unheard(node)]
+        unheard += self._connections.unmatched(self._entities)
         if unheard and now - self._ready_since < _CONNECTION_PATIENCE:
             return
         for topic in unheard:
-            self.get_logger().warning(f'goes on, though nobody expected listens on {topic}')
+            self.get_logger().warning(f'continues without an expected subscription to {topic}')
         self._look_timer.cancel()
         self.get_logger().info(
-            f'all are there: {", ".join(sorted(self._expected))}; the time starts'
+            f'all nodes are ready: {", ".join(sorted(self._expected))}; the time starts'
         )
-        self._remember_endpoints()
+        self._connections.remember()
         self._wall_start = self._due = now
         if self._followed is not None:
             self._first = self._step_at(self._followed)
@@ -317,56 +318,26 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     def _look_for_returned(self) -> None:
         now = time.monotonic()
         for node, since in sorted(self._returned.items()):
-            connected = not self._unheard(node) and not self._unmatched()
+            unheard = self._connections.unheard(node)
+            connected = not unheard and not self._connections.unmatched(self._entities)
             if connected or now - since > _CONNECTION_PATIENCE:
                 del self._returned[node]
-                self._remember_endpoints()
+                self._connections.remember()
                 self._repeated = self._stamp
                 robot = self._robot_of.get(node)
                 self._publish([robot] if robot is not None else [])
         if not self._returned:
             self._look_timer.cancel()
 
-    def _listeners(self, node: str, topic: str) -> set[bytes]:
-        """Return the subscriptions of a node to a topic."""
-        return {
-            bytes(info.endpoint_gid)
-            for info in self.get_subscriptions_info_by_topic(topic)
-            if f'{info.node_namespace.rstrip("/")}/{info.node_name}' == node
-        }
-
-    def _unheard(self, node: str) -> list[str]:
-        """Return the topics that a node does not listen on, or only by what it was before."""
-        return [
-            topic
-            for topic in self._expected[node]
-            if not self._listeners(node, topic) - self._endpoints.get((node, topic), set())
-        ]
-
-    def _unmatched(self) -> list[str]:
-        """Return the topics with a subscription that is known but would miss a message sent now."""
-        return [
-            publisher.topic_name
-            for publisher in self._entities
-            if isinstance(publisher, Publisher)
-            and publisher.get_subscription_count()
-            < len(self.get_subscriptions_info_by_topic(publisher.topic_name))
-        ]
-
-    def _remember_endpoints(self) -> None:
-        for node, topics in self._expected.items():
-            for topic in topics:
-                self._endpoints[node, topic] = self._listeners(node, topic)
-
     def _watch(self) -> None:
-        """Warn about the nodes that a step waits for, when it takes long."""
+        """Warn about the nodes that a long step waits for."""
         now = time.monotonic()
         if self._waiting and self.active and now - self._wall_step > _PATIENCE:
             waiting = ', '.join(sorted(self._waiting))
             self._say_waiting(f'step {self.step} waits for {waiting}', now)
 
     def _say_waiting(self, text: str, now: float) -> None:
-        """Warn of what is waited for when it changes, else seldom: compiling takes its time."""
+        """Warn when the text changes, else seldom: a node may compile for minutes."""
         if text != self._said or now - self._said_at >= _REMINDER:
             self._said, self._said_at = text, now
             self.get_logger().warning(text)
@@ -397,7 +368,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     def _publish(self, robots: list[str]) -> None:
         """Publish the data of some robots, the clock, and the step.
 
-        Where a step comes twice, images of the other robots have been taken the first time.
+        When a step is republished, images of the other robots are not taken again.
         """
         stamp = stamp_to_ros(self._stamp)
         for name in robots:
@@ -415,7 +386,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         )
 
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
-        """Pass everything on: commands are compared with the step, and zeros always stop."""
+        """Pass every message: commands are compared with the step, and zeros always stop."""
         callback(message)
 
     def _on_done(self, message: LockstepDone) -> None:
@@ -424,7 +395,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             if message.node in self._returned:
                 return
             self._waiting.discard(message.node)
-            self._go_on_if_complete()
+            self._advance_if_complete()
 
     def _on_command(self, name: str, message: TwistStamped) -> None:
         if self.step < 0 or name in self.simulation.away:
@@ -443,10 +414,10 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             )
         if self.settings.lockstep:
             self._waiting.discard(f'{name}/cmd_vel')
-            self._go_on_if_complete()
+            self._advance_if_complete()
 
     def _is_of_use(self, name: str, velocity: tuple[float, ...], stamp: int) -> bool:
-        """Return whether a command is of now; count it otherwise."""
+        """Return whether a command is for the current step or time; count it otherwise."""
         stops = not any(velocity)
         if self.settings.lockstep:
             if stamp == self._stamp:
@@ -477,8 +448,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             )
         return False
 
-    def _go_on_if_complete(self) -> None:
-        """Go on to the next step in lockstep if all are done, now or when it is time."""
+    def _advance_if_complete(self) -> None:
+        """Begin the next step in lockstep if all nodes are done, now or when it is due."""
         if self._waiting or not self.active or self.step < 0:
             return
         left = self._due - time.monotonic() if self._period > 0.0 else 0.0
@@ -494,7 +465,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
             return
         if self.settings.lockstep:
             self._step_timer.cancel()
-            self._go_on_if_complete()
+            self._advance_if_complete()
         else:
             self._advance_freely()
 

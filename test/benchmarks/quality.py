@@ -21,10 +21,11 @@ from typing import Any
 
 import numpy as np
 from quality_conditions import CONDITIONS, SEEDS
-from scipy.stats import beta, chi2, t
+from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
 from maasi_filter.metrics import match_targets, normalised_error, restricted_mean
+from maasi_sim.experiments.statistics import paired_difference
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
@@ -137,10 +138,7 @@ def summary(runs: Sequence[Run]) -> dict[str, Any]:
     return {
         'runs': number,
         'complete': complete,
-        'complete_interval': [
-            float(beta.ppf(0.025, complete, number - complete + 1)) if complete else 0.0,
-            float(beta.ppf(0.975, complete + 1, number - complete)) if complete < number else 1.0,
-        ],
+        'complete_interval': [*map(float, binomtest(complete, number).proportion_ci())],
         'false_per_run': false / number,
         'false_interval': [
             float(chi2.ppf(0.025, 2 * false)) / 2 / number if false else 0.0,
@@ -160,18 +158,12 @@ def difference(runs: Sequence[Run], others: Sequence[Run]) -> tuple[float, float
     A run that did not finish counts as CAP.
     """
     theirs = {run.seed: run.measurements if run.finished else CAP for run in others}
-    gaps = np.array(
-        [
-            (run.measurements if run.finished else CAP) - theirs[run.seed]
-            for run in runs
-            if run.seed in theirs
-        ],
-        float,
+    paired = [run for run in runs if run.seed in theirs]
+    gap = paired_difference(
+        [run.measurements if run.finished else CAP for run in paired],
+        [theirs[run.seed] for run in paired],
     )
-    if len(gaps) < 2:
-        return math.nan, math.nan
-    half = t.ppf(0.975, len(gaps) - 1) * gaps.std(ddof=1) / math.sqrt(len(gaps))
-    return float(gaps.mean()), float(half)
+    return gap.mean, gap.half_width
 
 
 def show(condition: str, method: str, row: dict[str, Any], gap: tuple[float, float] | None) -> str:

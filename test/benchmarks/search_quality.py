@@ -11,7 +11,6 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from quality_conditions import SEEDS
@@ -21,7 +20,7 @@ from maasi_sim.experiments.campaign import plan
 from maasi_sim.experiments.cases import Case
 from maasi_sim.experiments.comparison import SearchComparison, search_settings
 from maasi_sim.experiments.comparison_tables import markdown
-from maasi_sim.experiments.execution import carry_out_all, make_workers
+from maasi_sim.experiments.execution import carry_out_all
 from maasi_sim.experiments.experiment import Results
 
 # What differences are to.
@@ -88,8 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
         plan(comparison(regime, options.planner), options.out, options.runs, first=block[0])
         for regime in wanted
     ]
-    hire = partial(make_workers, max(options.jobs, 1), None, '--jobs')
-    problems = carry_out_all(plans, hire, False, lambda work: '')
+    problems = carry_out_all(plans, max(options.jobs, 1))
     text = tables([work.results() for work in plans])
     head = f'Block `{options.seeds}`, the first {options.runs} seeds (fewer for slow planners).\n'
     print(f'{head}\n{text}')

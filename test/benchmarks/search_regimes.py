@@ -7,9 +7,12 @@ from typing import Any
 
 from quality_conditions import NOISES
 
-from maasi_sim.experiments.searches import NEVER_DONE, merged
+from maasi_sim.experiments.searches import merged
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
+
+# Searches end when all is found or at the limit, not when the planner says that nothing is left.
+_NEVER_DONE = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
 
 GRID_2D = {'grid': [10, 10], 'spacing': 100.0, 'corner': [50.0, 50.0]}
 NEIGHBOURS_3D = {'ring': 6, 'distance': 30.0}
@@ -133,7 +136,7 @@ def prepared(regime: str, kind: str) -> Scenario:
         content['robots'] = dict.fromkeys(robots, like)
     limits = {'limits': {'time': what.limit}, 'filter': {'threads': 1}}
     content = merged(content, change, {'robots': robots}, limits)
-    content['planner'] = merged(content['planner'], NEVER_DONE, how.change)
+    content['planner'] = merged(content['planner'], _NEVER_DONE, how.change)
     for robot in content['robots'].values():
         if how.neighbours:
             robot['candidates'] = what.neighbours

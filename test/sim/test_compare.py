@@ -107,7 +107,7 @@ def test_interrupted_comparison_goes_on_in_its_folder(
 
     monkeypatch.setattr(campaign, 'execute', interrupt)
     assert command(scenario, None) == 130
-    assert 'the same command goes on' in capsys.readouterr().err
+    assert 'the same command resumes' in capsys.readouterr().err
     monkeypatch.setattr(campaign, 'execute', counting)
     assert command(scenario, None) == 0
     assert len(executed) == len(set(executed)) == 4

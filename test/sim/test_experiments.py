@@ -17,7 +17,15 @@ import yaml
 from scipy import stats
 
 from maasi_sim import machine
-from maasi_sim.experiments import campaign, registry, reproduce, results, statistics, tables
+from maasi_sim.experiments import (
+    campaign,
+    execution,
+    registry,
+    reproduce,
+    results,
+    statistics,
+    tables,
+)
 from maasi_sim.experiments.campaign import SerialExecutor, carry_out, plan
 from maasi_sim.experiments.cases import Case, Comparison, Outcome, Published, Quantity
 from maasi_sim.experiments.experiment import Experiment
@@ -514,7 +522,7 @@ def elsewhere(monkeypatch):
     """Let the workers of the command be those that are given."""
 
     def use(workers):
-        monkeypatch.setattr(reproduce, 'make_workers', lambda *_: workers)
+        monkeypatch.setattr(execution, 'make_workers', lambda *_: workers)
 
     return use
 

@@ -164,7 +164,7 @@ class Processes:
                 for future in wait(waiting, return_when=FIRST_COMPLETED).done:
                     yield (waiting.pop(future), *future.result())
         except BrokenProcessPool:
-            raise WorkersLost('a worker died; the same command goes on where it stopped') from None
+            raise WorkersLost('a worker died; the same command resumes') from None
 
     def close(self) -> None:
         """See `Workers.close`."""
@@ -186,8 +186,6 @@ class Cluster:
     ----------
     address : str
         Of its scheduler, such as 'tcp://127.0.0.1:8786'.
-    option : str
-        That gave it, for messages.
     patience : float
         How long to wait for the scheduler and a first worker [s].
 
@@ -197,21 +195,20 @@ class Cluster:
         If there is no scheduler, or it has no workers.
     """
 
-    def __init__(self, address: str, option: str = '--cluster', patience: float = 20.0) -> None:
-        self._option = option
+    def __init__(self, address: str, patience: float = 20.0) -> None:
         try:
             from distributed import Client
         except ImportError:
-            raise WorkersLost(f"{option} needs the package 'dask[distributed]'") from None
+            raise WorkersLost("a cluster needs the package 'dask[distributed]'") from None
         try:
             self._client: Any = Client(address, timeout=patience, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise WorkersLost(f'{option}: no scheduler answers at {address}: {error}') from None
+            raise WorkersLost(f'cluster: no scheduler answers at {address}: {error}') from None
         try:
             self._client.wait_for_workers(1, timeout=patience)
         except TimeoutError:
             self._client.close()
-            raise WorkersLost(f'{option}: the scheduler at {address} has no workers') from None
+            raise WorkersLost(f'cluster: the scheduler at {address} has no workers') from None
         self.number = sum(self._client.nthreads().values())
 
     def machines(self) -> Mapping[str, dict[str, str]]:
@@ -220,7 +217,7 @@ class Cluster:
             return dict(sorted(self._client.run(this_machine).items()))
         except Exception as error:
             self.close()
-            raise WorkersLost(f'{self._option}: {type(error).__name__}: {error}') from None
+            raise WorkersLost(f'cluster: {type(error).__name__}: {error}') from None
 
     def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
         """See `Workers.make`."""
@@ -234,7 +231,7 @@ class Cluster:
             try:
                 result = future.result()
             except Exception as error:
-                raise WorkersLost(f'{self._option}: {type(error).__name__}: {error}') from None
+                raise WorkersLost(f'cluster: {type(error).__name__}: {error}') from None
             yield (futures[future], *result)
             future.release()
 

@@ -4,26 +4,29 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 from collections.abc import Sequence
 from datetime import datetime
-from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from maasi_sim.arguments import count, positive, whole
-from maasi_sim.experiments.campaign import MixedWorkers, Plan, WorkersLost, plan
+from maasi_sim.experiments.campaign import Plan, plan
 from maasi_sim.experiments.comparison import SearchComparison, compared
 from maasi_sim.experiments.comparison_tables import document, facts, table_text, verdicts
-from maasi_sim.experiments.execution import carry_out_all, make_workers
+from maasi_sim.experiments.execution import (
+    DONE,
+    EXIT_CODES,
+    SOME_FAILED,
+    add_worker_options,
+    carry_out_all,
+    run_command,
+)
 from maasi_sim.experiments.experiment import Results
 from maasi_sim.experiments.outputs import as_png
-from maasi_sim.experiments.results import NoRoom, runs_text, write_file
+from maasi_sim.experiments.results import runs_text, write_file
 from maasi_sim.scenario.layering import ScenarioError
 
-DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
 _RUNS = Path('runs')
 
 
@@ -36,9 +39,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='compare',
         description='Compare planners and filters in whole searches on the same seeds, each '
-        'search in one process; the same command goes on where it stopped.',
-        epilog='Exit codes: 0 all searches are there, 1 some failed, 2 wrong input, 3 stopped: no '
-        'room on the disk, or the workers are gone, 130 interrupted.',
+        'search in one process; the same command resumes an interrupted comparison.',
+        epilog=EXIT_CODES,
     )
     parser.add_argument(
         'scenarios', nargs='+', metavar='SCENARIO', help='file, or name of one in config/scenarios'
@@ -66,20 +68,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--time-limit', type=positive, metavar='S', help="of a search [s], not the scenario's"
     )
-    parser.add_argument(
-        '--workers', type=count, metavar='N', help='processes (default: one for each core)'
-    )
-    parser.add_argument('--dask', metavar='ADDRESS', help='scheduler of a Dask cluster')
-    parser.add_argument(
-        '--mixed-workers',
-        action='store_true',
-        help='mix searches of different processors or versions, which may differ in the last bits',
-    )
+    add_worker_options(parser, '--dask')
     parser.add_argument(
         '--again',
         action='store_true',
-        help='make searches in DIR anew that are of other settings, or of another version of the '
-        'code',
+        help='repeat searches in DIR that are of other settings, or of another version of the code',
     )
     parser.add_argument(
         '--out',
@@ -106,28 +99,7 @@ def _seed(text: str) -> int:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     options = build_parser().parse_args(arguments)
-    signal.signal(signal.SIGTERM, _interrupt)
-    signal.signal(signal.SIGINT, _interrupt)
-    try:
-        return compare(options)
-    except (ScenarioError, WrongRequest) as error:
-        return _refuse(str(error), WRONG_INPUT)
-    except MixedWorkers as error:
-        return _refuse(f'{error}; --mixed-workers allows it', WRONG_INPUT)
-    except (NoRoom, WorkersLost) as error:
-        return _refuse(f'{error}; the searches until now are kept', STOPPED)
-    except KeyboardInterrupt:
-        return _refuse('interrupted; the same command goes on from here', INTERRUPTED)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
-
-
-def _refuse(text: str, code: int) -> int:
-    for line in text.splitlines():
-        print(f'error: {line}', file=sys.stderr)
-    return code
+    return run_command(lambda: compare(options), ScenarioError, WrongRequest)
 
 
 def compare(options: argparse.Namespace) -> int:
@@ -152,8 +124,7 @@ def compare(options: argparse.Namespace) -> int:
         _refuse_others(plans, out)
     print(f'results: {out}', file=sys.stderr)
     write_file(out / 'request.json', json.dumps(wanted, indent=2) + '\n')
-    hire = partial(make_workers, options.workers, options.dask, '--dask')
-    problems = carry_out_all(plans, hire, options.mixed_workers, lambda work: '')
+    problems = carry_out_all(plans, options.workers, options.cluster, options.mixed_workers)
     results = [work.results() for work in plans if work.done]
     if results:
         seeds = range(options.first_seed, options.first_seed + options.seeds)
@@ -209,7 +180,7 @@ def _refuse_others(plans: Sequence[Plan], out: Path) -> None:
     if other:
         raise WrongRequest(
             f'--out: {out}: {other} searches there are of other settings, or of another version '
-            'of the code; allowed is another folder, or --again to make them anew'
+            'of the code; allowed is another folder, or --again to repeat them'
         )
 
 

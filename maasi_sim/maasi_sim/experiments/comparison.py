@@ -106,7 +106,10 @@ def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
     result = search(scenario, seed, planner=clairvoyant if settings['clairvoyant'] else None)
     outcome = outcome_of(result, None, limit)
     times = find_times(result, limit)
-    outcome.summary['mean_time_to_find'] = float(times.mean()) if len(times) else None
+    complete = outcome.summary['time_to_find_all']
+    outcome.summary['complete'] = complete is not None
+    outcome.summary['time'] = limit if complete is None else complete
+    outcome.summary['mean_time'] = float(times.mean()) if len(times) else None
     outcome.timing['slowest_decision'] = max(result.planning_times, default=0.0)
     return outcome
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from maasi_sim.experiments.comparison_tables import TIME, complete, difference
+from maasi_sim.experiments.comparison_tables import COMPLETE, TIME, difference
 from maasi_sim.experiments.experiment import Results
-from maasi_sim.experiments.statistics import survival
+from maasi_sim.experiments.statistics import array, survival
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,9 +37,9 @@ def _style(index: int) -> tuple[str, str]:
 def _draw_survival(axes: Axes, results: Results) -> None:
     end = 0.0
     for index, name in enumerate(results.names()):
-        runs = results.runs[name]
-        durations = TIME.values(runs)
-        times, shares = survival(durations, [complete(run) for run in runs])
+        durations = array(results.values(name, TIME.name))
+        finished = array(results.values(name, COMPLETE.name)) > 0.0
+        times, shares = survival(durations, finished)
         end = max(end, float(durations.max()))
         colour, line = _style(index)
         last = float(durations.max())
@@ -67,12 +67,9 @@ def _draw_differences(axes: Axes, results: Results) -> None:
     axes.axvline(0.0, color='#222222', lw=0.8)
     for row, name in enumerate(names[1:]):
         colour, _ = _style(row + 1)
-        gaps = np.array(
-            [
-                TIME.value(first) - TIME.value(second)
-                for first, second in results.pairs(name, names[0])
-            ]
-        )
+        pairs = results.pairs(name, names[0])
+        ours, theirs = (array([pair[i].value(TIME.name) for pair in pairs]) for i in (0, 1))
+        gaps = ours - theirs
         # Spread, always the same way, so that equal values can be seen.
         lift = np.random.default_rng(0).uniform(0.12, 0.3, len(gaps))
         axes.plot(gaps, row + lift, 'o', color=colour, ms=4, alpha=0.45, mew=0)

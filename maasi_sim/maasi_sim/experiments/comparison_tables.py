@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from maasi_sim.experiments.cases import Quantity
 from maasi_sim.experiments.experiment import Results
-from maasi_sim.experiments.results import Run
-from maasi_sim.experiments.statistics import (
-    LEVEL,
-    Difference,
-    Interval,
-    bootstrap_difference,
-    mean_interval,
-)
+from maasi_sim.experiments.results import csv_text, plain
+from maasi_sim.experiments.statistics import LEVEL, Difference, array, bootstrap_difference
+from maasi_sim.experiments.tables import interval as interval_of
+from maasi_sim.experiments.tables import median
 from maasi_sim.machine import code_digest, this_machine
 
 VERSION = 1
@@ -29,104 +22,57 @@ VERSION = 1
 FEWEST = 10
 
 
-@dataclass(frozen=True)
-class Measure:
-    """Something that is measured in each search.
-
-    Attributes
-    ----------
-    name, label, unit : str
-        Key in files, words, unit.
-    value : function of a Run
-        Returns it; nan where the run has none.
-    scale : float
-        Of the numbers in Markdown.
-    shown_unit : str
-        There.
-    """
-
-    name: str
-    label: str
-    unit: str
-    value: Callable[[Run], float]
-    scale: float = 1.0
-    shown_unit: str = ''
-
-    @property
-    def head(self) -> str:
-        """Label and unit in Markdown."""
-        unit = self.shown_unit or self.unit
-        return f'{self.label} [{unit}]' if unit else self.label
-
-    def values(self, runs: Sequence[Run]) -> NDArray[np.float64]:
-        """Return it in each run."""
-        return np.array([self.value(run) for run in runs], dtype=float)
-
-
-def complete(run: Run) -> bool:
-    """Return whether a search found all targets."""
-    return run.value('time_to_find_all') is not None
-
-
-def time_to_find_all(run: Run) -> float:
-    """Return when all targets were found, the time limit if they were not [s]."""
-    return _or_nan(run.value('time_to_find_all' if complete(run) else 'time_limit'))
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _of(name: str) -> Callable[[Run], float]:
-    return lambda run: _or_nan(run.value(name))
-
-
-COMPLETE = Measure('complete', 'complete', '', lambda run: float(complete(run)))
-FALSE = Measure('false_found', 'false found', '', _of('false_found'))
-TIME = Measure('time', 'time to find all', 's', time_to_find_all)
-MEAN_TIME = Measure('mean_time', 'mean time to find', 's', _of('mean_time_to_find'))
-MEASUREMENTS = Measure('measurements', 'measurements', '', _of('measurements'))
-WAY = Measure('distance', 'way', 'm', _of('distance'))
-DECISION = Measure('planning_time', 'decision', 's', _of('planning_time'), 1e3, 'ms')
-STEP = Measure('filter_time', 'filter step', 's', _of('filter_time'), 1e3, 'ms')
-PROCESSOR = Measure('processor_time', 'computation of a search', 's', _of('processor_time'))
-
-MEASURES = (COMPLETE, FALSE, TIME, MEAN_TIME, MEASUREMENTS, WAY, DECISION, STEP, PROCESSOR)
+COMPLETE = Quantity('complete', 'complete')
+TIME = Quantity('time', 'time to find all', 's')
+_TIME_FOUND = Quantity('time_to_find_all', 'time to find all', 's', 'restricted')
+_OTHERS = (
+    Quantity('false_found', 'false found'),
+    TIME,
+    Quantity('mean_time', 'mean time to find', 's'),
+    Quantity('measurements', 'measurements'),
+    Quantity('distance', 'way', 'm'),
+)
+_COMPUTING = (
+    Quantity('planning_time', 'decision', 's'),
+    Quantity('filter_time', 'filter step', 's'),
+    Quantity('processor_time', 'computation of a search', 's'),
+)
+QUANTITIES = (COMPLETE, *_OTHERS, *_COMPUTING)
 # What is worth a column of differences.
-_DIFFERENCES = (COMPLETE, FALSE, TIME, MEAN_TIME, MEASUREMENTS, WAY)
+_DIFFERENCES = (COMPLETE, *_OTHERS)
+# Shown in milliseconds in Markdown.
+_SHORT = ('planning_time', 'filter_time')
 
 
 def share(results: Results, case: str) -> tuple[int, int, float, float]:
     """Return complete searches, searches, and the bounds of Wilson's 95 % interval of the share."""
-    runs = results.runs[case]
-    number = sum(complete(run) for run in runs)
-    if not runs:
+    finished = results.values(case, COMPLETE.name)
+    number = round(sum(value or 0.0 for value in finished))
+    if not finished:
         return 0, 0, math.nan, math.nan
-    low, high = stats.binomtest(number, len(runs)).proportion_ci(LEVEL, method='wilson')
-    return number, len(runs), float(low), float(high)
+    low, high = stats.binomtest(number, len(finished)).proportion_ci(LEVEL, method='wilson')
+    return number, len(finished), float(low), float(high)
 
 
 def median_time(results: Results, case: str) -> float:
     """Return the median of the time to find all [s]; nan if half of the searches did not."""
-    times = [time_to_find_all(run) if complete(run) else math.inf for run in results.runs[case]]
-    middle = float(np.median(times)) if times else math.nan
-    return middle if math.isfinite(middle) else math.nan
+    return median(array(results.values(case, _TIME_FOUND.name)), _TIME_FOUND)
 
 
-def difference(results: Results, case: str, other: str, measure: Measure) -> Difference:
+def difference(results: Results, case: str, other: str, quantity: Quantity) -> Difference:
     """Return the mean of a case minus another one, on the seeds of both."""
     pairs = results.pairs(case, other)
-    first, second = (measure.values([pair[i] for pair in pairs]) for i in (0, 1))
+    first, second = (array([pair[i].value(quantity.name) for pair in pairs]) for i in (0, 1))
     return bootstrap_difference(first, second)
 
 
-def differences(results: Results) -> list[tuple[str, str, Measure, Difference]]:
-    """Return each case minus the first one that has searches, of all measures."""
+def differences(results: Results) -> list[tuple[str, str, Quantity, Difference]]:
+    """Return each case minus the first one that has searches, of all quantities."""
     names = results.names()
     return [
-        (name, names[0], measure, difference(results, name, names[0], measure))
+        (name, names[0], quantity, difference(results, name, names[0], quantity))
         for name in names[1:]
-        for measure in MEASURES
+        for quantity in QUANTITIES
     ]
 
 
@@ -152,8 +98,8 @@ def verdicts(results: Results) -> list[str]:
     """Return a sentence on the time to find all for each case but the first one."""
     return [
         verdict(case, other, gap)
-        for case, other, measure, gap in differences(results)
-        if measure is TIME
+        for case, other, quantity, gap in differences(results)
+        if quantity is TIME
     ]
 
 
@@ -164,26 +110,32 @@ def _digits(value: float, sign: str = '') -> str:
     return f'{value:{sign}.{0 if size >= 1000.0 else 1 if size >= 10.0 else 2}f}'
 
 
-def _mean(interval: Interval, scale: float) -> str:
+def _mean(results: Results, case: str, quantity: Quantity) -> str:
+    interval = interval_of(results, case, quantity)
+    scale = 1e3 if quantity.name in _SHORT else 1.0
     half = f' ± {_digits(scale * interval.half_width)}' if interval.number > 1 else ''
     return _digits(scale * interval.mean) + half
 
 
+def _head(quantity: Quantity) -> str:
+    unit = 'ms' if quantity.name in _SHORT else quantity.unit
+    return f'{quantity.label} [{unit}]' if unit else quantity.label
+
+
 def markdown(results: Results) -> str:
     """Return the tables of a comparison: of cases, and of differences to the first one."""
-    columns = [measure for measure in MEASURES if measure is not COMPLETE]
-    heads = ['case', 'seeds', 'complete', 'median time [s]', *(item.head for item in columns)]
+    columns = QUANTITIES[1:]
+    heads = ['case', 'seeds', 'complete', 'median time [s]', *map(_head, columns)]
     lines = [_row(heads), _row(['---'] * len(heads))]
     for name in results.names():
-        runs = results.runs[name]
         number, total, low, high = share(results, name)
         cells = [name, str(total), f'{number} ({100 * low:.0f} to {100 * high:.0f} %)']
         cells.append(_digits(median_time(results, name)))
-        cells += [_mean(mean_interval(item.values(runs)), item.scale) for item in columns]
+        cells += [_mean(results, name, quantity) for quantity in columns]
         lines.append(_row(cells))
     names = results.names()
     if len(names) > 1:
-        heads = [f'minus {names[0]}', 'seeds', *(item.head for item in _DIFFERENCES)]
+        heads = [f'minus {names[0]}', 'seeds', *map(_head, _DIFFERENCES)]
         lines += ['', _row(heads), _row(['---'] * len(heads))]
         for name in names[1:]:
             gaps = [difference(results, name, names[0], item) for item in _DIFFERENCES]
@@ -215,51 +167,32 @@ def document(every: Sequence[Results], seeds: Sequence[int]) -> str:
 
 def table_text(every: Sequence[Results]) -> str:
     """Return all means and differences as CSV, a row each, in full precision."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator='\n')
-    writer.writerow(
-        [
-            'scenario',
-            'case',
-            'minus',
-            'quantity',
-            'unit',
-            'seeds',
-            'mean',
-            'low',
-            'high',
-            'median',
-            'needed',
-        ]
-    )
+    head = 'scenario case minus quantity unit seeds mean low high median needed'
+    rows: list[list[Any]] = [head.split()]
     for results in every:
         scenario = results.experiment.name
         for name in results.names():
-            for measure in MEASURES:
-                values = measure.values(results.runs[name])
-                one = mean_interval(values)
+            for quantity in QUANTITIES:
+                one = interval_of(results, name, quantity)
                 bounds = [one.mean - one.half_width, one.mean + one.half_width]
-                middle = float(np.nanmedian(values)) if one.number else math.nan
-                if measure is COMPLETE:
+                middle = math.nan
+                if quantity is COMPLETE:
                     bounds = list(share(results, name)[2:])
-                elif measure is TIME:
+                if quantity is TIME:
                     middle = median_time(results, name)
-                cells = [one.number, *map(_cell, (one.mean, *bounds, middle)), '']
-                writer.writerow([scenario, name, '', measure.name, measure.unit, *cells])
-        for name, other, measure, gap in differences(results):
-            cells = [gap.number, *map(_cell, (gap.mean, gap.low, gap.high, gap.median))]
-            needed = '' if gap.needed is None else gap.needed
-            writer.writerow([scenario, name, other, measure.name, measure.unit, *cells, needed])
-    return out.getvalue()
-
-
-def _cell(value: float) -> float | str:
-    return value if math.isfinite(value) else ''
+                elif one.number:
+                    middle = median(array(results.values(name, quantity.name)), quantity)
+                cells = [one.number, one.mean, *bounds, middle, None]
+                rows.append([scenario, name, '', quantity.name, quantity.unit, *cells])
+        for name, other, quantity, gap in differences(results):
+            cells = [gap.number, gap.mean, gap.low, gap.high, gap.median, gap.needed]
+            rows.append([scenario, name, other, quantity.name, quantity.unit, *cells])
+    return csv_text(rows)
 
 
 def facts(every: Sequence[Results], seeds: Sequence[int]) -> dict[str, Any]:
     """Return a comparison as plain values: searches, means, differences; none is infinite."""
-    return _plain(
+    values: dict[str, Any] = plain(
         {
             'version': VERSION,
             'seeds': list(seeds),
@@ -268,12 +201,12 @@ def facts(every: Sequence[Results], seeds: Sequence[int]) -> dict[str, Any]:
             'scenarios': {results.experiment.name: _scenario(results) for results in every},
         }
     )
+    return values
 
 
 def _scenario(results: Results) -> dict[str, Any]:
     cases: dict[str, Any] = {}
     for name in results.names():
-        runs = results.runs[name]
         number, total, low, high = share(results, name)
         settings = results.case(name).settings['scenario']
         cases[name] = {
@@ -284,13 +217,12 @@ def _scenario(results: Results) -> dict[str, Any]:
             'complete': {'number': number, 'low': low, 'high': high},
             'median_time': median_time(results, name),
             'means': {
-                item.name: asdict(mean_interval(item.values(runs))) | {'unit': item.unit}
-                for item in MEASURES
-                if item is not COMPLETE
+                item.name: asdict(interval_of(results, name, item)) | {'unit': item.unit}
+                for item in QUANTITIES[1:]
             },
             'runs': [
-                {'seed': run.seed, **{item.name: item.value(run) for item in MEASURES}}
-                for run in runs
+                {'seed': run.seed, **{item.name: run.value(item.name) for item in QUANTITIES}}
+                for run in results.runs[name]
             ],
         }
     return {
@@ -299,20 +231,12 @@ def _scenario(results: Results) -> dict[str, Any]:
             {
                 'case': name,
                 'minus': other,
-                'quantity': measure.name,
-                'unit': measure.unit,
+                'quantity': quantity.name,
+                'unit': quantity.unit,
                 **asdict(gap),
                 'told_from_zero': gap.told_from_zero,
             }
-            for name, other, measure, gap in differences(results)
+            for name, other, quantity, gap in differences(results)
         ],
         'verdicts': verdicts(results),
     }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

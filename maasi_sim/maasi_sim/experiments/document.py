@@ -40,7 +40,7 @@ one, and what the paper leaves open with what was taken and why.
 
     ./scripts/reproduce --list                      # what there is, and what it takes
     ./scripts/reproduce 000-fig4 000-fig11 --runs 30
-    ./scripts/reproduce all                         # the same command goes on where it stopped
+    ./scripts/reproduce all                         # the same command resumes
     ./scripts/reproduce --document docs/reproduction.md
 
 An experiment without runs in the folder keeps the tables that the page has; these rest on runs

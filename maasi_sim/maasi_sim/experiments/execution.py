@@ -1,11 +1,14 @@
-"""Carries out the plans of a command, with its progress on the terminal."""
+"""What the commands that run campaigns share: options, workers, progress, exit codes."""
 
 from __future__ import annotations
 
+import argparse
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
+from types import FrameType
 
 from rich.console import Console
 from rich.progress import (
@@ -18,51 +21,82 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from maasi_sim.arguments import count
 from maasi_sim.experiments.campaign import (
     Cluster,
+    MixedWorkers,
     Plan,
     Processes,
     SerialExecutor,
     Workers,
+    WorkersLost,
     carry_out,
     one_machine,
 )
-from maasi_sim.experiments.results import Run
+from maasi_sim.experiments.results import NoRoom, Run
+
+DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
+EXIT_CODES = (
+    'Exit codes: 0 all runs are there, 1 some failed, 2 wrong input, 3 stopped: no room on the '
+    'disk, or the workers are gone, 130 interrupted.'
+)
 
 # Wall time between two lines about progress where there is no terminal [s].
 _QUIET_PERIOD = 10.0
 
 
-def make_workers(wanted: int | None, cluster: str | None, option: str, number: int) -> Workers:
-    """Return who makes so many runs.
+def add_worker_options(parser: argparse.ArgumentParser, cluster: str) -> None:
+    """Add the options of `carry_out_all`; `cluster` is the name of that of a Dask cluster."""
+    parser.add_argument(
+        '--workers', type=count, metavar='N', help='processes (default: one for each core)'
+    )
+    parser.add_argument(
+        cluster, dest='cluster', metavar='ADDRESS', help='scheduler of a Dask cluster'
+    )
+    parser.add_argument(
+        '--mixed-workers',
+        action='store_true',
+        help='mix runs of different processors or versions, which may differ in the last bits',
+    )
 
-    Parameters
-    ----------
-    wanted : int or None
-        Processes; None: one for each core.
-    cluster : str or None
-        Scheduler of a Dask cluster, instead of processes.
-    option : str
-        That gave it, for messages.
-    number : int
-        Runs to be made.
 
-    Raises
-    ------
-    WorkersLost
-        If the cluster cannot be reached.
-    """
+def run_command(command: Callable[[], int], *wrong_input: type[Exception]) -> int:
+    """Run a command that can be interrupted, and return its exit code; errors are printed."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        return command()
+    except wrong_input as error:
+        text, code = str(error), WRONG_INPUT
+    except MixedWorkers as error:
+        text, code = f'{error}; --mixed-workers allows it', WRONG_INPUT
+    except (NoRoom, WorkersLost) as error:
+        text, code = f'{error}; the runs until now are kept', STOPPED
+    except KeyboardInterrupt:
+        text, code = 'interrupted; the same command resumes', INTERRUPTED
+    for line in text.splitlines():
+        print(f'error: {line}', file=sys.stderr)
+    return code
+
+
+def make_workers(number: int, wanted: int | None, cluster: str | None) -> Workers:
+    """Return who makes `number` runs; the other parameters are those of `carry_out_all`."""
     if cluster is not None:
-        return Cluster(cluster, option)
+        return Cluster(cluster)
     processes = min(wanted or os.cpu_count() or 1, number)
     return Processes(processes) if processes > 1 else SerialExecutor()
 
 
 def carry_out_all(
     plans: list[Plan],
-    hire: Callable[[int], Workers],
-    mixed: bool,
-    finished: Callable[[Plan], str],
+    workers: int | None = None,
+    cluster: str | None = None,
+    mixed: bool = False,
+    finished: Callable[[Plan], str] = lambda work: '',
 ) -> list[str]:
     """Make the runs of all plans, say what was made, and return what went wrong.
 
@@ -70,8 +104,10 @@ def carry_out_all(
     ----------
     plans : list of Plan
         One after the other.
-    hire : function of a number of runs
-        Returns who makes them.
+    workers : int, optional
+        Processes; none: one for each core.
+    cluster : str, optional
+        Scheduler of a Dask cluster, instead of processes.
     mixed : bool
         Whether runs of different processors or versions are mixed.
     finished : function of a Plan
@@ -80,29 +116,27 @@ def carry_out_all(
     Raises
     ------
     MixedWorkers, NoRoom, WorkersLost
-        See `one_machine` and `carry_out`.
+        See `one_machine` and `carry_out`; also if the cluster cannot be reached.
     """
     number = sum(len(work.tasks) for work in plans)
     problems: list[str] = []
-    workers: Workers | None = None
+    team: Workers | None = None
     begin = time.monotonic()
     try:
         if number:
-            workers = hire(number)
-        machine = None
-        if workers is not None and not mixed:
-            machine = one_machine(workers, plans)
+            team = make_workers(number, workers, cluster)
+        machine = one_machine(team, plans) if team is not None and not mixed else None
         with _Display(plans) as display:
             for work in plans:
-                if work.tasks and workers is not None:
-                    problems += carry_out(work, workers, display.advance(work), machine)
+                if work.tasks and team is not None:
+                    problems += carry_out(work, team, display.advance(work), machine)
                 line = finished(work)
                 if line:
                     display.say(line)
     finally:
-        if workers is not None:
-            workers.close()
-    used = f' by {workers.number} workers in {time.monotonic() - begin:.0f} s' if workers else ''
+        if team is not None:
+            team.close()
+    used = f' by {team.number} workers in {time.monotonic() - begin:.0f} s' if team else ''
     kept = sum(len(work.done) for work in plans)
     print(f'{number - len(problems)} runs made{used}; {kept} there in all')
     for problem in problems:

@@ -7,7 +7,7 @@ case. Several mappings of cases stand for all combinations of them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
@@ -42,7 +42,7 @@ RUNS = {
     'mission': run_mission,
     'timing': run_timing,
 }
-FIGURES = {
+FIGURES: dict[str, Callable[..., None]] = {
     'curves': figures.draw_curves,
     'paths': figures.draw_paths,
     'against': figures.draw_against,

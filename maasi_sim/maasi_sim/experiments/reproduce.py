@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-from functools import partial
 from pathlib import Path
-from types import FrameType
 
 from maasi_sim.arguments import count, whole
-from maasi_sim.experiments.campaign import MixedWorkers, Plan, WorkersLost, plan
+from maasi_sim.experiments.campaign import Plan, plan
 from maasi_sim.experiments.document import write_document
-from maasi_sim.experiments.execution import carry_out_all, make_workers
+from maasi_sim.experiments.execution import (
+    DONE,
+    EXIT_CODES,
+    SOME_FAILED,
+    add_worker_options,
+    carry_out_all,
+    run_command,
+)
 from maasi_sim.experiments.experiment import Experiment
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.registry import UnknownExperiment, experiments, find
-from maasi_sim.experiments.results import NoRoom
 
-DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
+
+class UnknownCase(ValueError):
+    """A name that no case of the experiments has."""
 
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='reproduce',
-        description="Run the papers' experiments; the same command goes on where it stopped.",
-        epilog='Exit codes: 0 all runs are there, 1 some failed, 2 wrong input, 3 stopped: no '
-        'room on the disk, or the workers are gone, 130 interrupted.',
+        description="Run the papers' experiments; the same command resumes an interrupted run.",
+        epilog=EXIT_CODES,
     )
     parser.add_argument('names', nargs='*', metavar='NAME', help='experiments, or "all"')
     parser.add_argument('--list', action='store_true', help='name every experiment')
@@ -40,15 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar='NAME',
         help='only this case of each experiment; may be given several times',
     )
-    parser.add_argument(
-        '--workers', type=count, metavar='N', help='processes (default: one for each core)'
-    )
-    parser.add_argument('--cluster', metavar='ADDRESS', help='scheduler of a Dask cluster')
-    parser.add_argument(
-        '--mixed-workers',
-        action='store_true',
-        help='mix runs of different processors or versions, which may differ in the last bits',
-    )
+    add_worker_options(parser, '--cluster')
     parser.add_argument(
         '--out',
         type=Path,
@@ -79,50 +75,26 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not (options.names or options.list or options.document):
         parser.error('give names of experiments, --list, or --document FILE')
-    signal.signal(signal.SIGTERM, _interrupt)
+    return run_command(lambda: _reproduce(options), UnknownExperiment, UnknownCase)
+
+
+def _reproduce(options: argparse.Namespace) -> int:
     if options.list:
         print('\n'.join(listing(list(experiments().values()))))
         return DONE
-    try:
-        wanted = (
-            list(experiments().values())
-            if options.names == ['all']
-            else [find(name) for name in dict.fromkeys(options.names)]
-        )
-    except UnknownExperiment as error:
-        return _refuse(str(error), WRONG_INPUT)
-    unknown = _unknown_case(wanted, options)
-    if unknown:
-        return _refuse(unknown, WRONG_INPUT)
-    try:
-        code = run_all(wanted, options) if wanted else DONE
-        if options.document is not None:
-            shown = write_document(options.document, options.out, options.seed, options.small)
-            print(f'wrote {options.document} with {len(shown)} experiments')
-        return code
-    except MixedWorkers as error:
-        return _refuse(f'{error}; --mixed-workers allows it', WRONG_INPUT)
-    except (NoRoom, WorkersLost) as error:
-        return _refuse(f'{error}; the runs until now are kept', STOPPED)
-    except KeyboardInterrupt:
-        return _refuse('interrupted; the same command goes on from here', INTERRUPTED)
-
-
-def _unknown_case(wanted: list[Experiment], options: argparse.Namespace) -> str:
-    """Return what is wrong with the names of cases, '' if nothing is."""
+    if options.names == ['all']:
+        wanted = list(experiments().values())
+    else:
+        wanted = [find(name) for name in dict.fromkeys(options.names)]
     known = {case.name for item in wanted for case in item.cases(options.small)}
     for name in options.case or []:
         if name not in known:
-            return f"unknown case '{name}'; allowed are {', '.join(sorted(known))}"
-    return ''
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
-
-
-def _refuse(text: str, code: int) -> int:
-    print(f'error: {text}', file=sys.stderr)
+            allowed = ', '.join(sorted(known))
+            raise UnknownCase(f"unknown case '{name}'; allowed are {allowed}")
+    code = run_all(wanted, options) if wanted else DONE
+    if options.document is not None:
+        shown = write_document(options.document, options.out, options.seed, options.small)
+        print(f'wrote {options.document} with {len(shown)} experiments')
     return code
 
 
@@ -154,8 +126,9 @@ def run_all(wanted: list[Experiment], options: argparse.Namespace) -> int:
         write_outputs(work.folder, work.results(), options.seed)
         return f'{work.experiment.name}: {work.folder.path}/table.md'
 
-    hire = partial(make_workers, options.workers, options.cluster, '--cluster')
-    problems = carry_out_all(plans, hire, options.mixed_workers, finished)
+    problems = carry_out_all(
+        plans, options.workers, options.cluster, options.mixed_workers, finished
+    )
     return SOME_FAILED if problems else DONE
 
 

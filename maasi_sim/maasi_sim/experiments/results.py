@@ -10,7 +10,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -88,19 +88,19 @@ def run_of(experiment: str, case: Case, number: int, seed: int, outcome: Outcome
         number,
         seed,
         case.digest(),
-        _plain(outcome.summary),
+        plain(outcome.summary),
         columns,
-        _plain(outcome.details),
-        _plain(outcome.timing),
+        plain(outcome.details),
+        plain(outcome.timing),
     )
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return a value as JSON holds it; what is not finite is None."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -121,14 +121,19 @@ def to_text(run: Run) -> str:
         'timing': run.timing,
         'machine': run.machine,
     }
-    body = io.StringIO()
-    body.write(f'# {json.dumps(facts, allow_nan=False)}\n')
-    writer = csv.writer(body, lineterminator='\n')
-    writer.writerow(run.columns)
-    for row in zip(*run.columns.values()):
-        writer.writerow([_number(value) for value in row])
-    text = body.getvalue()
+    rows = zip(*(map(_number, values) for values in run.columns.values()))
+    text = f'# {json.dumps(facts, allow_nan=False)}\n{csv_text([run.columns, *rows])}'
     return f'{_HEAD}{hashlib.sha256(text.encode()).hexdigest()}\n{text}'
+
+
+def csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    """Return rows as CSV; None and what is not finite stay empty."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator='\n').writerows(
+        ['' if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in row]
+        for row in rows
+    )
+    return out.getvalue()
 
 
 def _number(value: float) -> str:
@@ -243,37 +248,22 @@ class RunFolder:
         write_file(self.file(case, number), text)
 
 
-def steps_text(runs: Iterable[Run]) -> str:
+def steps_text(runs: Sequence[Run]) -> str:
     """Return all runs as one CSV, one row per run and step."""
-    listed = list(runs)
-    names = list(dict.fromkeys(name for run in listed for name in run.columns))
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator='\n')
-    writer.writerow(['case', 'map', *names])
-    for run in listed:
+    names = list(dict.fromkeys(name for run in runs for name in run.columns))
+    rows: list[list[Any]] = [['case', 'map', *names]]
+    for run in runs:
         length = max((len(values) for values in run.columns.values()), default=0)
-        for row in range(length):
-            writer.writerow(
-                [
-                    run.case,
-                    run.number,
-                    *(_number(run.columns[n][row]) if n in run.columns else '' for n in names),
-                ]
-            )
-    return out.getvalue()
+        cells = (map(_number, run.columns[n]) if n in run.columns else [''] * length for n in names)
+        rows += [[run.case, run.number, *row] for row in zip(*cells)]
+    return csv_text(rows)
 
 
-def runs_text(runs: Iterable[Run]) -> str:
+def runs_text(runs: Sequence[Run]) -> str:
     """Return what each run has come to as CSV, one row per run."""
-    listed = list(runs)
-    names = list(dict.fromkeys(name for run in listed for name in (*run.summary, *run.timing)))
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator='\n')
-    writer.writerow(['case', 'map', 'seed', *names])
-    for run in listed:
+    names = list(dict.fromkeys(name for run in runs for name in (*run.summary, *run.timing)))
+    rows: list[list[Any]] = [['case', 'map', 'seed', *names]]
+    for run in runs:
         known = {**run.summary, **run.timing}
-        writer.writerow(
-            [run.case, run.number, run.seed]
-            + ['' if known.get(name) is None else known[name] for name in names]
-        )
-    return out.getvalue()
+        rows.append([run.case, run.number, run.seed, *(known.get(name) for name in names)])
+    return csv_text(rows)

@@ -38,7 +38,7 @@ class Interval:
     @property
     def error(self) -> float:
         """Standard error of the mean."""
-        return self.half_width / float(stats.t.ppf(0.5 + 0.5 * LEVEL, self.degrees))
+        return self.half_width / _student(self.degrees)
 
 
 def mean_interval(values: ArrayLike) -> Interval:
@@ -52,9 +52,7 @@ def mean_interval(values: ArrayLike) -> Interval:
     if number == 1:
         return Interval(mean, math.nan, 1, 0.0)
     error = float(array.std(ddof=1)) / math.sqrt(number)
-    return Interval(
-        mean, error * float(stats.t.ppf(0.5 + 0.5 * LEVEL, number - 1)), number, number - 1.0
-    )
+    return Interval(mean, error * _student(number - 1), number, number - 1.0)
 
 
 def restricted_mean(durations: ArrayLike, finished: ArrayLike, limit: float) -> Interval:
@@ -90,24 +88,29 @@ def restricted_mean(durations: ArrayLike, finished: ArrayLike, limit: float) -> 
     if (ended | (times >= limit)).all():
         return mean_interval(np.minimum(times, limit))
     number = len(times)
-    survival, area, last = 1.0, 0.0, 0.0
-    steps: list[tuple[float, int, int]] = []
-    areas: list[float] = []
-    for time in np.unique(times[ended]):
-        area += survival * (time - last)
-        areas.append(area)
-        last = float(time)
-        risk = int((times >= time).sum())
-        deaths = int((ended & (times == time)).sum())
-        survival *= 1.0 - deaths / risk
-        steps.append((last, risk, deaths))
-    total = area + survival * (limit - last)
-    variance = 0.0
-    for (_, risk, deaths), before in zip(steps, areas):
-        if risk > deaths:
-            variance += (total - before) ** 2 * deaths / (risk * (risk - deaths))
-    half = math.sqrt(variance) * float(stats.t.ppf(0.5 + 0.5 * LEVEL, max(number - 1, 1)))
-    return Interval(total, half if number > 1 else math.nan, number, max(number - 1.0, 0.0))
+    steps, deaths = np.unique(times[ended], return_counts=True)
+    risk = (times >= steps[:, None]).sum(axis=1)
+    survival = np.concatenate([[1.0], np.cumprod(1.0 - deaths / risk)])
+    areas = np.cumsum(survival * np.diff([0.0, *steps, limit]))
+    left = risk > deaths
+    spread = (deaths / (risk * np.maximum(risk - deaths, 1)))[left]
+    variance = float(((areas[-1] - areas[:-1][left]) ** 2 * spread).sum())
+    half = math.sqrt(variance) * _student(max(number - 1, 1))
+    return Interval(
+        float(areas[-1]), half if number > 1 else math.nan, number, max(number - 1.0, 0.0)
+    )
+
+
+def _student(degrees: float) -> float:
+    """Return the half width of the interval of Student's t with variance 1."""
+    return float(stats.t.ppf(0.5 + 0.5 * LEVEL, degrees))
+
+
+def _gaps(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
+    one, two = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    if one.shape != two.shape:
+        raise ValueError(f'first, second: got shapes {one.shape}, {two.shape}, allowed are equal')
+    return one - two
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike) -> Interval:
@@ -118,10 +121,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> Interval:
     ValueError
         If the lengths differ.
     """
-    one, two = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
-    if one.shape != two.shape:
-        raise ValueError(f'first, second: got shapes {one.shape}, {two.shape}, allowed are equal')
-    return mean_interval(one - two)
+    return mean_interval(_gaps(first, second))
 
 
 @dataclass(frozen=True)
@@ -165,10 +165,8 @@ def bootstrap_difference(first: ArrayLike, second: ArrayLike) -> Difference:
     ValueError
         If the lengths differ.
     """
-    one, two = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
-    if one.shape != two.shape:
-        raise ValueError(f'first, second: got shapes {one.shape}, {two.shape}, allowed are equal')
-    gaps = (one - two)[~np.isnan(one - two)]
+    gaps = _gaps(first, second)
+    gaps = gaps[~np.isnan(gaps)]
     if not len(gaps):
         return Difference(math.nan, math.nan, math.nan, math.nan, 0, None)
     mean, median = float(gaps.mean()), float(np.median(gaps))
@@ -255,8 +253,7 @@ def independent_difference(first: Interval, second: Interval) -> Interval:
     if variance == 0.0:
         return Interval(difference, 0.0, number, min(degrees for _, degrees in parts))
     degrees = variance**2 / sum(part**2 / free for part, free in parts)
-    half = math.sqrt(variance) * float(stats.t.ppf(0.5 + 0.5 * LEVEL, degrees))
-    return Interval(difference, half, number, degrees)
+    return Interval(difference, math.sqrt(variance) * _student(degrees), number, degrees)
 
 
 def from_published(value: float, half_width: float | None, runs: int) -> Interval:

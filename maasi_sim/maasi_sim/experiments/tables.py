@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass
 
@@ -11,6 +9,7 @@ import numpy as np
 
 from maasi_sim.experiments.cases import Quantity
 from maasi_sim.experiments.experiment import Results
+from maasi_sim.experiments.results import csv_text
 from maasi_sim.experiments.statistics import (
     Interval,
     array,
@@ -200,65 +199,18 @@ def markdown(results: Results) -> str:
 
 def table_text(results: Results) -> str:
     """Return the table of ours against the paper's as CSV, in full precision."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator='\n')
-    writer.writerow(
-        [
-            'case',
-            'preset',
-            'quantity',
-            'unit',
-            'runs',
-            'finished',
-            'ours',
-            'ours_95',
-            'ours_median',
-            'paper',
-            'paper_95',
-            'difference',
-            'difference_95',
-            'note',
-        ]
-    )
+
+    def pair(item: Interval | None) -> list[float | None]:
+        return [None, None] if item is None else [item.mean, item.half_width]
+
+    head = 'case preset quantity unit runs finished ours ours_95 ours_median paper paper_95'
+    table: list[list[object]] = [[*head.split(), 'difference', 'difference_95', 'note']]
     for row in rows(results):
-        cells: list[float | str] = []
-        for item in (row.ours, row.paper, row.difference):
-            if item is None:
-                cells += ['', '']
-            else:
-                cells += [v if math.isfinite(v) else '' for v in (item.mean, item.half_width)]
-            if item is row.ours:
-                cells.append(row.median if math.isfinite(row.median) else '')
-        writer.writerow(
-            [
-                row.case,
-                row.preset,
-                row.quantity.name,
-                row.quantity.unit,
-                row.runs,
-                row.finished,
-                *cells,
-                row.note,
-            ]
-        )
-    for pair in paired_rows(results):
-        half = pair.difference.half_width
-        writer.writerow(
-            [
-                f'{pair.first} - {pair.second}',
-                'paired',
-                pair.quantity.name,
-                pair.quantity.unit,
-                pair.difference.number,
-                '',
-                '',
-                '',
-                '',
-                '',
-                '',
-                pair.difference.mean,
-                half if math.isfinite(half) else '',
-                'paired on the same maps',
-            ]
-        )
-    return out.getvalue()
+        first = [row.case, row.preset, row.quantity.name, row.quantity.unit, row.runs, row.finished]
+        cells = [*pair(row.ours), row.median, *pair(row.paper), *pair(row.difference)]
+        table.append([*first, *cells, row.note])
+    for item in paired_rows(results):
+        first = [f'{item.first} - {item.second}', 'paired', item.quantity.name, item.quantity.unit]
+        cells = [item.difference.number, *[None] * 6, *pair(item.difference)]
+        table.append([*first, *cells, 'paired on the same maps'])
+    return csv_text(table)

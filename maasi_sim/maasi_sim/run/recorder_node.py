@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import math
 import struct
 import time
@@ -25,6 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 
 from maasi_filter.ros.conversions import stamp_of_step
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE
 from maasi_msgs.msg import (
     AgentState,
     CuboidDecision,
@@ -39,6 +39,7 @@ from maasi_msgs.msg import (
 )
 from maasi_sim.run.bag import BagError, BagWriter, TopicQos
 from maasi_sim.run.mission import Observer
+from maasi_sim.run.serialised import message_class, stamp_of, time_at
 from maasi_sim.run.topics import CLOCK, STEP, within
 from maasi_sim.view.messages import is_shown
 
@@ -71,12 +72,6 @@ _WITH_STEP = (
 _LONGEST_HOLD, _LARGEST_LEAD = 1.0, 60 * 10**9
 # Longest wait for the acknowledgement of stop commands [s].
 _STOP_PATIENCE = 1.0
-_READY_QOS = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-_RELIABLE = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
-)
 
 
 class Recorder:
@@ -161,20 +156,12 @@ class Recorder:
         self._wanted = {*observer.topics, CLOCK, DONE, DIAGNOSTICS}
         self._subscriptions: dict[str, Subscription] = {}
         self._refused: set[str] = set()
-        self._ready_subscription = self._subscribe(
-            READY,
-            LockstepDone,
-            QoSProfile(
-                depth=100,
-                reliability=ReliabilityPolicy.RELIABLE,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL,
-            ),
-        )
+        self._ready_subscription = self._subscribe(READY, LockstepDone, LATCHED_ALL)
         self._ready_publisher = self.node.create_publisher(
-            LockstepDone, within(team, READY), _READY_QOS
+            LockstepDone, within(team, READY), LATCHED
         )
         self._done_publisher = self.node.create_publisher(
-            LockstepDone, within(team, DONE), _RELIABLE
+            LockstepDone, within(team, DONE), RELIABLE
         )
         self._wait_set = rclpy_implementation.WaitSet(2, 0, 0, 0, 0, 0, self.context.handle)
 
@@ -204,31 +191,17 @@ class Recorder:
             infos = self.node.get_publishers_info_by_topic(full)
             if not infos:
                 continue
-            profiles = [info.qos_profile for info in infos]
-            reliable = all(
-                profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles
-            )
-            latched = all(
-                profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles
-            )
+            qos = _reader_of([info.qos_profile for info in infos])
             try:
-                kind = _message_class(types[0])
+                kind = message_class(types[0])
                 if self.bag is not None:
+                    reliable = qos.reliability == ReliabilityPolicy.RELIABLE
+                    latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
                     self.bag.add_topic(full, types[0], TopicQos(reliable, latched))
             except (ImportError, AttributeError, BagError) as error:
                 self._refused.add(topic)
                 self.complaints.append(f'topic {full} is not recorded: {error}')
                 continue
-            qos = QoSProfile(
-                history=HistoryPolicy.KEEP_ALL if reliable else HistoryPolicy.KEEP_LAST,
-                depth=1000,
-                reliability=(
-                    ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-                ),
-                durability=(
-                    DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-                ),
-            )
             self._subscriptions[topic] = self._subscribe(topic, kind, qos)
             if shown:
                 self._shown[topic] = types[0]
@@ -307,7 +280,7 @@ class Recorder:
             self.step = struct.unpack_from('<Q', data, 4)[0]
             self._set_time(data, 12)
             if self._begun is None:
-                self._begun = _time_at(data, 12)
+                self._begun = time_at(data, 12)
         taken = [(CLOCK, data) for data in self._take_from(CLOCK)]
         for _, data in taken:
             self._set_time(data, 4)
@@ -395,7 +368,7 @@ class Recorder:
         due = []
         early: set[str] = set()
         for topic, data in items:
-            lead = _stamp(topic, self._subscriptions[topic].msg_type, data) - self.time
+            lead = stamp_of(topic, self._subscriptions[topic].msg_type, data) - self.time
             # Keep the order within a topic.
             if topic in early or 0 < lead <= _LARGEST_LEAD:
                 early.add(topic)
@@ -419,7 +392,7 @@ class Recorder:
             if self._finished and topic.rpartition('/')[2] in _AT_THE_END:
                 kept.append((topic, data))
                 continue
-            if _stamp(topic, kind, data) > end:
+            if stamp_of(topic, kind, data) > end:
                 continue
             if kind in _WITH_STEP and deserialize_message(data, kind).step > step:
                 continue
@@ -431,7 +404,7 @@ class Recorder:
         return [] if subscription is None else _take(subscription)
 
     def _set_time(self, data: bytes, offset: int) -> None:
-        self.time = max(self.time, _time_at(data, offset))
+        self.time = max(self.time, time_at(data, offset))
 
     def done_steps(self) -> dict[str, int]:
         """Return the last step that each node recently reported done."""
@@ -450,7 +423,7 @@ class Recorder:
             if self.node.count_subscribers(topic):
                 plain = types[topic] == ['geometry_msgs/msg/Twist']
                 chosen = Twist if plain else TwistStamped
-                publishers.append(self.node.create_publisher(chosen, topic, _RELIABLE))
+                publishers.append(self.node.create_publisher(chosen, topic, RELIABLE))
         deadline = time.monotonic() + _STOP_PATIENCE
         while time.monotonic() < deadline and any(
             publisher.get_subscription_count() < self.node.count_subscribers(publisher.topic)
@@ -494,35 +467,16 @@ def _take(subscription: Subscription) -> list[bytes]:
         taken.append(item[0])
 
 
-def _stamp_offset(topic: str, kind: Any, data: bytes) -> int | None:
-    """Return where the first stamp of a serialised message is; None where it has none."""
-    first = next(iter(kind.get_fields_and_field_types()))
-    if first in ('header', 'clock'):
-        return 4
-    # Transforms are a sequence, which starts with its length.
-    if topic.rpartition('/')[2] == 'tf' and first == 'transforms' and len(data) >= 16:
-        return 8
-    return None
-
-
-def _stamp(topic: str, kind: Any, data: bytes) -> int:
-    """Return the first stamp of a serialised message, 0 if it has none [ns]."""
-    offset = _stamp_offset(topic, kind, data)
-    if offset is None:
-        return 0
-    return _time_at(data, offset)
-
-
-def _time_at(data: bytes, offset: int) -> int:
-    """Return the time at a place of a serialised message [ns]."""
-    seconds, nanoseconds = struct.unpack_from('<iI', data, offset)
-    return int(seconds) * 10**9 + int(nanoseconds)
-
-
-def _message_class(name: str) -> type:
-    """Return the class of `package/msg/Type`."""
-    package, _, kind = name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), kind)
+def _reader_of(profiles: Sequence[QoSProfile]) -> QoSProfile:
+    """Return the quality of service that gets all messages of publishers."""
+    reliable = all(item.reliability == ReliabilityPolicy.RELIABLE for item in profiles)
+    latched = all(item.durability == DurabilityPolicy.TRANSIENT_LOCAL for item in profiles)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL if reliable else HistoryPolicy.KEEP_LAST,
+        depth=1000,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
 
 
 def _never(_: bytes) -> None:

@@ -9,10 +9,10 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 
+from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_msgs.msg import (
     BatchMember,
     DetectionArray,
@@ -24,13 +24,6 @@ from maasi_msgs.msg import (
 )
 from maasi_sim.run.recording import FILTER, Batch
 from maasi_sim.run.topics import BATCH, FOUND, UPDATE, within
-
-_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE)
-_LATCHED = QoSProfile(
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 
 
 class ReplayNode:
@@ -72,21 +65,21 @@ class ReplayNode:
         self.found_batch = dict.fromkeys(namespaces, 0)
         self._awaited = {within(name, f'/{FILTER}') for name in namespaces}
         self._batches = {
-            name: self.node.create_publisher(MeasurementBatch, within(name, BATCH), _ALL)
+            name: self.node.create_publisher(MeasurementBatch, within(name, BATCH), RELIABLE)
             for name in namespaces
         }
         self._detections = {
-            name: self.node.create_publisher(DetectionArray, f'/{name}/detections', _ALL)
+            name: self.node.create_publisher(DetectionArray, f'/{name}/detections', RELIABLE)
             for name in robots
         }
         for name in namespaces:
             self.node.create_subscription(
-                FilterUpdate, within(name, UPDATE), self.updates.append, _ALL
+                FilterUpdate, within(name, UPDATE), self.updates.append, RELIABLE
             )
             self.node.create_subscription(
-                FoundTargetArray, within(name, FOUND), partial(self._on_found, name), _LATCHED
+                FoundTargetArray, within(name, FOUND), partial(self._on_found, name), LATCHED_ALL
             )
-        self.node.create_subscription(LockstepDone, '/lockstep/ready', self._on_ready, _LATCHED)
+        self.node.create_subscription(LockstepDone, '/lockstep/ready', self._on_ready, LATCHED_ALL)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
 
