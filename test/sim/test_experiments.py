@@ -207,7 +207,7 @@ def test_damaged_run_is_made_again_and_no_other(toy, tmp_path, damage, capsys):
     assert reproduce.main(['000-toy', '--out', str(tmp_path), '--workers', '1']) == 0
     assert made == [(5, toy.seed(2))]
     said = capsys.readouterr().err
-    assert 'second-0002.csv' in said and 'made again' in said
+    assert 'second-0002.csv' in said and 'repeated' in said
     after = run_files(tmp_path)
     assert after.keys() == before.keys()
     assert after == before
@@ -591,5 +591,5 @@ def test_run_of_a_worker_that_came_later_and_differs_is_not_kept(toy, tmp_path, 
     elsewhere(Elsewhere({}, makes={'numpy': '1.0'}))
     assert reproduce.main(['000-toy', '--out', str(tmp_path), '--runs', '1']) == 1
     said = capsys.readouterr().err
-    assert 'first, map 0: not kept, made by a worker that differs: NumPy 1.0' in said
+    assert 'first, map 0: not kept, made by a different worker: NumPy 1.0' in said
     assert not run_files(tmp_path)

@@ -1,4 +1,4 @@
-"""Draws what can be laid beside the figures of 004."""
+"""Figures in the form of those of 004."""
 
 from __future__ import annotations
 

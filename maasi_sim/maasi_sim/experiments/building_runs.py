@@ -1,4 +1,4 @@
-"""Runs of searches of buildings as experiments: what is run, and what is measured."""
+"""Searches of buildings as experiments: runs and measured quantities."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from maasi_planner.buildings import (
 from maasi_sim.buildings.mission import CuboidMission, SearchRobot, summary
 from maasi_sim.experiments.cases import Outcome, Quantity
 
-# Steps of a mission at most.
+# Largest number of steps of a mission.
 _LIMIT = 1000
 # Without a limit on wall time a decision does not depend on the machine [s].
 _FOR_EVER = 1e9
@@ -52,7 +52,7 @@ def _robots(settings: dict[str, Any], seed: int) -> dict[str, SearchRobot]:
         starts = {}
         while len(starts) < settings['agents']:
             place = rng.uniform(box[:, 0], box[:, 1])
-            # A robot needs some air around it.
+            # Robots start at least 2 m from objects.
             near = (mission.solids[:, :, 0] - 2.0 < place) & (place < mission.solids[:, :, 1] + 2.0)
             if not near.all(axis=1).any():
                 starts[f'agent{len(starts) + 1:02d}'] = place.tolist()

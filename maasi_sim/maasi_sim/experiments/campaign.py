@@ -1,8 +1,8 @@
-"""Runs the cases of an experiment on its maps: here, in several processes, or on a Dask cluster.
+"""Runs the cases of an experiment on its maps: in this process, in several, or on a Dask cluster.
 
-The seed of a run is that of the map, whichever worker makes it. Runs that are there already are
-not made again. Another processor or other versions may change the last bits of numbers, so that
-runs of different machines are mixed only where this is asked for (docs/repeatability.md).
+The seed of a run is that of the map and does not depend on the worker. Stored runs are not
+repeated. Another processor or other versions may change the last bits of numbers, so that runs of
+different machines are mixed only on request (docs/repeatability.md).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from maasi_sim.experiments.registry import find
 from maasi_sim.experiments.results import DamagedRun, Run, RunFolder, from_text, run_of, to_text
 from maasi_sim.machine import machine_difference, this_machine
 
-# One thread for each worker: there are as many workers as wanted.
+# One thread for each worker; the number of workers sets the load.
 ONE_THREAD = {
     'OMP_NUM_THREADS': '1',
     'OPENBLAS_NUM_THREADS': '1',
@@ -39,9 +39,9 @@ _AHEAD = 2
 
 @dataclass(frozen=True)
 class Task:
-    """One run to be made; plain values only, so that it can be sent anywhere.
+    """One run to be made; plain values only, so that it can be sent to a worker.
 
-    `settings` are those of a comparison; None: the worker has the experiment by its name.
+    `settings` are those of a comparison; None: the worker finds the experiment by its name.
     """
 
     experiment: str
@@ -54,15 +54,15 @@ class Task:
 
 
 class WorkersLost(RuntimeError):
-    """The workers are gone; what they had finished is kept."""
+    """The workers are lost; their finished runs are kept."""
 
 
 class MixedWorkers(ValueError):
-    """Processors or versions differ, and it was not asked to mix them."""
+    """Processors or versions differ, and mixing was not requested."""
 
 
 def execute(task: Task) -> tuple[str, str]:
-    """Make a run and return the text of its file, or '' and what went wrong."""
+    """Make a run and return the text of its file and '', or '' and the error."""
     try:
         if task.settings is None:
             experiment = find(task.experiment)
@@ -71,7 +71,7 @@ def execute(task: Task) -> tuple[str, str]:
             experiment = SearchComparison(task.experiment, own)
         case = next((c for c in experiment.cases(task.small) if c.name == task.case), None)
         if case is None or case.digest() != task.digest:
-            return '', 'this worker has other settings for it: another version of the code'
+            return '', 'this worker has other settings of this case: another version of the code'
         seed = experiment.seed(task.number, task.seed)
         begin = time.process_time()
         outcome = experiment.run(case.settings, seed)
@@ -92,7 +92,7 @@ class Workers(Protocol):
         """Return the machine of each of them by its name, as `this_machine` has it."""
 
     def make(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, str, str]]:
-        """Yield each task with what `execute` returned, as they are done."""
+        """Yield each task with the result of `execute`, in the order of completion."""
 
     def close(self) -> None:
         """Shut down; pending runs are abandoned."""
@@ -139,7 +139,7 @@ class Processes:
             self._pool = ProcessPoolExecutor(
                 number, multiprocessing.get_context('spawn'), initializer=_begin_worker
             )
-            # Started now, while the environment is set.
+            # Start the processes while the environment is set.
             list(self._pool.map(_nothing, range(number)))
         finally:
             for name, value in before.items():
@@ -187,7 +187,7 @@ class Cluster:
     address : str
         Of its scheduler, such as 'tcp://127.0.0.1:8786'.
     patience : float
-        How long to wait for the scheduler and a first worker [s].
+        Longest wait for the scheduler and a first worker [s].
 
     Raises
     ------
@@ -251,11 +251,11 @@ class Plan:
     cases : list of Case
         Its cases.
     done : dict
-        Runs that are there, by case and map.
+        Stored runs, by case and map.
     tasks : list of Task
-        Runs to be made, map by map: an interrupted campaign has all cases on the first maps.
+        Missing runs, map by map: an interrupted campaign has all cases on the first maps.
     folder : RunFolder
-        Where they are kept.
+        Folder of the runs.
     complaints : list of str
         Damaged files.
     """
@@ -268,7 +268,7 @@ class Plan:
     complaints: list[str]
 
     def results(self) -> Results:
-        """Return the runs that are there."""
+        """Return the stored runs."""
         runs: dict[str, list[Run]] = {case.name: [] for case in self.cases}
         for (name, _), run in sorted(self.done.items(), key=lambda item: item[0][1]):
             runs[name].append(run)
@@ -296,7 +296,7 @@ def plan(
     seed : int
         Of the campaign.
     small : bool
-        Whether the small cases are meant.
+        Whether to use the small cases.
     first : int
         Number of the first map.
     """
@@ -310,7 +310,7 @@ def plan(
             try:
                 run = folder.load(case, number, experiment.seed(number, seed))
             except DamagedRun as error:
-                result.complaints.append(f'{error}; this run is made again')
+                result.complaints.append(f'{error}; this run is repeated')
                 run = None
             if run is not None:
                 result.done[case.name, number] = run
@@ -323,14 +323,14 @@ def plan(
 
 
 def one_machine(workers: Workers, plans: Sequence[Plan]) -> dict[str, str]:
-    """Return the machine that all workers and the runs that are there have in common.
+    """Return the machine that all workers and stored runs have in common.
 
-    Runs of files that do not say on what machine they were made are taken to be of the same.
+    Runs of files without a machine count as made on the same.
 
     Raises
     ------
     MixedWorkers
-        If there is none; says who differs in what.
+        If there is none; names the difference.
     """
     machines = workers.machines()
     first, machine = next(iter(machines.items()))
@@ -354,25 +354,25 @@ def carry_out(
     advance: Callable[[Run | None], None] = lambda run: None,
     machine: Mapping[str, str] | None = None,
 ) -> list[str]:
-    """Make the runs of a plan, keep each as soon as it is there, and return what went wrong.
+    """Make the missing runs of a plan, store each when it is done, and return the errors.
 
     Parameters
     ----------
     work : Plan
-        Its `done` grows.
+        Finished runs are added to `done`.
     workers : Workers
-        Who makes them.
+        That make the runs.
     advance : function
         Called after each run, with None if it failed.
     machine : mapping, optional
-        On which all runs must have been made, such as by workers that came later; None: on any.
+        On which all runs must have been made, also by workers that join later; None: any.
 
     Raises
     ------
     NoRoom
-        If a run cannot be written; those before are kept.
+        If a run cannot be written; earlier ones are kept.
     WorkersLost
-        If the workers are gone.
+        If the workers are lost.
     """
     cases = {case.name: case for case in work.cases}
     problems = []
@@ -380,7 +380,7 @@ def carry_out(
         run = None if problem else from_text(text)
         if run is not None and machine is not None:
             difference = machine_difference(machine, run.machine)
-            problem = difference and f'not kept, made by a worker that differs: {difference}'
+            problem = difference and f'not kept, made by a different worker: {difference}'
         if run is None or problem:
             problems.append(f'{task.experiment}, {task.case}, map {task.number}: {problem}')
             advance(None)

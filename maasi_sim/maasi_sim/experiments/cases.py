@@ -1,4 +1,4 @@
-"""What an experiment is made of: its cases, what is measured, and what the paper reports."""
+"""Parts of an experiment: cases, measured quantities, published numbers, results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Value = float | int | str | bool | None
 
 @dataclass(frozen=True)
 class Choice:
-    """Something that the paper leaves open, what is taken, and why."""
+    """Something that the paper leaves open, the value chosen here, and the reason."""
 
     what: str
     taken: str
@@ -31,9 +31,9 @@ class Case:
     name : str
         Unique within the experiment, such as 'ASI' or 'ASI, alpha 0.5, beta 5'.
     settings : dict
-        All that a run needs, as plain values that YAML and JSON can hold.
+        Everything that a run needs, as plain values for YAML and JSON.
     preset : str
-        'paper', the best reading of the paper, or 'recommended', what we would use.
+        'paper': the best reading of the paper; 'recommended': our own choice.
     runs : int, optional
         Number of maps at most; none: as many as asked for.
     """
@@ -49,14 +49,14 @@ class Case:
         return ''.join(c if c.isalnum() or c in '.-' else '_' for c in self.name.lower())
 
     def digest(self) -> str:
-        """Return a short hash of the settings: runs of other settings are not ours."""
+        """Return a short hash of the settings, by which stored runs are recognised."""
         text = json.dumps(self.settings, sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something that is measured in each run: a key of `Outcome.summary` or `Outcome.timing`.
+    """A measured quantity: a key of `Outcome.summary` or `Outcome.timing`.
 
     Attributes
     ----------
@@ -67,10 +67,10 @@ class Quantity:
     unit : str
         Empty for plain numbers.
     kind : str
-        'mean': averaged over the runs that have it. 'restricted': a duration that is None in runs
-        that did not get there; the mean is restricted to the shortest time that was tried.
+        'mean': averaged over the runs that have it. 'restricted': a duration that is None in
+        unfinished runs; its mean is restricted to the shortest limit of the runs.
     limit : str
-        Of a restricted one: the key in the summary that says how long was tried.
+        Of a restricted one: key of the limit in the summary.
     """
 
     name: str
@@ -89,13 +89,13 @@ class Published:
     case, quantity : str
         Which one.
     value : float
-        As printed, or as read off the figure (then say so in `note`).
+        As printed, or as read from the figure (then stated in `note`).
     half_width : float, optional
         Of the paper's 95 % confidence interval.
     runs : int
-        Behind it.
+        Number of runs.
     note : str
-        Where it stands.
+        Its place in the paper.
     """
 
     case: str
@@ -117,7 +117,7 @@ class Comparison:
 
 @dataclass
 class Outcome:
-    """What one run has come to.
+    """Results of one run.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class Outcome:
     columns : dict of arrays
         One row per step, all columns of the same length.
     details : dict
-        Anything else that a figure needs, such as true positions: lists and numbers.
+        Other data of figures, such as true positions: lists and numbers.
     timing : dict
         Wall times; the one part that differs when a run is repeated.
     """

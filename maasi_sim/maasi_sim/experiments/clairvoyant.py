@@ -1,8 +1,8 @@
-"""Reference for experiments: a planner that knows where the targets are.
+"""Reference for experiments: a planner that knows the positions of the targets.
 
-Its robots still have to find them with their sensors and filter; what other planners need more is
-their regret. A target counts as found with its second detection, and the routes minimise the
-expected time until all are found, by local search. It exists in the search in one process only.
+Its robots still have to find them with sensors and filter; the regret of another planner is its
+additional time. A target counts as found with its second detection, and the routes minimise the
+expected time until all are found, by local search. Available in the search in one process only.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Routes = list[list[int]]
 
-# A robot turns to its next target when the present one is found with this probability.
+# A robot moves to its next target when the present one is found with this probability.
 SURE = 0.8
 # Weight of the mean time to find a target beside the time to find all.
 MEAN_WEIGHT = 1.0
-# A simulated search ends after so many measurement periods.
+# Longest simulated search [measurement periods].
 TICKS = 4000
 # Rounds of local search.
 ROUNDS = 80
@@ -42,14 +42,14 @@ ROUNDS = 80
 class _Robots(NamedTuple):
     """The R robots in units of ticks, the shortest measurement period."""
 
-    tail: FloatArray  # (R, n, 3) way until each is free [m], padded by its last position
-    free: IntArray  # (R,) when
+    tail: FloatArray  # (R, n, 3) path until each is free [m], padded by its last position
+    free: IntArray  # (R,) when each is free
     speed: FloatArray  # (R,) [m]
-    pause: FloatArray  # (R,) what a turn costs
+    pause: FloatArray  # (R,) additional time of a turn
     period: IntArray  # (R,)
     kind: IntArray  # (R,)
     parameters: FloatArray  # (R, PARAMETERS)
-    yaw: FloatArray  # (R,) heading that it keeps [rad], nan: faces its travel
+    yaw: FloatArray  # (R,) constant heading [rad], nan: along its motion
 
 
 @njit(cache=True)
@@ -63,7 +63,7 @@ def _expected_end(
 ) -> float:
     """Return the expected time to find all on `routes` (R, n), -1 after the last, in ticks.
 
-    `stops` (R, 3) becomes where each robot turns to its second target.
+    Sets `stops` (R, 3) to the position where each robot leaves for its second target.
     """
     number, size = routes.shape
     # Probabilities of no detection and of exactly one.
@@ -182,7 +182,7 @@ class Clairvoyant(Planner):
         view = team.robots[name]
         if team.dimension == 2:
             wanted[:, 2] = view.state.pose.position[2]
-        # A waypoint nearer than a measurement period is passed.
+        # Skip a waypoint nearer than a measurement period.
         least = view.motion.settings.speed * view.period_steps * team.step_time
         if len(wanted) > 1 and np.linalg.norm(wanted[0] - view.state.pose.position) < least:
             wanted = wanted[1:]
@@ -202,7 +202,7 @@ class Clairvoyant(Planner):
 
 
 def _best_routes(team: TeamView, targets: FloatArray) -> tuple[Routes, FloatArray]:
-    """Return a route over the targets for each robot, and where its first leg ends, (R, 3)."""
+    """Return a route over the targets for each robot, and the end of its first leg, (R, 3)."""
     robots = _robots(team, targets)
     detected = np.array([_has_cluster(team, target) for target in targets], np.bool_)
     number = len(robots.free)
@@ -257,7 +257,7 @@ def _neighbours(routes: Routes) -> Iterator[Routes]:
 
 
 def _has_cluster(team: TeamView, target: FloatArray) -> bool:
-    """Return whether a target was detected already: a cluster is near it."""
+    """Return whether a target was detected: a cluster is near it."""
     d = team.dimension
     for cluster in team.clusters:
         offset = cluster.position[:d] - target[:d]

@@ -31,7 +31,7 @@ _RUNS = Path('runs')
 
 
 class WrongRequest(ValueError):
-    """What is asked for cannot be done."""
+    """An invalid request."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -103,7 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def compare(options: argparse.Namespace) -> int:
-    """Make the searches that are missing, write what they come to, and return the exit code."""
+    """Make the missing searches, write the results, and return the exit code."""
     comparisons = [
         compared(scenario, options.planners, options.filters, options.time_limit)
         for scenario in options.scenarios
@@ -136,7 +136,7 @@ def compare(options: argparse.Namespace) -> int:
 
 
 def request(comparisons: Sequence[SearchComparison], options: argparse.Namespace) -> dict[str, Any]:
-    """Return what is asked for: seeds, and a hash of the settings of each case."""
+    """Return the request: seeds, and a hash of the settings of each case."""
     return {
         'first_seed': options.first_seed,
         'seeds': options.seeds,
@@ -148,7 +148,7 @@ def request(comparisons: Sequence[SearchComparison], options: argparse.Namespace
 
 
 def unfinished(wanted: dict[str, Any]) -> Path | None:
-    """Return the newest folder of an interrupted comparison that was asked for the same."""
+    """Return the newest folder of an interrupted comparison with the same request."""
     for folder in sorted(_RUNS.glob('compare_*'), reverse=True):
         try:
             read = json.loads((folder / 'request.json').read_text(encoding='utf-8'))
@@ -190,7 +190,7 @@ def write_comparison(out: Path, results: Sequence[Results], seeds: Sequence[int]
     Raises
     ------
     NoRoom
-        If one cannot be written; the searches are there already.
+        If one cannot be written; the searches are stored already.
     """
     from maasi_sim.experiments.comparison_figure import draw_comparison
 

@@ -40,7 +40,7 @@ class SearchComparison(Experiment):
     name : str
         Of the scenario, or of what is searched.
     cases : sequence of Case
-        As `search_settings` has their settings. Differences are to the first one.
+        With settings from `search_settings`. Differences are to the first one.
     """
 
     def __init__(self, name: str, cases: Sequence[Case]) -> None:
@@ -70,9 +70,9 @@ def search_settings(scenario: Scenario, clairvoyant: bool = False) -> dict[str, 
     Parameters
     ----------
     scenario : Scenario
-        What is run.
+        To run.
     clairvoyant : bool
-        Whether the planner is the one that is told the true targets, not the scenario's.
+        Whether to use the planner that knows the true targets, not the scenario's.
     """
     return {
         'scenario': scenario.content(),
@@ -82,7 +82,7 @@ def search_settings(scenario: Scenario, clairvoyant: bool = False) -> dict[str, 
 
 
 def code_of(scenario: Scenario) -> str:
-    """Return a hash of the code of a search, the file of a planner of the user's own included."""
+    """Return a hash of the code of a search, including the file of a user's own planner."""
     name = scenario.planner.name
     if name in PLANNERS.own:
         return code_digest()
@@ -92,12 +92,12 @@ def code_of(scenario: Scenario) -> str:
 
 
 def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search of a case and return what is measured of it.
+    """Run a search of a case and return its results.
 
     Raises
     ------
     RuntimeError
-        If the code here is not that of the settings.
+        If the code differs from that of the settings.
     """
     scenario = scenario_from_content(settings['scenario'], 'settings')
     if settings['code'] != code_of(scenario):
@@ -117,7 +117,7 @@ def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
 def find_times(result: SearchResult, limit: float) -> NDArray[np.float64]:
     """Return when the first, second and so on of the true targets was found, (n,) [s].
 
-    A target that was not found has the limit.
+    A target that was not found counts with the limit.
     """
     times = np.full(len(result.truth), limit)
     for item in reversed(result.progress):
@@ -153,7 +153,7 @@ def compared(
     cases = []
     for method in filters or (None,):
         for planner in planners or (None,):
-            # Many searches run beside each other; results do not depend on it.
+            # Many searches run in parallel; results do not depend on the number of threads.
             overrides: dict[str, tuple[Key, Any]] = {'one process': (('filter', 'threads'), 1)}
             if planner is not None:
                 overrides['--planners'] = ('planner', 'name'), planner

@@ -1,4 +1,4 @@
-"""What a comparison of searches has come to: as plain values, in Markdown and as CSV."""
+"""Results of a comparison of searches: as plain values, in Markdown and as CSV."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _COMPUTING = (
     Quantity('processor_time', 'computation of a search', 's'),
 )
 QUANTITIES = (COMPLETE, *_OTHERS, *_COMPUTING)
-# What is worth a column of differences.
+# Columns of the table of differences.
 _DIFFERENCES = (COMPLETE, *_OTHERS)
 # Shown in milliseconds in Markdown.
 _SHORT = ('planning_time', 'filter_time')
@@ -77,7 +77,7 @@ def differences(results: Results) -> list[tuple[str, str, Quantity, Difference]]
 
 
 def verdict(case: str, other: str, gap: Difference) -> str:
-    """Return in words whether the time to find all differs, and how many seeds would show it."""
+    """Return in words whether the time to find all differs, and the seeds needed to show it."""
     who = f'{case} minus {other}: '
     if gap.number < 2:
         return f'{who}{gap.number} seed on which both ran, too few for an interval.'

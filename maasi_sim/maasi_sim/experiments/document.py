@@ -1,4 +1,4 @@
-"""Writes the page of all experiments that have been run: docs/reproduction.md and its pictures."""
+"""Writes docs/reproduction.md, the page of all experiments, with its figures."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _INTRODUCTION = """\
 # The papers' experiments, run again
 
 Written by `./scripts/reproduce --document docs/reproduction.md`; do not edit. Each section is one
-figure or table of a paper: our numbers beside the paper's, a picture to lay beside the printed
-one, and what the paper leaves open with what was taken and why.
+figure or table of a paper: our numbers beside the paper's, a figure in the form of the printed
+one, and the paper's open points with the choices made and their reasons.
 
     ./scripts/reproduce --list                      # what there is, and what it takes
     ./scripts/reproduce 000-fig4 000-fig11 --runs 30
@@ -95,7 +95,7 @@ def available(experiment: Experiment, out: Path, seed: int = 1, small: bool = Fa
 
 
 def how_many(results: Results, every: bool = True) -> str:
-    """Return in words on how many runs an experiment rests, and how many the paper has.
+    """Return in words the number of runs of an experiment, and that of the paper.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def how_many(results: Results, every: bool = True) -> str:
 
 
 def how_long(results: Results) -> str:
-    """Return in words the median time of a run on one core, '' where it is not known."""
+    """Return in words the median time of a run on one core, '' if unknown."""
     times = [
         value
         for name in results.names()
@@ -191,23 +191,23 @@ def wrapped(text: str) -> str:
 
 
 def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) -> list[str]:
-    """Write the page of what is in a folder, with a picture for each experiment beside it.
+    """Write the page of the experiments in a folder, with a figure for each beside it.
 
     Parameters
     ----------
     file : Path
-        The page; pictures go to `reproduction/` beside it.
+        The page; figures are written to `reproduction/` beside it.
     out : Path
         Folder of all experiments.
     seed : int
         Of the campaign.
     small : bool
-        Whether the small cases are meant.
+        Whether to use the small cases.
 
     Returns
     -------
     list of str
-        The experiments whose runs are in the folder; others keep what the page says of them.
+        Experiments with runs in the folder; others keep their present tables.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) ->
             results[name] = found
     for name, found in results.items():
         image = file.parent / 'reproduction' / f'{name}.png'
-        # Keep a figure of all cases rather than one of some.
+        # A figure of all cases is not replaced by one of some.
         if len(found.names()) == len(found.cases) or not image.exists():
             write_file(image, picture(found, _PICTURE_DPI))
     earlier = earlier_sections(file.read_text()) if file.exists() else {}

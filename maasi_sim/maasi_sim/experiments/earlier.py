@@ -13,14 +13,14 @@ _RESTS = re.compile(r'Rests on (.+?)\.( A run takes about .+?\.)?$')
 
 @dataclass(frozen=True)
 class Earlier:
-    """What an earlier page says of an experiment.
+    """Results of an experiment on an earlier page.
 
     Attributes
     ----------
     rests : str
-        On how many runs it rests; says that they are of an earlier campaign.
+        Number of runs in words, marked as of an earlier campaign.
     duration : str
-        How long a run takes, or ''.
+        Time of a run in words, or ''.
     tables : str
         The tables in Markdown.
     """
@@ -31,7 +31,7 @@ class Earlier:
 
 
 def earlier_sections(text: str) -> dict[str, Earlier]:
-    """Return the experiments on a page by name; those without a table are left out."""
+    """Return the experiments on a page by name, without those that have no table."""
     parts = _SECTION.split(text)
     found = {}
     for name, body in zip(parts[1::2], parts[2::2]):
@@ -62,7 +62,7 @@ def _tables(body: str) -> str:
 
 
 def completed(tables: str, earlier: str) -> str:
-    """Return new tables with the rows of an earlier page that they do not have, marked as such.
+    """Return new tables, completed with rows of an earlier page that are marked as such.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def _cells(row: str) -> list[str]:
 
 
 def _key(row: str, head: str) -> tuple[str, ...]:
-    """Return what tells rows apart: the case; of paired differences the quantity as well."""
+    """Return the key of a row: the case; of paired differences the quantity as well."""
     cells = _cells(row)
     return (cells[0],) if head == 'case' else (cells[0], cells[1])
 

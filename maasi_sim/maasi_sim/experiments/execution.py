@@ -41,7 +41,7 @@ EXIT_CODES = (
     'disk, or the workers are gone, 130 interrupted.'
 )
 
-# Wall time between two lines about progress where there is no terminal [s].
+# Wall time between two lines of progress without a terminal [s].
 _QUIET_PERIOD = 10.0
 
 
@@ -84,7 +84,7 @@ def run_command(command: Callable[[], int], *wrong_input: type[Exception]) -> in
 
 
 def make_workers(number: int, wanted: int | None, cluster: str | None) -> Workers:
-    """Return who makes `number` runs; the other parameters are those of `carry_out_all`."""
+    """Return workers for `number` runs; the other parameters are those of `carry_out_all`."""
     if cluster is not None:
         return Cluster(cluster)
     processes = min(wanted or os.cpu_count() or 1, number)
@@ -98,7 +98,7 @@ def carry_out_all(
     mixed: bool = False,
     finished: Callable[[Plan], str] = lambda work: '',
 ) -> list[str]:
-    """Make the runs of all plans, say what was made, and return what went wrong.
+    """Make the missing runs of all plans, print a summary, and return the errors.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def carry_out_all(
     mixed : bool
         Whether runs of different processors or versions are mixed.
     finished : function of a Plan
-        Called when its runs are there; returns a line to print, '' for none.
+        Called when its runs are done; returns a line to print, '' for none.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def carry_out_all(
 
 
 class _Display:
-    """Progress and an estimate of what is left: a bar, or lines where there is no terminal."""
+    """Progress and remaining time: a bar, or lines without a terminal."""
 
     def __init__(self, plans: list[Plan]) -> None:
         self._plans = plans
@@ -175,7 +175,7 @@ class _Display:
             self._bar.stop()
 
     def advance(self, work: Plan):  # type: ignore[no-untyped-def]
-        """Return what is to be called after each run of an experiment."""
+        """Return the function to call after each run of an experiment."""
 
         def note(run: Run | None) -> None:
             self._made += 1
@@ -196,7 +196,7 @@ class _Display:
         return note
 
     def say(self, text: str) -> None:
-        """Write a line that stays."""
+        """Print a line."""
         if self._bar is not None:
             self._bar.console.print(text, markup=False, highlight=False)
         else:

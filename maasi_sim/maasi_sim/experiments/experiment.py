@@ -1,4 +1,4 @@
-"""What an experiment is, and what its runs have come to."""
+"""Experiments and their results."""
 
 from __future__ import annotations
 
@@ -23,34 +23,33 @@ class Experiment:
     name : str
         Such as '000-fig4'.
     title : str
-        What it shows, in a line.
+        One line.
     cases : function of bool
-        Returns the cases; True asks for small ones that take a second: for tests and a first look.
-        Settings are built when this is called, not when the module is imported.
+        Returns the cases; with True small ones that take a second, for tests and a first look.
     run : function of settings and seed
-        Runs one case once. The seed is that of the map; it is the same for every case.
+        Runs one case once. The seed is that of the map, the same for every case.
     quantities : sequence of Quantity
         Columns of the table.
     draw : function of an empty figure and the results
-        Draws what can be laid beside the paper's figure.
+        Draws a figure in the form of the paper's.
     published : sequence of Published
-        What the paper reports.
+        Numbers of the paper.
     comparisons : sequence of Comparison
         Paired differences to report.
     choices : sequence of Choice
-        What the paper leaves open.
+        Open points of the paper.
     causes : str
-        Why we may differ from the paper; not tested.
+        Likely causes of differences from the paper; not tested.
     tested : str
-        Why we differ from the paper, tested by runs; says which, and what stays unknown.
+        Causes of differences that were tested by runs.
     runs : int
         Number of maps in the paper.
     seconds : float
-        What a run takes on one core, roughly; for --list.
+        Approximate time of a run on one core; for --list.
     maps : str, optional
-        Experiments with the same word here have the same maps; none: maps of its own.
+        Experiments with the same value have the same maps; none: maps of its own.
     note : str
-        What a reader must know.
+        Further information for readers.
     """
 
     name: str
@@ -75,7 +74,7 @@ class Experiment:
         return self.name[:3]
 
     def seed(self, number: int, seed: int = 1) -> int:
-        """Return the seed of a map: of the experiment's maps, their number and the seed only.
+        """Return the seed of a map; it depends on `maps`, the number and the seed only.
 
         Parameters
         ----------

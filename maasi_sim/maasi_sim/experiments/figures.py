@@ -1,4 +1,4 @@
-"""Draws what can be laid beside the papers' figures."""
+"""Figures in the form of the papers'."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def draw_curves(
         mean = np.array([span.mean for span in spans])
         half = np.nan_to_num(np.array([span.half_width for span in spans]))
         axes.plot(grid, mean, line, color=colour, lw=1.8, label=name)
-        # Of two or three runs it would fill the picture.
+        # The band of two or three runs would fill the figure.
         if len(runs) >= _FEWEST_SHADED:
             axes.fill_between(grid, mean - half, mean + half, color=colour, alpha=0.15, lw=0)
         targets = max(targets, *(run.value('targets') or 0.0 for run in runs))
@@ -235,7 +235,7 @@ def draw_against(
     setting : sequence of str
         Keys of the number in the scenario.
     label : str
-        What the number is.
+        Its name and unit.
     quantities : sequence of str
         One picture each, side by side.
     """

@@ -1,4 +1,4 @@
-"""What an experiment leaves in its folder beside the single runs."""
+"""Output files of an experiment beside the single runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def configuration_text(results: Results, seed: int) -> str:
-    """Return all that was run as YAML: choices, cases with their settings, seeds."""
+    """Return the configuration as YAML: choices, cases with their settings, seeds."""
     experiment = results.experiment
     numbers = sorted({run.number for runs in results.runs.values() for run in runs})
     content = {
@@ -47,7 +47,7 @@ def picture(results: Results, dpi: int = 110) -> bytes:
 
 
 def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
-    """Return what is drawn on an empty figure as PNG."""
+    """Return a figure, drawn by a function, as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -60,7 +60,7 @@ def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
 
 
 def table_markdown(results: Results) -> str:
-    """Return the tables with what a reader must know of them."""
+    """Return the tables with title, note, causes and choices."""
     experiment = results.experiment
     parts = [f'# {experiment.name}: {experiment.title}\n', described(experiment, markdown(results))]
     return '\n'.join(parts)
@@ -91,7 +91,7 @@ def write_outputs(folder: RunFolder, results: Results, seed: int) -> None:
     Raises
     ------
     NoRoom
-        If one cannot be written; the runs are there already.
+        If one cannot be written; the runs are stored already.
     """
     runs = [run for case in results.cases for run in results.runs[case.name]]
     write_file(folder.path / 'steps.csv', steps_text(runs))

@@ -1,8 +1,8 @@
 """Experiments of the papers, from the YAML files in `papers/`, one per paper.
 
-A case is what its layers give, merged one over the other, and its own values over them. The layers
-are those of the experiment, that with the name of its preset if there is one, and those of the
-case. Several mappings of cases stand for all combinations of them.
+The settings of a case are its layers, merged one over the other, with its own values on top. The
+layers are those of the experiment, the one with the name of its preset, if any, and those of the
+case. A list of mappings of cases means all combinations of them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Names every experiment."""
+"""All experiments by name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PAPERS = ('000', '001', '002', '003', '004')
 
 
 class UnknownExperiment(ValueError):
-    """A name that no experiment has."""
+    """There is no experiment of this name."""
 
 
 def experiments() -> dict[str, Experiment]:
@@ -25,7 +25,7 @@ def find(name: str) -> Experiment:
     Raises
     ------
     UnknownExperiment
-        With the nearest names.
+        Names the nearest ones.
     """
     known = experiments()
     if name in known:

@@ -1,4 +1,4 @@
-"""Run the papers' experiments and lay what comes out beside what the papers report."""
+"""Run the papers' experiments and compare the results with the papers'."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from maasi_sim.experiments.registry import UnknownExperiment, experiments, find
 
 
 class UnknownCase(ValueError):
-    """A name that no case of the experiments has."""
+    """There is no case of this name."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -34,7 +34,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=EXIT_CODES,
     )
     parser.add_argument('names', nargs='*', metavar='NAME', help='experiments, or "all"')
-    parser.add_argument('--list', action='store_true', help='name every experiment')
+    parser.add_argument('--list', action='store_true', help='list all experiments')
     parser.add_argument(
         '--runs', type=count, metavar='N', help="maps of each (default: the paper's number)"
     )
@@ -53,18 +53,18 @@ def build_parser() -> argparse.ArgumentParser:
         help='folder of the results (default: %(default)s)',
     )
     parser.add_argument(
-        '--seed', type=whole, default=1, metavar='N', help='other maps (default: %(default)s)'
+        '--seed', type=whole, default=1, metavar='N', help='of the maps (default: %(default)s)'
     )
     parser.add_argument(
         '--small',
         action='store_true',
-        help='a look at how it works, in seconds: short runs, whose numbers mean nothing',
+        help='short runs for a first look; their numbers mean nothing',
     )
     parser.add_argument(
         '--document',
         type=Path,
         metavar='FILE',
-        help='write the page of all experiments that are in DIR, with their figures beside it',
+        help='write the page of all experiments in DIR, with their figures beside it',
     )
     return parser
 
@@ -99,7 +99,7 @@ def _reproduce(options: argparse.Namespace) -> int:
 
 
 def listing(known: list[Experiment]) -> list[str]:
-    """Return a line for each experiment: name, what it takes, and what it shows."""
+    """Return a line for each experiment: name, cases, runs, time and title."""
     lines = []
     for item in known:
         cases = item.cases(False)

@@ -1,4 +1,4 @@
-"""Keeps the runs: a file for each, written at once or not at all, that tells when it is damaged."""
+"""Files of runs, one each: written atomically, with a checksum."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _HEAD = '# maasi run, sha256 '
 
 
 class DamagedRun(ValueError):
-    """A file that does not hold what was written."""
+    """A file of a run whose content is not what was written."""
 
 
 class NoRoom(OSError):
-    """Nothing more can be written."""
+    """A file cannot be written."""
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Run:
     summary, columns, details, timing
         See `Outcome`.
     machine : dict
-        On what it was made, see `this_machine`; empty in files of earlier versions.
+        That made it, see `this_machine`; empty in files of earlier versions.
     """
 
     experiment: str
@@ -65,7 +65,7 @@ class Run:
     machine: dict[str, str] = field(default_factory=dict)
 
     def value(self, quantity: str) -> float | None:
-        """Return a measured quantity; None where the run has none."""
+        """Return a measured quantity; None if the run has none."""
         read = self.summary.get(quantity, self.timing.get(quantity))
         return None if read is None or isinstance(read, str) else float(read)
 
@@ -76,7 +76,7 @@ def run_of(experiment: str, case: Case, number: int, seed: int, outcome: Outcome
     Raises
     ------
     ValueError
-        If the columns are not of one length.
+        If the columns differ in length.
     """
     columns = {name: np.asarray(values, float) for name, values in outcome.columns.items()}
     lengths = {len(values) for values in columns.values()}
@@ -96,7 +96,7 @@ def run_of(experiment: str, case: Case, number: int, seed: int, outcome: Outcome
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON holds it; what is not finite is None."""
+    """Return a value for JSON; non-finite numbers become None."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -127,7 +127,7 @@ def to_text(run: Run) -> str:
 
 
 def csv_text(rows: Iterable[Iterable[Any]]) -> str:
-    """Return rows as CSV; None and what is not finite stay empty."""
+    """Return rows as CSV; None and non-finite numbers become empty cells."""
     out = io.StringIO()
     csv.writer(out, lineterminator='\n').writerows(
         ['' if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in row]
@@ -146,13 +146,13 @@ def from_text(text: str, origin: str = 'run') -> Run:
     Raises
     ------
     DamagedRun
-        If anything is missing or was changed.
+        If anything is missing or changed.
     """
     head, _, body = text.partition('\n')
     if not head.startswith(_HEAD):
-        raise DamagedRun(f'{origin}: does not begin as a run does')
+        raise DamagedRun(f'{origin}: is not the file of a run')
     if head[len(_HEAD) :] != hashlib.sha256(body.encode()).hexdigest():
-        raise DamagedRun(f'{origin}: its checksum is that of other content')
+        raise DamagedRun(f'{origin}: the checksum does not match')
     first, _, rows = body.partition('\n')
     facts = json.loads(first[2:])
     read = list(csv.reader(io.StringIO(rows)))
@@ -167,7 +167,7 @@ def load_run(path: Path) -> Run:
     Raises
     ------
     DamagedRun
-        If it is not whole.
+        If it is damaged.
     """
     try:
         return from_text(path.read_bytes().decode('utf-8'), str(path))
@@ -176,12 +176,12 @@ def load_run(path: Path) -> Run:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file at once: it is there whole, or as it was before.
+    """Write a file atomically: afterwards it is complete, or as before.
 
     Raises
     ------
     NoRoom
-        If the disk is full or nothing may be written there; says where.
+        If the disk is full or the folder is not writable.
     """
     data = content.encode() if isinstance(content, str) else content
     draft = path.with_name(f'.{path.name}.{os.getpid()}')
@@ -206,9 +206,9 @@ class RunFolder:
     Parameters
     ----------
     path : Path
-        Made when the first run is written.
+        Created with the first run.
     experiment : str
-        Name of that whose runs they are.
+        Its name.
     """
 
     def __init__(self, path: Path, experiment: str) -> None:
@@ -216,11 +216,11 @@ class RunFolder:
         self.experiment = experiment
 
     def file(self, case: Case, number: int) -> Path:
-        """Return where a run is kept."""
+        """Return the file of a run."""
         return self.path / 'runs' / f'{case.slug}-{number:04d}.csv'
 
     def maps(self) -> int:
-        """Return on how many maps there are runs: the largest number, and one."""
+        """Return the largest number of a map with runs, plus one."""
         numbers = [
             int(path.stem.rsplit('-', 1)[1])
             for path in (self.path / 'runs').glob('*-[0-9][0-9][0-9][0-9].csv')
@@ -228,12 +228,12 @@ class RunFolder:
         return max(numbers, default=-1) + 1
 
     def load(self, case: Case, number: int, seed: int) -> Run | None:
-        """Return a run that is there, None where there is none of these settings and seed.
+        """Return a stored run, None if there is none with these settings and seed.
 
         Raises
         ------
         DamagedRun
-            If its file is not whole.
+            If its file is damaged.
         """
         path = self.file(case, number)
         if not path.exists():
@@ -244,7 +244,7 @@ class RunFolder:
         return run if found == wanted else None
 
     def write(self, case: Case, number: int, text: str) -> None:
-        """Keep the text of a run."""
+        """Write the file of a run."""
         write_file(self.file(case, number), text)
 
 
@@ -260,7 +260,7 @@ def steps_text(runs: Sequence[Run]) -> str:
 
 
 def runs_text(runs: Sequence[Run]) -> str:
-    """Return what each run has come to as CSV, one row per run."""
+    """Return the results of all runs as CSV, one row per run."""
     names = list(dict.fromkeys(name for run in runs for name in (*run.summary, *run.timing)))
     rows: list[list[Any]] = [['case', 'map', 'seed', *names]]
     for run in runs:

@@ -1,4 +1,4 @@
-"""Searches in one process as experiments: settings, what is measured, and cases of them."""
+"""Searches in one process as experiments: cases, runs and measured quantities."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ def search_case(
     name : str
         Of the case.
     values : mapping
-        The scenario as a file has it; robot types come from config/robots.
+        Content of a scenario file; robot types come from config/robots.
     most_measurements : int
         Cap on the measurements of all robots.
     preset : str
         'paper' or 'recommended'.
     small : bool
-        Only a few measurements and particles.
+        Whether to use few measurements and particles.
     runs : int, optional
         See `Case`.
     """
@@ -80,14 +80,14 @@ def search_case(
 
 
 def run_search(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search and return what is measured of it."""
+    """Run a search and return its results."""
     scenario = scenario_from_content(settings['scenario'], 'settings')
     result = search(scenario, seed, settings['most_measurements'])
     return outcome_of(result, settings['most_measurements'], scenario.limits.time)
 
 
 def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: float) -> Outcome:
-    """Return what is measured of a search."""
+    """Return the results of a search."""
     progress = result.progress
     complete = next(
         (item for item in progress if len(result.truth) and item.true_found == len(result.truth)),
@@ -137,9 +137,9 @@ def outcome_of(result: SearchResult, most_measurements: int | None, time_limit: 
 
 
 def run_exploring(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search and measure which share of the environment is explored, the mean of 1 - e.
+    """Run a search and measure the explored share of the environment, the mean of 1 - e.
 
-    Column 'explored' has it after each measurement batch, and the summary in the end.
+    Column 'explored' is after each measurement batch, that of the summary at the end.
     """
     outcome = run_search(settings, seed)
     scenario = scenario_from_content(settings['scenario'], 'settings')

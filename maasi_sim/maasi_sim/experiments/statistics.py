@@ -1,4 +1,4 @@
-"""Means with their confidence, of numbers, of durations cut short, and of paired differences."""
+"""Means with confidence intervals: of numbers, censored durations, and paired differences."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Interval:
     half_width : float
         Of the interval; nan with fewer than two values.
     number : int
-        Values behind it.
+        Number of values.
     degrees : float
         Of freedom, of Student's t.
     """
@@ -56,18 +56,17 @@ def mean_interval(values: ArrayLike) -> Interval:
 
 
 def restricted_mean(durations: ArrayLike, finished: ArrayLike, limit: float) -> Interval:
-    """Return the mean of min(T, limit), where some of the durations T were cut short.
+    """Return the restricted mean of durations T, of which some are censored.
 
-    The area under Kaplan and Meier's curve up to the limit. Where nothing is cut short before
-    the limit, that is the plain mean of min(T, limit), and the interval is Student's of it;
-    otherwise Greenwood's variance is used.
+    The area under Kaplan and Meier's curve up to the limit. Without censoring before the limit it
+    is the mean of min(T, limit) with Student's interval; otherwise Greenwood's variance is used.
 
     Parameters
     ----------
     durations : (n,) array
-        T, or how long was tried.
+        T, or the time of censoring.
     finished : (n,) array of bool
-        Whether it is T.
+        False where censored.
     limit : float
         At least 0.
 
@@ -137,8 +136,8 @@ class Difference:
     number : int
         Pairs.
     needed : int or None
-        Pairs with which a difference of this size would be told from 0 in four of five cases;
-        None if that cannot be said: no difference, no spread, or more than a million.
+        Pairs for a power of 0.8 at a difference of this size; None without difference or spread,
+        and above a million.
     """
 
     mean: float
@@ -157,8 +156,8 @@ class Difference:
 def bootstrap_difference(first: ArrayLike, second: ArrayLike) -> Difference:
     """Return the mean of first minus second on the same maps; pairs with a nan are left out.
 
-    The interval is bias-corrected and accelerated (Efron), of resampled pairs, always with the
-    same random numbers.
+    The interval is the bias-corrected and accelerated bootstrap (Efron) of pairs, with fixed random
+    numbers.
 
     Raises
     ------
@@ -187,16 +186,16 @@ def _bootstrap_interval(gaps: tuple[float, ...]) -> tuple[float, float]:
 
 
 def pairs_needed(gaps: ArrayLike, power: float = 0.8, most: int = 1_000_000) -> int | None:
-    """Return how many pairs a paired t test needs to find a mean difference as large as this.
+    """Return the number of pairs that a paired t test needs for a mean difference as found.
 
     Parameters
     ----------
     gaps : (n,) array
-        Differences found, two or more.
+        Differences, two or more.
     power : float
-        Probability with which it is to be found.
+        Probability of a significant result.
     most : int
-        Above that, None.
+        Return None above it.
     """
     values = np.asarray(gaps, dtype=float)
     deviation = float(values.std(ddof=1))
@@ -204,7 +203,7 @@ def pairs_needed(gaps: ArrayLike, power: float = 0.8, most: int = 1_000_000) -> 
         return None
     effect = abs(float(values.mean())) / deviation
     tail = 0.5 + 0.5 * LEVEL
-    # With the normal distribution, which needs a few less.
+    # Start from the normal approximation, which is slightly too small.
     number = max(2, int(((stats.norm.ppf(tail) + stats.norm.ppf(power)) / effect) ** 2))
     while number <= most:
         limit = stats.t.ppf(tail, number - 1)
@@ -217,14 +216,14 @@ def pairs_needed(gaps: ArrayLike, power: float = 0.8, most: int = 1_000_000) -> 
 def survival(
     durations: ArrayLike, finished: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Kaplan and Meier's curve: times, and the share that is not finished from then on.
+    """Return Kaplan and Meier's curve: times, and the share not finished from each time on.
 
     Parameters
     ----------
     durations : (n,) array
-        How long each took, or was tried.
+        Of each, or time of censoring.
     finished : (n,) array of bool
-        Whether it is that it took.
+        False where censored.
     """
     times, ended = np.asarray(durations, dtype=float), np.asarray(finished, dtype=bool)
     curve = stats.ecdf(stats.CensoredData.right_censored(times, ~ended)).sf
@@ -237,8 +236,7 @@ def survival(
 def independent_difference(first: Interval, second: Interval) -> Interval:
     """Return the difference of two means of different runs, after Welch and Satterthwaite.
 
-    Without a spread of one of them the interval is that of the other: too narrow, but all that
-    is known.
+    If the interval of one is unknown, that of the other is used, which is too narrow.
     """
     parts = [
         (item.error**2, item.degrees)
@@ -257,12 +255,12 @@ def independent_difference(first: Interval, second: Interval) -> Interval:
 
 
 def from_published(value: float, half_width: float | None, runs: int) -> Interval:
-    """Return a paper's number as an interval; a half width of None is not known."""
+    """Return a paper's number as an interval; a half width of None is unknown."""
     if half_width is None or runs < 2:
         return Interval(value, math.nan, runs, 0.0)
     return Interval(value, half_width, runs, runs - 1.0)
 
 
 def array(values: Sequence[float | None]) -> np.ndarray:
-    """Return values as an array, nan where there is none."""
+    """Return values as an array, None as nan."""
     return np.array([np.nan if value is None else float(value) for value in values])

@@ -1,4 +1,4 @@
-"""Tables of what we measure beside what the paper reports."""
+"""Tables of our results beside the papers'."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ class Row:
     Attributes
     ----------
     case, preset : str
-        Of which case.
+        Of the case.
     quantity : Quantity
-        What.
+        Measured quantity.
     runs, finished : int
-        Runs, and how many have the quantity.
+        Number of runs, and of runs that have the quantity.
     ours : Interval
-        What we measure.
+        Our mean.
     median : float
-        Of our runs; those that did not get there count as the longest, nan where they are half.
+        Of our runs; unfinished ones count as longest, nan if they are half or more.
     paper, difference : Interval or None
-        What the paper reports, and ours minus it.
+        Mean of the paper, and ours minus it.
     note : str
-        Where it stands in the paper.
+        Its place in the paper.
     """
 
     case: str
@@ -77,7 +77,7 @@ def interval(results: Results, case: str, quantity: Quantity) -> Interval:
 
 
 def median(values: np.ndarray, quantity: Quantity) -> float:
-    """Return the median of a quantity; of durations, runs that did not get there are longest."""
+    """Return the median of a quantity; unfinished durations count as longest."""
     if quantity.kind == 'restricted':
         middle = float(np.median(np.where(np.isnan(values), np.inf, values)))
         return middle if math.isfinite(middle) else math.nan
@@ -85,7 +85,7 @@ def median(values: np.ndarray, quantity: Quantity) -> float:
 
 
 def rows(results: Results) -> list[Row]:
-    """Return the table of an experiment: every quantity of every case that has one."""
+    """Return the table of an experiment: every quantity of every case."""
     experiment = results.experiment
     published = {(item.case, item.quantity): item for item in experiment.published}
     table = []
@@ -120,7 +120,7 @@ def rows(results: Results) -> list[Row]:
 
 
 def paired_rows(results: Results) -> list[Paired]:
-    """Return the paired differences that the experiment asks for."""
+    """Return the paired differences of the experiment's comparisons."""
     table = []
     for item in results.experiment.comparisons:
         pairs = results.pairs(item.first, item.second)
@@ -140,7 +140,7 @@ def paired_rows(results: Results) -> list[Paired]:
 
 
 def number(value: float) -> str:
-    """Return a number with as many digits as a reader needs."""
+    """Return a number with three significant digits."""
     if not math.isfinite(value):
         return '-'
     if abs(value) >= 100.0:
@@ -174,7 +174,7 @@ def markdown(results: Results) -> str:
         if row.note:
             paper += f' ({row.note})'
         name = row.case if row.preset == 'paper' else f'{row.case} (recommended)'
-        # If no run finished, the restricted mean is just the limit.
+        # Without finished runs the restricted mean is the limit.
         ours = shown(row.ours) if row.finished else f'more than {number(row.ours.mean)}'
         if row.quantity.kind == 'restricted' and row.runs > 2 and math.isfinite(row.median):
             ours += f' (median {number(row.median)})'

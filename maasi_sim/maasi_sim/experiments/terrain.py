@@ -1,4 +1,4 @@
-"""Terrain with the statistics of real terrain, where that of a paper is not to be had."""
+"""Random terrain with the statistics of real terrain, as the paper's is not available."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def chunk(generator: np.random.Generator, size: float, nodes: int) -> FloatArray
     Parameters
     ----------
     generator : numpy.random.Generator
-        Of map and place.
+        Source of random numbers.
     size : float
         Side of the area [m].
     nodes : int
@@ -111,7 +111,7 @@ def littered(
         centre = np.array([sides[0][row], sides[1][column]])
         for _ in range(number // 2):
             places = centre + generator.normal(0.0, spread, (10, 2))
-            # Folded back at the bounds, so that targets do not lie in a line along them.
+            # Reflected at the bounds, so that targets do not accumulate along them.
             places = np.where(places < low, 2.0 * low - places, places)
             places = np.where(places > high, 2.0 * high - places, places)
             places = np.clip(places, low, high)
