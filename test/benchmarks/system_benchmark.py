@@ -47,7 +47,7 @@ def scenario(name: str, folder: Path, limit: float) -> float:
     if done.returncode not in (0, 1):
         raise RuntimeError(f'{name} ended with {done.returncode}:\n{done.stdout}{done.stderr}')
     log = (folder / 'sim_node.log').read_text()
-    found = re.search(r'\[(\d+\.\d+)\] \[sim_node\]: all are there', log)
+    found = re.search(r'\[(\d+\.\d+)\] \[sim_node\]: all nodes are ready', log)
     if found is None:
         raise RuntimeError(f'{name}: the time did not start:\n{log}')
     return float(found.group(1)) - begin

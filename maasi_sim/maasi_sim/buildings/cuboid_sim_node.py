@@ -23,11 +23,11 @@ _PATIENCE = 0.1
 
 
 class CuboidSimNode(SimNode):
-    """Plays the robots of a search of buildings, the time, and a radio of limited range.
+    """Simulates the robots of a search of buildings, and a radio of limited range.
 
-    What a robot sends at a step is passed on to those within the communication range, with all that
-    they hear at once: when all robots that are there have sent, or, free running, soon after the
-    step began.
+    What a robot sends at a step is delivered to those within the communication range, in one
+    message with all that they receive: when all present robots have sent, or, free running, soon
+    after the step began.
 
     Publishes
     ---------
@@ -69,7 +69,7 @@ class CuboidSimNode(SimNode):
                     RELIABLE,
                 )
             )
-        self._link_timer = self.create_wall_timer(1.0, self._pass_on)
+        self._link_timer = self.create_wall_timer(1.0, self._deliver)
         self._link_timer.cancel()
         return entities
 
@@ -95,9 +95,9 @@ class CuboidSimNode(SimNode):
         # A restarted robot receives the messages of this step again.
         self._served.discard(name)
         if all(robot in self._sent for robot in self.simulation.present):
-            self._pass_on()
+            self._deliver()
 
-    def _pass_on(self) -> None:
+    def _deliver(self) -> None:
         """Deliver to each robot that has sent the messages in its range."""
         self._link_timer.cancel()
         senders = sorted(name for name, message in self._sent.items() if not message.silent)

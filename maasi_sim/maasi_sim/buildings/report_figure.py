@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -13,46 +12,36 @@ from numpy.typing import NDArray
 from maasi_sim.buildings.observer import CuboidRecord
 from maasi_sim.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours_of
 from maasi_sim.buildings.report import build_cuboid_report
-from maasi_sim.run.report_files import END_REASONS, title
+from maasi_sim.run.report_files import END_REASONS
 from maasi_sim.run.report_panels import (
     View,
     add_legend,
     draw_start_and_end,
-    draw_times,
     draw_way,
+    event_rows,
+    finish_figure,
     make_panels,
     step_plot,
-    write_rows,
 )
 
 FloatArray = NDArray[np.float64]
 
 
 def plot_cuboid_report(record: CuboidRecord) -> Figure:
-    """Return a picture: the mission from above and the sides, cuboids visited over time."""
-    figure = Figure(figsize=(13.0, 8.0), layout='constrained')
-    FigureCanvasAgg(figure)
+    """Return a figure: the mission from above and the sides, cuboids visited over time."""
     colours = colours_of(record.scenario.names())
-    bands = 0.12 + 0.1 * min(len(colours), 8)
-    panels = make_panels(figure, _area(record), [1.0, bands, 0.7, 1.4])
+    panels = make_panels(_area(record), len(colours), [0.7, 1.4])
     visited = {shot.cuboid for shot in record.snapshots}
     for view in panels.views:
         _draw_mission(view, record, visited)
         for name, colour in colours.items():
             draw_way(view, record.trajectories[name], colour, record.end_time, name)
     draw_start_and_end(panels.views[0])
-    add_legend(figure, panels)
-    over, times, active, words = panels.plots
+    add_legend(panels)
+    over, _, active, _ = panels.plots
     step_plot(over, '', lambda axes: _draw_visited(axes, record))
-    over.sharex(times)
-    over.tick_params(labelbottom=False)
-    over.set_title('Cuboids visited', fontsize=11)
-    draw_times(times, colours, record.end_time)
-    times.set_xlim(0.0, max(record.end_time, 1e-9))
     step_plot(active, 'time [s]', lambda axes: _draw_active(axes, record))
-    write_rows(words, _rows(record))
-    figure.suptitle(title(record), fontsize=13, fontweight='bold')
-    return figure
+    return finish_figure(panels, record, colours, 'Cuboids visited', _rows(record))
 
 
 def _area(record: CuboidRecord) -> FloatArray:
@@ -126,7 +115,4 @@ def _rows(record: CuboidRecord) -> list[tuple[str, str]]:
         *((key, f'{number} decisions') for key, number in report['choices'].items()),
         ('ended', f'{reason}, at {record.end_time:.1f} s'),
     ]
-    for event in record.events[:4]:
-        who = event.get('agent', event.get('node', ''))
-        rows.append((f'{event["time"]:.0f} s', f'{who} {event["event"]}'))
-    return rows
+    return rows + event_rows(record, 4, 0)

@@ -14,13 +14,13 @@ from maasi_sim.buildings.mission import within_range
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.world.odometry import OdometryModel, OdometryReading
 from maasi_sim.world.robots import Battery, Equipment
-from maasi_sim.world.simulation import step_of_event
+from maasi_sim.world.simulation import SimulatedTeam
 
 FloatArray = NDArray[np.float64]
 
 
 class MassPointBody(Body):
-    """A mass point under bounded forces, 004, (1): the force that a velocity asks for."""
+    """A mass point under bounded forces, 004, (1): the force that reaches a commanded velocity."""
 
     def __init__(self, dynamics: Dynamics, pose: Pose, velocity: ArrayLike) -> None:
         self._dynamics = dynamics
@@ -45,7 +45,7 @@ class MassPointBody(Body):
 
 
 class SearchingRobot:
-    """A robot that searches buildings, as the simulation plays it.
+    """A simulated robot that searches buildings.
 
     A command holds for one step. Without one it brakes and hovers, as autopilots do.
 
@@ -87,11 +87,11 @@ class SearchingRobot:
         self.odometry: OdometryReading = self._odometry.step(self.state, 0)
 
     def command(self, velocity: ArrayLike) -> None:
-        """Take the velocity (4,) that it should have at the next step [m/s, rad/s]."""
+        """Set the velocity (4,) for the next step [m/s, rad/s]."""
         self._command = check_command(velocity)
 
     def step(self, step: int, dt: float) -> None:
-        """Go on by `dt` seconds to the discrete step `step`, from 1."""
+        """Advance by `dt` seconds to the discrete step `step`, from 1."""
         before = self.state
         command, self._command = self._command, None
         self._body.step(np.zeros(4) if command is None else command, dt)
@@ -102,15 +102,15 @@ class SearchingRobot:
         self.odometry = self._odometry.step(self.state, step)
 
     def stand(self, step: int) -> None:
-        """Stay where it is until the discrete step `step`, at rest; the last command is void."""
+        """Stand still until the discrete step `step`; the last command is void."""
         self._command = None
         self._body = MassPointBody(self._dynamics, self.state.pose, np.zeros(3))
         self.state = self._body.robot_state()
         self.odometry = self._odometry.step(self.state, step)
 
 
-class CuboidSimulation:
-    """The robots of a search of buildings, from step 0 on.
+class CuboidSimulation(SimulatedTeam):
+    """The robots of a search of buildings.
 
     Parameters
     ----------
@@ -118,50 +118,21 @@ class CuboidSimulation:
         With all layers.
     seed : int
         Of the run.
-
-    Attributes
-    ----------
-    step : int
-        Discrete step k.
-    robots : dict
-        SearchingRobot by name, in name order.
-    away : set of str
-        Robots that have left: they stand still and are silent.
     """
 
+    scenario: CuboidScenario
+    robots: dict[str, SearchingRobot]
+
     def __init__(self, scenario: CuboidScenario, seed: int) -> None:
-        self.scenario = scenario
-        self.step = 0
         self.world = scenario.world(seed)
         self.mission = scenario.mission()
-        self.robots = {
+        robots = {
             name: SearchingRobot(name, scenario, self.mission, seed) for name in scenario.names()
         }
-        self.away: set[str] = set()
-        self._apply_events()
-
-    @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self.step * self.scenario.step
-
-    @property
-    def present(self) -> list[str]:
-        """Robots that take part, in name order."""
-        return [name for name in self.robots if name not in self.away]
+        super().__init__(scenario, robots)
 
     def warm_up(self) -> None:
         """Do nothing: there is nothing to compile."""
-
-    def advance(self) -> None:
-        """Go on to the next step, each robot under its command."""
-        self.step += 1
-        for name, robot in self.robots.items():
-            if name in self.away:
-                robot.stand(self.step)
-            else:
-                robot.step(self.step, self.scenario.step)
-        self._apply_events()
 
     def images_due(self, name: str) -> bool:
         """Return false: snapshots are taken by the planners."""
@@ -175,8 +146,3 @@ class CuboidSimulation:
         """Return the senders within C_R of each sender (III-B)."""
         places = {name: self.robots[name].state.pose.position for name in senders}
         return within_range(places, self.scenario.planner.communication_range)
-
-    def _apply_events(self) -> None:
-        for event in sorted(self.scenario.events, key=lambda event: event.at):
-            if step_of_event(event.at, self.scenario.step) == self.step:
-                (self.away.add if event.do == 'leave' else self.away.discard)(event.robot)

@@ -1,1 +1,1 @@
-"""Fault campaign: whole runs in which nodes are killed or hang, judged by what they leave."""
+"""Fault campaign: whole runs in which nodes are killed or hang, and checks of their results."""

@@ -1,4 +1,4 @@
-"""The command of the fault campaign: choose cases, run them, sum up."""
+"""The command of the fault campaign: selects cases, runs them, summarises the results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _GOLDEN = 0.6180339887498949
 
 @dataclass(frozen=True)
 class Result:
-    """A case with what came of it; `problems` is empty where it passed."""
+    """Result of a case; `problems` is empty if it passed."""
 
     case: Case
     code: int | None
@@ -38,7 +38,7 @@ class Result:
 
     @property
     def passed(self) -> bool:
-        """Whether all that is promised was kept."""
+        """Whether all guarantees held."""
         return not self.problems
 
 
@@ -46,27 +46,25 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='chaos',
-        description='Run scenarios in which nodes are killed or hang, and judge what they leave: '
+        description='Run scenarios in which nodes are killed or hang, and check the results: '
         'exit code, robots at rest, found targets, recording, report, processes.',
         epilog='Exit codes: 0 all cases passed, 1 some did not, 2 wrong input.',
     )
-    parser.add_argument('--list', action='store_true', help='name all cases, and run none')
-    parser.add_argument(
-        '--case', nargs='+', metavar='NAME', help='only these; * stands for anything'
-    )
+    parser.add_argument('--list', action='store_true', help='list all cases and exit')
+    parser.add_argument('--case', nargs='+', metavar='NAME', help='only these; * is a wildcard')
     parser.add_argument('--seed', type=whole, default=_SEED, metavar='N', help='of all runs')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the results')
     parser.add_argument(
         '--out', type=Path, metavar='DIR', help='keep the runs (default: a temporary folder)'
     )
     parser.add_argument(
-        '--jobs', type=count, default=1, metavar='N', help='cases beside each other (default: 1)'
+        '--jobs', type=count, default=1, metavar='N', help='cases in parallel (default: 1)'
     )
     parser.add_argument(
         '--budget',
         type=float,
         metavar='S',
-        help='wall time after which no case is begun; cases of all kinds come first then [s]',
+        help='wall time after which no case is started; the order then mixes all kinds [s]',
     )
     return parser
 
@@ -77,7 +75,7 @@ def chosen_cases(names: Sequence[str] | None) -> list[Case]:
     Raises
     ------
     ValueError
-        If one fits no case.
+        If a pattern matches no case.
     """
     cases = all_cases()
     if names is None:
@@ -89,7 +87,7 @@ def chosen_cases(names: Sequence[str] | None) -> list[Case]:
 
 
 def run_case(case: Case, folder: Path, seed: int) -> Result:
-    """Run and judge a case."""
+    """Run and check a case."""
     begin = time.monotonic()
     outcome = execute(case, folder / case.name, seed)
     seconds = time.monotonic() - begin
@@ -97,7 +95,7 @@ def run_case(case: Case, folder: Path, seed: int) -> Result:
 
 
 def summary(results: Sequence[Result], seed: int, left_out: int) -> dict[str, Any]:
-    """Return the results as they are written."""
+    """Return the results as plain values."""
     counts: dict[str, Counter[str]] = {}
     for item in results:
         case = item.case
@@ -136,9 +134,9 @@ def run_all(
     budget: float | None = None,
     file: Path | None = None,
 ) -> list[Result]:
-    """Run cases, say how each went, and write the results after each."""
+    """Run cases, print each result, and write all results after each."""
     if budget is not None:
-        # Spread evenly over the list, whenever it ends.
+        # Spread evenly over the list, wherever the budget ends it.
         order = sorted(range(len(cases)), key=lambda index: (index * _GOLDEN) % 1.0)
         cases = [cases[index] for index in order]
     results: list[Result] = []

@@ -1,4 +1,4 @@
-"""The cases of the fault campaign, and what is promised for each."""
+"""The cases of the fault campaign, and the guarantee for each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SIM = '/sim_node'
 PAUSE = 3.0
 
 _GRID = {'grid': [6, 6], 'spacing': 0.45, 'corner': [-0.1, -0.1]}
-# One target is seen from the start, so that there is something to lose; the last one is far.
+# One target is in view at the start, so that a result can be lost; the last one is far.
 _SEARCH: dict[str, Any] = {
     'version': 1,
     'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
@@ -69,18 +69,18 @@ _BUILDINGS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Case:
-    """A run, and the fault in it.
+    """A run with a fault.
 
     Attributes
     ----------
     fault : {'kill', 'pause', 'hang'}
         SIGKILL; SIGSTOP and SIGCONT after three seconds; SIGSTOP.
     nodes : tuple of str
-        Whom it strikes, all at the same time.
+        Affected nodes, all at the same time.
     when : {'start', 'middle'}
-        As soon as their processes are there; once a target is found (a cell is visited).
+        As soon as their processes exist; once a target is found (a cell is visited).
     lockstep, respawn : bool
-        How the scenario runs.
+        Mode of the run.
     buildings : bool
         Whether it is the search of buildings.
     """
@@ -108,14 +108,14 @@ class Case:
 
     @property
     def ends_the_run(self) -> bool:
-        """Whether exit code 3 is promised; otherwise the run goes on to its end, 0 or 1."""
+        """Whether exit code 3 is guaranteed; otherwise the run continues to its end, 0 or 1."""
         if self.fault == 'pause':
             return False
-        # No step waits for a guard, and its start has `limits.start`, longer than these runs.
+        # No step waits for a guard, and `limits.start` is longer than these runs.
         beside = all(node.endswith('/guard') for node in self.nodes)
         if beside and self.fault == 'hang' and self.when == 'start':
             return False
-        # Another sim would begin with another time; a start that hangs is not repeated.
+        # A restarted simulation would begin at time 0; a start that hangs is not repeated.
         if not self.respawn or SIM in self.nodes:
             return True
         if beside:
@@ -128,7 +128,7 @@ class Case:
         if self.fault == 'hang' and self.when == 'start':
             limits['start'] = 30.0
         if not self.ends_the_run and not self.lockstep:
-            # Long enough for a node to start again on a busy machine.
+            # Long enough for a restart on a busy machine.
             limits['time'] = 16.0 if self.fault == 'pause' else 20.0
         if self.buildings:
             limits['time'] *= 3.0
@@ -140,14 +140,14 @@ class Case:
         }
 
     def options(self) -> list[str]:
-        """Return how its run is started."""
+        """Return the options of its run."""
         if self.lockstep:
             return ['--lockstep']
         return ['--rate', '3'] if self.buildings else []
 
 
 def all_cases() -> list[Case]:
-    """Return the whole campaign; the cases of which most is at stake come first."""
+    """Return the whole campaign; the most important cases come first."""
     cases: list[Case] = []
     modes = [(lockstep, respawn) for lockstep in (False, True) for respawn in (True, False)]
     striking: tuple[Fault, ...] = ('kill', 'hang')

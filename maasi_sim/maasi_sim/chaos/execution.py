@@ -1,4 +1,4 @@
-"""Run a case of the fault campaign: start it, strike, wait for its end."""
+"""Run a case of the fault campaign: start it, inject the fault, wait for its end."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from maasi_sim.chaos.cases import PAUSE, Case
 from maasi_sim.scenario.layering import to_yaml
 
-# Longest wait for a run to come to where the fault strikes, and for its end after that [s].
+# Longest wait for the moment of the fault, and for the end of the run after it [s].
 _TRIGGER_PATIENCE, _END_PATIENCE = 120.0, 120.0
 _LOOK_PERIOD = 0.02
 _FOUND = re.compile(r'(\d+) (?:found|visited)')
@@ -24,7 +23,7 @@ _FOUND = re.compile(r'(\d+) (?:found|visited)')
 
 @dataclass
 class Outcome:
-    """What is left of a run.
+    """Result of a run.
 
     Attributes
     ----------
@@ -33,13 +32,13 @@ class Outcome:
     code : int or None
         Exit code; None: it did not end.
     output : str
-        What it printed.
+        Printed text.
     struck : bool
-        Whether the fault came about.
+        Whether the fault was injected.
     ended_after : float
         From the fault to the end [s].
     left : list of str
-        Command lines of processes that were still there after the end.
+        Command lines of processes that were still running after the end.
     """
 
     folder: Path
@@ -51,7 +50,7 @@ class Outcome:
 
 
 class _Output:
-    """Reads what a run prints, while it prints."""
+    """Reads the output of a running process."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -69,7 +68,7 @@ class _Output:
         return max((int(match.group(1)) for match in matches if match), default=0)
 
     def text(self) -> str:
-        """Return all of it, after the end."""
+        """Return the whole output, after the end."""
         self._thread.join(5.0)
         return ''.join(self.lines)
 
@@ -109,11 +108,10 @@ def execute(case: Case, folder: Path, seed: int) -> Outcome:
 
 
 def _victims(case: Case, run: Path, process: subprocess.Popen[str], output: _Output) -> list[int]:
-    """Return the processes of the case's nodes at the moment of the fault; none: it is over."""
-    condition: Callable[[], bool] = lambda: case.when == 'start' or output.found() > 0  # noqa: E731
+    """Return the processes of the case's nodes at the moment of the fault; none: the run ended."""
     deadline = time.monotonic() + _TRIGGER_PATIENCE
     while time.monotonic() < deadline and process.poll() is None:
-        if condition():
+        if case.when == 'start' or output.found() > 0:
             found = {name: _pid(run, name) for name in case.nodes}
             pids = [pid for pid in found.values() if pid is not None]
             if len(pids) == len(case.nodes):
@@ -124,7 +122,7 @@ def _victims(case: Case, run: Path, process: subprocess.Popen[str], output: _Out
 
 def _strike(case: Case, victims: list[int]) -> bool:
     number = signal.SIGKILL if case.fault == 'kill' else signal.SIGSTOP
-    # All of them, whatever becomes of the first.
+    # All of them, even if the first has ended.
     done = [_send(pid, number) for pid in victims]
     if case.fault == 'pause':
         time.sleep(PAUSE)
@@ -148,7 +146,7 @@ def _pid(run: Path, node: str) -> int | None:
 
 
 def processes_of(run: Path) -> dict[int, str]:
-    """Return the processes that have a run's folder in their command line, without zombies."""
+    """Return the processes with a run's folder in their command line, without zombies."""
     found = {}
     for entry in Path('/proc').iterdir():
         if not entry.name.isdigit():

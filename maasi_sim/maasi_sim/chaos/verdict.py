@@ -1,4 +1,4 @@
-"""Judge a run of the fault campaign by its exit code, its recording and its report."""
+"""Check a run of the fault campaign: exit code, recording and report."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ FloatArray = NDArray[np.float64]
 # From a driver's last state until its robot stands, and from the last update of the filter until
 # all do: held after 5 s, and then braking [s].
 DRIVER_STOP, FILTER_STOP = 2.5, 7.0
-# Where the guard is struck as well it is the run that stops the robot, after 5 s [s].
+# Without the guard the run itself stops the robot, after 5 s [s].
 UNGUARDED_STOP = 7.0
-# Slower than this it stands: noise of odometry [m/s].
+# Below this speed, noise of odometry, a robot is at rest [m/s].
 STANDING = 0.06
 _CODES = {True: (3,), False: (0, 1)}
 
 
 def judge(case: Case, outcome: Outcome) -> list[str]:
-    """Return what a run did otherwise than promised; nothing where it passes."""
+    """Return violations of the guarantees; empty if it passes."""
     if not outcome.struck:
-        return [f'the fault did not come about: exit code {outcome.code}']
+        return [f'the fault was not injected: exit code {outcome.code}']
     problems = []
     expected = _CODES[case.ends_the_run]
     if outcome.code not in expected:
-        problems.append(f'exit code: got {outcome.code}, promised is one of {expected}')
+        problems.append(f'exit code: got {outcome.code}, guaranteed is one of {expected}')
     if case.ends_the_run:
         named = [node for node in case.nodes if node in outcome.output]
         if not named:
@@ -64,14 +64,14 @@ def _judge_bag(case: Case, bag: Bag) -> list[str]:
         problems += _judge_found(bag)
         if not case.lockstep:
             problems += _judge_gaps(case, bag, robots)
-    # Where the sim is gone, so are its robots.
+    # Without the simulation there are no robots.
     if SIM not in case.nodes or case.fault == 'pause':
         problems += [_judge_last_command(bag, name) for name in robots]
     return [problem for problem in problems if problem]
 
 
 def _judge_found(bag: Bag) -> list[str]:
-    """Found targets never become fewer, and keep their ids."""
+    """Check that found targets are never lost and keep their ids."""
     problems: list[str] = []
     before, ids = 0, set[int]()
     for item in bag.messages(['/filter_update']):
@@ -84,7 +84,7 @@ def _judge_found(bag: Bag) -> list[str]:
     for item in bag.messages(['/found_targets']):
         now = [int(target.id) for target in item.message.targets]
         if len(set(now)) != len(now):
-            problems.append(f'found_targets: an id comes twice in {now}')
+            problems.append(f'found_targets: duplicate id in {now}')
         if lost := sorted(ids - set(now)):
             problems.append(f'found_targets: without {lost} that were found')
         ids |= set(now)
@@ -92,7 +92,7 @@ def _judge_found(bag: Bag) -> list[str]:
 
 
 def _judge_gaps(case: Case, bag: Bag, robots: list[str]) -> list[str]:
-    """Free running: a robot stands while its driver is silent, and all while the filter is."""
+    """Check, free running, that a robot stands while its driver or the filter is silent."""
     problems = []
     updates = _times(bag, '/filter_update')
     end = max(_times(bag, '/clock'), default=0.0)
@@ -119,7 +119,7 @@ def _judge_gaps(case: Case, bag: Bag, robots: list[str]) -> list[str]:
 
 
 def _gaps(times: list[float], end: float, least: float) -> list[tuple[float, float]]:
-    """Return where nothing came for longer than `least`, up to the end of the recording."""
+    """Return gaps between messages longer than `least`, up to the end of the recording."""
     if not times:
         return []
     pairs = zip(times, [*times[1:], end])
@@ -140,7 +140,7 @@ def _speeds(bag: Bag, robot: str) -> FloatArray:
 
 
 def _judge_last_command(bag: Bag, robot: str) -> str:
-    """Whatever ended the run, the last command of each robot is to stand."""
+    """Check that the last command of a robot is zero."""
     last = None
     for item in bag.messages([f'/{robot}/cmd_vel']):
         last = item.message
@@ -148,4 +148,4 @@ def _judge_last_command(bag: Bag, robot: str) -> str:
         return ''
     twist = getattr(last, 'twist', last)
     values = (twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.z)
-    return '' if not any(values) else f'{robot}: the last command is {values}, promised are zeros'
+    return '' if not any(values) else f'{robot}: the last command is {values}, guaranteed are zeros'

@@ -1,4 +1,4 @@
-"""Parts of the figures of reports: views from above and the side, ways over time, legend."""
+"""Parts of the figures of reports: views from above and the side, paths over time, legend."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec, SubplotSpec
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
+
+from maasi_sim.run.report_files import title
+from maasi_sim.run.run_record import RunRecord
 
 FloatArray = NDArray[np.float64]
 
@@ -55,6 +60,8 @@ class Panels:
 
     Attributes
     ----------
+    figure : Figure
+        That holds them.
     views : list of View
         The map in 2D; in 3D from above, from the south, and from the east.
     plots : list of Axes
@@ -65,24 +72,28 @@ class Panels:
         Between the views, if there is room for a legend.
     """
 
+    figure: Figure
     views: list[View]
     plots: list[Axes]
     grid: GridSpec
     corner: SubplotSpec | None
 
 
-def make_panels(figure: Figure, area: FloatArray, heights: Sequence[float]) -> Panels:
-    """Return the axes of a figure with constrained layout.
+def make_panels(area: FloatArray, robots: int, heights: Sequence[float]) -> Panels:
+    """Return the axes of a new figure.
 
     Parameters
     ----------
-    figure : Figure
-        Empty.
     area : (d, 2) array
         That the views show [m, map].
+    robots : int
+        Number of bands of the second plot.
     heights : sequence of float
-        Relative heights of the plots beside the views.
+        Relative heights of the plots beside the views, after the first two.
     """
+    figure = Figure(figsize=(13.0, 8.0), layout='constrained')
+    FigureCanvasAgg(figure)
+    heights = [1.0, 0.12 + 0.1 * min(robots, 8), *heights]
     size = area[:, 1] - area[:, 0]
     outer = GridSpec(2, 2, figure, width_ratios=[1.5, 1.0], height_ratios=[1.0, 1e-6])
     views = []
@@ -111,9 +122,42 @@ def make_panels(figure: Figure, area: FloatArray, heights: Sequence[float]) -> P
         view.axes.set_xlabel(f'{_NAMES[right]} [m]')
         view.axes.set_ylabel(f'{_NAMES[up]} [m]')
         view.axes.spines[['top', 'right']].set_visible(False)
-    beside = outer[0, 1].subgridspec(len(heights), 1, height_ratios=list(heights))
+    beside = outer[0, 1].subgridspec(len(heights), 1, height_ratios=heights)
     plots = [figure.add_subplot(beside[row]) for row in range(len(heights))]
-    return Panels(views, plots, outer, corner)
+    return Panels(figure, views, plots, outer, corner)
+
+
+def finish_figure(
+    panels: Panels,
+    record: RunRecord,
+    colours: Mapping[str, str],
+    heading: str,
+    rows: Sequence[tuple[str, str]],
+) -> Figure:
+    """Draw the bands of the robots, the last rows of text and the titles; return the figure.
+
+    The first plot, over time, has the heading; the last one takes the rows.
+    """
+    over, times = panels.plots[:2]
+    over.sharex(times)
+    over.tick_params(labelbottom=False)
+    over.set_title(heading, fontsize=11)
+    _draw_times(times, colours, record.end_time)
+    times.set_xlim(0.0, max(record.end_time, 1e-9))
+    _write_rows(panels.plots[-1], rows)
+    panels.figure.suptitle(title(record), fontsize=13, fontweight='bold')
+    return panels.figure
+
+
+def event_rows(record: RunRecord, most: int, digits: int) -> list[tuple[str, str]]:
+    """Return the first events as rows of text, with time [s]."""
+    return [
+        (
+            f'{event["time"]:.{digits}f} s',
+            f'{event.get("agent", event.get("node", ""))} {event["event"]}',
+        )
+        for event in record.events[:most]
+    ]
 
 
 def fade(colour: str) -> LinearSegmentedColormap:
@@ -149,7 +193,7 @@ def draw_start_and_end(view: View) -> None:
     view.axes.plot([], [], 'o', color=PALE, ms=7, label='end')
 
 
-def draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
+def _draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
     """Draw a band for each robot: which shade of its way is which time [s]."""
     for row, (_, colour) in enumerate(colours.items()):
         axes.imshow(
@@ -165,8 +209,9 @@ def draw_times(axes: Axes, colours: Mapping[str, str], end: float) -> None:
     axes.spines[['top', 'right', 'left']].set_visible(False)
 
 
-def add_legend(figure: Figure, panels: Panels) -> None:
-    """Add a legend of all views with each label once, in axes that are large enough for it."""
+def add_legend(panels: Panels) -> None:
+    """Add a legend of all views with each label once, in axes that are large enough."""
+    figure = panels.figure
     unique: dict[str, Any] = {}
     for view in panels.views:
         handles, labels = view.axes.get_legend_handles_labels()
@@ -192,12 +237,12 @@ def add_legend(figure: Figure, panels: Panels) -> None:
         labelspacing=0.6,
         frameon=False,
     )
-    # Else the layout would make room for it a second time.
+    # The axes already reserve its space in the layout.
     legend.set_in_layout(False)
 
 
-def write_rows(axes: Axes, rows: Sequence[tuple[str, str]], least: int = 10) -> None:
-    """Write names and values below each other; room is left for at least so many."""
+def _write_rows(axes: Axes, rows: Sequence[tuple[str, str]], least: int = 10) -> None:
+    """Write names and values below each other, with space for at least `least`."""
     axes.set_axis_off()
     for index, (key, value) in enumerate(rows):
         height = 1.0 - (index + 0.5) / max(len(rows), least)
@@ -207,8 +252,6 @@ def write_rows(axes: Axes, rows: Sequence[tuple[str, str]], least: int = 10) -> 
 
 def step_plot(axes: Axes, label: str, draw: Callable[[Axes], None]) -> None:
     """Draw a plot of counts with whole numbers upwards."""
-    from matplotlib.ticker import MaxNLocator
-
     draw(axes)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(label)

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Rectangle
 from numpy.typing import NDArray
 
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_sim.run.report_files import END_REASONS, title
+from maasi_sim.run.report_files import END_REASONS
 from maasi_sim.run.report_panels import (
     COLOURS,
     PALE,
@@ -22,11 +21,11 @@ from maasi_sim.run.report_panels import (
     View,
     add_legend,
     draw_start_and_end,
-    draw_times,
     draw_way,
+    event_rows,
+    finish_figure,
     make_panels,
     step_plot,
-    write_rows,
 )
 from maasi_sim.targets.report import build_report
 from maasi_sim.targets.target_record import TargetRecord
@@ -42,14 +41,11 @@ _VIEW_GRID = 160
 
 
 def plot_report(record: TargetRecord) -> Figure:
-    """Return a picture: the search from above, in 3D from the sides too, and its course."""
-    figure = Figure(figsize=(13.0, 8.0), layout='constrained')
-    FigureCanvasAgg(figure)
+    """Return a figure: the search from above, in 3D also from the sides, and its progress."""
     bounds = record.scenario.environment.array()
     names = record.scenario.names()
     colours = {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(names)}
-    bands = 0.12 + 0.1 * min(len(names), 8)
-    panels = make_panels(figure, bounds, [1.0, bands, 1.0, 1.5])
+    panels = make_panels(bounds, len(names), [1.0, 1.5])
     explored = _explored(record)
     for view in panels.views:
         _draw_explored(view, explored, bounds)
@@ -64,26 +60,19 @@ def plot_report(record: TargetRecord) -> Figure:
     first.axes.plot([], [], '+', color=PALE, ms=8, label='waypoint')
     draw_start_and_end(first)
     first.axes.plot([], [], ':', color=PALE, lw=1.5, label='field of view at the end')
-    add_legend(figure, panels)
-    over_time, times, over_measurements, words = panels.plots
+    add_legend(panels)
+    over_time, _, over_measurements, _ = panels.plots
     step_plot(over_time, '', lambda axes: _draw_progress(axes, record, True))
-    over_time.sharex(times)
-    over_time.tick_params(labelbottom=False)
-    over_time.set_title('Targets found', fontsize=11)
-    draw_times(times, colours, record.end_time)
-    times.set_xlim(0.0, max(record.end_time, 1e-9))
     step_plot(
         over_measurements,
         'measurements, all robots',
         lambda axes: _draw_progress(axes, record, False),
     )
-    write_rows(words, _rows(record))
-    figure.suptitle(title(record), fontsize=13, fontweight='bold')
-    return figure
+    return finish_figure(panels, record, colours, 'Targets found', _rows(record))
 
 
 def _explored(record: TargetRecord) -> UnexploredMap:
-    """Return what the robots have explored from where they measured."""
+    """Return the exploration after all measurements of the robots."""
     scenario = record.scenario
     explored = UnexploredMap(scenario.environment.array(), scenario.filter.exploration_spacing)
     for name, poses in record.measured_from.items():
@@ -94,7 +83,7 @@ def _explored(record: TargetRecord) -> UnexploredMap:
 
 
 def _draw_explored(view: View, explored: UnexploredMap, bounds: FloatArray) -> None:
-    """Shade what is unseen: e, in 3D its mean along the line of sight."""
+    """Shade unexplored places: e, in 3D its mean along the line of sight."""
     hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
     values = explored.values.mean(axis=hidden) if hidden else explored.values
     if view.plane[0] < view.plane[1]:
@@ -239,7 +228,4 @@ def _rows(record: TargetRecord) -> list[tuple[str, str]]:
     ]
     reason = END_REASONS.get(report['end_reason'], report['end_reason'])
     rows.append(('ended', f'{reason}, at {record.end_time:.1f} s'))
-    for event in record.events[:3]:
-        who = event.get('agent', event.get('node', ''))
-        rows.append((f'{event["time"]:.1f} s', f'{who} {event["event"]}'))
-    return rows
+    return rows + event_rows(record, 3, 1)

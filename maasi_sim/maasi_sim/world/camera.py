@@ -1,5 +1,5 @@
 """
-A simulated camera: the floor with its markers as a robot's camera would deliver it.
+A simulated camera: images of the floor with its markers.
 
 The geometry is that of `maasi_drivers.vision.camera_model.Camera`, distortion included; light,
 noise, blur and distractors are set by `RenderSettings`. The image is linear in the light.
@@ -49,7 +49,7 @@ class CameraRenderer:
     Parameters
     ----------
     camera : Camera
-        Geometry; the true one (a driver may believe another).
+        True geometry; the driver may have another calibration.
     settings : RenderSettings
         Light, noise, blur.
     shapes : sequence of Shape
@@ -211,7 +211,7 @@ class CameraRenderer:
 
 
 def through_jpeg(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    """Return an RGB image as it comes out of JPEG at a quality of 1 to 100."""
+    """Return an RGB image after JPEG compression at a quality of 1 to 100."""
     _, encoded = cv2.imencode(
         '.jpg', cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
     )

@@ -1,4 +1,4 @@
-"""A robot that another program moves: a simulator of an autopilot, or a real vehicle."""
+"""A robot moved by another program: an autopilot's simulator, or a real vehicle."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from maasi_planner.motion import RobotState
 
 class ExternalRobot:
     """
-    Where a robot is by its own driver; simulated sensors see from there.
+    The state of a robot as its driver publishes it; simulated sensors measure from there.
 
     Parameters
     ----------
     start : Pose
-        In the map, before its driver says where it is.
+        In the map, until its driver publishes one.
 
     """
 
@@ -26,16 +26,16 @@ class ExternalRobot:
 
     @property
     def state(self) -> RobotState:
-        """Where its driver says that it is, in the map."""
+        """The last published state, in the map."""
         return self._state
 
     @property
     def obeys(self) -> bool:
-        """Nothing has to be awaited at the end: it is there without the sim."""
+        """False: the simulation does not wait for it at shutdown."""
         return False
 
     def take(self, message: AgentState) -> None:
-        """Take the newest state."""
+        """Store the newest state."""
         linear, angular = message.twist.linear, message.twist.angular
         try:
             self._state = RobotState(
@@ -44,11 +44,11 @@ class ExternalRobot:
                 np.array([angular.x, angular.y, angular.z]),
             )
         except ValueError:
-            # Drivers publish finite poses; of others the last good one counts.
+            # Not finite: keep the last valid pose.
             return
 
     def cut(self, cut: bool = True) -> None:
-        """Leave its link alone: it is not simulated."""
+        """Do nothing: its link is not simulated."""
 
     def close(self) -> None:
-        """Leave it."""
+        """Do nothing."""

@@ -1,4 +1,4 @@
-"""What lies on the floor: markers, obstacles, and things that are mistaken for markers."""
+"""Objects on the floor: markers, obstacles, and distractors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Colour = Sequence[float]
 @dataclass(frozen=True)
 class Shape:
     """
-    Something flat on the floor.
+    A flat object on the floor.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ def draw_distractors(
     """
     Draw the distractors of a world.
 
-    None but sheets touches a marker: a marker half under something else is no fair target.
+    Only sheets may touch a marker: one that is partly covered could not be detected.
     """
     counts = settings.distractors
     low, high = world.bounds[:2, 0], world.bounds[:2, 1]
@@ -117,7 +117,7 @@ def _clear_line(
 
 
 def scene_of(world: World, settings: RenderSettings, seed: int) -> list[Shape]:
-    """Return what lies on the floor, bottom first: distractors, obstacles, markers."""
+    """Return the objects on the floor, bottom first: distractors, obstacles, markers."""
     shapes = draw_distractors(settings, world, noise_stream(seed, purpose='distractors'))
     shapes += [
         disc(centre, float(radius), (0.25, 0.24, 0.23))

@@ -25,7 +25,7 @@ class LaserSettings(Settings):
     noise: float = Field(default=0.01, ge=0.0, description='Deviation of a range [m]')
     rate: float = Field(default=5.0, gt=0.0, description='Turns per second [Hz]')
     wall_margin: float = Field(
-        default=0.3, ge=0.0, description='How far outside the bounds the walls stand [m]'
+        default=0.3, ge=0.0, description='Distance of the walls outside the bounds [m]'
     )
 
     @model_validator(mode='after')
@@ -85,7 +85,7 @@ class LaserScanner:
     seed : int
         Of the run.
     robot : str
-        Whose scanner it is.
+        Name of the robot.
 
     """
 
@@ -119,13 +119,13 @@ class LaserScanner:
         step : int
             Discrete step, which keys the noise.
         centres, radii : array_like, shapes (n, 2) and (n,)
-            More circles: the other robots [m].
+            Further circles: the other robots [m].
 
         Returns
         -------
         ndarray, shape (beams,), float32
-            Anticlockwise from straight ahead [m]; infinite where there is no return, minus infinite
-            where something is too near (REP 117).
+            Anticlockwise from straight ahead [m]; infinite without a return, minus infinite below
+            the minimum range (REP 117).
 
         """
         settings = self.settings

@@ -18,11 +18,11 @@ def noise_stream(
     seed : int
         Of the run, not negative.
     robot : str
-        Name of the robot; empty for what belongs to the world.
+        Name of the robot; empty for noise of the world.
     step : int
         Discrete step k, not negative.
     purpose : str
-        What the noise is for, such as 'camera' or 'odometry'.
+        Such as 'camera' or 'odometry'.
 
     Returns
     -------

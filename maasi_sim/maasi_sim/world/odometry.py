@@ -1,4 +1,4 @@
-"""Simulated odometry: starts at zero, with noise, and drift that grows with the way."""
+"""Simulated odometry: starts at zero, with noise, and drift that grows with the distance."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from maasi_planner.motion import RobotState
 from maasi_sim.world.noise_streams import noise_stream
 
 Array = NDArray[np.float64]
-# A variance reported is never quite zero: consumers invert it.
+# Reported variances stay positive: consumers invert them.
 _LEAST_VARIANCE = 1e-12
 
 
 class OdometrySettings(Settings):
-    """How good a robot's odometry is; all zero: perfect."""
+    """Errors of a robot's odometry; all zero: perfect."""
 
     position_noise: float = Field(
-        default=0.002, ge=0.0, description='Deviation of each coordinate, anew each step [m]'
+        default=0.002, ge=0.0, description='Deviation of each coordinate, independent each step [m]'
     )
     heading_noise: float = Field(
-        default=0.002, ge=0.0, description='Deviation of the heading, anew each step [rad]'
+        default=0.002, ge=0.0, description='Deviation of the heading, independent each step [rad]'
     )
     velocity_noise: float = Field(
         default=0.005, ge=0.0, description='Deviation of each part of the velocity [m/s]'
@@ -53,7 +53,7 @@ class OdometrySettings(Settings):
 @dataclass(frozen=True)
 class OdometryReading:
     """
-    What a robot says about its motion, as in ``nav_msgs/Odometry``.
+    Odometry of one step, as in ``nav_msgs/Odometry``.
 
     Attributes
     ----------
@@ -76,8 +76,8 @@ class OdometryModel:
     """
     A robot's odometry.
 
-    Height, roll and pitch are measured against the ground and gravity: they carry noise at most,
-    while x, y and heading are counted up, and drift.
+    Height, roll and pitch are measured absolutely and have noise at most; x, y and heading are
+    integrated, and drift.
 
     Parameters
     ----------
@@ -88,9 +88,9 @@ class OdometryModel:
     seed : int
         Of the run.
     robot : str
-        Whose odometry it is.
+        Name of the robot.
     reported : OdometrySettings, optional
-        What the covariance is of; none: `settings`.
+        Errors that the covariance describes; none: `settings`.
 
     """
 
@@ -106,7 +106,7 @@ class OdometryModel:
         self.reported = reported or settings
         self.seed = seed
         self.robot = robot
-        # Plain numbers throughout: for so few of them arrays take several times as long.
+        # Plain numbers: arrays of this size take several times as long.
         to_start = inverse(Pose.from_yaw(start.position, start.yaw))
         self._shift = to_start.position.tolist()
         self._rotation = to_start.rotation().tolist()
@@ -128,7 +128,7 @@ class OdometryModel:
 
     def step(self, state: RobotState, step: int) -> OdometryReading:
         """
-        Go on to the robot's next true state and return what its odometry says.
+        Return the odometry of the next true state.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class OdometryModel:
             root = math.sqrt(way)
             before = self._place(x, y)
             self._turn += settings.heading_drift * root * dh
-            # The heading turns about where the robot is, not about the origin.
+            # The error of heading turns the estimate about the robot, not about the origin.
             after = self._place(x, y)
             drift = settings.position_drift * root
             self._offset = (
@@ -199,7 +199,7 @@ class OdometryModel:
         )
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
-        """Return where the odometry believes the robot is when it is at x, y."""
+        """Return the estimated position of a robot at x, y."""
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
         return (
             self._offset[0] + cosine * x - sine * y,
@@ -207,7 +207,7 @@ class OdometryModel:
         )
 
     def _grow(self, move_x: float, move_y: float, way: float) -> None:
-        """Carry the covariance of the drift along a move: an error of heading leads astray."""
+        """Propagate the covariance of the drift over a move; an error of heading turns the move."""
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
         # d(x, y) / d(heading).
         a = -(sine * move_x + cosine * move_y)

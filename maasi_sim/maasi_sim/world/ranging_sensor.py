@@ -1,4 +1,4 @@
-"""Plays a sensor of range, bearing and elevation that misses targets and measures them badly."""
+"""A simulated sensor of range, bearing and elevation with misses, noise and clutter."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class RangingSensor:
     seed : int
         Of the run.
     robot : str
-        Whose sensor it is: with the seed and the step it keys every draw.
+        Name of the robot; with seed and step it keys the random numbers.
     reach : float
-        Farthest range at which clutter appears [m].
+        Largest range of clutter [m].
 
     """
 
@@ -58,7 +58,7 @@ class RangingSensor:
         step : int
             Discrete step.
         targets : ndarray, shape (n, 3) or (n, 2), optional
-            Where the targets are by now, if they have moved [m, map].
+            Present positions, if the targets have moved [m, map].
 
         Returns
         -------
@@ -71,14 +71,14 @@ class RangingSensor:
         dimension = self.sensor.dimension
         generator = noise_stream(self.seed, self.robot, step, 'ranging')
         count = len(self.targets)
-        # As many draws whatever is detected: what happens to one target leaves the others alone.
+        # The number of draws does not depend on detections: targets do not affect each other.
         chance = generator.random(count)
         noise = generator.standard_normal((count, dimension))
         positions = (self.targets if targets is None else targets)[:, :dimension]
         values = self.sensor.measurement.measure(positions, pose)
         seen = chance < self.sensor.detection.probability(positions, pose)
         seen &= values[:, 0] <= self.sensor.maximum_range
-        # Summed in a fixed order, whatever linear algebra library is there.
+        # Summed in a fixed order: the result must not depend on the linear algebra library.
         errors = np.zeros((count, dimension))
         for column in range(dimension):
             errors += noise[:, column, None] * self._spread[:, column]

@@ -92,7 +92,7 @@ def place(shapes, rims, floor_x, floor_y, view, motion, margin, boxes, drift):  
     left = bottom = np.inf
     right = top = -np.inf
     horizon = False
-    # The outline bounds what the image sees: the floor is a smooth map of the image.
+    # The border of the image bounds the visible floor, as floor coordinates vary smoothly over it.
     for row in range(height):
         step = 1 if row == 0 or row == height - 1 else max(width - 1, 1)
         for column in range(0, width, step):
@@ -191,7 +191,7 @@ def paint(albedo, floor_x, floor_y, shapes, boxes, drift, blur):  # type: ignore
                 if np.isnan(xc + yc + xr + yr):
                     continue
                 distance, nx, ny = _signed_distance(kind, a, b, cosine, sine, x - cx, y - cy)
-                # Farther from the edge than it is soft and moves, a pixel is in or out.
+                # Pixels far from the edge, relative to its blur and motion, are fully in or out.
                 edge = np.sqrt(xc * xc + yc * yc + xr * xr + yr * yr)
                 if abs(distance) > 0.5 * (move + soft * edge):
                     cover = 1.0 if distance < 0.0 else 0.0
@@ -249,7 +249,7 @@ def expose(albedo, floor_x, floor_y, exposure, noise, offsets, image):  # type: 
     """
     Turn albedo (3, h, w) into grey levels (h, w, 3): light, gains, noise, quantisation.
 
-    The light is a smooth wave of parabolas, much like a sine but without its cost.
+    The light is a wave of parabolas, a cheap approximation of a sine.
     """
     lens, light, gains = exposure.lens, exposure.light, exposure.gains
     read, shot = exposure.read_noise, exposure.shot_noise
@@ -259,7 +259,7 @@ def expose(albedo, floor_x, floor_y, exposure, noise, offsets, image):  # type: 
     amplitude = 4.0 * light[0]
     read2, shot1 = np.float32(read * read), np.float32(shot)
     zero, half, full = np.float32(0.0), np.float32(0.5), np.float32(255.0)
-    # Row by row over contiguous pieces: that is what the compiler makes fast code of.
+    # Row by row over contiguous memory, so that the compiler vectorises.
     for row in range(height):
         xs, ys, fall_off = floor_x[row], floor_y[row], lens[row]
         for column in range(width):

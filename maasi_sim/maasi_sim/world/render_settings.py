@@ -1,4 +1,4 @@
-"""How a simulated camera sees: light, noise, blur, and what is mistaken for a marker."""
+"""Rendering of simulated cameras: light, noise, blur, and distractors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class DistractorSettings(Settings):
 
 
 class RenderSettings(Settings):
-    """How the simulated camera sees: moderate by default, exact with `RenderSettings.ideal()`."""
+    """Disturbances of the simulated camera: moderate by default, none with `ideal()`."""
 
     marker_diameter: float = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
     marker_colour: list[Finite] = Field(
@@ -44,10 +44,10 @@ class RenderSettings(Settings):
         default=0.15,
         ge=0,
         lt=1,
-        description='Relative amplitude of light and shade over the floor [-]',
+        description='Relative amplitude of the light over the floor [-]',
     )
     light_wavelength: float = Field(
-        default=3.0, gt=0, description='Distance from one bright place to the next [m]'
+        default=3.0, gt=0, description='Wavelength of the light over the floor [m]'
     )
     vignetting: float = Field(
         default=0.1,
@@ -78,10 +78,13 @@ class RenderSettings(Settings):
     )
     blur: float = Field(default=0.5, ge=0, description='Deviation of the blur of the lens [px]')
     jpeg_quality: int | None = Field(
-        default=None, ge=1, le=100, description='Passed through JPEG at this quality; none: not [1]'
+        default=None,
+        ge=1,
+        le=100,
+        description='Quality of JPEG compression; none: no JPEG [1]',
     )
     distractors: DistractorSettings = Field(
-        default_factory=DistractorSettings, description='What misleads'
+        default_factory=DistractorSettings, description='Objects like markers'
     )
 
     @model_validator(mode='after')

@@ -29,7 +29,7 @@ from maasi_sim.world.world import World
 
 Array = NDArray[np.float64]
 
-# Speed at which a flying robot with an empty battery comes down [m/s].
+# Sink rate of a flying robot with an empty battery [m/s].
 _SINKING = 0.3
 
 
@@ -53,11 +53,11 @@ class Battery:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing is left."""
+        """Whether no charge is left."""
         return self.charge <= 0.0
 
     def drain(self, speed: float, dt: float) -> None:
-        """Take what `dt` seconds at a speed [m/s] need."""
+        """Drain the battery by `dt` seconds at a speed [m/s]."""
         power = self.settings.idle_power + self.settings.motion_power * speed
         self.charge = max(self.charge - power * dt / self.settings.capacity, 0.0)
 
@@ -65,7 +65,7 @@ class Battery:
 @dataclass(frozen=True)
 class Equipment:
     """
-    What a simulated robot is made of.
+    Body and sensors of a simulated robot.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Equipment:
     odometry : OdometrySettings
         Noise and drift, as it reports them.
     true_odometry : OdometrySettings or None
-        As they are, where that is something else.
+        True noise and drift, if different.
     battery : BatterySettings
         Capacity and drain.
 
@@ -99,19 +99,19 @@ class Equipment:
 
 
 class Leader(Protocol):
-    """What moves a robot in place of its simulation."""
+    """Moves a robot instead of its simulated body."""
 
     @property
     def state(self) -> RobotState:
-        """Where it truly is, in the map."""
+        """True state, in the map."""
 
 
 class SimulatedRobot:
     """
-    A robot as the simulation plays it.
+    A simulated robot.
 
-    The last command holds until the next one, as on a robot without a watchdog. A robot that would
-    run into an obstacle stops short of it; one with an empty battery stops, or sinks to the floor.
+    A command holds until the next one, as on a robot without a watchdog. A robot stops before it
+    hits an obstacle; with an empty battery it stops, or sinks to the floor.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class SimulatedRobot:
     world : World
         Targets and obstacles.
     floor : RenderSettings
-        How cameras see.
+        Rendering of camera images.
     seed : int
         Of the run.
 
@@ -188,7 +188,7 @@ class SimulatedRobot:
 
     def command(self, velocity: ArrayLike) -> None:
         """
-        Take a velocity command, which holds until the next.
+        Set the velocity command, which holds until the next one.
 
         Parameters
         ----------
@@ -204,12 +204,12 @@ class SimulatedRobot:
         self._command = check_command(velocity)
 
     def follow(self, leader: Leader) -> None:
-        """Be from now on where `leader` is: what moves it is not this simulation."""
+        """Take the state from `leader` from now on, instead of simulating the body."""
         self._leader = leader
         self.state = leader.state
 
     def step(self, step: int, dt: float) -> None:
-        """Go on by `dt` seconds to the discrete step `step`, from 1."""
+        """Advance by `dt` seconds to the discrete step `step`, from 1."""
         if self._leader is not None:
             was_clear = not self._hits(self.state.pose.position)
             self.state = self._leader.state
@@ -235,7 +235,7 @@ class SimulatedRobot:
         self.odometry = self._odometry.step(self.state, step)
 
     def stand(self, step: int) -> None:
-        """Stay where it is until the discrete step `step`, at rest; the last command is void."""
+        """Stand still until the discrete step `step`; the last command is void."""
         if self._leader is not None:
             self.step(step, 0.0)
             return

@@ -1,18 +1,16 @@
-"""All simulated robots of a scenario on one clock, with what happens to them."""
+"""Simulated robots on one clock, with the events of the scenario."""
 
 from __future__ import annotations
 
 import math
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.models.pose import Pose
-from maasi_sim.scenario.schema import (
-    RobotSettings,
-    Scenario,
-    steps_of,
-)
+from maasi_sim.scenario.base import BaseScenario
+from maasi_sim.scenario.schema import RobotSettings, Scenario, steps_of
 from maasi_sim.world.robots import Equipment, SimulatedRobot
 from maasi_sim.world.world import World
 
@@ -20,47 +18,39 @@ from maasi_sim.world.world import World
 _TOLERANCE = 1e-6
 
 
-class Simulation:
-    """
-    The robots of a scenario, from step 0 on.
+class Steppable(Protocol):
+    """A robot that is simulated step by step."""
+
+    def step(self, step: int, dt: float) -> None:
+        """Advance by `dt` seconds to the discrete step `step`, from 1."""
+
+    def stand(self, step: int) -> None:
+        """Stand still until the discrete step `step`; the last command is void."""
+
+
+class SimulatedTeam:
+    """Robots of a scenario on one clock, from step 0, with events applied.
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : BaseScenario
         With all layers.
-    seed : int
-        Of the run.
+    robots : dict
+        By name, in name order.
 
     Attributes
     ----------
     step : int
         Discrete step k.
-    robots : dict
-        SimulatedRobot by name, in name order.
     away : set of str
         Robots that have left: they stand still and are silent.
-    world : World
-        The truth.
-
-    Raises
-    ------
-    ValueError
-        If a robot starts inside an obstacle.
-
     """
 
-    def __init__(self, scenario: Scenario, seed: int) -> None:
-        self.scenario = scenario
+    def __init__(self, scenario: BaseScenario, robots: dict[str, Any]) -> None:
+        self.scenario: Any = scenario
+        self.robots = robots
         self.step = 0
-        self.world = scenario.world(seed)
-        self.robots = {
-            name: simulated_robot(name, scenario, self.world, seed) for name in scenario.names()
-        }
         self.away: set[str] = set()
-        self._image_steps = {
-            name: _steps_between_images(scenario.robots[name], scenario.step)
-            for name in self.robots
-        }
         self._events: dict[int, list[tuple[str, str]]] = {}
         for event in sorted(scenario.events, key=lambda event: event.at):
             step = step_of_event(event.at, scenario.step)
@@ -77,13 +67,8 @@ class Simulation:
         """Robots that take part, in name order."""
         return [name for name in self.robots if name not in self.away]
 
-    def warm_up(self) -> None:
-        """Compile, or load from the cache, what the robots use; nothing changes."""
-        for robot in self.robots.values():
-            robot.warm_up()
-
     def advance(self) -> None:
-        """Go on to the next step, each robot under its last command."""
+        """Advance by one step, each robot under its last command."""
         self.step += 1
         for name, robot in self.robots.items():
             if name in self.away:
@@ -91,6 +76,50 @@ class Simulation:
             else:
                 robot.step(self.step, self.scenario.step)
         self._apply_events()
+
+    def _apply_events(self) -> None:
+        for name, change in self._events.get(self.step, []):
+            (self.away.add if change == 'leave' else self.away.discard)(name)
+
+
+class Simulation(SimulatedTeam):
+    """The robots of a search for targets.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With all layers.
+    seed : int
+        Of the run.
+
+    Attributes
+    ----------
+    world : World
+        The truth.
+
+    Raises
+    ------
+    ValueError
+        If a robot starts inside an obstacle.
+    """
+
+    scenario: Scenario
+    robots: dict[str, SimulatedRobot]
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self.world = scenario.world(seed)
+        robots = {
+            name: simulated_robot(name, scenario, self.world, seed) for name in scenario.names()
+        }
+        self._image_steps = {
+            name: _steps_between_images(scenario.robots[name], scenario.step) for name in robots
+        }
+        super().__init__(scenario, robots)
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, what the robots use; nothing changes."""
+        for robot in self.robots.values():
+            robot.warm_up()
 
     def images_due(self, name: str) -> bool:
         """Return whether the camera, or the ranging sensor, of a robot has data at this step."""
@@ -120,13 +149,6 @@ class Simulation:
             [other.state.pose.position[:2] for other in others],
             [other.equipment.radius for other in others],
         )
-
-    def _apply_events(self) -> None:
-        for name, change in self._events.get(self.step, []):
-            if change == 'leave':
-                self.away.add(name)
-            else:
-                self.away.discard(name)
 
 
 def step_of_event(time: float, step: float) -> int:

@@ -1,4 +1,4 @@
-"""What is true of a simulated robot apart from what the robots believe."""
+"""True parameters of a simulated robot, where they differ from those that the suite assumes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class SimulatedSettings(Settings):
-    """What is true of a robot, where that differs from its other settings.
+    """True parameters of a robot, where they differ from its other settings.
 
     The sensor's part is for ranging sensors; a camera has its own true settings.
     """
@@ -25,14 +25,13 @@ class SimulatedSettings(Settings):
         default=None, description="True noise of its sensor; none: the sensor's"
     )
     noise_factor: float = Field(
-        default=1.0, gt=0.0, le=1000.0, description='What true deviations are multiplied with [1]'
+        default=1.0, gt=0.0, le=1000.0, description='Factor on the true deviations [1]'
     )
     probability_factor: float = Field(
         default=1.0,
         ge=0.0,
         le=100.0,
-        description='What the true probability of detection is multiplied with; at most 1 '
-        'results [1]',
+        description='Factor on the true probability of detection, which is at most 1 [1]',
     )
     clutter_per_scan: float | None = Field(
         default=None,

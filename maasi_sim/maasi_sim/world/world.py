@@ -1,4 +1,4 @@
-"""What the robots search: bounds, targets, obstacles, and things on the floor that mislead."""
+"""The true world: bounds, targets, obstacles."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from maasi_sim.world.noise_streams import noise_stream
 
 Array = NDArray[np.float64]
 
-# Draws for one target before the space is said to be too full.
+# Draws for one target before the space counts as full.
 _ATTEMPTS = 1000
-# Whole sets of targets drawn anew where the last ones found no room.
+# Draws of a whole set of targets before the space counts as full.
 _RESTARTS = 10
 
 
@@ -51,7 +51,7 @@ class TargetSettings(Settings):
 
     identified: bool = Field(
         default=False,
-        description='Whether sensors read the identity of each target, as of a transponder; '
+        description='Whether sensors read the identity of each target, as from a transponder; '
         'ranging sensors only',
     )
     classes: list[str] = Field(
@@ -84,7 +84,7 @@ class World:
     seed : int
         Of the walk.
     labels : tuple of Label
-        What sensors tell of each target; empty: nothing.
+        Label that sensors report for each target; empty: none.
 
     """
 
@@ -107,7 +107,7 @@ class World:
         return self.targets_3d_at(0)
 
     def targets_at(self, step: int) -> Array:
-        """Return where the targets are at a discrete step, (n, d) [m]; bounds turn them back."""
+        """Return target positions at a discrete step, (n, d) [m], reflected at the bounds."""
         if self.walk == 0.0:
             return self.targets
         if not self._way:
@@ -150,7 +150,7 @@ class World:
 
 
 def labels_of(targets: TargetSettings, count: int) -> tuple[Label, ...]:
-    """Return what sensors tell of `count` targets; empty: nothing."""
+    """Return the labels that sensors report for `count` targets; empty: none."""
     if not (targets.identified or targets.classes):
         return ()
     return tuple(
@@ -203,7 +203,7 @@ def draw_targets(
     bounds : ndarray, shape (d, 2)
         [m].
     generator : numpy.random.Generator
-        Where the randomness comes from.
+        Source of random numbers.
     obstacles : Obstacles, optional
         No target lies inside one, nor within ``margin`` of one.
 
@@ -251,7 +251,7 @@ def _draw(
     for index in range(count):
         for _ in range(_ATTEMPTS):
             if settings.distribution == 'clustered':
-                # Centres in turn: none stays without targets, whatever the draw.
+                # Centres in turn, so that each has targets.
                 position = generator.normal(centres[index % len(centres)], spread)
                 if np.any((position < low) | (position > high)):
                     continue
