@@ -43,30 +43,30 @@ from maasi_sim.world.world import World
 FloatArray = NDArray[np.float64]
 
 
-# Settings, and what returns the true targets that are not found yet.
+# From the settings, and a function that returns the true targets that are not found yet.
 MakePlanner = Callable[[PlannerSettings, Callable[[], FloatArray]], Planner]
 
 
 @dataclass(frozen=True)
 class Found:
-    """When a search stood how.
+    """State of a search after a measurement batch.
 
     Attributes
     ----------
     time : float
         [s].
     measurements : int
-        Taken by then, by all robots.
+        Number so far, of all robots.
     found, true_found : int
-        Targets found by then, and how many of them are true.
+        Targets found so far, and the number of true ones among them.
     rmse : float
         Of the true ones [m]; nan without any.
     step : int
         k.
     members : tuple of str
-        Who measured.
+        Robots that measured.
     positions : dict
-        Where every robot is, (3,) [m].
+        Of all robots, (3,) [m].
     """
 
     time: float
@@ -98,7 +98,7 @@ class SearchResult:
     measurements : dict
         Number of each robot.
     distance : dict
-        Way of each robot [m].
+        Distance travelled by each robot [m].
     steps : int
         Length of the search.
     progress : list of Found
@@ -108,11 +108,11 @@ class SearchResult:
     filter_times, planning_times : list of float
         Wall time of each filter step and of each decision [s].
     trace : SearchTrace or None
-        What a replay shows.
+        For a replay.
     pairs : list of (int, int)
         Index of a found target, and of the true one that it is.
     origin : OriginSettings or None
-        Where the map lies on the earth.
+        Of the map on the earth.
     """
 
     end_reason: str
@@ -173,7 +173,7 @@ class SearchResult:
 
 
 class _Robot:
-    """A simulated robot with what its driver does."""
+    """A simulated robot with the functions of its driver."""
 
     def __init__(self, name: str, scenario: Scenario, seed: int, world: World) -> None:
         settings = scenario.robots[name]
@@ -206,7 +206,7 @@ class _Robot:
         self.state = RobotState(self.pose.pose, self.pose.velocity, self.pose.angular_velocity)
 
     def has_ended(self, goal: int) -> bool:
-        """Return whether the goal of this number is over."""
+        """Return whether the goal of this number has ended."""
         follower = self.follower
         return (
             follower.goal is not None
@@ -215,7 +215,7 @@ class _Robot:
         )
 
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
-        """Return what the robot sees at a step."""
+        """Return the measurement of the robot at a step."""
         if self.detector is None:
             sweep = self.body.sweep(step)
             reading = SensorReading.of_sweep(sweep, self.sensor, self.pose.pose)
@@ -235,7 +235,7 @@ class _Robot:
 
 
 class _Group:
-    """Robots that share filter and planner: all, or one by itself (002, section 4)."""
+    """Robots that share filter and planner: all, or a single one (002, section 4)."""
 
     def __init__(
         self, space: str, names: list[str], scenario: Scenario, trace: SearchTrace
@@ -250,7 +250,7 @@ class _Group:
             scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
         )
         self.last_batch: int | None = None
-        # What the others know of: as it stood at the end of the step before.
+        # Found targets at the end of the previous step, for the other groups.
         self.shared: list[FoundTarget] = []
         self.filter_times: list[float] = []
         self.planning_times: list[float] = []
@@ -293,7 +293,7 @@ class _Group:
         present: Mapping[str, PresentRobot],
         others: Sequence[_Group],
     ) -> list[str]:
-        """Let those measure that do so now, and the filter have it; return their names."""
+        """Measure with the robots that are due, update the filter, and return their names."""
         able = {name for name in present if step % robots[name].imaging_steps == 0}
         members = self.coordinator.measuring(step, present, able)
         if not members:
@@ -316,7 +316,7 @@ class _Group:
 
 
 def leaving(scenario: Scenario) -> dict[int, list[str]]:
-    """Return which robots leave at which step, as the simulation plays it."""
+    """Return the robots that leave, by step."""
     steps: dict[int, list[str]] = {}
     for event in scenario.events:
         if event.do != 'leave':
@@ -339,7 +339,7 @@ def search(
     Parameters
     ----------
     scenario : Scenario
-        What to search, by whom. Of its events, robots that leave are played.
+        To run. Of its events, only leaving robots are simulated.
     seed : int
         Of all random numbers.
     most_measurements : int, optional
@@ -349,7 +349,7 @@ def search(
         Planner; or a function that returns the planner of each group, from its settings and a
         function that returns the true targets that are not found yet, (n, 3) [m].
     view : bool
-        Whether to show the search in a browser while it goes on.
+        Whether to show the running search in a browser.
 
     Raises
     ------
@@ -486,7 +486,7 @@ def search(
 
 
 def _numbered(found: list[list[FoundTarget]]) -> list[FoundTarget]:
-    """Return what each filter found itself as one list, numbered in the order of being found."""
+    """Return the found targets of all filters as one list, numbered in the order of time."""
     if len(found) == 1:
         return found[0]
     every = sorted(itertools.chain(*found), key=lambda item: (item.time, item.robot, item.id))

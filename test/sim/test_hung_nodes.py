@@ -27,6 +27,6 @@ def test_a_node_in_an_endless_loop_is_killed_and_started_again(tmp_path, scenari
     run = Run(tmp_path / 'run', path, script={'filter_node': trouble})
     code, output = run.wait()
     assert code == 0, output
-    assert 'it is killed' in output and 'it is started again' in output
+    assert 'it is killed' in output and 'it is restarted' in output
     events = [item['event'] for item in run.report['events'] if 'node' in item]
     assert events == ['hung', 'restarted']

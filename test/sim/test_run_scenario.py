@@ -276,7 +276,7 @@ def test_a_node_that_dies_is_started_again_where_the_scenario_says_so(tmp_path, 
     run = Run(tmp_path / 'run', path, '--lockstep', script=script)
     code, output = run.wait()
     assert code == 0, output
-    assert 'it is started again' in output
+    assert 'it is restarted' in output
     (event,) = [event for event in run.report['events'] if 'node' in event]
     assert event['event'] == 'restarted' and event['node'] == '/second/driver'
 

@@ -124,7 +124,7 @@ def test_a_killed_planner_stops_nobody_and_takes_up_its_work(tmp_path):
     finally:
         process.kill()
     assert process.returncode == 0, output
-    assert 'started again' in output
+    assert 'is restarted' in output
     with Bag(folder / 'bag') as bag:
         decisions = {
             name: [plain(item.message) for item in bag.messages([f'/{name}/decision'])]

@@ -103,9 +103,7 @@ def test_killed_nodes_are_started_again_where_the_scenario_says_so(tmp_path):
     }
     for file, node in names.items():
         kill(folder, file)
-        wait_for(
-            lambda node=node: f'{node} was started again' in log.read_text(), f'{node} is back'
-        )
+        wait_for(lambda node=node: f'{node} was restarted' in log.read_text(), f'{node} is back')
     output, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode in (0, 1), output
     with Bag(folder / 'bag') as bag:
@@ -117,7 +115,7 @@ def test_killed_nodes_are_started_again_where_the_scenario_says_so(tmp_path):
     )
     # They take part again: the last batches are answered.
     assert updates[-1] >= batches[-1] - 1 and len(batches) > 30
-    assert 'started again' in output
+    assert 'is restarted' in output
 
 
 def test_ctrl_c_leaves_no_process_and_a_readable_bag(tmp_path):

@@ -1,4 +1,4 @@
-"""Gathers what the report of a search of buildings needs from its messages."""
+"""Gathers the data of the report of a search of buildings from its messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SnapshotRecord:
 
 @dataclass(frozen=True)
 class Moment:
-    """Where a run stood when the last cuboid was visited."""
+    """When a cuboid was visited."""
 
     time: float
     step: int
@@ -50,17 +50,17 @@ class CuboidRecord(RunRecord):
     Attributes
     ----------
     mission : Mission
-        What was searched.
+        Searched objects.
     snapshots : list of SnapshotRecord
         In the order of steps and robots; of a cuboid there can be several.
     choices : dict
-        Decisions by how they were made.
+        Decisions by the way they were made.
     active : (n, 2) array
         Time [s] and robots that search.
     solve_times : array
         Of decisions [s].
     most_heard : int
-        Robots heard at once, at most.
+        Largest number of robots received at once.
     completed : Moment or None
         When the last cuboid was visited.
     """
@@ -75,7 +75,7 @@ class CuboidRecord(RunRecord):
 
 
 class CuboidObserver:
-    """Gather what a report needs from serialised messages, in the order in which they come.
+    """Gathers the data of a report from serialised messages, in the order of arrival.
 
     Parameters
     ----------
@@ -142,14 +142,14 @@ class CuboidObserver:
 
     @property
     def settled(self) -> str | None:
-        """Why nothing is left to gain, once every planner says so."""
+        """The reason, once all planners report that all cuboids are visited."""
         if len(self._done) < len(self._decision_topics):
             return None
         return 'every planner knows that all cuboids are visited'
 
     @property
     def end_step(self) -> int | None:
-        """Step at which the run came to its end by itself, if it has."""
+        """Step at which the search ended by itself, if it has."""
         if self.completed is not None:
             return self.completed.step
         return max(self._done.values()) if self.settled is not None else None

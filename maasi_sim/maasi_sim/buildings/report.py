@@ -13,7 +13,7 @@ from maasi_sim.run.report_files import END_REASONS, ending, identity, pace, path
 def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
     """Return the report of a run as plain values; nothing in it is infinite or not a number.
 
-    There are no targets: what is found is cuboids visited, `cuboids` in the report.
+    There are no targets; visited cuboids count as found, `cuboids` in the report.
     """
     mission = record.mission
     first: dict[int, Any] = {}

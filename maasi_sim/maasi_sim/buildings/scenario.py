@@ -38,7 +38,7 @@ class SearchRobotSettings(Settings):
     type: str = Field(description='Name of the type: a file in config/robots')
     description: str = Field(default='', description='What it is, in words')
     link: Literal['topics'] = Field(
-        default='topics', description='How its planner reaches it; the sim plays the other end'
+        default='topics', description='How its planner reaches it; the other end is simulated'
     )
     start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
         description='Position at the start, and of its station, x y z [m, map]'
@@ -49,7 +49,7 @@ class SearchRobotSettings(Settings):
         default_factory=HazardSettings, description='How its battery fails'
     )
     odometry: OdometrySettings = Field(
-        default_factory=OdometrySettings, description='How good its odometry is, simulated'
+        default_factory=OdometrySettings, description='Errors of its simulated odometry'
     )
     battery: BatterySettings = Field(
         default_factory=BatterySettings, description='Its battery as it is shown, simulated'

@@ -1,4 +1,4 @@
-"""Robots that the simulation does not move: it plays their link in real time, or others do."""
+"""Robots behind a link: simulated with their protocol in real time, or external."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ class LinkedRobot(Leader, Protocol):
         """Whether it executes the commands of its driver."""
 
     def cut(self, cut: bool = True) -> None:
-        """Cut the link, or mend it."""
+        """Cut the link, or restore it."""
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
 
 
 def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
     """
-    Return the other end of a robot's link; time passes for it at once.
+    Return the simulated end of a robot's link; it runs in real time at once.
 
     Raises
     ------

@@ -21,17 +21,19 @@ _LIMIT = 1000
 # Without a limit on wall time a decision does not depend on the machine [s].
 _FOR_EVER = 1e9
 
-STEPS = Quantity('steps', 'time until all cuboids are visited', 's', 'restricted')
-CUBOIDS = Quantity('cuboids', 'cuboids')
-COVERAGE = Quantity('coverage', 'share of the faces that is seen')
-COMPLETE = Quantity('complete', 'missions with all cuboids visited')
-COLLISIONS = Quantity('collisions', 'steps on which an object was cut')
-LEAST = Quantity('least_detection_probability', 'least p_d of a snapshot')
-ACTIVE = Quantity('active', 'robots that search, mean over the steps')
-RECHARGES = Quantity('recharges', 'batteries that failed')
-SOLVE = Quantity('solve_mean', 'time of a decision', 's')
-CENTRALIZED = Quantity('centralized', 'time of a joint decision, P1', 's')
-DISTRIBUTED = Quantity('distributed', 'time of a decision of one robot, P2', 's')
+QUANTITIES = (
+    Quantity('steps', 'time until all cuboids are visited', 's', 'restricted'),
+    Quantity('cuboids', 'cuboids'),
+    Quantity('coverage', 'share of the faces that is seen'),
+    Quantity('complete', 'missions with all cuboids visited'),
+    Quantity('collisions', 'steps on which an object was cut'),
+    Quantity('least_detection_probability', 'least p_d of a snapshot'),
+    Quantity('active', 'robots that search, mean over the steps'),
+    Quantity('recharges', 'batteries that failed'),
+    Quantity('solve_mean', 'time of a decision', 's'),
+    Quantity('centralized', 'time of a joint decision, P1', 's'),
+    Quantity('distributed', 'time of a decision of one robot, P2', 's'),
+)
 _STEPS_TIMED = 8
 
 

@@ -139,7 +139,7 @@ def page(results: dict[str, Results], earlier: dict[str, Earlier] | None = None)
     results : dict
         Runs of experiments.
     earlier : dict, optional
-        What an earlier page says of the others.
+        Sections of an earlier page, for the others.
     """
     sections = dict(earlier or {})
     for name, found in results.items():

@@ -17,7 +17,7 @@ import yaml
 
 from maasi_sim.experiments import building_figures, building_runs, figures, searches
 from maasi_sim.experiments.building_runs import run_mission, run_timing
-from maasi_sim.experiments.cases import Case, Choice, Comparison, Published, Quantity
+from maasi_sim.experiments.cases import Case, Choice, Comparison, Published
 from maasi_sim.experiments.experiment import Experiment
 from maasi_sim.experiments.searches import (
     merged,
@@ -28,12 +28,7 @@ from maasi_sim.experiments.searches import (
 )
 from maasi_sim.experiments.terrain import run_on_terrain
 
-QUANTITIES = {
-    item.name: item
-    for module in (searches, building_runs)
-    for item in vars(module).values()
-    if isinstance(item, Quantity)
-}
+QUANTITIES = {item.name: item for item in (*searches.QUANTITIES, *building_runs.QUANTITIES)}
 RUNS = {
     'search': run_search,
     'exploring': run_exploring,

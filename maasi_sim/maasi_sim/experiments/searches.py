@@ -14,19 +14,19 @@ from maasi_sim.experiments.cases import Case, Outcome, Quantity
 from maasi_sim.scenario.loading import scenario_from_content, scenario_from_values
 from maasi_sim.search import SearchResult, search
 
-MEASUREMENTS = Quantity(
-    'measurements_to_find_all', 'measurements to find all', '', 'restricted', 'limit'
+QUANTITIES = (
+    Quantity('measurements_to_find_all', 'measurements to find all', '', 'restricted', 'limit'),
+    Quantity('time_to_find_all', 'time to find all', 's', 'restricted', 'time_limit'),
+    Quantity('measurements', 'measurements taken'),
+    Quantity('found', 'targets found'),
+    Quantity('false_found', 'false targets'),
+    Quantity('rmse', 'RMSE', 'm'),
+    Quantity('step_time', 'computation per measurement', 's'),
+    Quantity('filter_time', 'filter step', 's'),
+    Quantity('planning_time', 'decision', 's'),
+    Quantity('explored', 'share explored in the end'),
+    Quantity('clearance', 'smallest distance to an obstacle', 'm'),
 )
-TIME = Quantity('time_to_find_all', 'time to find all', 's', 'restricted', 'time_limit')
-TAKEN = Quantity('measurements', 'measurements taken')
-FOUND = Quantity('found', 'targets found')
-FALSE = Quantity('false_found', 'false targets')
-RMSE = Quantity('rmse', 'RMSE', 'm')
-STEP_TIME = Quantity('step_time', 'computation per measurement', 's')
-FILTER_TIME = Quantity('filter_time', 'filter step', 's')
-PLANNING_TIME = Quantity('planning_time', 'decision', 's')
-EXPLORED = Quantity('explored', 'share explored in the end')
-CLEARANCE = Quantity('clearance', 'smallest distance to an obstacle', 'm')
 
 # Measurements, and particles, of a small case.
 _SMALL = 12

@@ -7,7 +7,6 @@ import threading
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
@@ -59,7 +58,7 @@ class BagWriteError(BagError):
 
 @dataclass(frozen=True)
 class TopicQos:
-    """What a player of the recording needs to know of a topic's quality of service."""
+    """Quality of service of a topic, for players of the recording."""
 
     reliable: bool = True
     latched: bool = False
@@ -115,13 +114,13 @@ def load_types(packages: Collection[str] = ('maasi_msgs',)) -> Typestore:
 
 
 class BagWriter:
-    """Write a recording in a thread of its own; always closable, and readable once closed.
+    """Writes a recording in its own thread; after any error it can be closed, and is readable then.
 
-    What was handed in is in the file after `FLUSH_PERIOD`: a killed process loses no more.
+    Messages are in the file after `FLUSH_PERIOD`: a killed process loses no more.
 
     Images are stored as `sensor_msgs/msg/CompressedImage` on `<topic>/compressed`, in the encoding
-    that image_transport would use. Messages keep the order in which they were handed in: times
-    that do not rise are moved up by a nanosecond.
+    that image_transport would use. Messages keep their order: times that do not increase are moved
+    up by a nanosecond.
 
     Parameters
     ----------
@@ -133,12 +132,12 @@ class BagWriter:
         How images are stored. JPEG has quality 95 without chroma subsampling; PNG is lossless and
         costs ten times the time.
     backlog : int
-        Bytes that may wait to be written before `write` waits.
+        Bytes waiting to be written above which `write` blocks.
 
     Raises
     ------
     BagError
-        If the folder exists. `write`, `wait` and `close` raise it when the thread failed.
+        If the folder exists. `write`, `wait` and `close` raise it after an error of the thread.
     BagWriteError
         If the folder cannot be made, or the thread could not write (disk full).
     """
@@ -174,7 +173,7 @@ class BagWriter:
         self._thread.start()
 
     def add_topic(self, topic: str, type_name: str, qos: TopicQos | None = None) -> None:
-        """Announce a topic; it appears in the recording even without messages.
+        """Announce a topic, which is in the recording even without messages.
 
         Raises
         ------
@@ -201,12 +200,12 @@ class BagWriter:
         self._queue.put((topic, time, data))
 
     def write_message(self, topic: str, time: int, message: Any) -> None:
-        """Serialise and take a message of `rosbags`' own classes."""
+        """Serialise and write a message of the classes of `rosbags`."""
         type_name = self._topics[topic][0]
         self.write(topic, time, bytes(self._types.serialize_cdr(message, type_name)))
 
     def write_scenario(self, text: str, facts: Mapping[str, str]) -> None:
-        """Store what was run: latched on topic `/scenario`, and as custom data of the recording."""
+        """Store the scenario: latched on topic `/scenario`, and as custom data of the recording."""
         string = self._types.types['std_msgs/msg/String']
         self.add_topic(SCENARIO_TOPIC, 'std_msgs/msg/String', TopicQos(latched=True, depth=1))
         for key, value in facts.items():
@@ -215,17 +214,17 @@ class BagWriter:
 
     @property
     def failed(self) -> bool:
-        """Whether something could not be written: nothing more is."""
+        """Whether writing has failed; nothing more is written then."""
         return self._error is not None
 
     def wait(self, backlog: int = 0) -> None:
-        """Wait until at most `backlog` bytes are still to be written."""
+        """Wait until at most `backlog` bytes are waiting to be written."""
         with self._changed:
             self._changed.wait_for(lambda: self._pending <= backlog or self._error)
         self._check()
 
     def close(self) -> None:
-        """Write all that is held, and the index; closing again does nothing."""
+        """Write all waiting messages and the index; closing again does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -246,13 +245,8 @@ class BagWriter:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close, whatever happened."""
+    def __exit__(self, *_: object) -> None:
+        """Close."""
         self.close()
 
     def _check(self) -> None:
@@ -343,15 +337,15 @@ class BagWriter:
 
 
 class Bag(BagReader):
-    """Read the recording of a run; also one whose end is missing."""
+    """Reads the recording of a run, also one whose end is missing."""
 
     def scenario(self) -> dict[str, Any]:
-        """Return what was run: scenario, seed and the parameters of each node.
+        """Return scenario, seed and the parameters of each node of the run.
 
         Raises
         ------
         BagError
-            If the recording does not hold it.
+            If the recording does not have them.
         """
         for item in self.messages([SCENARIO_TOPIC]):
             content = yaml.safe_load(item.message.data)

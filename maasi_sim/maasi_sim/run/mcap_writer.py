@@ -1,4 +1,4 @@
-"""The writer of `rosbags`, with what it lacks: flushes by time, type hashes, the distribution."""
+"""The writer of `rosbags`, extended: flushes by time, type hashes, name of the distribution."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class BagFile(Writer):
         self.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
 
     def flush(self) -> float:
-        """Write to the file what is due; return the time until the next [s]."""
+        """Write due chunks to the file; return the time until the next [s]."""
         assert isinstance(self.storage, FlushingStorage)
         return self.storage.flush(time.monotonic())
 
@@ -101,7 +101,7 @@ class BagFile(Writer):
         copy.replace(self.metapath)
 
     def give_up(self) -> None:
-        """Close after a failed write: what is whole stays readable, an index is missing."""
+        """Close after a failed write: complete records stay readable, without an index."""
         file = self.path / f'{self.path.name}.mcap'
         self.metapath.with_suffix('.yaml.tmp').unlink(missing_ok=True)
         with contextlib.suppress(Exception):

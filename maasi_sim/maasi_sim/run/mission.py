@@ -1,4 +1,4 @@
-"""The interface between a run and what it is for: a search for targets, or of buildings."""
+"""The interface between a run and its mission: a search for targets, or of buildings."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Completion(Protocol):
 
 
 class Observer(Protocol[RecordOut]):
-    """Gathers what the report needs from the serialised messages of a run, and tells its end."""
+    """Gathers the data of the report from serialised messages, and detects the end of the run."""
 
     #: Whether something was found since the caller last reset it.
     news: bool
@@ -46,7 +46,7 @@ class Observer(Protocol[RecordOut]):
 
     @property
     def result_topics(self) -> Sequence[str]:
-        """Of these, what may still arrive for the last step after the run has ended."""
+        """Of these, topics whose messages of the last step may arrive after the end of the run."""
 
     @property
     def found(self) -> int:
@@ -70,11 +70,11 @@ class Observer(Protocol[RecordOut]):
 
     @property
     def settled(self) -> str | None:
-        """Why nothing is left to gain, once all planners say so."""
+        """The reason, once all planners report that nothing is left to gain."""
 
     @property
     def end_step(self) -> int | None:
-        """Step at which the search ended by itself; None while it goes on."""
+        """Step at which the search ended by itself; None before."""
 
     def add(self, topic: str, data: bytes) -> None:
         """Add a serialised message; one of another topic is ignored."""
@@ -87,11 +87,11 @@ class Observer(Protocol[RecordOut]):
 
 
 class Mission(Protocol[Record]):
-    """What is searched for: scenario, nodes, observer and report."""
+    """A kind of search: scenario, nodes, observer and report."""
 
     #: Name of the scenario.
     name: str
-    #: What happens to what is searched for, in the progress line.
+    #: Word for a success in the progress line.
     found_word: str
 
     @property
@@ -99,7 +99,7 @@ class Mission(Protocol[Record]):
         """The scenario with all layers."""
 
     def prepare(self) -> None:
-        """Give simulated robots the addresses that they have on this host.
+        """Assign addresses on this host to simulated robots.
 
         Raises
         ------
@@ -123,13 +123,13 @@ class Mission(Protocol[Record]):
         """Return the simulated robots that take off by their drivers' service `arm`."""
 
     def external(self) -> list[str]:
-        """Return the robots that another program moves, and that the user lets take off."""
+        """Return the robots moved by another program, which take off on the user's command."""
 
     def warning(self) -> str:
-        """Return what the user should know of the scenario, or an empty text; takes a while."""
+        """Return a warning about the scenario, or an empty text; takes a while."""
 
     def observer(self, types: Typestore) -> Observer[Record]:
-        """Return what gathers the messages of a run."""
+        """Return the observer of a run."""
 
     def report(self, record: Record) -> dict[str, Any]:
         """Return the report as plain values."""

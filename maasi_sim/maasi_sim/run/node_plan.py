@@ -15,7 +15,7 @@ from maasi_sim.run.topics import CLOCK, STEP, within
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import to_yaml
 
-# The time is that of the simulation.
+# Time of the simulation.
 SIMULATED = {'use_sim_time': True}
 
 
@@ -66,7 +66,7 @@ class NodePlan:
     parameters : dict
         Flat, with dots.
     topics : tuple of str
-        That it publishes and that the run needs.
+        Published ones that the run needs.
     says_ready : bool
         Whether it reports on `lockstep/ready`, and is awaited.
     says_done : bool
@@ -193,7 +193,7 @@ def sim_plan(executable: str, scenario: BaseScenario, run: RunSettings) -> NodeP
 
 
 def guard_plan(robot: str, common: Mapping[str, Any], period: float) -> NodePlan:
-    """Return the guard of a robot whose executor may be busy for `period` seconds."""
+    """Return the guard of a robot whose driver may be busy for `period` seconds."""
     lease = max(LIVELINESS_LEASE, period)
     return NodePlan(
         'maasi_drivers',

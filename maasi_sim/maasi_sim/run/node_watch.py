@@ -32,10 +32,10 @@ def waited_for_processor(pid: int | None) -> float:
 
 
 class NodeWatch:
-    """Judges nodes by the heartbeats that their executors publish each second.
+    """Detects nodes that hang, by the heartbeats that their executors publish each second.
 
-    Time in which a node waited for a processor does not count: a busy machine is no fault of a
-    node. Until its first heartbeat a node starts, which may take long as it may have to compile.
+    Time in which a node waited for a processor does not count. Until its first heartbeat a node
+    counts as starting, which may include compilation.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Processes of a run: a ROS domain of its own, nodes that never outlive it, bounded endings."""
+"""Processes of a run: a ROS domain, nodes that never outlive the run, shutdown in bounded time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, NoReturn
 
 from setproctitle import setproctitle
@@ -42,19 +41,19 @@ class Domain:
     Parameters
     ----------
     number : int, optional
-        The domain to use; the first free one from 1 if not given (0 is where everybody else is).
+        The domain to use; the first free one from 1 if not given (0 is the ROS default).
     folder : Path, optional
-        Where the lock files are: one for each domain, and one for each namespace in it.
+        Of the lock files: one for each domain, and one for each namespace in it.
     team : str
         Namespace of the run.
     shared : bool
-        Whether other runs, in other namespaces, may be in it already.
+        Whether other runs, in other namespaces, may use it as well.
 
     Raises
     ------
     ProcessError
-        If the one asked for is used by another run, is not from 0 to 101, or none is free, or if
-        the loopback interface is down, through which nodes find each other.
+        If the requested one is used by another run or not from 0 to 101, if none is free, or if
+        the loopback interface, through which nodes discover each other, is down.
     """
 
     def __init__(
@@ -66,7 +65,7 @@ class Domain:
         shared: bool = False,
     ) -> None:
         _check_loopback()
-        # A run that was just killed while starting leaves recent ports.
+        # A run that was killed while starting leaves recent ports.
         remove_dead_ports(patience=LONGEST_CREATION + 1.0)
         self._folder = folder or Path('/tmp/maasi_domains')
         self._folder.mkdir(mode=0o777, parents=True, exist_ok=True)
@@ -87,7 +86,7 @@ class Domain:
         raise ProcessError(f'no ROS domain from 1 to {DOMAINS[-1]} is free')
 
     def _take(self, number: int, team: str, shared: bool) -> str:
-        """Lock a domain and a namespace in it; return what is locked already, empty if nothing."""
+        """Lock a domain and a namespace in it; return the name of a taken one, else empty."""
         wanted = {} if shared else {f'{number}': f'{number}'}
         wanted[f'{number}_{team.replace("/", ".")}'] = f'namespace /{team} in {number}'
         self._files: list[int] = []
@@ -119,7 +118,7 @@ class Domain:
     def environment(self) -> dict[str, str]:
         """Return the variables that keep nodes in this domain, and on this host.
 
-        Where the user has no profile for Fast DDS, one with which they find each other sooner.
+        Without a profile of the user for Fast DDS, one with faster discovery is set.
         """
         variables = {
             'ROS_DOMAIN_ID': str(self.number),
@@ -130,7 +129,7 @@ class Domain:
         return variables
 
     def release(self) -> None:
-        """Let others have the domain."""
+        """Release the domain."""
         while self._files:
             os.close(self._files.pop())
 
@@ -138,12 +137,7 @@ class Domain:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Release it."""
         self.release()
 
@@ -192,7 +186,7 @@ def find_executable(package: str, executable: str) -> Path:
 
 
 def _die_with_parent(parent: int) -> None:
-    """Ask Linux to kill this process when its parent ends, however it ends."""
+    """Let Linux kill this process when its parent ends for any reason."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:
         os._exit(1)
@@ -201,18 +195,18 @@ def _die_with_parent(parent: int) -> None:
 class ForkedProcess:
     """A copy of this process that runs a function; with the interface of `subprocess.Popen`.
 
-    What was imported and compiled here is there already: a node is up in a tenth of the time.
+    Imported modules and compiled kernels are inherited: a node starts in a tenth of the time.
 
     Parameters
     ----------
     function : callable
-        What to run; its result is the exit code.
+        To run; its result is the exit code.
     command : list of str
-        What it finds in `sys.argv`, and what `ps` shows.
+        Its `sys.argv`, also shown by `ps`.
     log : int
-        File that takes what it prints.
+        File of its output.
     environment : dict
-        Variables on top of this process's own.
+        Additional variables.
     """
 
     def __init__(
@@ -256,7 +250,7 @@ def _run_and_exit(
     environment: Mapping[str, str],
     parent: int,
 ) -> NoReturn:
-    """Be a process of its own from here on, whatever was above it when it was forked."""
+    """Run as an independent process; never return to the code that forked it."""
     code: Any = 1
     try:
         os.setsid()
@@ -289,13 +283,13 @@ def _run_and_exit(
 
 
 def _single_threaded() -> bool:
-    """Return whether this process can be forked: locks of other threads would stay locked."""
+    """Return whether this process may fork: locks of other threads would stay locked."""
     return len(os.listdir('/proc/self/task')) == 1
 
 
 @dataclass
 class NodeProcess:
-    """A node that runs as a process of its own and cannot outlive this one.
+    """A node that runs as a process and cannot outlive this one.
 
     Attributes
     ----------
@@ -304,14 +298,14 @@ class NodeProcess:
     command : list of str
         What is run.
     log : Path
-        Takes what it prints; goes on growing over restarts.
+        Of its output; kept over restarts.
     environment : dict
         Variables on top of this process's own.
     main : callable, optional
-        What `command` runs, where it is loaded already: the node is then forked from this process,
+        The function that `command` runs, if loaded: the node is then forked from this process,
         unless that has several threads.
     restarts : int
-        How often it was started again.
+        Number of restarts.
     """
 
     name: str
@@ -352,14 +346,14 @@ class NodeProcess:
                 raise ProcessError(f'{self.name}: cannot be started: {error}') from error
 
     def _output(self) -> BinaryIO:
-        """Open the log; where it cannot be (disk full), the node runs without one."""
+        """Open the log; if that fails (disk full), the node runs without one."""
         try:
             return self.log.open('ab')
         except OSError:
             return open(os.devnull, 'ab')
 
     def restart(self) -> None:
-        """Start it again after it died."""
+        """Restart it after it died."""
         self.restarts += 1
         remove_dead_ports()
         with contextlib.suppress(OSError), self.log.open('ab') as output:
@@ -399,7 +393,7 @@ class NodeProcess:
             return f'was killed by signal {-code}'
 
     def last_words(self, lines: int = 12) -> str:
-        """Return the end of its log."""
+        """Return the last lines of its log."""
         try:
             text = self.log.read_text(encoding='utf-8', errors='replace')
         except OSError:

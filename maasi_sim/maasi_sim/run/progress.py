@@ -1,4 +1,4 @@
-"""Progress of a run on the terminal: one line that changes, or plain lines where there is none."""
+"""Progress of a run: one updated line on a terminal, else plain lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Status:
-    """What is shown: simulated time [s], counts, share explored, real-time factor."""
+    """Shown values: simulated time [s], counts, explored share, real-time factor."""
 
     time: float
     measurements: int
@@ -42,9 +42,9 @@ class ProgressDisplay:
     Parameters
     ----------
     stream : TextIO
-        Where to; a terminal gets a line that changes, anything else a line now and then.
+        Output; on a terminal one line is updated, otherwise lines are printed now and then.
     period : float
-        Seconds between lines that say nothing new, where it is no terminal.
+        Seconds between lines without news, without a terminal.
     """
 
     def __init__(self, stream: TextIO | None = None, period: float = 5.0) -> None:
@@ -57,11 +57,11 @@ class ProgressDisplay:
 
     @property
     def due(self) -> bool:
-        """Whether it is time to show something."""
+        """Whether an update is due."""
         return time.monotonic() - self._last >= self._period
 
     def say(self, text: str) -> None:
-        """Write a line that stays; a terminal that is gone or a full disk does not end the run."""
+        """Print a line; a closed terminal or a full disk does not end the run."""
         with contextlib.suppress(OSError):
             if self._live is not None:
                 self._live.console.print(text, markup=False, highlight=False)
@@ -69,7 +69,7 @@ class ProgressDisplay:
                 print(text, file=self._stream, flush=True)
 
     def show(self, status: Status) -> None:
-        """Show a status, if it is time or it has a new target."""
+        """Show a status, if an update is due or it has a new target."""
         if not self.due and (self._terminal or status.found == self._found):
             return
         self._last = time.monotonic()

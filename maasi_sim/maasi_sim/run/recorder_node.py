@@ -78,12 +78,12 @@ class Recorder:
     """
     A node that takes serialised messages from all topics that it discovers.
 
-    It is not spun: `wait` and `drain` take the messages without callbacks, which costs a fifth.
+    It has no executor: `wait` and `drain` take messages without callbacks, at a fifth of the cost.
 
     Subscribes
     ----------
     every topic with a publisher, with the quality of service of that publisher; where the team has
-    a namespace, only those below it, `/clock`, and what its nodes say on `/diagnostics` and
+    a namespace, only those below it, `/clock`, and messages of its nodes on `/diagnostics` and
     `/rosout`;
     `lockstep/ready` (maasi_msgs/LockstepDone)
 
@@ -97,14 +97,14 @@ class Recorder:
     domain : int
         ROS domain.
     observer : Observer
-        Is fed with what the report needs.
+        Gets the messages that the report needs.
     step_length : float
         Duration of a step [s].
     bag : BagWriter, optional
-        Recording; None: nothing is recorded, and only what the observer needs is taken.
+        Recording; None: no recording, and only messages that the observer needs are taken.
     team : str
-        Namespace of the team, without slashes at its ends. The observer is not told of it: its
-        topics are relative to it.
+        Namespace of the team, without slashes at its ends. Topics of the observer are relative to
+        it.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Recorder:
         self._begun: int | None = None
         self.step: int | None = None
         self.last_seen: dict[str, float] = {}
-        #: Share of the environment explored, as planners say each second.
+        #: Share of the environment explored, published by planners each second.
         self.explored = 0.0
         #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
@@ -150,7 +150,7 @@ class Recorder:
         self._finished = False
         self._last_step = -1
         self.complaints: list[str] = []
-        #: Takes topic, type and content of each message that a page shows.
+        #: Called with topic, type and content of each message that a page shows.
         self.listener: Callable[[str, str, bytes], None] | None = None
         self._shown: dict[str, str] = {}
         self._wanted = {*observer.topics, CLOCK, DONE, DIAGNOSTICS}
@@ -207,9 +207,9 @@ class Recorder:
                 self._shown[topic] = types[0]
 
     def missing(self, topics: Sequence[str]) -> list[str]:
-        """Return those topics, of use to the recorder, of which a publisher is not connected yet.
+        """Return the topics, among those recorded, with a publisher that is not connected yet.
 
-        A topic is given once for each of its publishers.
+        `topics` has each topic once for each of its publishers.
         """
         publishers = Counter(topics)
         return [
@@ -219,7 +219,7 @@ class Recorder:
         ]
 
     def _connected(self, topic: str | None) -> float:
-        """Return the number of connected publishers; unlimited if it is of no use."""
+        """Return the number of connected publishers; infinite if the topic is not recorded."""
         if topic is None or not self._wants(topic):
             return math.inf
         subscription = self._subscriptions.get(topic)
@@ -257,10 +257,9 @@ class Recorder:
 
     def drain(self, limit: int | None = None) -> None:
         """
-        Take all messages that have come: to the observer, and into the recording.
+        Pass all received messages to the observer and the recording.
 
-        What ends a run ends it at a step: of what nodes have sent since, nothing is kept that
-        would make one recording differ from another.
+        A run ends at a step: later messages are dropped, so that equal runs give equal recordings.
 
         Parameters
         ----------
@@ -269,7 +268,7 @@ class Recorder:
         """
         # Messages left in the queue would end each wait at once.
         self.take_ready()
-        # What an update refers to is published before it: take updates first, add them last.
+        # Messages that an update refers to precede it: take updates first, add them last.
         updates = [
             (topic, data)
             for topic in self.observer.update_topics
@@ -316,7 +315,7 @@ class Recorder:
         self._record(taken)
 
     def _note_explored(self, status: DiagnosticStatus) -> None:
-        """Note what a planner says between its decisions."""
+        """Note the exploration that a planner publishes between its decisions."""
         for item in status.values:
             if item.key == 'explored' and status.name.endswith('/planner_node'):
                 with contextlib.suppress(ValueError):
@@ -332,7 +331,7 @@ class Recorder:
         return 0 if self._begun is None else self.time - self._begun
 
     def _is_own(self, topic: str, data: bytes) -> bool:
-        """Return whether a message on a topic that all teams share is the team's own."""
+        """Return whether a message on a topic shared by all teams is the team's own."""
         if not self._team:
             return True
         if topic == DIAGNOSTICS:
@@ -378,7 +377,7 @@ class Recorder:
         return due
 
     def finish(self) -> None:
-        """Keep from now on only messages of the steps so far, and of the shutdown."""
+        """Keep only messages of the steps so far and of the shutdown from now on."""
         self._finished = True
         if self._last_step < 0 and self.step is not None:
             self._last_step = self.step
@@ -415,7 +414,7 @@ class Recorder:
         return steps
 
     def stop_robots(self, names: Collection[str]) -> None:
-        """Publish zeros on `cmd_vel` of robots that listen to it, and wait until they arrive."""
+        """Publish zeros on `cmd_vel` of robots that subscribe to it, and wait until they arrive."""
         types = dict(self.node.get_topic_names_and_types())
         publishers = []
         for name in names:
@@ -442,7 +441,7 @@ class Recorder:
             self.node.destroy_publisher(publisher)
 
     def followers(self) -> list[str]:
-        """Return the namespaces of the runs that follow this clock."""
+        """Return the namespaces of the runs that follow the clock of this one."""
         return sorted(
             info.node_namespace
             for info in self.node.get_subscriptions_info_by_topic(CLOCK)
@@ -457,7 +456,7 @@ class Recorder:
 
 
 def _take(subscription: Subscription) -> list[bytes]:
-    """Return all serialised messages that wait in a subscription."""
+    """Return all serialised messages queued in a subscription."""
     taken: list[bytes] = []
     handle = subscription.handle
     while True:

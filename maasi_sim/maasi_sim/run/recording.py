@@ -1,4 +1,4 @@
-"""The part of a recording that a replay needs: batches of measurements and their updates."""
+"""The part of a recording that a replay needs: measurement batches and filter updates."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Batch:
     stamp : (int, int)
         Seconds and nanoseconds.
     members : list of (robot, decision, measurement)
-        That were processed, in their order.
+        Processed ones, in their order.
     detections : list of bytes
         Serialised DetectionArray of each member.
     update : dict
-        What the filter published.
+        Published by the filter.
     late : bool
-        Whether it is a measurement that came too late for its batch, or without a request.
+        Whether it is a measurement that arrived after its batch, or without a request.
     namespace : str
         Of the filter; empty for the root.
     """
@@ -46,7 +46,7 @@ class Batch:
 
 @dataclass
 class Recording:
-    """What a replay takes from a recording.
+    """Contents of a recording for a replay.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Recording:
     found : dict
         By the namespace of the filter: found targets at the end, a list of dict.
     found_batch : dict
-        By the namespace: the batch after which they stood so.
+        By the namespace: the batch after which they were published.
     """
 
     facts: dict[str, Any]
@@ -72,12 +72,12 @@ class Recording:
 
 
 def read_recording(path: Path) -> Recording:
-    """Return what a replay needs of a recording.
+    """Return the contents of a recording for a replay.
 
     Raises
     ------
     BagError
-        If it is none, or measurements that the filter processed are not in it.
+        If it is none, or lacks measurements that the filter processed.
     """
     with Bag(path) as bag:
         recording = Recording(bag.scenario())

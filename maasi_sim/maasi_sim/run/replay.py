@@ -1,4 +1,4 @@
-"""Feed a recording's measurements to the filter node again, and compare what it finds."""
+"""Replay the measurements of a recording to the filter node, and compare the found targets."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def replay(
     domain_id: int | None,
     interrupted: Callable[[], bool],
 ) -> int:
-    """Replay a recording, say whether the filter finds the same, and return the exit code.
+    """Replay a recording, print whether the found targets are equal, and return the exit code.
 
     Parameters
     ----------
@@ -59,9 +59,9 @@ def replay(
     out : Path, optional
         Folder for the node's log and parameters.
     domain_id : int, optional
-        ROS domain; one of its own if not given.
+        ROS domain; a free one if not given.
     interrupted : callable
-        Becomes true when the user wants it to end.
+        Returns true after an interruption.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Stands in for planner and drivers of the filter node, from a recording."""
+"""Replaces planner and drivers for the filter node, from a recording."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class ReplayNode:
 
     @property
     def ready(self) -> bool:
-        """Whether the filters are, and hear all that will be published."""
+        """Whether the filters are ready and subscribe to all topics that will be published."""
         publishers = [*self._batches.values(), *self._detections.values()]
         return not self._awaited and all(item.get_subscription_count() for item in publishers)
 
@@ -94,7 +94,7 @@ class ReplayNode:
         self._executor.spin_once(timeout_sec=timeout)
 
     def publish(self, batch: Batch) -> None:
-        """Publish a batch with the measurements that the filter processed then."""
+        """Publish a batch with the measurements that the filter had processed."""
         if not batch.late:
             self._publish_batch(batch)
         for (robot, _, _), data in zip(batch.members, batch.detections):

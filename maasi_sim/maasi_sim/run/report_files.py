@@ -1,4 +1,4 @@
-"""The files of a report, and what the reports of all kinds of runs have in common."""
+"""The files of a report, and the common part of all reports."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ END_REASONS = {
 
 @dataclass(frozen=True)
 class StoredReport:
-    """A report, what to say of it, and where it is.
+    """A report, its summary, and its folder.
 
     Attributes
     ----------
     report : dict
-        What stands in `report.json`.
+        Content of `report.json`.
     words : str
         Its summary.
     folder : Path or None
-        That holds it; None: it could be written nowhere.
+        Of the files; None: it could not be written.
     problem : str
-        Why it is not in the folder of the run; empty if it is.
+        Why it is not in the folder of the run; else empty.
     """
 
     report: dict[str, Any]
@@ -110,9 +110,9 @@ def write_report(mission: Mission[Any], record: RunRecord, folder: Path) -> dict
 
 
 def store_report(mission: Mission[Any], record: RunRecord, folder: Path) -> StoredReport:
-    """Write a report into the folder of the run; elsewhere if it must be.
+    """Write a report into the folder of the run, or, if that fails, into another one.
 
-    Elsewhere is a new folder below the first of these that has room: that of temporary files, the
+    The other one is a new folder below the first of these with space: that of temporary files, the
     home of the user, `/dev/shm`.
     """
 

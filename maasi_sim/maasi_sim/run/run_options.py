@@ -15,7 +15,7 @@ _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line says about a run."""
+    """Options of a run."""
 
     scenario: str = ''
     out: Path | None = None
@@ -133,7 +133,7 @@ def _namespace(text: str) -> str:
 
 
 def parse(arguments: list[str] | None) -> Options:
-    """Return what a command line says; a wrong one ends the process with 2."""
+    """Return the options of a command line; a wrong one ends the process with 2."""
     parser = build_parser()
     options = parser.parse_args(arguments)
     if (options.replay is None) == (options.scenario is None):

@@ -1,4 +1,4 @@
-"""The page of a run while it goes on."""
+"""The page of a running scenario."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from maasi_sim.view.server import Commander
 
 
 class RunPage:
-    """Serve a run, fed with the messages that its recorder takes.
+    """Serves the page of a run, with the messages of its recorder.
 
     Parameters
     ----------
@@ -47,11 +47,11 @@ class RunPage:
         self._feed = MessageFeed(self.view, load_types())
 
     def put(self, topic: str, type_name: str, data: bytes) -> None:
-        """Take a message; never waits."""
+        """Queue a message; never blocks."""
         self._feed.put(topic, type_name, data)
 
     def close(self) -> None:
-        """Show what is left, and stop serving."""
+        """Show the queued messages, and stop serving."""
         self._feed.close()
         self.view.end('the run has ended')
         if self._commander is not None:

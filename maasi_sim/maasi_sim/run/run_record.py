@@ -1,4 +1,4 @@
-"""What is known of a run after its end, and what every observer gathers of it."""
+"""The record of a run, and the part of it that all observers gather."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class RunEnd:
 
 @dataclass
 class RunRecord:
-    """What the reports of all kinds of runs need.
+    """Data of the reports of all kinds of runs.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class RunRecord:
 
 
 class TeamLog:
-    """Which robots take part, from the messages of the simulation, and since when a run lasts."""
+    """Robots that take part, by the messages of the simulation, and the start of the run."""
 
     def __init__(self, types: Typestore) -> None:
         self._types = types
@@ -91,7 +91,7 @@ class TeamLog:
         return seconds(stamp) - (self.begin or 0.0)
 
     def note(self, step: Any) -> bool:
-        """Note the robots of a `LockstepStep`; return whether they are others than before."""
+        """Note the robots of a `LockstepStep`; return whether they have changed."""
         if self.begin is None:
             self.begin = seconds(step.stamp)
         before, self.robots = self.robots, list(step.robots)

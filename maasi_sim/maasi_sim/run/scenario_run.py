@@ -116,7 +116,7 @@ class ScenarioRun:
         session: Session | None = None
         page: RunPage | None = None
         try:
-            # Before anything that takes time, and while this process has a single thread.
+            # First, while this process has a single thread.
             if not self.interruption:
                 self.supervisor.start()
             if self.options.view is not None:
@@ -145,7 +145,7 @@ class ScenarioRun:
         return self._report(session)
 
     def _report(self, session: Session) -> int:
-        """Write the report, say how the run went, and return the exit code."""
+        """Write the report, print a summary, and return the exit code."""
         ending = session.ending
         end = RunEnd(
             ending.reason, session.recorder.elapsed, session.wall_time, self.supervisor.events
@@ -171,7 +171,7 @@ class ScenarioRun:
         return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
     def _page(self, options: ViewOptions, domain: int) -> RunPage | None:
-        """Serve the page of the run; a run goes on without one."""
+        """Serve the page of the run; an error does not end the run."""
         try:
             page = RunPage(self.mission, options, domain, self.options.namespace)
         except OSError as error:

@@ -1,4 +1,4 @@
-"""A run while its nodes run: waits until they are ready, follows it, and decides when it ends."""
+"""A run after the start of its nodes: waits until they are ready, monitors it, ends it."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from maasi_sim.run.run_options import Options
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.scenario.layering import to_yaml
 
-# Bytes that may wait for the disk when the recorder says that it is done with a step.
+# Bytes that may wait for the disk when the recorder reports a step done.
 _BACKLOG = 8 * 2**20
 # Longest wall time between two checks of processes and topics [s].
 _POLL = 0.02
 # Between two checks for runs that follow the clock [s].
 _FOLLOWERS_PERIOD = 0.5
-# Wall time between two messages on what is waited for [s].
+# Wall time between two messages about missing nodes [s].
 _START_PATIENCE = 10.0
 
 
 class Session:
-    """Records and follows a run whose nodes have been started.
+    """Records and monitors a run whose nodes have been started.
 
     Parameters
     ----------
@@ -51,18 +51,18 @@ class Session:
     interruption : Interruption
         Ends the run when it becomes true.
     display : ProgressDisplay
-        Shows how it goes on.
+        Shows the progress.
 
     Attributes
     ----------
     recorder : Recorder
     observer : Observer
     listener : callable or None
-        Takes topic, type and content of each message that a page shows; set before `open`.
+        Called with topic, type and content of each message that a page shows; set before `open`.
     ending : Ending
         How the run ended, after `run`.
     unwritten : list of str
-        What could not be written, and why.
+        Errors of writing.
     """
 
     recorder: Recorder
@@ -118,7 +118,7 @@ class Session:
             self.unwritten.append(str(error))
 
     def run(self) -> None:
-        """Follow the run from the start to the end of its nodes."""
+        """Monitor the run from the start to the end of its nodes."""
         team = f'{self._options.namespace}/'.lstrip('/')
         robots = [team + name for name in self.mission.taking_off()]
         self._arming = Arming(self.recorder.context, robots)
@@ -139,7 +139,7 @@ class Session:
 
     @property
     def is_followed(self) -> bool:
-        """Whether another run needs the clock of this one, and may have it."""
+        """Whether another run follows the clock of this one."""
         follows = self._options.follow_clock or self._scenario.external_clock
         own = self._supervisor.clock_running and not (follows or self._options.lockstep)
         return bool(own and not self._interruption and self.recorder.followers())
@@ -153,7 +153,7 @@ class Session:
             self.recorder.drain()
 
     def _facts(self) -> str:
-        """Return all that a replay needs, as YAML."""
+        """Return the data for a replay, as YAML."""
         options = self._options
         facts = {
             'name': self.mission.name,
@@ -180,7 +180,7 @@ class Session:
             self._display.say(f'warning: {warning}')
 
     def _wait_until_ready(self) -> Ending | None:
-        """Wait until every node takes part, the recorder last; return an ending if one does not."""
+        """Wait until every node is ready, the recorder last; return an ending if one is not."""
         recorder, supervisor = self.recorder, self._supervisor
         begin = time.monotonic()
         patience = _START_PATIENCE
@@ -194,7 +194,7 @@ class Session:
             # Before the look for topics: those of a node that has reported are known.
             ready = set(recorder.take_ready())
             recorder.discover()
-            # What the nodes send while they start is recorded as it comes.
+            # Messages of starting nodes are recorded as they arrive.
             recorder.drain()
             self._arming.call(ready)
             late = [name for name in expected if name not in ready]
@@ -232,7 +232,7 @@ class Session:
             )
 
     def _follow(self) -> Ending:
-        """Follow the run until it ends, and return how."""
+        """Monitor the run until it ends, and return its ending."""
         recorder, supervisor = self.recorder, self._supervisor
         limit = round(self._limits.time * 1e9)
         moved = time.monotonic()
@@ -251,7 +251,7 @@ class Session:
                 supervisor.running = True
                 self._finish_step()
             elif supervisor.restarting:
-                # A restarted node may have to compile: `limits.start` holds.
+                # A restarted node may have to compile: `limits.start` applies.
                 moved = time.monotonic()
             elif time.monotonic() - moved > self._limits.silence:
                 if self._options.follow_clock:
@@ -266,7 +266,7 @@ class Session:
                 self._show()
 
     def _finish_step(self) -> None:
-        """Say that the recorder is done with a step, once the disk keeps up."""
+        """Report that the recorder is done with a step, once the disk keeps up."""
         if self._bag is not None:
             with contextlib.suppress(BagError):
                 self._bag.wait(_BACKLOG)
@@ -280,7 +280,7 @@ class Session:
         return self._supervisor.check(self.recorder)
 
     def _goal(self) -> Ending | None:
-        """Return the ending that the scenario asks for, if it has come."""
+        """Return the ending that the scenario defines, if it is reached."""
         observer = self.observer
         if observer.completed is not None:
             return Ending('all_found', DONE)

@@ -26,20 +26,20 @@ _CHECK_PERIOD = 0.05
 
 
 class Supervisor:
-    """Starts the nodes of a run, and ends the run or restarts a node that dies or hangs.
+    """Starts the nodes of a run; restarts a node that dies or hangs, or ends the run.
 
     Parameters
     ----------
     plans : list of NodePlan
         Nodes to start.
     scenario : BaseScenario
-        Its limits, and what to do with a node that dies.
+        Limits, and the reaction to a node that dies.
     options : Options
         From the command line.
     folder : Path
         Of the run: gets parameter files and logs.
     display : ProgressDisplay
-        Is told what happens.
+        Prints messages.
 
     Attributes
     ----------
@@ -48,9 +48,9 @@ class Supervisor:
     events : list of dict
         Nodes that died, hung or were restarted.
     failed : set of str
-        Nodes because of which the run ended.
+        Nodes that caused the end of the run.
     running : bool
-        Whether the first step has come; before, nodes may take long to start.
+        Whether the first step has begun; before it nodes may take long to start.
 
     Raises
     ------
@@ -92,7 +92,7 @@ class Supervisor:
         }
 
     def load(self) -> None:
-        """Load once what the nodes share, where they are forked from this process."""
+        """Import and compile the shared code once, for nodes that are forked from this process."""
         for plan in self.plans:
             self.processes[plan.full_name].main = main_of(plan.package, plan.executable)
         if any(process.main is not None for process in self.processes.values()):
@@ -105,8 +105,8 @@ class Supervisor:
             self.watch.begin(process.name, process.pid, time.monotonic())
 
     def check(self, recorder: Recorder) -> Ending | None:
-        """Return an ending if a node has died or hangs for good; restart it otherwise."""
-        # Asking the system about each process takes longer than a step may.
+        """Return an ending if a node has died or hangs and is not restarted."""
+        # Polling each process takes longer than a short step.
         if time.monotonic() - self._checked < _CHECK_PERIOD:
             return None
         self._checked = time.monotonic()
@@ -130,14 +130,14 @@ class Supervisor:
         robot = self._robot_of(name)
         if robot is not None and self._plan_of[name].drives:
             recorder.stop_robots([robot])
-        # Another simulation would begin with another time.
+        # A restarted simulation would begin at time 0.
         tries = 0 if name in self.clocks else self._limits.restarts
         if self._respawn and process.restarts < tries:
             self.events.append({**event, 'event': 'restarted'})
             recorder.ready.discard(name)
             process.restart()
             self.watch.begin(name, process.pid, self._checked)
-            self._display.say(f'{text}; it is started again')
+            self._display.say(f'{text}; it is restarted')
             return None
         self.events.append(event)
         self.failed.add(name)
@@ -159,7 +159,7 @@ class Supervisor:
         """Kill a node that hangs, or return the ending of the run."""
         for name, silent in self.watch.hung(self._checked).items():
             plan = self._plan_of[name]
-            # A lockstep step may take long: `limits.silence` holds for the nodes that it awaits.
+            # A lockstep step may take long: `limits.silence` applies to awaited nodes.
             awaited = self._lockstep and (plan.says_done or plan.is_clock)
             if not self.running or awaited or not self.processes[name].running:
                 continue
@@ -204,15 +204,15 @@ class Supervisor:
         return all(self.processes[name].running for name in self.clocks)
 
     def stop(self, recorder: Recorder, keep_clock: bool, poll: float) -> None:
-        """Stop the robots, then the nodes, and record what they still send."""
+        """Stop the robots, then the nodes, and record their last messages."""
         kept = self.clocks if keep_clock else set()
         drivers = [
             plan.full_name for plan in self.plans if plan.drives or plan.package == 'maasi_drivers'
         ]
         others = [name for name in self.processes if name not in kept.union(drivers)]
         robots = self._scenario.names()
-        # Drivers stop their robots: the simulation, or the robot, must still be there to hear it.
-        # One that hangs does not, and may have sent a command when it is killed: before and after.
+        # Drivers stop their robots while the simulation, or the robot, still runs. One that hangs
+        # does not, and may send a command until it is killed: stop the robots before and after.
         recorder.stop_robots(robots)
         stubborn = stop([self.processes[name] for name in drivers])
         recorder.stop_robots(robots)

@@ -1,4 +1,4 @@
-"""What the scenario files of all kinds of missions have in common."""
+"""The common part of scenario files of all missions."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from maasi_sim.scenario.layering import to_yaml
 
 
 class EventSettings(Settings):
-    """Something that happens to a robot."""
+    """An event of a robot."""
 
     at: float = Field(ge=0.0, description='When [s]')
-    robot: str = Field(description='To whom')
-    do: Literal['leave', 'back'] = Field(description='It goes silent, or it is there again')
+    robot: str = Field(description='Of which robot')
+    do: Literal['leave', 'back'] = Field(description='It leaves and is silent, or returns')
 
 
 class LimitSettings(Settings):
@@ -55,7 +55,7 @@ class OriginSettings(Settings):
 
 
 class ScenarioEnvironment(EnvironmentSettings):
-    """Where the search takes place, and where that is on the earth."""
+    """Where the search takes place, with its position on the earth."""
 
     origin: OriginSettings | None = Field(
         default=None, description='Of the map on the earth, for found_targets.geojson'
@@ -91,14 +91,14 @@ class BaseScenario(Settings):
     )
     robots: Mapping[str, Any] = Field(min_length=1, description='Robots by name')
     planner: Any = Field(description='Planner')
-    events: list[EventSettings] = Field(default_factory=list, description='What happens to robots')
+    events: list[EventSettings] = Field(default_factory=list, description='Events of robots')
     stop: Literal['all_found', 'planner_done'] = Field(
         default='all_found',
         description='When the run ends well: all true targets are found, or all cuboids visited; '
-        'or every planner says that nothing is left to gain',
+        'or every planner reports that nothing is left to gain',
     )
     on_exit: Literal['end', 'respawn'] = Field(
-        default='end', description='A node that dies ends the run, or is started again'
+        default='end', description='A node that dies ends the run, or is restarted'
     )
     limits: LimitSettings = Field(default_factory=LimitSettings, description='When to give up')
     record: RecordSettings = Field(default_factory=RecordSettings, description='Recording')

@@ -1,4 +1,4 @@
-"""What must hold between the settings of a scenario."""
+"""Checks between the settings of a scenario."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ROBOT_NAME = re.compile(r'^[a-z][a-z0-9_]*$')
 
 _RESERVED = ('exploration', 'ground_truth', 'lockstep', 'scenario')
 
-# How far a time may be from a whole number of steps.
+# Largest deviation of a time from a whole number of steps.
 _STEP_TOLERANCE = 1e-6
 
 # Drivers of robots that have no camera.
@@ -31,12 +31,12 @@ _RANGING = ('ranging_driver', 'mavlink_driver')
 # Drivers that have link mavlink.
 _MAVLINK = ('mavlink_driver', 'mavlink_camera_driver')
 
-# Where the driver of a vehicle listens that the sim plays.
+# URL of the driver of a simulated vehicle.
 _MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
 
 
 def problems_of(scenario: Scenario) -> Iterator[tuple[Key, str]]:
-    """Yield what is wrong between the keys: key and text."""
+    """Yield problems between keys: key and text."""
     yield from _world_problems(scenario)
     for name, robot in scenario.robots.items():
         for inner, text in _robot_problems(name, robot, scenario):
@@ -135,7 +135,7 @@ def _robot_problems(
 
 
 def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
-    """Yield what a camera or a robot outside the simulation cannot play."""
+    """Yield settings that a camera or an external robot does not have."""
     nothing = SimulatedSettings()
     if robot.camera is not None:
         for field in ('noise', 'noise_factor', 'probability_factor', 'clutter_per_scan'):
@@ -162,7 +162,7 @@ def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tu
 
 
 def check_names(name: str) -> Iterator[str]:
-    """Yield what is wrong with the name of a robot."""
+    """Yield problems of the name of a robot."""
     if not _ROBOT_NAME.match(name) or name.endswith('_') or '__' in name:
         yield f"read '{name}' as a name, allowed are lower case letters, digits and single _"
     if name in _RESERVED:
@@ -177,7 +177,7 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple
         try:
             detection.build(scenario.dimension)
         except Exception as error:
-            # Somebody else's code: whatever it raises, it is said before anything starts.
+            # User code: report any error before the nodes start.
             yield ('sensor', 'detection'), f'{type(error).__name__}: {error}'
     for name in used:
         length = len(getattr(detection, name))
@@ -239,7 +239,7 @@ def _mambo_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
         if link.full_speed is None:
             yield (
                 (*key, 'full_speed'),
-                'is missing: it would never take off; measure_mambo says it, of fake_mambo too',
+                'is missing: it would never take off; measure_mambo measures it',
             )
         if link.pose != 'events':
             yield (*key, 'pose'), f"read '{link.pose}', allowed in simulation is 'events'"
@@ -281,7 +281,7 @@ def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
             if not robot.external:
                 yield (
                     (*key, 'url'),
-                    f"read '{link.url}', allowed is udpin:HOST:PORT, as the sim plays the vehicle, "
+                    f"read '{link.url}', allowed is udpin:HOST:PORT, as the vehicle is simulated, "
                     'or autopilot: external',
                 )
         elif match[1] in ports:
@@ -311,7 +311,7 @@ def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
 
 
 def doubts_about(robots: Mapping[str, Any]) -> Iterator[tuple[Key, str]]:
-    """Yield what is valid and hardly meant: key and text."""
+    """Yield valid but probably unintended values: key and text."""
     for name, robot in robots.items():
         if abs(robot.yaw) > 2.0 * math.pi:
             yield (
@@ -332,7 +332,7 @@ def doubts_about(robots: Mapping[str, Any]) -> Iterator[tuple[Key, str]]:
 def event_problems(
     events: Sequence[EventSettings], names: Sequence[str], limits: LimitSettings
 ) -> Iterator[tuple[Key, str]]:
-    """Yield what is wrong with what happens to robots: key and text."""
+    """Yield problems of the events: key and text."""
     away: set[str] = set()
     order = sorted(range(len(events)), key=lambda index: events[index].at)
     for index in order:

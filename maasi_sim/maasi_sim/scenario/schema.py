@@ -1,4 +1,4 @@
-"""What a scenario file may hold: its settings, checked one by one."""
+"""The schema of scenario files."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ class RobotSettings(Settings):
         'that publishes its odometry and the time (/clock)',
     )
     link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
-        default='topics', description='How its driver reaches it; the sim plays the other end'
+        default='topics', description='How its driver reaches it; the other end is simulated'
     )
     mambo: MamboSettings | None = Field(
         default=None,
         description='With link mambo_wifi: how, and what it may be made to do; an address that '
-        'is not of this host is replaced, as the sim plays the drone',
+        'is not of this host is replaced, as the drone is simulated',
     )
     mavlink: MavlinkSettings | None = Field(
         default=None, description='With link mavlink: how, and what it may be made to do'
@@ -76,21 +76,20 @@ class RobotSettings(Settings):
         description='Waypoints to choose from; left out: a grid from which it sees everything'
     )
     motion: MotionSettings = Field(description='How it moves')
-    sensor: SensorSettings = Field(description='What it sees, as the filter believes')
+    sensor: SensorSettings = Field(description='Its sensor, as assumed by the filter')
     camera: CameraSettings | None = Field(
         default=None, description='Its camera; none: a ranging sensor'
     )
     laser: LaserSettings | None = Field(default=None, description='Its laser scanner, if any')
     odometry: OdometrySettings = Field(
-        default_factory=OdometrySettings, description='How good its odometry is, simulated'
+        default_factory=OdometrySettings, description='Errors of its simulated odometry'
     )
     battery: BatterySettings = Field(
         default_factory=BatterySettings, description='Its battery, simulated'
     )
     simulated: SimulatedSettings = Field(
         default_factory=SimulatedSettings,
-        description='What is true of it in the simulation, where that differs from what the '
-        'robots believe',
+        description='True parameters in the simulation, where they differ from those assumed',
     )
 
     def true_sensor(self, name: str, bounds: NDArray[np.float64]) -> Sensor:
@@ -131,7 +130,7 @@ class Scenario(BaseScenario):
     planner: PlannerSettings = Field(default_factory=PlannerSettings, description='Planner')
     floor: RenderSettings = Field(
         default_factory=lambda: RenderSettings.model_validate({}),
-        description='What simulated cameras see',
+        description='Images of simulated cameras',
     )
     scoring: ScoringSettings = Field(default_factory=ScoringSettings, description='Scores')
 

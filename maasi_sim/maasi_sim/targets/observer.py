@@ -1,4 +1,4 @@
-"""Gathers what the report of a search for targets needs from its messages."""
+"""Gathers the data of the report of a search for targets from its messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNAVAILABLE = 5
 
 
 class TargetObserver:
-    """Gather what a report needs from serialised messages, in the order in which they come.
+    """Gathers the data of a report from serialised messages, in the order of arrival.
 
     Times are those since the first step. Filter updates and found targets are decoded at once, as
     the end of a run depends on them; the rest is decoded by `record`.
@@ -86,22 +86,22 @@ class TargetObserver:
 
     @property
     def progress(self) -> list[Progress]:
-        """Where the run stood after each filter update."""
+        """State of the run after each filter update."""
         return self._tally.progress
 
     @property
     def completed(self) -> Progress | None:
-        """Where the run stood when all was found."""
+        """State of the run when all targets were found."""
         return self._tally.completed
 
     @property
     def settled(self) -> str | None:
-        """Why nothing is left to gain, once every planner says so that has a robot."""
+        """The reason, once all planners with robots report that nothing is left to gain."""
         return None if self._ending is None else self._ending[1]
 
     @property
     def end_step(self) -> int | None:
-        """Step at which the run came to its end by itself, if it has."""
+        """Step at which the search ended by itself, if it has."""
         if self.completed is not None:
             return self.completed.step
         return None if self._ending is None else self._ending[0]
@@ -213,7 +213,7 @@ class TargetObserver:
             self._note_ending(int(step.step))
 
     def record(self, end: RunEnd) -> TargetRecord:
-        """Return the record of the run; one that is complete ends where it became so."""
+        """Return the record of the run, up to the step at which it was complete."""
         tally = self._final_tally()
         end_time, last_step = end.time, None
         if tally.completed is not None:
@@ -274,7 +274,7 @@ def _point(point: Any) -> tuple[float, float, float]:
 
 
 def _pose(message: Any) -> Pose | None:
-    """Return a pose; None for one that is none."""
+    """Return a pose; None if it is invalid."""
     turn = message.orientation
     try:
         return Pose(np.array(_point(message.position)), np.array([turn.w, turn.x, turn.y, turn.z]))

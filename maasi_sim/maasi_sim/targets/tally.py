@@ -32,7 +32,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stood after a filter update."""
+    """State of a run after a filter update."""
 
     time: float
     step: int
@@ -44,7 +44,7 @@ class Progress:
 
 @dataclass
 class Update:
-    """An update of a filter, in a namespace, with the found targets as they were changed by it."""
+    """An update of a filter, in a namespace, with the found targets published with it."""
 
     namespace: str
     message: Any
@@ -82,7 +82,7 @@ class Tally:
         return [replace(item, id=number) for number, item in enumerate(every, start=1)]
 
     def take(self, update: Update) -> bool:
-        """Take an update; return whether the number of found targets is another one."""
+        """Count an update; return whether the number of found targets has changed."""
         message = update.message
         before = self._found[update.namespace]
         changed = bool(update.arrays)

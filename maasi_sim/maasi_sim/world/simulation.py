@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +16,6 @@ from maasi_sim.world.world import World
 
 # A time this close to a step, in steps, is the step's.
 _TOLERANCE = 1e-6
-
-
-class Steppable(Protocol):
-    """A robot that is simulated step by step."""
-
-    def step(self, step: int, dt: float) -> None:
-        """Advance by `dt` seconds to the discrete step `step`, from 1."""
-
-    def stand(self, step: int) -> None:
-        """Stand still until the discrete step `step`; the last command is void."""
 
 
 class SimulatedTeam:

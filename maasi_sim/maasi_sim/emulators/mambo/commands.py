@@ -14,7 +14,7 @@ _LIMITS = {(2, 8, 1): 'limit_tilt', (2, 1, 0): 'limit_climb', (2, 1, 1): 'limit_
 
 def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) -> None:
     """
-    Have a firmware do what a command says; one that it does not know does nothing.
+    Execute a command on a firmware; unknown ones are ignored.
 
     Raises
     ------

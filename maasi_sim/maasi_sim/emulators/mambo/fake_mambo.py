@@ -1,6 +1,6 @@
-"""A fake Parrot Mambo: the drone's end of its WiFi protocol, over a firmware that flies a model.
+"""A fake Parrot Mambo: the drone's side of its WiFi protocol, with a simulated firmware.
 
-Speaks what pyparrot 1.5.20 speaks: a handshake in JSON over TCP, then frames over UDP.
+The protocol is that of pyparrot 1.5.20: a handshake in JSON over TCP, then frames over UDP.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import struct
 import sys
 import threading
 import time
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -48,11 +47,11 @@ EVENTS, ACKED_EVENTS = 126, 127
 _ID = struct.Struct('<BBH')
 
 _SENSOR_PERIOD, _PING_PERIOD = 0.5, 1.0
-# A frame that is not acknowledged is sent again after this, so many times.
+# Period and number of retransmissions of a frame without acknowledgement.
 _RETRY_PERIOD, _RETRIES = 0.15, 5
 _POLL = 0.1
 _STEP = 0.02
-# Longest time caught up at once when the host stood still [s].
+# Longest time simulated at once after the host was suspended [s].
 _CATCH_UP = 0.5
 _TRIES = 100
 
@@ -90,7 +89,7 @@ class FakeMambo:
     """
     A Mambo on this host, which a client such as pyparrot connects to.
 
-    Whoever owns it moves its time by `advance`, or has it run by itself in real time with `run`.
+    Its time advances by calls of `advance`, or in real time after `run`.
 
     Parameters
     ----------
@@ -106,9 +105,9 @@ class FakeMambo:
     position_sent : str
         'true', or for tests 'none' (no position events), 'stuck' (always the same), 'nan'.
     cut_up, cut_down : bool
-        Whether the network loses what comes, and what is sent.
+        Whether the network loses received, and sent, datagrams.
     refused : int
-        Datagrams that were no frames, or commands with contents that make no sense.
+        Number of invalid datagrams and commands.
 
     """
 
@@ -161,12 +160,7 @@ class FakeMambo:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Leave the network."""
         self.close()
 
@@ -180,7 +174,7 @@ class FakeMambo:
         self._air.close()
 
     def run(self) -> None:
-        """Let its time pass as it does here, in a thread, until it is closed."""
+        """Advance in real time, in a thread, until it is closed."""
         thread = threading.Thread(target=self._live, name='fake Mambo time', daemon=True)
         self._threads.append(thread)
         thread.start()
@@ -195,7 +189,7 @@ class FakeMambo:
     # ---- time --------------------------------------------------------------------------------
 
     def advance(self, dt: float) -> None:
-        """Go on for `dt` seconds, and send what is due."""
+        """Advance by `dt` seconds, and send due messages."""
         with self._lock:
             firmware = self.firmware
             firmware.advance(dt)
@@ -214,7 +208,7 @@ class FakeMambo:
                     self._transmit(frame)
 
     def snapshot(self) -> tuple[Any, Any, float]:
-        """Return true state in the map, flying state and charge, all of one instant."""
+        """Return true state in the map, flying state and charge at one instant."""
         with self._lock:
             firmware = self.firmware
             return firmware.state, firmware.flying_state, firmware.charge.charge
@@ -345,7 +339,7 @@ class FakeMambo:
         if frame.kind == DATA_WITH_ACK:
             self._send(ACK, frame.buffer + 128, bytes([frame.sequence]))
             if self._done.get(frame.buffer) == frame.sequence:
-                # Sent again because the acknowledgement was lost.
+                # Retransmission after a lost acknowledgement.
                 return
             self._done[frame.buffer] = frame.sequence
         if frame.buffer not in (COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS):
@@ -406,7 +400,7 @@ def build_parser() -> argparse.ArgumentParser:
         '--lost-link',
         choices=('hover', 'land'),
         default=firmware.lost_link,
-        help='what it does when its controller falls silent (%(default)s)',
+        help='behaviour when its controller is silent (%(default)s)',
     )
     return parser
 

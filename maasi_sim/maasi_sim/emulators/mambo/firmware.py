@@ -191,12 +191,12 @@ class MamboFirmware:
 
     @property
     def percent(self) -> int:
-        """Battery as it is reported, 0 to 100."""
+        """Reported battery charge, 0 to 100."""
         return round(100.0 * self.charge.charge)
 
     @property
     def state(self) -> RobotState:
-        """Where it truly is, in the map."""
+        """True state, in the map."""
         return self._body.robot_state()
 
     @property
@@ -207,7 +207,7 @@ class MamboFirmware:
     # ---- commands ----------------------------------------------------------------------------
 
     def hear(self) -> None:
-        """Note that something came from the controller."""
+        """Note the time of a message from the controller."""
         self._heard_at = self.time
 
     def take_off(self) -> None:
@@ -245,7 +245,7 @@ class MamboFirmware:
     # ---- time --------------------------------------------------------------------------------
 
     def advance(self, dt: float) -> None:
-        """Go on for `dt` seconds."""
+        """Advance by `dt` seconds."""
         pieces = max(1, math.ceil(dt / _PIECE - 1e-9))
         for _ in range(pieces):
             self._piece(dt / pieces)
@@ -266,7 +266,7 @@ class MamboFirmware:
         return self.charge.charge <= self.settings.critical_charge
 
     def _look_after(self) -> None:
-        """Do what the firmware does by itself."""
+        """Land, or change the flying state, without a command."""
         state = self.flying_state
         if state in (FlyingState.LANDED, FlyingState.LANDING, FlyingState.EMERGENCY):
             return
@@ -290,7 +290,7 @@ class MamboFirmware:
         return piloting if acts else Piloting()
 
     def _command(self) -> TiltCommand:
-        """Return what the body is told."""
+        """Return the command of the body."""
         if self.flying_state == FlyingState.TAKING_OFF:
             return TiltCommand(climb=_TAKE_OFF_SPEED)
         if self.flying_state == FlyingState.LANDING:
@@ -322,10 +322,10 @@ class MamboFirmware:
             self.flying_state = state
             self.on_change()
 
-    # ---- what it believes --------------------------------------------------------------------
+    # ---- estimate ----------------------------------------------------------------------------
 
     def estimate(self) -> Estimate:
-        """Return what the firmware believes now; each call draws new noise."""
+        """Return the estimate of the firmware; each call draws new noise."""
         state = self.state
         self._readings += 1
         reading = self._odometry.step(state, self._readings)

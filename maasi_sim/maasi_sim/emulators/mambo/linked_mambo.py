@@ -1,4 +1,4 @@
-"""The far end of the link to a Mambo: a fake of it that flies in real time."""
+"""The simulated end of the link to a Mambo: a fake drone in real time."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class LinkedMambo:
     name : str
         Of the robot; keys its noise.
     robot : RobotSettings
-        Its start is where it is to hover; it stands below that, on the floor.
+        Its start is the place to hover; the drone stands below it, on the floor.
     seed : int
         Of the run.
 
     Raises
     ------
     OSError
-        If its address cannot be had.
+        If its address is not available.
 
     """
 
@@ -54,17 +54,17 @@ class LinkedMambo:
 
     @property
     def state(self) -> RobotState:
-        """Where it truly is, in the map."""
+        """True state, in the map."""
         return self.fake.snapshot()[0]
 
     @property
     def obeys(self) -> bool:
-        """Whether it is in the air, and does not land yet."""
+        """Whether it is in the air and not landing."""
         flying_state = self.fake.snapshot()[1]
         return flying_state in AIRBORNE and flying_state != FlyingState.LANDING
 
     def cut(self, cut: bool = True) -> None:
-        """Cut the link, or mend it."""
+        """Cut the link, or restore it."""
         self.fake.cut_up = self.fake.cut_down = cut
 
     def close(self) -> None:

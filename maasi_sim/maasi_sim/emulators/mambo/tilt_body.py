@@ -1,4 +1,4 @@
-"""How a quadrotor moves that is told tilt angles: what a Mambo does with piloting commands.
+"""Motion of a quadrotor under commanded tilt angles, as a Mambo under piloting commands.
 
 Roll and pitch of a piloting command are shares of the largest tilt, not of a speed (pyparrot,
 docs/minidronecommands.rst, `fly_direct`; Parrot's minidrone.xml, PCMD and MaxTilt). At level
@@ -60,7 +60,7 @@ class TiltBodySettings(Settings):
 @dataclass(frozen=True)
 class TiltCommand:
     """
-    What the body is told.
+    Command of the body.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class TiltCommand:
 
 class TiltBody:
     """
-    A quadrotor that is told tilts; it knows nothing of a floor.
+    A quadrotor under commanded tilts, without a floor.
 
     Parameters
     ----------

@@ -16,10 +16,10 @@ class AutopilotSettings(Settings):
 
     external: bool = Field(
         default=False,
-        description='Whether the sim plays no autopilot: a simulator of ArduPilot or PX4, or a '
-        'real vehicle, is there instead; in a scenario, autopilot: external',
+        description='Whether the autopilot is not simulated here, but a simulator of ArduPilot or '
+        'PX4, or a real vehicle; in a scenario, autopilot: external',
     )
-    firmware: FirmwareName = Field(default='arducopter', description='Whose manners it has')
+    firmware: FirmwareName = Field(default='arducopter', description='Whose behaviour it has')
     system: int = Field(default=1, ge=1, le=255, description='Its system id')
     depth: float = Field(
         default=0.0, ge=0.0, description='Of a submarine when it is switched on [m]'
@@ -28,10 +28,10 @@ class AutopilotSettings(Settings):
         default=2.0, ge=0.0, description='Until its position estimate is ready [s]'
     )
     noise: float = Field(
-        default=0.005, ge=0.0, description='Deviation of the position that it says [m]'
+        default=0.005, ge=0.0, description='Deviation of its reported position [m]'
     )
     barometer_drift: Finite = Field(
-        default=0.0, description='Of the height that it believes until it is armed [m/s]'
+        default=0.0, description='Of its estimated height until it is armed [m/s]'
     )
     more_batteries: list[Annotated[float, Field(ge=0.0, le=1.0)]] = Field(
         default_factory=list,

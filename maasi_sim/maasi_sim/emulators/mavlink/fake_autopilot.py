@@ -1,6 +1,6 @@
-"""A fake autopilot: it answers MAVLink 2 as ArduCopter, ArduSub or PX4 do.
+"""A fake autopilot, which answers MAVLink 2 as ArduCopter, ArduSub or PX4 do.
 
-ArduCopter's manners are those of its source: the height of NAV_TAKEOFF is above home
+The behaviour of ArduCopter is that of its source: the height of NAV_TAKEOFF is above home
 (`ModeGuided::do_user_takeoff_start_m`), home is set at arming (`AP_Arming_Copter::arm`), a take-off
 is refused in the air (`Mode::do_user_takeoff_U_m`) and ends within a tenth of its height
 (`_AutoTakeoff::run`), EXTENDED_SYS_STATE tells take-off from flight
@@ -56,14 +56,14 @@ class _Setpoint:
 
 class FakeAutopilot:
     """
-    One vehicle with its autopilot, without a wire and without a clock of its own.
+    One vehicle with its autopilot, without a connection and a clock.
 
-    A setpoint that is not finite crashes it, as it did ArduPilot: it says so and is silent.
+    A setpoint that is not finite crashes it, as it did ArduPilot: it reports that and is silent.
 
     Parameters
     ----------
     settings : AutopilotSettings
-        What it is like.
+        Its behaviour.
     sender : MAVLink
         Packs messages and writes them to the wire.
     yaw : float
@@ -74,7 +74,7 @@ class FakeAutopilot:
     Attributes
     ----------
     crashed : str
-        Why it runs no more; empty while it does.
+        Reason of a crash; else empty.
     now : float
         Time since its start [s].
 
@@ -115,9 +115,9 @@ class FakeAutopilot:
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
         self._rising_to: float | None = None
-        # True height at arming, and how far off the height is that it believes [m].
+        # True height at arming, and error of the estimated height [m].
         self._home, self._height_error = 0.0, 0.0
-        # Time at which GNSS was lost; its position estimate goes a while later.
+        # Time of the loss of GNSS; the position estimate is lost later.
         self._gnss_lost_at = math.inf
         self._armed_at = -math.inf
         self._station_at = math.inf
@@ -129,7 +129,7 @@ class FakeAutopilot:
 
     @property
     def ready(self) -> bool:
-        """Whether its position estimate is."""
+        """Whether its position estimate is ready."""
         return self.now >= self.settings.estimator_time
 
     @property

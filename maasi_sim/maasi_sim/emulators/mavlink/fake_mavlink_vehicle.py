@@ -23,12 +23,12 @@ from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
 from maasi_sim.scenario.schema import RobotSettings
 
 _PERIOD = 0.02
-# Of a turn that came late, in steps of the period [s].
+# Longest time simulated at once after a delay [s].
 _LONGEST = 0.5
 
 
 class _Gate:
-    """Lets bytes through to a wire, or not."""
+    """Passes bytes to a connection unless it is shut."""
 
     def __init__(self, wire: Any) -> None:
         self._wire = wire
@@ -42,14 +42,14 @@ class _Gate:
 
 class FakeVehicle:
     """
-    A fake autopilot with a wire and a thread that moves it in real time.
+    A fake autopilot with a connection and a thread that runs it in real time.
 
     Parameters
     ----------
     settings : AutopilotSettings
-        What it is like.
+        Its behaviour.
     url : str
-        As pymavlink has it: where the driver listens.
+        Of the driver, in the form of pymavlink.
     start : Pose
         In the map, of the origin of its local frame, and its heading; that frame is ENU.
     generator : Generator
@@ -76,7 +76,7 @@ class FakeVehicle:
 
     @property
     def state(self) -> RobotState:
-        """Where it truly is, in the map."""
+        """True state, in the map."""
         with self._lock:
             body = self.autopilot.body
             return RobotState(
@@ -102,7 +102,7 @@ class FakeVehicle:
         return not self.autopilot.crashed
 
     def close(self) -> None:
-        """Stop the thread, and close the wire."""
+        """Stop the thread, and close the connection."""
         self._end.set()
         self._thread.join(timeout=2.0)
         self._connection.close()
@@ -151,13 +151,13 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--url',
         default='udpout:127.0.0.1:14550',
-        help='where the driver listens, as pymavlink has it (default: %(default)s)',
+        help='of the driver, in the form of pymavlink (default: %(default)s)',
     )
     parser.add_argument(
         '--firmware',
         choices=sorted(FIRMWARES),
         default='arducopter',
-        help='whose manners it has (default: %(default)s)',
+        help='whose behaviour it has (default: %(default)s)',
     )
     parser.add_argument('--system', type=int, default=1, help='system id (default: 1)')
     parser.add_argument(
@@ -199,7 +199,7 @@ def read_parameters(items: list[str]) -> dict[str, float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Play a vehicle until it is told to end; a crash of the autopilot is exit code 3."""
+    """Simulate a vehicle until a signal; a crash of the autopilot is exit code 3."""
     options = build_parser().parse_args(arguments)
     try:
         settings = AutopilotSettings(
