@@ -147,7 +147,7 @@ class Run:
                 batch_id=self.batch,
                 targets=self.found,
             )
-        member = 'maasi_msgs/msg/BatchMember'
+        member, place = 'maasi_msgs/msg/BatchMember', self.pose([0.0, 0.0, 0.0]).pose
         self.send(
             within(self.namespace, '/filter_update'),
             'FilterUpdate',
@@ -155,7 +155,8 @@ class Run:
             batch_id=self.batch,
             step=round(time / self.scenario.step),
             members=[
-                self.make(member, robot=name, decision=0, measurement=self.batch) for name in robots
+                self.make(member, robot=name, decision=0, measurement=self.batch, pose=place)
+                for name in robots
             ],
             missing=[],
             expected_number=1.5,
