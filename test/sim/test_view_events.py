@@ -9,7 +9,7 @@ from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import OccupancyGrid
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray, PlanDecision
+from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray, LockstepStep, PlanDecision
 from maasi_sim.missions import load_mission
 from maasi_sim.search import search
 from maasi_sim.view.event_log import EventLog, line, thin
@@ -122,6 +122,13 @@ def test_time_that_jumps_back_begins_another_run():
     messages = MessageEvents(begin(), None, begin)
     messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(100.0))
     messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(130.0))
+    # What another topic says late, as in a bag that is played fast, begins nothing.
+    messages.take(
+        '/lockstep/step',
+        'maasi_msgs/msg/LockstepStep',
+        LockstepStep(stamp=stamp_to_ros(102 * 10**9)),
+    )
+    assert len(made) == 1
     messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(101.0))
     assert len(made) == 2
     assert [event[0] for event in events] == [0.0, 30.0, 0.0]

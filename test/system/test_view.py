@@ -1,16 +1,25 @@
 """The page of a run in a browser: what it shows is what the bag and the report hold."""
 
+import importlib
 import subprocess
+import time
 
 import numpy as np
 import pytest
+import rclpy
 from browsers import CHROMIUM, chromium, needs_chromium
+from rclpy.executors import SingleThreadedExecutor
 from scenario_runs import PATIENCE, Run, command, of_topic
 
+from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.bag import Bag, BagWriter, load_types
+from maasi_sim.run.processes import Domain
 from maasi_sim.view.bag_events import read_events
+from maasi_sim.view.live_view import LiveView, MessageFeed
 from maasi_sim.view.messages import is_shown
 from maasi_sim.view.page_file import REPLAY
+from maasi_sim.view.scene import empty_scene
+from maasi_sim.view.view_node import ViewNode
 from maasi_sim.view.view_run import main
 
 pytestmark = pytest.mark.system
@@ -258,3 +267,71 @@ def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
         assert sum(event[1] == kind for event in log.events) == sum(
             event[1] == kind for event in whole.events
         )
+
+
+@pytest.fixture
+def ros(monkeypatch):
+    with Domain() as domain:
+        for name, value in domain.environment().items():
+            monkeypatch.setenv(name, value)
+        rclpy.init(domain_id=domain.number)
+        yield
+        rclpy.try_shutdown()
+
+
+def test_the_view_node_shows_a_bag_that_is_played_and_begins_again_with_it(run, ros):
+    view = LiveView(empty_scene(), 0)
+    feed = MessageFeed(view, load_types(), waits=False)
+    player = rclpy.create_node('player', enable_rosout=False)
+    node = ViewNode(feed.put)
+    executor = SingleThreadedExecutor()
+    try:
+        with Bag(run.bag) as bag:
+            kept = {
+                topic: kind
+                for topic, kind in bag.types.items()
+                if is_shown(topic, kind) and topic != '/rosout'
+            }
+            played = [(topic, data) for topic, _, _, data in bag.raw(kept)]
+        publishers = {
+            topic: player.create_publisher(class_of(kind), topic, RELIABLE)
+            for topic, kind in kept.items()
+        }
+        executor.add_node(node)
+
+        def spin_until(condition):
+            deadline = time.monotonic() + PATIENCE
+            while not condition():
+                assert time.monotonic() < deadline
+                executor.spin_once(0.05)
+
+        spin_until(lambda: all(item.get_subscription_count() for item in publishers.values()))
+        whole = read_events(run.folder)
+        for topic, data in played:
+            publishers[topic].publish(data)
+            executor.spin_once(0.0)
+        for kind in ('plan', 'found', 'filter', 'seen'):
+            expected = count(whole.events, kind)
+            spin_until(
+                lambda kind=kind, expected=expected: count(view.hub._events, kind) == expected
+            )
+        assert view.maker.latest == pytest.approx(whole.duration, abs=0.2)
+        # It is played again: the page begins again.
+        for topic, data in played[: len(played) // 4]:
+            publishers[topic].publish(data)
+        spin_until(lambda: 0.0 < view.maker.latest < 0.5 * whole.duration)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        player.destroy_node()
+        feed.close()
+        view.end()
+
+
+def count(events, kind):
+    return sum(event[1] == kind for event in events)
+
+
+def class_of(kind):
+    package, _, name = kind.split('/')
+    return getattr(importlib.import_module(f'{package}.msg'), name)

@@ -22,7 +22,7 @@ _ACTIVITIES = ('searching', 'returning', 'recharging')
 _WARNING, _ERROR = 30, 40
 _FINE, _STALE = 0, 3
 _DIAGNOSTIC_WORDS = {0: 'well again', 1: 'warning', 2: 'error', 3: 'stale'}
-# A stamp that is earlier than the latest by more than this begins another run [s].
+# A stamp that is earlier than the topic's last one by more than this begins another run [s].
 _REWIND = 10.0
 # From type to the last parts that the name may have; empty: any.
 TOPICS: dict[str, tuple[str, ...]] = {
@@ -74,6 +74,8 @@ class MessageEvents:
         self._begin = begin
         self._on_restart = on_restart
         self._team: set[str] | None = None
+        # Time of the last message of each topic that says how time goes on [s].
+        self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
         self._cuboids: dict[str, None] = {}
         self._takers: dict[str, Callable[[str, Any], None]] = {
@@ -97,16 +99,20 @@ class MessageEvents:
         """Take a message of a topic for which `is_shown` is true."""
         self._takers[type_name.rpartition('/')[2]](topic, message)
 
-    def _now(self, message: Any) -> float:
-        """Return the time of a message that says how time goes on; begin again if it jumps back."""
+    def _now(self, topic: str, message: Any) -> float:
+        """Return the time of a message that says how time goes on; begin again if it jumps back.
+
+        Of each topic by itself, as messages of a bag that is played fast overtake each other.
+        """
         now = seconds(message.stamp if hasattr(message, 'stamp') else message.header.stamp)
         if self._begin is None:
             self._begin = now
-        time = now - self._begin
-        if time < self.maker.latest - _REWIND and self._on_restart is not None:
+        if now < self._last.get(topic, now) - _REWIND and self._on_restart is not None:
             self.maker = self._on_restart()
-            self._begin, self._team, time = now, None, 0.0
-        return max(time, 0.0)
+            self._begin, self._team = now, None
+            self._last.clear()
+        self._last[topic] = now
+        return max(now - self._begin, 0.0)
 
     def _time(self, message: Any) -> float:
         """Return the time of any other message: a latched one may be old [s]."""
@@ -114,8 +120,8 @@ class MessageEvents:
             return 0.0
         return max(seconds(message.header.stamp) - self._begin, 0.0)
 
-    def _take_step(self, _: str, message: Any) -> None:
-        time = self._now(message)
+    def _take_step(self, topic: str, message: Any) -> None:
+        time = self._now(topic, message)
         before, self._team = self._team, set(message.robots)
         if before is not None:
             for name in sorted(before - self._team):
@@ -123,7 +129,7 @@ class MessageEvents:
             for name in sorted(self._team - before):
                 self.maker.message(time, name, 'team', 'joined')
 
-    def _take_state(self, _: str, message: Any) -> None:
+    def _take_state(self, topic: str, message: Any) -> None:
         pose = message.pose.pose
         turn = pose.orientation
         yaw = np.arctan2(
@@ -131,7 +137,7 @@ class MessageEvents:
         )
         place = (pose.position.x, pose.position.y, pose.position.z, float(yaw))
         if np.isfinite(place).all():
-            time = self._now(message)
+            time = self._now(topic, message)
             self.maker.robot(
                 time,
                 message.robot,
