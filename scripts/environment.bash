@@ -192,6 +192,8 @@ maasi_use() {
   source "$maasi_workspace/install/local_setup.bash"
   PYTHONPATH="$(maasi_source_path)${PYTHONPATH:-}"
   export PYTHONPATH
+  # The wheels have no `ros2`: what `ros2 run` starts is called by its name.
+  PATH="$PATH$(printf ':%s' "$maasi_workspace"/install/*/lib/maasi_*)"
   set "$nounset"
   NUMBA_CACHE_DIR="$(maasi_kernels)"
   export NUMBA_CACHE_DIR

@@ -47,6 +47,12 @@ def test_shell_runs_a_command_and_gives_its_exit_code(tmp_path: Path) -> None:
     assert (result.returncode, result.stdout) == (7, 'jazzy\n')
 
 
+def test_shell_finds_executables_by_their_names(tmp_path: Path) -> None:
+    result = call(ROOT / 'scripts' / 'shell', 'filter_node', '--help', folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert 'measurement_batch' in result.stdout
+
+
 def test_an_interactive_shell_survives_an_environment_that_cannot_be_set_up() -> None:
     commands = f'source {ENVIRONMENT}; echo "status $?"'
     result = call('bash', '--norc', '-ic', commands, PYTHON='no_such_python')
