@@ -1,6 +1,35 @@
-"""What holds for all tests."""
+"""What holds for all tests, and fixtures that they share."""
 
 import signal
 
+import pytest
+
 # Workers of pytest-xdist ignore SIGINT, and so would the processes that their tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    """Reserve a ROS domain for this test and the processes that it starts."""
+    from maasi_sim.run.processes import Domain
+
+    with Domain() as reserved:
+        for name, value in reserved.environment().items():
+            monkeypatch.setenv(name, value)
+        yield reserved
+
+
+@pytest.fixture
+def context(domain):
+    """Return a context of rclpy in a domain of its own."""
+    # rclpy starts threads when it is imported, and some tests fork.
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.signals import SignalHandlerOptions
+
+    made = Context()
+    rclpy.init(
+        context=made, domain_id=domain.number, signal_handler_options=SignalHandlerOptions.NO
+    )
+    yield made
+    rclpy.shutdown(context=made)

@@ -10,11 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import rclpy
 import yaml
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
 from robot_team import KINDS, TURTLEBOT, Team, parameters_of
 
 from maasi_drivers.agent.driver_settings import DriverSettings
@@ -24,7 +21,6 @@ from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.run.processes import Domain
 from maasi_sim.world.camera import CameraRenderer
 from maasi_sim.world.floor_scene import scene_of
 from maasi_sim.world.render_settings import RenderSettings
@@ -169,21 +165,6 @@ def hard_score() -> Callable[[str, int, int], Score]:
         return score(MarkerDetector(settings), sequence(settings, hard_floor(seed), seed, frames))
 
     return run
-
-
-@pytest.fixture
-def context(monkeypatch):
-    with Domain() as domain:
-        for name, value in domain.environment().items():
-            monkeypatch.setenv(name, value)
-        context = Context()
-        rclpy.init(
-            context=context,
-            domain_id=domain.number,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        yield context
-        rclpy.shutdown(context=context)
 
 
 @pytest.fixture

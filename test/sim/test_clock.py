@@ -8,7 +8,6 @@ import time
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.srv import GetState
@@ -16,17 +15,14 @@ from nav_msgs.msg import Odometry
 from node_kinds import KINDS
 from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
-from maasi_sim.run.processes import Domain
 
 # Far more than eleven nodes need to start, for a machine that is busy with something else.
 PATIENCE = 400.0
@@ -98,21 +94,11 @@ class World(Node):
 
 
 @pytest.fixture
-def world(monkeypatch):
-    with Domain() as domain:
-        for name, value in domain.environment().items():
-            monkeypatch.setenv(name, value)
-        context = Context()
-        rclpy.init(
-            context=context,
-            domain_id=domain.number,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        made = World(context)
-        yield made
-        made.executor_used.shutdown()
-        made.destroy_node()
-        rclpy.shutdown(context=context)
+def world(context):
+    made = World(context)
+    yield made
+    made.executor_used.shutdown()
+    made.destroy_node()
 
 
 @pytest.fixture

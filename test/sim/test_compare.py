@@ -11,27 +11,12 @@ import numpy as np
 import pytest
 import yaml
 from scipy import stats
+from small_field import SMALL_FIELD
 
 from maasi_sim.experiments import campaign, compare, comparison, statistics
 from maasi_sim.experiments.comparison_tables import verdict
 from maasi_sim.experiments.statistics import Difference
 
-SCENARIO = {
-    'version': 1,
-    'environment': {'bounds': [[0.0, 60.0], [0.0, 60.0]]},
-    'step': 0.1,
-    'targets': {'count': 2, 'separation': 10.0, 'margin': 5.0},
-    'robots': {
-        'drone': {
-            'type': 'ranging_drone',
-            'start': [1.0, 1.0, 1.0],
-            'candidates': {'grid': [4, 4], 'spacing': 15.0, 'corner': [7.0, 7.0]},
-        }
-    },
-    'filter': {'method': 'pmb', 'expected_targets': 2.0},
-    'planner': {'name': 'maasi'},
-    'limits': {'time': 15.0},
-}
 PLANNERS = ['nearest_widest', 'lawnmower']
 
 
@@ -39,7 +24,7 @@ PLANNERS = ['nearest_widest', 'lawnmower']
 def scenario(tmp_path):
     """Return the file of a scenario whose search takes a fraction of a second."""
     path = tmp_path / 'field.yaml'
-    path.write_text(yaml.safe_dump(SCENARIO))
+    path.write_text(yaml.safe_dump(SMALL_FIELD))
     return path
 
 

@@ -7,15 +7,12 @@ import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import Bag, BagWriter, load_types
-from maasi_sim.run.processes import Domain
 from maasi_sim.run.recorder_node import Recorder
 
 PATIENCE = 120.0
@@ -96,22 +93,12 @@ class Session:
 
 
 @pytest.fixture
-def session(tmp_path, monkeypatch):
-    with Domain() as domain:
-        for name, value in domain.environment().items():
-            monkeypatch.setenv(name, value)
-        context = Context()
-        rclpy.init(
-            context=context,
-            domain_id=domain.number,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        made = Session(tmp_path, domain.number, context)
-        yield made
-        made.bag.close()
-        made.recorder.close()
-        made.node.destroy_node()
-        rclpy.shutdown(context=context)
+def session(tmp_path, domain, context):
+    made = Session(tmp_path, domain.number, context)
+    yield made
+    made.bag.close()
+    made.recorder.close()
+    made.node.destroy_node()
 
 
 def test_no_stamp_is_ahead_of_the_time_of_its_message(session, monkeypatch):

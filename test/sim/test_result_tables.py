@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from small_field import SMALL_FIELD
 
 from maasi_filter.models.label import Label
 from maasi_filter.records import FoundTarget
@@ -76,24 +77,9 @@ def field(tmp_path):
     """Return a function that loads a small scenario with an origin."""
 
     def load(**origin):
-        content = {
-            'version': 1,
-            'environment': {'bounds': [[0.0, 60.0], [0.0, 60.0]], 'origin': origin},
-            'step': 0.1,
-            'targets': {'count': 2, 'separation': 10.0, 'margin': 5.0},
-            'robots': {
-                'drone': {
-                    'type': 'ranging_drone',
-                    'start': [1.0, 1.0, 1.0],
-                    'candidates': {'grid': [4, 4], 'spacing': 15.0, 'corner': [7.0, 7.0]},
-                }
-            },
-            'filter': {'method': 'pmb', 'expected_targets': 2.0},
-            'planner': {'name': 'nearest_widest'},
-            'limits': {'time': 15.0},
-        }
+        environment = {**SMALL_FIELD['environment'], 'origin': origin}
         path = tmp_path / 'field.yaml'
-        path.write_text(yaml.safe_dump(content))
+        path.write_text(yaml.safe_dump({**SMALL_FIELD, 'environment': environment}))
         return load_scenario(path)
 
     return load

@@ -9,17 +9,14 @@ from copy import deepcopy
 
 import numpy as np
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from visualization_msgs.msg import Marker, MarkerArray
@@ -30,7 +27,6 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import pose_to_ros
 from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, RangeArray
-from maasi_sim.run.processes import Domain
 from maasi_sim.sim_node import SimNode
 
 STEP = 0.05
@@ -93,21 +89,6 @@ LINKED = {
     ],
 }
 FORWARD = (0.2, 0.0, 0.0, 0.0)
-
-
-@pytest.fixture
-def context(monkeypatch):
-    with Domain() as domain:
-        for name, value in domain.environment().items():
-            monkeypatch.setenv(name, value)
-        context = Context()
-        rclpy.init(
-            context=context,
-            domain_id=domain.number,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        yield context
-        rclpy.shutdown(context=context)
 
 
 class Member(Node):
