@@ -33,6 +33,7 @@ _SEARCH = (
     'maasi_sim.world',
     'maasi_sim.targets',
     'maasi_sim.search',
+    'maasi_sim.search_result',
 )
 _LIBRARIES = ('numpy', 'scipy', 'numba', 'llvmlite', 'cv2')
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +25,9 @@ from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import Planner
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision
-from maasi_sim.scenario.base import OriginSettings
-from maasi_sim.scenario.schema import (
-    Scenario,
-    planner_settings,
-    steps_of,
-)
-from maasi_sim.targets.data_frames import data_frame
-from maasi_sim.targets.scoring import score, scoring_radius
+from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
+from maasi_sim.search_result import Found, SearchResult
+from maasi_sim.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.view.live_view import open_view
 from maasi_sim.view.search_trace import SearchTrace
 from maasi_sim.world.simulation import simulated_robot, step_of_event
@@ -45,131 +38,6 @@ FloatArray = NDArray[np.float64]
 
 # From the settings, and a function that returns the true targets that are not found yet.
 MakePlanner = Callable[[PlannerSettings, Callable[[], FloatArray]], Planner]
-
-
-@dataclass(frozen=True)
-class Found:
-    """State of a search after a measurement batch.
-
-    Attributes
-    ----------
-    time : float
-        [s].
-    measurements : int
-        Number so far, of all robots.
-    found, true_found : int
-        Targets found so far, and the number of true ones among them.
-    rmse : float
-        Of the true ones [m]; nan without any.
-    step : int
-        k.
-    members : tuple of str
-        Robots that measured.
-    positions : dict
-        Of all robots, (3,) [m].
-    """
-
-    time: float
-    measurements: int
-    found: int
-    true_found: int
-    rmse: float
-    step: int
-    members: tuple[str, ...]
-    positions: dict[str, FloatArray]
-
-
-@dataclass
-class SearchResult:
-    """Result of a search.
-
-    Attributes
-    ----------
-    end_reason : str
-        'all_found', 'planner_done' or 'time_limit'.
-    found_targets : list of FoundTarget
-        At the end.
-    truth : (n, d) array
-        True targets [m].
-    missed, false_found : int
-        True targets without a found one, and found ones without a true one.
-    rmse : float
-        Of the true ones among those found [m]; nan without any.
-    measurements : dict
-        Number of each robot.
-    distance : dict
-        Distance travelled by each robot [m].
-    steps : int
-        Length of the search.
-    progress : list of Found
-        After each measurement batch.
-    decisions : list of Decision
-        In their order.
-    filter_times, planning_times : list of float
-        Wall time of each filter step and of each decision [s].
-    trace : SearchTrace or None
-        For a replay.
-    pairs : list of (int, int)
-        Index of a found target, and of the true one that it is.
-    origin : OriginSettings or None
-        Of the map on the earth.
-    """
-
-    end_reason: str
-    found_targets: list[FoundTarget]
-    truth: FloatArray
-    missed: int
-    false_found: int
-    rmse: float
-    measurements: dict[str, int]
-    distance: dict[str, float]
-    steps: int
-    progress: list[Found] = field(default_factory=list)
-    decisions: list[Decision] = field(default_factory=list)
-    filter_times: list[float] = field(default_factory=list)
-    planning_times: list[float] = field(default_factory=list)
-    trace: SearchTrace | None = field(default=None, repr=False, compare=False)
-    pairs: list[tuple[int, int]] = field(default_factory=list)
-    origin: OriginSettings | None = None
-
-    def save_replay(self, path: str | Path) -> None:
-        """Write a page that shows the search, one HTML file.
-
-        Raises
-        ------
-        ResultsError
-            If it cannot be written.
-        """
-        assert self.trace is not None, 'a result that `search` returned has a trace'
-        self.trace.save_replay(Path(path))
-
-    def to_dataframe(self, table: str = 'found_targets') -> Any:
-        """Return a pandas data frame.
-
-        Parameters
-        ----------
-        table : str
-            'found_targets': a row for each, with the columns of `found_targets.csv`. 'progress': a
-            row for each measurement batch, with the fields of `Found` and the places of robots.
-
-        Raises
-        ------
-        ImportError
-            If pandas is not installed.
-        ValueError
-            If there is no such table.
-        """
-        return data_frame(self, table)
-
-    @property
-    def total_measurements(self) -> int:
-        """Measurements of all robots."""
-        return sum(self.measurements.values())
-
-    @property
-    def complete(self) -> bool:
-        """Whether all targets are found, and nothing else."""
-        return self.missed == 0 and self.false_found == 0
 
 
 class _Robot:
@@ -204,6 +72,14 @@ class _Robot:
             reading.angular_velocity,
         )
         self.state = RobotState(self.pose.pose, self.pose.velocity, self.pose.angular_velocity)
+
+    def move(self, command: FloatArray, step: int, dt: float) -> None:
+        """Advance by `dt` seconds under a velocity command."""
+        before = self.body.state.pose.position
+        self.body.command(command)
+        self.body.step(step, dt)
+        moved = self.body.state.pose.position - before
+        self.distance += float(np.sqrt((moved * moved).sum()))
 
     def has_ended(self, goal: int) -> bool:
         """Return whether the goal of this number has ended."""
@@ -361,128 +237,165 @@ def search(
     if isinstance(planner, str):
         scenario = scenario.model_copy(update={'planner': scenario.planner.renamed(planner)})
         planner = None
-    world = scenario.world(seed)
-    robots = {name: _Robot(name, scenario, seed, world) for name in scenario.names()}
-    departures = leaving(scenario)
-    away: set[str] = set()
-    trace = SearchTrace(scenario, seed)
-    feed = open_view(trace) if view else None
-    groups = [
-        _Group(space, names, scenario, trace) for space, names in scenario.namespaces().items()
-    ]
-    destinations = {name: np.array(robot.start) for name, robot in scenario.robots.items()}
-    truth = np.asarray(world.targets, dtype=float)
-    trace.truth(0.0, truth)
-    radius = scoring_radius(scenario, truth)
-    counts = dict.fromkeys(robots, 0)
-    progress: list[Found] = []
-    decisions: list[Decision] = []
-    end_reason = 'time_limit'
-    step = -1
-
-    def found_targets() -> list[FoundTarget]:
-        return _numbered([item.filter.own_found_targets() for item in groups])
-
-    def missing() -> FloatArray:
-        positions = np.array([item.position for item in found_targets()])
-        pairs = match_targets(positions, world.targets_at(step), radius).pairs
-        return np.delete(world.targets_3d_at(step), [j for _, j in pairs], axis=0)
-
-    if planner is not None:
-        for group in groups:
-            group.coordinator.planner = planner(scenario.planner, missing)
-    for step in range(steps_of(scenario.limits.time, scenario.step)):
-        time = step * scenario.step
-        for name in departures.get(step, []):
-            away.add(name)
-            trace.leave(time, name)
-            for group in groups:
-                if name in group.names:
-                    group.coordinator.leave(name)
-        here = {name: robot for name, robot in robots.items() if name not in away}
-        for robot in here.values():
-            robot.observe(round(time * 1e9))
-        trace.robots(time, {name: robot.state for name, robot in here.items()})
-        commands = {
-            name: robot.follower.update(robot.state, step)[0] for name, robot in here.items()
-        }
-        complete = False
-        for group in groups:
-            others = [other for other in groups if other is not group]
-            taken = [
-                (destinations[name], scenario.robots[name].radius)
-                for other in others
-                for name in other.names
-                if name in here
-            ]
-            present, decision = group.plan(step, here, taken)
-            for name in present:
-                destinations[name] = group.coordinator.destination(name, present[name].state)
-            if decision is not None:
-                decisions.append(decision)
-            measured = group.measure(step, time, here, present, others)
-            for name in measured:
-                counts[name] += 1
-            if measured:
-                positions = [target.position for target in found_targets()]
-                truth = world.targets_at(step)
-                if world.walk > 0.0:
-                    trace.truth(time, truth)
-                scores = score(positions, truth, radius, scenario.scoring.order)
-                complete = complete or (bool(len(truth)) and scores.complete)
-                progress.append(
-                    Found(
-                        time,
-                        sum(counts.values()),
-                        len(positions),
-                        scores.match.true_found,
-                        scores.match.rmse,
-                        step,
-                        tuple(measured),
-                        {name: robot.body.state.pose.position for name, robot in robots.items()},
-                    )
-                )
-        if complete and scenario.stop == 'all_found':
-            end_reason = 'all_found'
-            break
-        searching = [group for group in groups if not away.issuperset(group.names)]
-        if searching and all(group.coordinator.finished is not None for group in searching):
-            end_reason = 'planner_done'
-            break
-        if most_measurements is not None and sum(counts.values()) >= most_measurements:
-            end_reason = 'measurement_limit'
-            break
-        for group in groups:
-            group.shared = group.filter.own_found_targets()
-        for name, robot in here.items():
-            before = robot.body.state.pose.position
-            robot.body.command(commands[name])
-            robot.body.step(step + 1, scenario.step)
-            moved = robot.body.state.pose.position - before
-            robot.distance += float(np.sqrt((moved * moved).sum()))
+    running = _Search(scenario, seed, planner)
+    feed = open_view(running.trace) if view else None
+    end_reason = running.run(most_measurements)
     if feed is not None:
         feed.close(f'ended: {end_reason}')
-    found = found_targets()
-    truth = np.asarray(world.targets_at(max(step, 0)), dtype=float)
-    scores = score([item.position for item in found], truth, radius, scenario.scoring.order)
-    return SearchResult(
-        end_reason=end_reason,
-        found_targets=found,
-        truth=truth,
-        missed=len(truth) - scores.match.true_found,
-        false_found=len(found) - scores.match.true_found,
-        rmse=scores.match.rmse,
-        measurements=counts,
-        distance={name: robot.distance for name, robot in robots.items()},
-        steps=step + 1,
-        progress=progress,
-        decisions=decisions,
-        trace=trace,
-        filter_times=[item for group in groups for item in group.filter_times],
-        planning_times=[item for group in groups for item in group.planning_times],
-        pairs=scores.match.pairs,
-        origin=scenario.environment.origin,
-    )
+    return running.result(end_reason)
+
+
+class _Search:
+    """A search while it runs, step by step."""
+
+    def __init__(self, scenario: Scenario, seed: int, planner: MakePlanner | None) -> None:
+        self.scenario = scenario
+        self.world = scenario.world(seed)
+        self.trace = SearchTrace(scenario, seed)
+        self.step = -1
+        self._robots = {name: _Robot(name, scenario, seed, self.world) for name in scenario.names()}
+        self._departures = leaving(scenario)
+        self._away: set[str] = set()
+        self._groups = [
+            _Group(space, names, scenario, self.trace)
+            for space, names in scenario.namespaces().items()
+        ]
+        self._destinations = {
+            name: np.array(robot.start) for name, robot in scenario.robots.items()
+        }
+        truth = np.asarray(self.world.targets, dtype=float)
+        self.trace.truth(0.0, truth)
+        self._radius = scoring_radius(scenario, truth)
+        self._counts = dict.fromkeys(self._robots, 0)
+        self._progress: list[Found] = []
+        self._decisions: list[Decision] = []
+        # Whether the last score of a step was complete.
+        self._complete = False
+        if planner is not None:
+            for group in self._groups:
+                group.coordinator.planner = planner(scenario.planner, self._missing)
+
+    def run(self, most_measurements: int | None) -> str:
+        """Run the search and return the reason of its end."""
+        for step in range(steps_of(self.scenario.limits.time, self.scenario.step)):
+            self.step = step
+            time = step * self.scenario.step
+            self._let_leave(time)
+            here = {name: r for name, r in self._robots.items() if name not in self._away}
+            for robot in here.values():
+                robot.observe(round(time * 1e9))
+            self.trace.robots(time, {name: robot.state for name, robot in here.items()})
+            commands = {
+                name: robot.follower.update(robot.state, self.step)[0]
+                for name, robot in here.items()
+            }
+            self._complete = False
+            for group in self._groups:
+                self._plan(group, here)
+            reason = self._end_reason(most_measurements)
+            if reason is not None:
+                return reason
+            for group in self._groups:
+                group.shared = group.filter.own_found_targets()
+            for name, robot in here.items():
+                robot.move(commands[name], self.step + 1, self.scenario.step)
+        return 'time_limit'
+
+    def _let_leave(self, time: float) -> None:
+        for name in self._departures.get(self.step, []):
+            self._away.add(name)
+            self.trace.leave(time, name)
+            for group in self._groups:
+                if name in group.names:
+                    group.coordinator.leave(name)
+
+    def _plan(self, group: _Group, here: Mapping[str, _Robot]) -> None:
+        """Plan for the robots of a group, measure with those that are due, and score."""
+        others = [other for other in self._groups if other is not group]
+        taken = [
+            (self._destinations[name], self.scenario.robots[name].radius)
+            for other in others
+            for name in other.names
+            if name in here
+        ]
+        present, decision = group.plan(self.step, here, taken)
+        for name in present:
+            self._destinations[name] = group.coordinator.destination(name, present[name].state)
+        if decision is not None:
+            self._decisions.append(decision)
+        time = self.step * self.scenario.step
+        measured = group.measure(self.step, time, here, present, others)
+        for name in measured:
+            self._counts[name] += 1
+        if measured:
+            self._score(time, measured)
+
+    def _score(self, time: float, measured: list[str]) -> None:
+        truth = self.world.targets_at(self.step)
+        if self.world.walk > 0.0:
+            self.trace.truth(time, truth)
+        found = self._found_targets()
+        scores = self._scores(found, truth)
+        self._complete = self._complete or (bool(len(truth)) and scores.complete)
+        self._progress.append(
+            Found(
+                time,
+                sum(self._counts.values()),
+                len(found),
+                scores.match.true_found,
+                scores.match.rmse,
+                self.step,
+                tuple(measured),
+                {name: r.body.state.pose.position for name, r in self._robots.items()},
+            )
+        )
+
+    def _end_reason(self, most_measurements: int | None) -> str | None:
+        if self._complete and self.scenario.stop == 'all_found':
+            return 'all_found'
+        searching = [group for group in self._groups if not self._away.issuperset(group.names)]
+        if searching and all(group.coordinator.finished is not None for group in searching):
+            return 'planner_done'
+        if most_measurements is not None and sum(self._counts.values()) >= most_measurements:
+            return 'measurement_limit'
+        return None
+
+    def _found_targets(self) -> list[FoundTarget]:
+        return _numbered([group.filter.own_found_targets() for group in self._groups])
+
+    def _missing(self) -> FloatArray:
+        """Return the true targets that are not found yet, (n, 3) [m]."""
+        positions = np.array([item.position for item in self._found_targets()])
+        pairs = match_targets(positions, self.world.targets_at(self.step), self._radius).pairs
+        return np.delete(self.world.targets_3d_at(self.step), [j for _, j in pairs], axis=0)
+
+    def _scores(self, found: list[FoundTarget], truth: FloatArray) -> Scores:
+        positions = [target.position for target in found]
+        return score(positions, truth, self._radius, self.scenario.scoring.order)
+
+    def result(self, end_reason: str) -> SearchResult:
+        """Return the result after `run`."""
+        found = self._found_targets()
+        truth = np.asarray(self.world.targets_at(max(self.step, 0)), dtype=float)
+        scores = self._scores(found, truth)
+        return SearchResult(
+            end_reason=end_reason,
+            found_targets=found,
+            truth=truth,
+            missed=len(truth) - scores.match.true_found,
+            false_found=len(found) - scores.match.true_found,
+            rmse=scores.match.rmse,
+            measurements=self._counts,
+            distance={name: robot.distance for name, robot in self._robots.items()},
+            steps=self.step + 1,
+            progress=self._progress,
+            decisions=self._decisions,
+            trace=self.trace,
+            filter_times=[item for group in self._groups for item in group.filter_times],
+            planning_times=[item for group in self._groups for item in group.planning_times],
+            pairs=scores.match.pairs,
+            origin=self.scenario.environment.origin,
+        )
 
 
 def _numbered(found: list[list[FoundTarget]]) -> list[FoundTarget]:

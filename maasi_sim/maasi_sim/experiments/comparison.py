@@ -26,7 +26,8 @@ from maasi_sim.scenario.loading import (
     scenario_from_content,
 )
 from maasi_sim.scenario.schema import Scenario
-from maasi_sim.search import SearchResult, leaving, search
+from maasi_sim.search import leaving, search
+from maasi_sim.search_result import SearchResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

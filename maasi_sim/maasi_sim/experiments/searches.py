@@ -12,7 +12,8 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.experiments.cases import Case, Outcome, Quantity
 from maasi_sim.scenario.loading import scenario_from_content, scenario_from_values
-from maasi_sim.search import SearchResult, search
+from maasi_sim.search import search
+from maasi_sim.search_result import SearchResult
 
 QUANTITIES = (
     Quantity('measurements_to_find_all', 'measurements to find all', '', 'restricted', 'limit'),
