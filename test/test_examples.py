@@ -95,6 +95,15 @@ def test_nodes_run_planner_and_sensor_as_one_process_does(run):
     assert np.allclose(found, positions, atol=1e-6)
 
 
+def test_a_recording_is_read_as_the_document_says(run, capsys):
+    text = (EXAMPLES.parent / 'docs' / 'how_to' / 'bags.md').read_text()
+    (block,) = re.findall(r'```python\n(.*?)```', text, re.DOTALL)
+    exec(block.replace('runs/20260101_120000/bag', str(run / 'out' / 'bag')), {})
+    report = json.loads((run / 'out' / 'report.json').read_text())
+    assert len(report['found']) > 0
+    assert capsys.readouterr().out.splitlines()[-1].count('(') == len(report['found'])
+
+
 def test_a_recording_is_read_without_our_packages(run):
     done = subprocess.run(
         # Isolated: neither PYTHONPATH nor the current folder.
