@@ -14,7 +14,8 @@ from maasi_filter.models.detection import detection_probability_at
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.unexplored_map import UnexploredMap, check_bounds
-from maasi_planner.objective.predicted_measurements import reach_of
+from maasi_planner.objective.predicted_measurements import Kernel, reach_of
+from maasi_planner.objective.unexplored_nodes import box_within
 from maasi_planner.settings import CandidateSettings
 
 FloatArray = NDArray[np.float64]
@@ -223,68 +224,43 @@ def unseen_parts(
     size = float((box[:, 1] - box[:, 0]).max())
     grid = UnexploredMap(box, size / (cells if len(box) == 2 else min(cells, 40)))
     nodes = grid.nodes()
-    seen = np.zeros(len(nodes), dtype=np.bool_)
+    values, lower, step = grid.kernel()
+    seen = np.zeros(values.shape, dtype=np.bool_)
     members = list(viewers.values()) if isinstance(viewers, Mapping) else list(viewers)
     for viewer in members:
         places, yaws = _poses(viewer, size)
         kernel = viewer.sensor.detection.kernel()
-        _, lower, step = grid.kernel()
-        shape = np.ones(3, np.int64)
-        shape[: grid.dimension] = grid.values.shape
-        _mark_seen(
-            seen,
-            shape,
-            lower,
-            step,
-            places,
-            yaws,
-            grid.dimension,
-            *kernel,
-            reach_of(*kernel),
-            probability,
-        )
+        reach = reach_of(*kernel)
+        _mark_seen(seen, (lower, step), places, yaws, grid.dimension, kernel, reach, probability)
     return _parts(grid, seen, nodes)
 
 
 @njit(cache=True)
 def _mark_seen(
     seen: NDArray[np.bool_],
-    shape: NDArray[np.int64],
-    lower: FloatArray,
-    step: FloatArray,
+    grid: tuple[FloatArray, FloatArray],
     places: FloatArray,
     yaws: FloatArray,
     dimension: int,
-    kind: int,
-    parameters: FloatArray,
+    kernel: Kernel,
     reach: float,
     probability: float,
 ) -> None:
-    """Mark the nodes that some pose sees; `seen` is flat, in the order of the grid's nodes."""
-    low = np.zeros(3, np.int64)
-    high = np.ones(3, np.int64)
-    left = 0
-    for n in range(seen.shape[0]):
-        if not seen[n]:
-            left += 1
+    """Mark the nodes that some pose sees in seen (nx, ny, nz); `grid`: first node, distances."""
+    lower, step = grid
+    kind, parameters = kernel
+    box = np.zeros((2, 3), np.int64)
+    left = seen.size - np.sum(seen)
     for m in range(places.shape[0]):
         if left == 0:
             break
         cosine = math.cos(yaws[m])
         sine = math.sin(yaws[m])
-        for axis in range(dimension):
-            low[axis] = 0
-            high[axis] = shape[axis]
-            if reach < np.inf:
-                centre = (places[m, axis] - lower[axis]) / step[axis]
-                width = reach / step[axis]
-                low[axis] = min(max(math.floor(centre - width), 0), shape[axis])
-                high[axis] = max(min(math.ceil(centre + width) + 1, shape[axis]), 0)
-        for i in range(low[0], high[0]):
-            for j in range(low[1], high[1]):
-                for k in range(low[2], high[2]):
-                    node = (i * shape[1] + j) * shape[2] + k
-                    if seen[node]:
+        box_within(places[m], reach, lower, step, seen.shape, box)
+        for i in range(box[0, 0], box[1, 0]):
+            for j in range(box[0, 1], box[1, 1]):
+                for k in range(box[0, 2], box[1, 2]):
+                    if seen[i, j, k]:
                         continue
                     dz = lower[2] + k * step[2] - places[m, 2] if dimension == 3 else 0.0
                     found = detection_probability_at(
@@ -297,7 +273,7 @@ def _mark_seen(
                         sine,
                     )
                     if found >= probability:
-                        seen[node] = True
+                        seen[i, j, k] = True
                         left -= 1
 
 

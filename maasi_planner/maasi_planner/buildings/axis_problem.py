@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -27,6 +28,15 @@ SCALE = 1e4
 TOLERANCE = 1e-7
 # A row is a combination of active ones when this share of its length is left.
 DEPENDENT = 1e-10
+
+
+class AxisRoom(NamedTuple):
+    """Scratch of `solve_axis` for n forces: (n + 1,) twice, (n + 1, n + 1), (2, n + 1)."""
+
+    active: IntArray
+    multipliers: FloatArray
+    factor: FloatArray
+    work: FloatArray
 
 
 @dataclass(frozen=True)
@@ -100,10 +110,7 @@ def solve_axis(
     most: int,
     cutoff: float,
     y: FloatArray,
-    active: IntArray,
-    multipliers: FloatArray,
-    factor: FloatArray,
-    work: FloatArray,
+    room: AxisRoom,
 ) -> float:
     """Minimise over the rows' values y within their bounds: dual active-set method.
 
@@ -125,9 +132,10 @@ def solve_axis(
         Objective at which to give up.
     y : (m,) array
         Takes the values.
-    active, multipliers, factor, work : arrays (n + 1,), (n + 1,), (n + 1, n + 1), (2, n + 1)
-        Room to work in, n the number of forces.
+    room : AxisRoom
+        Scratch.
     """
+    active, multipliers, factor, work = room
     m = free.shape[0]
     for i in range(m):
         y[i] = free[i]

@@ -133,10 +133,7 @@ def _solve(instance: Instance, tree: Tree, node: int, cutoff: float) -> bool:
             horizon,
             cutoff - total,
             tree.values[node, a],
-            tree.active,
-            tree.multipliers,
-            tree.factor,
-            tree.work,
+            tree.room,
         )
         if cost == math.inf:
             return False

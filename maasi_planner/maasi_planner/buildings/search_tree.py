@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from maasi_planner.buildings.axis_problem import AxisRoom
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -40,8 +42,8 @@ class Tree(NamedTuple):
         Objective of the best node.
     scratch : (3, m) array
         Bounds of an axis while it is solved.
-    active, multipliers, factor, work : arrays
-        Room for `solve_axis`.
+    room : AxisRoom
+        Scratch of `solve_axis`.
     """
 
     bound: FloatArray
@@ -59,15 +61,12 @@ class Tree(NamedTuple):
     counts: IntArray
     best: FloatArray
     scratch: FloatArray
-    active: IntArray
-    multipliers: FloatArray
-    factor: FloatArray
-    work: FloatArray
+    room: AxisRoom
 
 
 def make_tree(size: int, horizon: int, rows: int) -> Tree:
     """Return room for `size` nodes."""
-    room = horizon + 1
+    n = horizon + 1
     return Tree(
         bound=np.empty(size),
         reward=np.empty(size),
@@ -84,10 +83,7 @@ def make_tree(size: int, horizon: int, rows: int) -> Tree:
         counts=np.zeros(6, dtype=np.int64),
         best=np.full(1, np.inf),
         scratch=np.empty((3, rows)),
-        active=np.empty(room, dtype=np.int64),
-        multipliers=np.empty(room),
-        factor=np.empty((room, room)),
-        work=np.empty((2, room)),
+        room=AxisRoom(np.empty(n, np.int64), np.empty(n), np.empty((n, n)), np.empty((2, n))),
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel
 
 from maasi_filter.models.pose import Pose
-from maasi_planner.motion.steering import Surroundings
+from maasi_planner.motion.steering import Steering, Surroundings, sideways_command
 from maasi_planner.obstacles import KeepOut, Obstacles
 from maasi_planner.settings import MotionSettings
 
@@ -260,6 +260,39 @@ class MotionModel(ABC):
             self._goal = waypoint.copy()
             self._goal_table = self.keep_out.to_goal(waypoint)
         return self._goal_table
+
+
+class SteeredMotion(MotionModel):
+    """Motion model of a robot that can move in any direction.
+
+    Attributes
+    ----------
+    steering : Steering
+        How it approaches its waypoint.
+    """
+
+    steering: Steering
+
+    def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
+        """See `MotionModel.command`."""
+        goal = check_waypoint(waypoint)
+        out = np.zeros(4)
+        sideways_command(
+            np.array(state.pose.position),
+            state.pose.yaw,
+            goal,
+            self._table(goal),
+            self.steering,
+            self.surroundings,
+            np.zeros((2, 3)),
+            out,
+        )
+        return out
+
+
+def check_waypoint(waypoint: ArrayLike) -> FloatArray:
+    """Return a waypoint as a (3,) array; errors as of `check_waypoints`."""
+    return check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
 
 
 def check_waypoints(waypoints: ArrayLike) -> FloatArray:

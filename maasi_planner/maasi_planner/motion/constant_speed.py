@@ -11,14 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
-    MotionModel,
     RobotState,
+    SteeredMotion,
     Trajectories,
     TrajectoryArrays,
     add_position,
     check_command,
     check_step,
-    check_waypoints,
 )
 from maasi_planner.motion.steering import (
     Steering,
@@ -217,7 +216,7 @@ class ConstantSpeedBody(Body):
         )
 
 
-class ConstantSpeed(MotionModel):
+class ConstantSpeed(SteeredMotion):
     """Controller and prediction of `ConstantSpeedBody`; its input is the velocity command."""
 
     def __init__(
@@ -256,22 +255,6 @@ class ConstantSpeed(MotionModel):
             step,
             out.arrays(),
         )
-
-    def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
-        """See `MotionModel.command`."""
-        goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
-        out = np.zeros(4)
-        sideways_command(
-            np.array(state.pose.position),
-            state.pose.yaw,
-            goal,
-            self._table(goal),
-            self.steering,
-            self.surroundings,
-            np.zeros((2, 3)),
-            out,
-        )
-        return out
 
     def body(self, state: RobotState) -> ConstantSpeedBody:
         """See `MotionModel.body`."""

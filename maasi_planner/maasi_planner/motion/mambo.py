@@ -20,14 +20,13 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
-    MotionModel,
     RobotState,
+    SteeredMotion,
     Trajectories,
     TrajectoryArrays,
     add_position,
     check_command,
     check_step,
-    check_waypoints,
 )
 from maasi_planner.motion.mambo_dynamics import (
     ENTRIES,
@@ -169,7 +168,7 @@ def twelve_states(state: RobotState) -> FloatArray:
     return out
 
 
-class Mambo(MotionModel):
+class Mambo(SteeredMotion):
     """Controller and prediction of `MamboBody`."""
 
     def __init__(
@@ -229,22 +228,10 @@ class Mambo(MotionModel):
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`: the LQR's set-point as a velocity command."""
-        goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
-        out = np.zeros(4)
-        position = np.array(state.pose.position)
-        yaw = state.pose.yaw
-        sideways_command(
-            position,
-            yaw,
-            goal,
-            self._table(goal),
-            self.steering,
-            self.surroundings,
-            np.zeros((2, 3)),
-            out,
-        )
+        out = super().command(state, waypoint)
         if self._term.kind:
-            add_obstacle_term(position, yaw, self._term, self.parameters, out)
+            position = np.array(state.pose.position)
+            add_obstacle_term(position, state.pose.yaw, self._term, self.parameters, out)
         return out
 
     def body(self, state: RobotState) -> MamboBody:

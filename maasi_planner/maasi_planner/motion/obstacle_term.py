@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 KINDS = ('none', 'printed', 'away')
 PRINTED = 1
-AWAY = 2
 
 
 class ObstacleTerm(NamedTuple):
@@ -27,7 +26,7 @@ class ObstacleTerm(NamedTuple):
     Attributes
     ----------
     kind : int
-        Index in KINDS. PRINTED: the same k_obs off every input. AWAY: k_obs along the way out.
+        Index in KINDS: none; the same k_obs off every input; k_obs along the way out.
     distance, gain : float
         d_l [m] and k_obs [N m and N].
     circles : (n, 5) array

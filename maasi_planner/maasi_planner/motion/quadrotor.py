@@ -23,14 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
-    MotionModel,
     RobotState,
+    SteeredMotion,
     Trajectories,
     TrajectoryArrays,
     add_position,
     check_command,
     check_step,
-    check_waypoints,
 )
 from maasi_planner.motion.mambo_dynamics import control_periods
 from maasi_planner.motion.mambo_gains import GRAVITY
@@ -256,7 +255,7 @@ class QuadrotorBody(Body):
         )
 
 
-class Quadrotor(MotionModel):
+class Quadrotor(SteeredMotion):
     """Controller and prediction of `QuadrotorBody`."""
 
     def __init__(
@@ -298,22 +297,6 @@ class Quadrotor(MotionModel):
             h,
             out.arrays(),
         )
-
-    def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
-        """See `MotionModel.command`: the first stage of the backstepping."""
-        goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
-        out = np.zeros(4)
-        sideways_command(
-            np.array(state.pose.position),
-            heading_of(thirteen_states(state)),
-            goal,
-            self._table(goal),
-            self.steering,
-            self.surroundings,
-            np.zeros((2, 3)),
-            out,
-        )
-        return out
 
     def body(self, state: RobotState) -> QuadrotorBody:
         """See `MotionModel.body`."""

@@ -27,7 +27,7 @@ from maasi_planner.motion.base import (
     add_position,
     check_command,
     check_step,
-    check_waypoints,
+    check_waypoint,
 )
 from maasi_planner.motion.dynamic_window import (
     ACCELERATION,
@@ -328,7 +328,7 @@ class Unicycle(MotionModel):
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`."""
-        goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
+        goal = check_waypoint(waypoint)
         here = as_tuple(five_states(state))
         out = np.zeros(4)
         if len(self.keep_out):

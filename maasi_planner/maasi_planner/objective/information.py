@@ -8,12 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.models.detection import (
-    detection_probability_at,
-)
+from maasi_filter.models.detection import detection_probability_at
 from maasi_filter.models.pose import Pose
 from maasi_planner.objective.candidate_table import CandidateTable
-from maasi_planner.objective.predicted_measurements import Events
+from maasi_planner.objective.predicted_measurements import Events, Kernel
 from maasi_planner.team import RobotView
 
 FloatArray = NDArray[np.float64]
@@ -131,16 +129,15 @@ def expected_new_targets(table: CandidateTable, g: int, chosen: IntArray) -> flo
 
 def add_information(
     view: RobotView,
-    kernel: tuple[int, FloatArray],
+    kernel: Kernel,
     item: Events,
-    own: IntArray,
     first: int,
     centres: FloatArray,
     dimension: int,
     out: FloatArray,
 ) -> None:
     """Add sum pi H' R^-1 H over the measurements to out (W, C, d, d)."""
-    most = int(own.max(initial=0))
+    most = int(item.own.max(initial=0))
     if most <= first:
         return
     places = item.places[:, :most]
@@ -149,7 +146,7 @@ def add_information(
         offsets[..., 2] = 0.0
     sensor = view.sensor
     probabilities = np.zeros(offsets.shape[:3])
-    _probabilities(item.turns, offsets, first, own, *kernel, probabilities)
+    _probabilities(item, offsets, first, kernel, probabilities)
     flat = np.ascontiguousarray(offsets[..., :dimension].reshape(-1, dimension))
     # Nearer than the noise of the range the linear model would promise too much.
     least = math.sqrt(float(sensor.covariance[0, 0]))
@@ -159,15 +156,9 @@ def add_information(
     matrices = np.zeros((len(flat), dimension, dimension))
     if len(needed):
         jacobian = sensor.measurement.jacobian(flat[needed], Pose(np.zeros(3)))
-        whitened = _whitened(jacobian, sensor.covariance)
-        matrices[needed] = whitened
-    _information(
-        matrices.reshape(*probabilities.shape, dimension, dimension),
-        probabilities,
-        first,
-        np.asarray(own),
-        out,
-    )
+        matrices[needed] = _whitened(jacobian, sensor.covariance)
+    matrices = matrices.reshape(*probabilities.shape, dimension, dimension)
+    _information(matrices, probabilities, first, item.own, out)
 
 
 def _whitened(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -192,16 +183,11 @@ def _whitened(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
 
 @njit(cache=True)
 def _probabilities(
-    turns: FloatArray,
-    offsets: FloatArray,
-    first: int,
-    own: IntArray,
-    kind: int,
-    parameters: FloatArray,
-    out: FloatArray,
+    item: Events, offsets: FloatArray, first: int, kernel: Kernel, out: FloatArray
 ) -> None:
+    kind, parameters = kernel
     for w in range(offsets.shape[0]):
-        for i in range(first, own[w]):
+        for i in range(first, item.own[w]):
             for c in range(offsets.shape[2]):
                 out[w, i, c] = detection_probability_at(
                     kind,
@@ -209,6 +195,6 @@ def _probabilities(
                     offsets[w, i, c, 0],
                     offsets[w, i, c, 1],
                     offsets[w, i, c, 2],
-                    turns[w, i, 0],
-                    turns[w, i, 1],
+                    item.turns[w, i, 0],
+                    item.turns[w, i, 1],
                 )

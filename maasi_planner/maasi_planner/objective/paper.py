@@ -6,12 +6,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.models.detection import (
-    detection_probability_at,
-)
+from maasi_filter.models.detection import detection_probability_at
 from maasi_planner.objective.candidate_table import CandidateTable
+from maasi_planner.objective.predicted_measurements import Events, Kernel, Measurements
 from maasi_planner.objective.unexplored_nodes import (
     ROOM_ROWS,
+    Entries,
     apply_misses,
     fill_detection,
     is_vectorised,
@@ -23,23 +23,22 @@ IntArray = NDArray[np.int64]
 
 @njit(cache=True)
 def centre_sum(
-    places: FloatArray,
-    turns: FloatArray,
+    item: Events,
     first: int,
-    own: IntArray,
     centres: FloatArray,
     dimension: int,
-    kind: int,
-    parameters: FloatArray,
+    kernel: Kernel,
     out: FloatArray,
 ) -> None:
     """Write T of each candidate into `out`: the sum of pi at cluster centres (000, (19), (31))."""
+    kind, parameters = kernel
+    places, turns = item.places, item.turns
     together = is_vectorised(kind)
     room = np.empty((ROOM_ROWS, places.shape[1] * centres.shape[0]))
     for w in range(places.shape[0]):
         total = 0.0
         number = 0
-        for i in range(first, own[w]):
+        for i in range(first, item.own[w]):
             for c in range(centres.shape[0]):
                 dx = centres[c, 0] - places[w, i, 0]
                 dy = centres[c, 1] - places[w, i, 1]
@@ -54,58 +53,22 @@ def centre_sum(
                         kind, parameters, dx, dy, dz, turns[w, i, 0], turns[w, i, 1]
                     )
         if together:
-            chances = fill_detection(kind, parameters, number, room)
+            chances = fill_detection(kernel, number, room)
             for i in range(number):
                 total += chances[i]
         out[w] = total
 
 
 @njit(cache=True)
-def _fill_miss_factors(
-    nodes: FloatArray,
-    until: IntArray,
-    times: IntArray,
-    places: FloatArray,
-    turns: FloatArray,
-    dimension: int,
-    kind: int,
-    parameters: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write what a row of measurements leaves at each entry, up to the entry's own time."""
-    out[:] = 1.0
-    apply_misses(nodes, until, 0, times, places, turns, dimension, kind, parameters, out)
-
-
-@njit(cache=True)
 def apply_settled_misses(
-    entry_count: IntArray,
-    entry_value: FloatArray,
-    entry_node: FloatArray,
-    entry_time: IntArray,
-    times: IntArray,
-    places: FloatArray,
-    turns: FloatArray,
-    dimension: int,
-    kind: int,
-    parameters: FloatArray,
+    entries: Entries, measured: Measurements, dimension: int, kernel: Kernel
 ) -> None:
     """Multiply the entries by what a robot whose trajectory is settled will have seen."""
     begin = 0
-    for w in range(entry_count.shape[0]):
-        end = begin + entry_count[w]
-        apply_misses(
-            entry_node[begin:end],
-            entry_time[begin:end],
-            0,
-            times,
-            places,
-            turns,
-            dimension,
-            kind,
-            parameters,
-            entry_value[begin:end],
-        )
+    for w in range(entries.count.shape[0]):
+        end = begin + entries.count[w]
+        nodes, until = entries.node[begin:end], entries.time[begin:end]
+        apply_misses(nodes, until, measured, dimension, kernel, entries.value[begin:end])
         begin = end
 
 
@@ -127,15 +90,17 @@ def miss_factors(table: CandidateTable, g: int, other: int) -> FloatArray:
     first = table.event_start[other]
     last = table.event_start[other + 1]
     robot = table.robot[other]
-    _fill_miss_factors(
+    out[:] = 1.0
+    apply_misses(
         table.entry_node[begin:end],
         table.entry_time[begin:end],
-        table.event_time[first:last],
-        table.event_place[first:last],
-        table.event_turn[first:last],
+        Measurements(
+            table.event_time[first:last],
+            table.event_place[first:last],
+            table.event_turn[first:last],
+        ),
         table.dimension,
-        table.kind[robot],
-        table.parameters[robot],
+        (table.kind[robot], table.parameters[robot]),
         out,
     )
     return out

@@ -11,13 +11,26 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.models.custom_kernel import CUSTOM, REACH
-from maasi_filter.models.detection import (
-    BOX,
-)
+from maasi_filter.models.detection import BOX
 from maasi_planner.team import RobotView
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+
+# Kind and parameters of a probability of detection pi.
+Kernel = tuple[int, FloatArray]
+
+
+class Measurements(NamedTuple):
+    """Measurements in order of time.
+
+    times (n,) [steps from now], places (n, 3) [m], turns (n, 2): cosine and sine of the heading.
+    """
+
+    times: IntArray
+    places: FloatArray
+    turns: FloatArray
 
 
 class Events(NamedTuple):
@@ -33,43 +46,65 @@ class Events(NamedTuple):
     own: IntArray
     total: IntArray
 
+    def present(self) -> Events:
+        """Return the first planned measurement of the first trajectory, if there is any."""
+        first = Events(*(array[:1] for array in self))
+        return first._replace(own=np.minimum(first.own, 1))
+
+    def expected(self) -> Measurements:
+        """Return the measurements that others expect on the first trajectory."""
+        total = int(self.total[0])
+        return Measurements(self.times[0, :total], self.places[0, :total], self.turns[0, :total])
+
+
+class Timing(NamedTuple):
+    """When a robot measures on a trajectory.
+
+    Attributes
+    ----------
+    phase, period : int
+        Steps to the first measurement and between measurements.
+    horizon : int
+        Last step of interest.
+    arrival : bool
+        Whether the measurement on arrival belongs to the trajectory, too.
+    extend : bool
+        Whether a robot goes on measuring where its trajectory ends (000, section 6: appended
+        constant states), which others see in e but which it does not count for itself.
+    """
+
+    phase: int
+    period: int
+    horizon: int
+    arrival: bool
+    extend: bool
+
 
 @njit(cache=True)
 def _fill_events(
-    positions: FloatArray,
-    yaws: FloatArray,
-    lengths: IntArray,
-    phase: int,
-    period: int,
-    horizon: int,
-    arrival: bool,
-    extend: bool,
-    times: IntArray,
-    places: FloatArray,
-    turns: FloatArray,
-    own: IntArray,
-    total: IntArray,
+    positions: FloatArray, yaws: FloatArray, lengths: IntArray, timing: Timing, out: Events
 ) -> None:
+    times, places, turns = out.times, out.places, out.turns
     for w in range(positions.shape[0]):
         length = lengths[w]
         number = 0
-        t = phase
+        t = timing.phase
         while t < length:
             times[w, number] = t
             number += 1
-            t += period
-        if arrival:
+            t += timing.period
+        if timing.arrival:
             times[w, number] = length
             number += 1
             if t == length:
-                t += period
-        own[w] = number
-        if extend:
-            while t <= horizon:
+                t += timing.period
+        out.own[w] = number
+        if timing.extend:
+            while t <= timing.horizon:
                 times[w, number] = t
                 number += 1
-                t += period
-        total[w] = number
+                t += timing.period
+        out.total[w] = number
         last_yaw = 0.0
         cosine = 1.0
         sine = 0.0
@@ -85,16 +120,7 @@ def _fill_events(
             turns[w, i, 1] = sine
 
 
-def events(
-    positions: FloatArray,
-    yaws: FloatArray,
-    lengths: IntArray,
-    phase: int,
-    period: int,
-    horizon: int,
-    arrival: bool,
-    extend: bool,
-) -> Events:
+def events(positions: FloatArray, yaws: FloatArray, lengths: IntArray, timing: Timing) -> Events:
     """Return the predicted measurements along trajectories.
 
     Parameters
@@ -103,19 +129,12 @@ def events(
         Trajectories, metres and radians.
     lengths : (W,) array
         Their lengths in steps.
-    phase, period : int
-        Steps to the first measurement and between measurements.
-    horizon : int
-        Last step of interest.
-    arrival : bool
-        Whether the measurement on arrival belongs to the trajectory, too.
-    extend : bool
-        Whether a robot goes on measuring where its trajectory ends (000, section 6: appended
-        constant states), which others see in e but which it does not count for itself.
+    timing : Timing
+        When the robot measures.
     """
     number = len(positions)
-    longest = max(horizon, int(lengths.max(initial=0)))
-    slots = max(0, longest - phase) // period + 3
+    longest = max(timing.horizon, int(lengths.max(initial=0)))
+    slots = max(0, longest - timing.phase) // timing.period + 3
     out = Events(
         np.zeros((number, slots), np.int64),
         np.zeros((number, slots, 3)),
@@ -123,27 +142,8 @@ def events(
         np.zeros(number, np.int64),
         np.zeros(number, np.int64),
     )
-    _fill_events(
-        positions,
-        yaws,
-        lengths,
-        phase,
-        period,
-        horizon,
-        arrival,
-        extend,
-        out.times,
-        out.places,
-        out.turns,
-        out.own,
-        out.total,
-    )
+    _fill_events(positions, yaws, lengths, timing, out)
     return out
-
-
-def first_row(item: Events) -> Events:
-    """Return the events of the first trajectory."""
-    return Events(item.times[:1], item.places[:1], item.turns[:1], item.own[:1], item.total[:1])
 
 
 def reach_of(kind: int, parameters: FloatArray) -> float:
@@ -171,16 +171,9 @@ def tail_events(view: RobotView, horizon: int, extend: bool) -> Events:
         yaws = np.full(positions.shape[:2], view.state.pose.yaw)
     lengths = np.array([positions.shape[1] - 1], np.int64)
     # Where the tail ends the robot measures in any case: it plans there.
-    return events(
-        positions,
-        yaws,
-        lengths,
-        max(0, view.phase),
-        view.period_steps,
-        horizon,
-        view.tail is not None and len(view.tail) > 1,
-        extend,
-    )
+    arrival = view.tail is not None and len(view.tail) > 1
+    timing = Timing(max(0, view.phase), view.period_steps, horizon, arrival, extend)
+    return events(positions, yaws, lengths, timing)
 
 
 def rows_of(planned: list[Events]) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_filter.models.detection import (
-    BOX,
-    PARAMETERS,
-)
+from maasi_filter.models.detection import BOX, PARAMETERS
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.objective.candidate_table import CACHE_ROWS, CandidateTable
 from maasi_planner.objective.candidate_value import (
@@ -30,8 +28,9 @@ from maasi_planner.objective.joint_search import (
 from maasi_planner.objective.paper import apply_settled_misses, centre_sum
 from maasi_planner.objective.predicted_measurements import (
     Events,
+    Kernel,
+    Timing,
     events,
-    first_row,
     joined,
     reach_of,
     rows_of,
@@ -39,7 +38,13 @@ from maasi_planner.objective.predicted_measurements import (
     starts_of,
     tail_events,
 )
-from maasi_planner.objective.unexplored_nodes import block_sums, entries_of, miss_at_nodes
+from maasi_planner.objective.unexplored_nodes import (
+    Entries,
+    NodeGrid,
+    block_sums,
+    entries_of,
+    miss_at_nodes,
+)
 from maasi_planner.objective.weights import resolve
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import RobotView, TeamView
@@ -52,6 +57,14 @@ BoolArray = NDArray[np.bool_]
 # Above this number of pairs of a candidate and another robot, reported values of candidates that
 # were not chosen neglect the other planning robots.
 REPORT_LIMIT = 600
+
+
+class _Measuring(NamedTuple):
+    """A robot, its probability of detection, and its predicted measurements."""
+
+    view: RobotView
+    kernel: Kernel
+    item: Events
 
 
 class TeamObjective:
@@ -105,29 +118,19 @@ class TeamObjective:
         allowed: Mapping[str, BoolArray],
     ) -> None:
         team, weights, names = self.team, self.weights, self.names
-        robots = [team.robots[name] for name in names]
         horizon = max((int(trajectories[name].lengths.max(initial=0)) for name in names), default=0)
-        kernels = [view.sensor.detection.kernel() for view in robots]
-        planned = [
-            events(
-                trajectories[name].positions,
-                trajectories[name].yaws,
-                trajectories[name].lengths,
-                0,
-                view.period_steps,
-                horizon,
-                weights.arrival,
-                weights.extend,
-            )
-            for name, view in zip(names, robots)
-        ]
-        self.events = dict(zip(names, planned))
+        planned = []
         settled = []
         for name in team.names():
-            if name not in names:
-                view = team.robots[name]
-                kernel = view.sensor.detection.kernel()
-                settled.append((view, kernel, tail_events(view, horizon, weights.extend)))
+            view = team.robots[name]
+            if name in names:
+                way = trajectories[name]
+                timing = Timing(0, view.period_steps, horizon, weights.arrival, weights.extend)
+                item = events(way.positions, way.yaws, way.lengths, timing)
+                planned.append(_Measuring(view, view.sensor.detection.kernel(), item))
+            else:
+                item = tail_events(view, horizon, weights.extend)
+                settled.append(_Measuring(view, view.sensor.detection.kernel(), item))
         first = 0 if weights.present else 1
         lengths = joined([trajectories[name].lengths for name in names], np.int64)
         if weights.per_distance:
@@ -135,7 +138,7 @@ class TeamObjective:
         else:
             norm = lengths.astype(float)
         self.lengths = lengths
-        self.measurements = joined([item.own for item in planned], np.int64)
+        self.measurements = joined([robot.item.own for robot in planned], np.int64)
         number = int(self.start[-1])
         clusters = team.clusters
         dimension = team.dimension
@@ -143,13 +146,9 @@ class TeamObjective:
         for index, cluster in enumerate(clusters):
             centres[index, :dimension] = cluster.position[:dimension]
         refinement = np.zeros(number)
-        empty_entries = (
-            np.zeros(number + 1, np.int64),
-            np.zeros(0),
-            np.zeros((0, 3)),
-            np.zeros(0, np.int64),
+        entries = Entries(
+            np.zeros(number, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64)
         )
-        entries = empty_entries
         rows = (
             np.zeros(number + 1, np.int64),
             np.zeros(0, np.int64),
@@ -168,30 +167,22 @@ class TeamObjective:
             covariance = np.zeros((len(clusters), d, d))
             for index, cluster in enumerate(clusters):
                 covariance[index] = cluster.covariance[:d, :d]
-            base, gain = self._information(robots, kernels, planned, settled, centres, first)
+            base, gain = self._information(planned, settled, centres, first)
             if weights.beta > 0.0:
-                unseen, miss = self._new_targets(kernels, planned, settled, first)
+                unseen, miss = self._new_targets(planned, settled, first)
         else:
-            for index, (kernel, item) in enumerate(zip(kernels, planned)):
-                centre_sum(
-                    item.places,
-                    item.turns,
-                    first,
-                    item.own,
-                    centres,
-                    dimension,
-                    *kernel,
-                    refinement[self.start[index] : self.start[index + 1]],
-                )
+            for index, robot in enumerate(planned):
+                part = refinement[self.start[index] : self.start[index + 1]]
+                centre_sum(robot.item, first, centres, dimension, robot.kernel, part)
             if weights.beta > 0.0:
-                entries = self._entries(kernels, planned, settled, first)
+                entries = self._entries(planned, settled, first)
                 if len(names) > 1:
-                    rows = rows_of(planned)
-        pairs = number if len(entries[1]) and len(names) > 1 else 0
-        longest = int(np.diff(entries[0]).max(initial=0)) if pairs else 0
+                    rows = rows_of([robot.item for robot in planned])
+        pairs = number if len(entries.value) and len(names) > 1 else 0
+        longest = int(entries.count.max(initial=0)) if pairs else 0
         parameters = np.zeros((len(names), PARAMETERS))
-        for index, kernel in enumerate(kernels):
-            parameters[index] = kernel[1]
+        for index, robot in enumerate(planned):
+            parameters[index] = robot.kernel[1]
         self.table = CandidateTable(
             start=self.start,
             robot=self.robot,
@@ -199,7 +190,7 @@ class TeamObjective:
                 [allowed[name] & (trajectories[name].lengths > 0) for name in names], np.bool_
             ),
             waypoints=stacked([candidates[name] for name in names], 3),
-            radii=np.array([view.radius for view in robots], dtype=float),
+            radii=np.array([robot.view.radius for robot in planned], dtype=float),
             control=joined([trajectories[name].control_cost for name in names], float),
             norm=np.maximum(norm, 1e-9),
             alpha=float(weights.alpha),
@@ -212,12 +203,12 @@ class TeamObjective:
             event_time=rows[1],
             event_place=rows[2],
             event_turn=rows[3],
-            kind=np.array([kernel[0] for kernel in kernels], np.int64),
+            kind=np.array([robot.kernel[0] for robot in planned], np.int64),
             parameters=parameters,
-            entry_start=entries[0],
-            entry_value=entries[1],
-            entry_node=entries[2],
-            entry_time=entries[3],
+            entry_start=starts_of(entries.count),
+            entry_value=entries.value,
+            entry_node=entries.node,
+            entry_time=entries.time,
             slot=np.full((pairs, pairs), -1, np.int32),
             cache=np.empty((min(CACHE_ROWS, pairs * pairs), longest)),
             used=np.zeros(1, np.int64),
@@ -229,72 +220,35 @@ class TeamObjective:
             miss=miss,
         )
 
-    def _entries(
-        self,
-        kernels: list[tuple[int, FloatArray]],
-        planned: list[Events],
-        settled: list[tuple[RobotView, tuple[int, FloatArray], Events]],
-        first: int,
-    ) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
-        values, lower, step = self.team.exploration.kernel()
-        corners = 4 if self.team.dimension == 2 else 8
-        counts, value_parts, node_parts, time_parts = [], [], [], []
-        for kernel, item in zip(kernels, planned):
+    def _entries(self, planned: list[_Measuring], settled: list[_Measuring], first: int) -> Entries:
+        grid = self.team.exploration.kernel()
+        dimension = self.team.dimension
+        corners = 4 if dimension == 2 else 8
+        parts = []
+        for _, kernel, item in planned:
             most = corners * int(item.own.sum())
-            count = np.zeros(len(item.own), np.int64)
-            entry_value = np.empty(most)
-            entry_node = np.empty((most, 3))
-            entry_time = np.empty(most, np.int64)
-            number = entries_of(
-                item.times,
-                item.places,
-                item.turns,
-                first,
-                item.own,
-                self.weights.own,
-                self.team.dimension,
-                *kernel,
-                values,
-                lower,
-                step,
-                count,
-                entry_value,
-                entry_node,
-                entry_time,
+            part = Entries(
+                np.zeros(len(item.own), np.int64),
+                np.empty(most),
+                np.empty((most, 3)),
+                np.empty(most, np.int64),
             )
-            entry_value = entry_value[:number]
-            entry_node = entry_node[:number]
-            entry_time = entry_time[:number]
-            for _, other, tail in settled:
-                total = int(tail.total[0])
-                apply_settled_misses(
-                    count,
-                    entry_value,
-                    entry_node,
-                    entry_time,
-                    tail.times[0, :total],
-                    tail.places[0, :total],
-                    tail.turns[0, :total],
-                    self.team.dimension,
-                    *other,
-                )
-            counts.append(count)
-            value_parts.append(entry_value)
-            node_parts.append(entry_node)
-            time_parts.append(entry_time)
-        return (
-            starts_of(joined(counts, np.int64)),
-            joined(value_parts, float),
-            stacked(node_parts, 3),
-            joined(time_parts, np.int64),
+            number = entries_of(item, first, self.weights.own, dimension, kernel, grid, part)
+            part = Entries(part.count, *(array[:number] for array in part[1:]))
+            for other in settled:
+                apply_settled_misses(part, other.item.expected(), dimension, other.kernel)
+            parts.append(part)
+        return Entries(
+            joined([part.count for part in parts], np.int64),
+            joined([part.value for part in parts], float),
+            stacked([part.node for part in parts], 3),
+            joined([part.time for part in parts], np.int64),
         )
 
     def _information(
         self,
-        robots: list[RobotView],
-        kernels: list[tuple[int, FloatArray]],
-        planned: list[Events],
-        settled: list[tuple[RobotView, tuple[int, FloatArray], Events]],
+        planned: list[_Measuring],
+        settled: list[_Measuring],
         centres: FloatArray,
         first: int,
     ) -> tuple[FloatArray, FloatArray]:
@@ -304,33 +258,28 @@ class TeamObjective:
         gain = np.zeros((int(self.start[-1]), number, d, d))
         if number == 0:
             return base, gain
-        for view, kernel, tail in settled:
+        for view, kernel, item in settled:
             out = np.zeros((1, number, d, d))
-            add_information(view, kernel, tail, tail.own, 0, centres, d, out)
+            add_information(view, kernel, item, 0, centres, d, out)
             base += out[0]
-        for index, (view, kernel, item) in enumerate(zip(robots, kernels, planned)):
+        for index, (view, kernel, item) in enumerate(planned):
             rows = slice(int(self.start[index]), int(self.start[index + 1]))
-            add_information(view, kernel, item, item.own, first, centres, d, gain[rows])
+            add_information(view, kernel, item, first, centres, d, gain[rows])
             if first:
                 # The present measurement does not depend on the choice.
-                here = first_row(item)
                 out = np.zeros((1, number, d, d))
-                add_information(view, kernel, here, np.minimum(here.own, 1), 0, centres, d, out)
+                add_information(view, kernel, item.present(), 0, centres, d, out)
                 base += out[0]
         return base, gain
 
     def _new_targets(
-        self,
-        kernels: list[tuple[int, FloatArray]],
-        planned: list[Events],
-        settled: list[tuple[RobotView, tuple[int, FloatArray], Events]],
-        first: int,
+        self, planned: list[_Measuring], settled: list[_Measuring], first: int
     ) -> tuple[FloatArray, FloatArray]:
         exploration = self.team.exploration
         values, lower, step = exploration.kernel()
         volumes = exploration.cell_volumes().reshape(values.shape)
         # A field of view with hard edges needs every node: omitted nodes would never be seen.
-        hard = any(kernel[0] >= BOX for kernel in kernels)
+        hard = any(robot.kernel[0] >= BOX for robot in planned)
         stride = 1
         if not hard:
             while np.prod([-(-size // stride) for size in values.shape]) > (
@@ -344,60 +293,27 @@ class TeamObjective:
         start = lower + 0.5 * (stride - 1) * step
         if self.team.dimension == 2:
             start[2] = 0.0
-        for _, kernel, tail in settled:
-            self._see(kernel, tail, 0, tail.own, start, step * stride, left)
-        if first:
-            for kernel, item in zip(kernels, planned):
-                here = first_row(item)
-                self._see(kernel, here, 0, np.minimum(here.own, 1), start, step * stride, left)
+        every = NodeGrid(start, step * stride, np.arange(left.size, dtype=np.int64).reshape(shape))
+        # What does not depend on the choice: settled robots, and the present measurements.
+        given = settled + [robot._replace(item=robot.item.present()) for robot in planned if first]
+        for robot in given:
+            miss = np.ones((1, left.size))
+            self._miss(robot, 0, every, miss)
+            left *= miss.reshape(left.shape)
         flat = left.ravel()
         columns = np.flatnonzero(flat > 0.0)
         index = np.full(flat.shape, -1, np.int64)
         index[columns] = np.arange(len(columns))
-        index = index.reshape(shape)
+        unseen = every._replace(index=index.reshape(shape))
         miss = np.ones((int(self.start[-1]), len(columns)))
-        for i, (kernel, item) in enumerate(zip(kernels, planned)):
-            miss_at_nodes(
-                item.places,
-                item.turns,
-                first,
-                item.own,
-                start,
-                step * stride,
-                index,
-                self.team.dimension,
-                *kernel,
-                reach_of(*kernel),
-                miss[self.start[i] : self.start[i + 1]],
-            )
+        for i, robot in enumerate(planned):
+            self._miss(robot, first, unseen, miss[self.start[i] : self.start[i + 1]])
         return flat[columns], miss
 
-    def _see(
-        self,
-        kernel: tuple[int, FloatArray],
-        item: Events,
-        first: int,
-        own: IntArray,
-        start: FloatArray,
-        step: FloatArray,
-        left: FloatArray,
-    ) -> None:
-        index = np.arange(left.size, dtype=np.int64).reshape(left.shape)
-        miss = np.ones((1, left.size))
-        miss_at_nodes(
-            item.places,
-            item.turns,
-            first,
-            own,
-            start,
-            step,
-            index,
-            self.team.dimension,
-            *kernel,
-            reach_of(*kernel),
-            miss,
-        )
-        left *= miss.reshape(left.shape)
+    def _miss(self, robot: _Measuring, first: int, grid: NodeGrid, miss: FloatArray) -> None:
+        reach = reach_of(*robot.kernel)
+        dimension = self.team.dimension
+        miss_at_nodes(robot.item, first, grid, dimension, robot.kernel, reach, miss)
 
     def alone(self) -> FloatArray:
         """Return T, E and J of each candidate without the other planning robots, (G, 3)."""

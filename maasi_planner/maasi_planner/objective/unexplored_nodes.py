@@ -3,25 +3,64 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.models.detection import (
-    BOX,
-    detection_probability_at,
-    fill_probabilities,
-)
+from maasi_filter.models.detection import BOX, detection_probability_at, fill_probabilities
+from maasi_planner.objective.predicted_measurements import Events, Kernel, Measurements
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-
-# Room for so many offsets at a time: x, y, z and pi.
+# Offsets that are processed at a time, and rows for them: x, y, z and pi.
 ROOM = 1024
-
 ROOM_ROWS = 4
+
+
+class Entries(NamedTuple):
+    """Nodes of (22), the candidates one after the other.
+
+    count (W,) nodes of each candidate; of each node value (n,): its weight times what is unseen,
+    node (n, 3) [m], and time (n,): that of the measurement [steps from now].
+    """
+
+    count: IntArray
+    value: FloatArray
+    node: FloatArray
+    time: IntArray
+
+
+class _Corners(NamedTuple):
+    """Scratch of `_nodes_around`.
+
+    shared (n,): entries of the same node in a row have the same number; measurement (n,): the
+    index of that of the entry; before (2, 8): nodes of the last two measurements.
+    """
+
+    shared: IntArray
+    measurement: IntArray
+    before: IntArray
+
+
+class _Products(NamedTuple):
+    """Scratch of `_apply_own_misses`: count, begin (n + 2,), rank (8 n,), work (4, 8 n), room."""
+
+    count: IntArray
+    begin: IntArray
+    rank: IntArray
+    work: FloatArray
+    room: FloatArray
+
+
+class NodeGrid(NamedTuple):
+    """Nodes of a grid: the first and the distances [m], and index (nx, ny, nz), -1: left out."""
+
+    start: FloatArray
+    step: FloatArray
+    index: IntArray
 
 
 @njit(cache=True)
@@ -34,8 +73,9 @@ def is_vectorised(kind: int) -> bool:
 
 
 @njit(cache=True)
-def fill_detection(kind: int, parameters: FloatArray, number: int, room: FloatArray) -> FloatArray:
+def fill_detection(kernel: Kernel, number: int, room: FloatArray) -> FloatArray:
     """Return pi at the first `number` offsets in room (rows x, y, z and one more)."""
+    kind, parameters = kernel
     fill_probabilities(kind, parameters, room[0], room[1], room[2], number, 1.0, 0.0, room[3])
     return room[3]
 
@@ -44,26 +84,23 @@ def fill_detection(kind: int, parameters: FloatArray, number: int, room: FloatAr
 def apply_misses(
     nodes: FloatArray,
     until: IntArray,
-    margin: int,
-    times: IntArray,
-    places: FloatArray,
-    turns: FloatArray,
+    measured: Measurements,
     dimension: int,
-    kind: int,
-    parameters: FloatArray,
+    kernel: Kernel,
     values: FloatArray,
 ) -> None:
-    """Multiply values at nodes (n, 3) by what a row of measurements leaves there.
+    """Multiply values at nodes (n, 3) by 1 - pi of the measurements up to the times `until` (n,).
 
-    Of the measurements those count that are at least `margin` steps before `until` (n,); neither
-    these times nor those of the measurements decrease.
+    Neither these times nor those of the measurements decrease.
     """
+    kind, parameters = kernel
+    times, places, turns = measured
     number = nodes.shape[0]
     if not is_vectorised(kind):
         for i in range(number):
             left = values[i]
             for e in range(times.shape[0]):
-                if times[e] + margin > until[i] or left <= 0.0:
+                if times[e] > until[i] or left <= 0.0:
                     break
                 left *= 1.0 - detection_probability_at(
                     kind,
@@ -85,11 +122,11 @@ def apply_misses(
     for e in range(times.shape[0] + 1):
         width = 0
         if e < times.shape[0]:
-            while begin < number and until[begin] < times[e] + margin:
+            while begin < number and until[begin] < times[e]:
                 begin += 1
             width = number - begin
         if width == 0 or filled + width > room.shape[1]:
-            chances = fill_detection(kind, parameters, filled, room)
+            chances = fill_detection(kernel, filled, room)
             for b in range(done, e):
                 later = values[first[b] :]
                 for i in range(later.shape[0]):
@@ -116,42 +153,36 @@ def apply_misses(
 
 
 @njit(cache=True)
-def own_products(
-    shared: IntArray,
-    time: IntArray,
-    nodes: FloatArray,
-    values: FloatArray,
+def _apply_own_misses(
+    corners: _Corners,
+    entries: Entries,
+    number: int,
     places: FloatArray,
     margin: int,
     dimension: int,
-    kind: int,
-    parameters: FloatArray,
-    count: IntArray,
-    begin: IntArray,
-    rank: IntArray,
-    work: FloatArray,
-    room: FloatArray,
+    kernel: Kernel,
+    scratch: _Products,
 ) -> None:
-    """Multiply entries by what a row of measurements leaves at their nodes, in place (21).
+    """Multiply the first `number` entries by what a row of measurements leaves at them (21).
 
-    Entry q is of measurement time[q], which does not decrease; those of one node that follow each
-    other without a gap have the same number shared[q], so that what is left there is multiplied on.
-    Of the measurements at `places` (n, 3) those count that are at least `margin` before an entry's.
-
-    `count` and `begin` (n + 2,), `rank` (8 n,), `work` (4, 8 n) and `room` are scratch.
+    Of the measurements at `places` (n, 3) those count that are at least `margin` before that of an
+    entry, which does not decrease. What is left at a node that several entries in a row share is
+    multiplied on.
     """
-    entries = shared.shape[0]
-    number = places.shape[0]
+    shared, time = corners.shared[:number], corners.measurement[:number]
+    nodes, values = entries.node[:number], entries.value[:number]
+    count, begin, rank, work, room = scratch
+    measurements = places.shape[0]
     unique = 0
-    for q in range(entries):
+    for q in range(number):
         # The last entry of a node stays.
         rank[shared[q]] = time[q]
         unique = max(unique, shared[q] + 1)
     # Sorted by their last measurement, the nodes that a measurement concerns are one slice.
-    count[: number + 2] = 0
+    count[: measurements + 2] = 0
     for u in range(unique):
         count[rank[u] + 1] += 1
-    for m in range(number):
+    for m in range(measurements):
         count[m + 1] += count[m]
         begin[m] = count[m]
     for u in range(unique):
@@ -161,7 +192,7 @@ def own_products(
     x, y, z = work[0, :unique], work[1, :unique], work[2, :unique]
     left = work[3, :unique]
     left[:] = 1.0
-    for q in range(entries):
+    for q in range(number):
         u = rank[shared[q]]
         x[u] = nodes[q, 0]
         y[u] = nodes[q, 1]
@@ -169,20 +200,20 @@ def own_products(
     done = 0
     filled = 0
     entry = 0
-    for e in range(number + 1):
+    for e in range(measurements + 1):
         width = 0
-        if e + margin < number:
+        if e + margin < measurements:
             width = unique - begin[e + margin]
         if width == 0 or filled + width > room.shape[1]:
-            chances = fill_detection(kind, parameters, filled, room)
+            chances = fill_detection(kernel, filled, room)
             for m in range(done, e):
                 later = left[begin[m + margin] :]
                 for i in range(later.shape[0]):
                     later[i] *= 1.0 - chances[i]
                 chances = chances[later.shape[0] :]
-                while entry < entries and time[entry] < m + margin:
+                while entry < number and time[entry] < m + margin:
                     entry += 1
-                while entry < entries and time[entry] == m + margin:
+                while entry < number and time[entry] == m + margin:
                     values[entry] *= left[rank[shared[entry]]]
                     entry += 1
             done = e
@@ -214,41 +245,32 @@ def _cell(position: float, lower: float, step: float, nodes: int) -> tuple[int, 
 
 @njit(cache=True, error_model='numpy')
 def _nodes_around(
+    item: Events,
     w: int,
-    begin: int,
-    places: FloatArray,
-    times: IntArray,
     first: int,
-    own: IntArray,
     dimension: int,
-    values: FloatArray,
-    lower: FloatArray,
-    step: FloatArray,
-    entry_value: FloatArray,
-    entry_node: FloatArray,
-    entry_time: IntArray,
-    shared: IntArray,
-    measurement: IntArray,
-    before: IntArray,
+    grid: tuple[FloatArray, FloatArray, FloatArray],
+    corners: _Corners,
+    out: Entries,
 ) -> int:
-    """Fill the nodes around the measurements of a trajectory: weight times e, if above 0.
+    """Fill the nodes around the measurements of trajectory w: weight times e, if above 0.
 
-    `shared` and `measurement` are as in `_own_products`, `before` (2, 8) is scratch. Return how
-    many there are.
+    Return how many there are.
     """
+    values, lower, step = grid
+    shared, measurement, before = corners
     number = 0
     unique = 0
     depth = 2 if dimension == 3 else 1
     before[:] = -1
     ci, cj, ck = np.int64(-9), np.int64(-9), np.int64(0)
-    for m in range(first, own[w]):
+    for m in range(first, item.own[w]):
         pi, pj, pk = ci, cj, ck
         fz = 0.0
-        ci, fx = _cell(places[w, m, 0], lower[0], step[0], values.shape[0])
-        cj, fy = _cell(places[w, m, 1], lower[1], step[1], values.shape[1])
+        ci, fx = _cell(item.places[w, m, 0], lower[0], step[0], values.shape[0])
+        cj, fy = _cell(item.places[w, m, 1], lower[1], step[1], values.shape[1])
         if depth == 2:
-            ck, fz = _cell(places[w, m, 2], lower[2], step[2], values.shape[2])
-        time = times[w, m]
+            ck, fz = _cell(item.places[w, m, 2], lower[2], step[2], values.shape[2])
         now = m & 1
         for i in range(2):
             x = lower[0] + (ci + i) * step[0]
@@ -272,162 +294,159 @@ def _nodes_around(
                     before[now, corner] = same
                     shared[number] = same
                     measurement[number] = m
-                    entry_value[begin + number] = weight
-                    entry_node[begin + number, 0] = x
-                    entry_node[begin + number, 1] = y
-                    entry_node[begin + number, 2] = lower[2] + (ck + k) * step[2]
-                    entry_time[begin + number] = time
+                    out.value[number] = weight
+                    out.node[number, 0] = x
+                    out.node[number, 1] = y
+                    out.node[number, 2] = lower[2] + (ck + k) * step[2]
+                    out.time[number] = item.times[w, m]
                     number += 1
     return number
 
 
 @njit(cache=True)
+def _keep_unseen(
+    item: Events,
+    w: int,
+    measurement: IntArray,
+    margin: int,
+    dimension: int,
+    kernel: Kernel,
+    entries: Entries,
+) -> int:
+    """Do what `_apply_own_misses` does, one by one, and drop the entries where nothing is left.
+
+    Return how many are kept.
+    """
+    kind, parameters = kernel
+    places, turns = item.places[w], item.turns[w]
+    kept = 0
+    for q in range(measurement.shape[0]):
+        left = entries.value[q]
+        e = measurement[q] - margin
+        # The latest first: with a sharp view it ends the product at once.
+        while e >= 0 and left > 0.0:
+            left *= 1.0 - detection_probability_at(
+                kind,
+                parameters,
+                entries.node[q, 0] - places[e, 0],
+                entries.node[q, 1] - places[e, 1],
+                (entries.node[q, 2] - places[e, 2]) if dimension == 3 else 0.0,
+                turns[e, 0],
+                turns[e, 1],
+            )
+            e -= 1
+        if left > 0.0:
+            entries.value[kept] = left
+            entries.node[kept] = entries.node[q]
+            entries.time[kept] = entries.time[q]
+            kept += 1
+    return kept
+
+
+@njit(cache=True)
 def entries_of(
-    times: IntArray,
-    places: FloatArray,
-    turns: FloatArray,
+    item: Events,
     first: int,
-    own: IntArray,
     own_counts: bool,
     dimension: int,
-    kind: int,
-    parameters: FloatArray,
-    values: FloatArray,
-    lower: FloatArray,
-    step: FloatArray,
-    entry_count: IntArray,
-    entry_value: FloatArray,
-    entry_node: FloatArray,
-    entry_time: IntArray,
+    kernel: Kernel,
+    grid: tuple[FloatArray, FloatArray, FloatArray],
+    out: Entries,
 ) -> int:
-    """Fill the nodes of (22): weight times e times the robot's own product (21), if above 0."""
+    """Fill the nodes of (22): weight times e times the robot's own product (21), if above 0.
+
+    `first` is the first measurement that counts, `own_counts` whether a measurement itself is in
+    its product, `grid` the values, first node and distances of e. Return the number of nodes.
+    """
     most = 0
-    for w in range(places.shape[0]):
-        most = max(most, own[w])
+    for w in range(item.own.shape[0]):
+        most = max(most, item.own[w])
     size = (4 if dimension == 2 else 8) * most
-    shared = np.empty(size, np.int64)
-    measurement = np.empty(size, np.int64)
-    before = np.empty((2, 8), np.int64)
-    together = is_vectorised(kind)
+    corners = _Corners(
+        np.empty(size, np.int64), np.empty(size, np.int64), np.empty((2, 8), np.int64)
+    )
+    together = is_vectorised(kernel[0])
+    rows = size if together else 0
+    scratch = _Products(
+        np.empty(most + 2, np.int64),
+        np.empty(most + 2, np.int64),
+        np.empty(rows, np.int64),
+        np.empty((4, rows)),
+        np.empty((ROOM_ROWS, max(ROOM, rows))),
+    )
+    margin = 0 if own_counts else 1
     number = 0
-    if together:
-        rank = np.empty(size, np.int64)
-        count = np.empty(most + 2, np.int64)
-        begin_at = np.empty(most + 2, np.int64)
-        work = np.empty((4, size))
-        room = np.empty((ROOM_ROWS, max(ROOM, size)))
-    for w in range(places.shape[0]):
-        begin = number
-        found = _nodes_around(
-            w,
-            begin,
-            places,
-            times,
-            first,
-            own,
-            dimension,
-            values,
-            lower,
-            step,
-            entry_value,
-            entry_node,
-            entry_time,
-            shared,
-            measurement,
-            before,
-        )
-        if together:
-            number += found
-            entry_count[w] = found
-            if found:
-                own_products(
-                    shared[:found],
-                    measurement[:found],
-                    entry_node[begin:number],
-                    entry_value[begin:number],
-                    places[w, : own[w]],
-                    0 if own_counts else 1,
-                    dimension,
-                    kind,
-                    parameters,
-                    count,
-                    begin_at,
-                    rank,
-                    work,
-                    room,
-                )
-            continue
-        # What is seen already is left out, in place.
-        for q in range(begin, begin + found):
-            m = measurement[q - begin]
-            left = entry_value[q]
-            e = m if own_counts else m - 1
-            # The latest first: with a sharp view it ends the product at once.
-            while e >= 0 and left > 0.0:
-                left *= 1.0 - detection_probability_at(
-                    kind,
-                    parameters,
-                    entry_node[q, 0] - places[w, e, 0],
-                    entry_node[q, 1] - places[w, e, 1],
-                    (entry_node[q, 2] - places[w, e, 2]) if dimension == 3 else 0.0,
-                    turns[w, e, 0],
-                    turns[w, e, 1],
-                )
-                e -= 1
-            if left > 0.0:
-                entry_value[number] = left
-                entry_node[number] = entry_node[q]
-                entry_time[number] = entry_time[q]
-                number += 1
-        entry_count[w] = number - begin
+    for w in range(item.own.shape[0]):
+        rest = Entries(out.count, out.value[number:], out.node[number:], out.time[number:])
+        found = _nodes_around(item, w, first, dimension, grid, corners, rest)
+        if not together:
+            measurement = corners.measurement[:found]
+            found = _keep_unseen(item, w, measurement, margin, dimension, kernel, rest)
+        elif found:
+            places = item.places[w, : item.own[w]]
+            _apply_own_misses(corners, rest, found, places, margin, dimension, kernel, scratch)
+        out.count[w] = found
+        number += found
     return number
 
 
 @njit(cache=True)
+def box_within(
+    place: FloatArray,
+    reach: float,
+    start: FloatArray,
+    step: FloatArray,
+    shape: tuple[int, int, int],
+    box: IntArray,
+) -> None:
+    """Write the first and one past the last node within `reach` of a place, into box (2, 3).
+
+    Axes without a distance between their nodes are in the box as a whole.
+    """
+    for axis in range(3):
+        box[0, axis] = 0
+        box[1, axis] = shape[axis]
+        if reach < np.inf and step[axis] > 0.0:
+            centre = (place[axis] - start[axis]) / step[axis]
+            width = reach / step[axis]
+            box[0, axis] = min(max(math.floor(centre - width), 0), shape[axis])
+            box[1, axis] = max(min(math.ceil(centre + width) + 1, shape[axis]), 0)
+
+
+@njit(cache=True)
 def miss_at_nodes(
-    places: FloatArray,
-    turns: FloatArray,
+    item: Events,
     first: int,
-    own: IntArray,
-    axes_start: FloatArray,
-    axes_step: FloatArray,
-    index: IntArray,
+    grid: NodeGrid,
     dimension: int,
-    kind: int,
-    parameters: FloatArray,
+    kernel: Kernel,
     reach: float,
     miss: FloatArray,
 ) -> None:
-    """Multiply `miss` (W, L) by 1 - pi of each measurement at the nodes.
+    """Multiply `miss` (W, L) by 1 - pi of each measurement from `first` on at the nodes.
 
-    `index` (nx, ny, nz) is the column of a node, or -1 where nothing is left to see; only nodes
-    within `reach` of a measurement are visited.
+    The index of a node is its column. Only nodes within `reach` of a measurement are visited.
     """
-    low = np.zeros(3, np.int64)
-    high = np.zeros(3, np.int64)
-    for w in range(places.shape[0]):
-        for m in range(first, own[w]):
-            for axis in range(3):
-                low[axis] = 0
-                high[axis] = index.shape[axis]
-                if axis < dimension and reach < np.inf and axes_step[axis] > 0.0:
-                    centre = (places[w, m, axis] - axes_start[axis]) / axes_step[axis]
-                    width = reach / axes_step[axis]
-                    low[axis] = min(max(math.floor(centre - width), 0), high[axis])
-                    high[axis] = max(min(math.ceil(centre + width) + 1, high[axis]), 0)
-            for i in range(low[0], high[0]):
-                dx = axes_start[0] + i * axes_step[0] - places[w, m, 0]
-                for j in range(low[1], high[1]):
-                    dy = axes_start[1] + j * axes_step[1] - places[w, m, 1]
-                    for k in range(low[2], high[2]):
+    kind, parameters = kernel
+    start, step, index = grid
+    box = np.zeros((2, 3), np.int64)
+    for w in range(item.own.shape[0]):
+        for m in range(first, item.own[w]):
+            place = item.places[w, m]
+            box_within(place, reach, start, step, index.shape, box)
+            for i in range(box[0, 0], box[1, 0]):
+                dx = start[0] + i * step[0] - place[0]
+                for j in range(box[0, 1], box[1, 1]):
+                    dy = start[1] + j * step[1] - place[1]
+                    for k in range(box[0, 2], box[1, 2]):
                         column = index[i, j, k]
                         if column < 0:
                             continue
                         dz = 0.0
                         if dimension == 3:
-                            dz = axes_start[2] + k * axes_step[2] - places[w, m, 2]
+                            dz = start[2] + k * step[2] - place[2]
                         miss[w, column] *= 1.0 - detection_probability_at(
-                            kind, parameters, dx, dy, dz, turns[w, m, 0], turns[w, m, 1]
+                            kind, parameters, dx, dy, dz, item.turns[w, m, 0], item.turns[w, m, 1]
                         )
 
 
