@@ -86,8 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def read_parameters(path: Path) -> DriverSettings:
-    """
-    Return the settings in a driver's parameter file.
+    """Return the settings in a driver's parameter file.
 
     Raises
     ------
@@ -134,8 +133,7 @@ def _dotted(node: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 class RecordedRobot:
-    """
-    A robot in a recording.
+    """A robot in a recording.
 
     Parameters
     ----------

@@ -21,8 +21,7 @@ _LOOK_PERIOD = 0.5
 
 
 class GuardNode(LockstepLifecycleNode[GuardSettings]):
-    """
-    Publishes zeros while no driver is alive, and nothing while one is.
+    """Publishes zeros while no driver is alive, and nothing while one is.
 
     Every robot that is commanded by a topic needs it: without a new one it continues
     the last one. Where Nav2 drives, its goals are cancelled, or it would continue as well.

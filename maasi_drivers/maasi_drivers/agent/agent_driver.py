@@ -35,8 +35,7 @@ MakeSensor = Callable[[RobotNode], SensorInput]
 
 
 class AgentDriver(RobotNode):
-    """
-    The driver of a robot, in the robot's namespace.
+    """The driver of a robot, in the robot's namespace.
 
     It is composed of a link to the robot, a sensor, and parts with one concern each: `GoalServer`
     (action `go_to`), `MeasurementResponder`, `StatePublisher`, `Watchdog`, `BatteryWatch`,
@@ -68,7 +67,6 @@ class AgentDriver(RobotNode):
         What makes the link, for each allowed value of the parameter `link`.
     make_sensor : callable
         Makes the sensor.
-
     """
 
     link: RobotLink
@@ -322,8 +320,7 @@ def run(
     sensor: MakeSensor,
     arguments: list[str] | None = None,
 ) -> int:
-    """
-    Run the driver of a robot until it is asked to end; return the exit code.
+    """Run the driver of a robot until it is asked to end; return the exit code.
 
     Parameters
     ----------
@@ -333,7 +330,6 @@ def run(
         What makes the sensor, as `CameraInput`.
     arguments : list of str, optional
         Of the command line.
-
     """
     links = link if isinstance(link, Mapping) else {'topics': link}
     return run_node(lambda: AgentDriver(links, sensor), arguments, AgentDriver)

@@ -13,14 +13,12 @@ UNTIL_ARM = 'until the service arm is called'
 
 
 class ArmPermission:
-    """
-    Whether a vehicle may take off: one take-off for each call of the service.
+    """Whether a vehicle may take off: one take-off for each call of the service.
 
     Parameters
     ----------
     timeout : float
         After which an unused permission expires [s].
-
     """
 
     def __init__(self, timeout: float) -> None:
@@ -46,8 +44,7 @@ class ArmPermission:
 
 
 def offer_arm(node: Node, arm: Callable[[], str]) -> None:
-    """
-    Create the service `arm` (std_srvs/Trigger) of a node.
+    """Create the service `arm` (std_srvs/Trigger) of a node.
 
     Parameters
     ----------
@@ -55,7 +52,6 @@ def offer_arm(node: Node, arm: Callable[[], str]) -> None:
         Of a robot that takes off.
     arm : callable
         Gives the permission, or returns the reason of a refusal; empty where it is given.
-
     """
 
     def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -9,8 +9,7 @@ _WINDOW = 2.0
 
 
 class ArrivalClock:
-    """
-    The node's time at any instant of the steady clock.
+    """The node's time at any instant of the steady clock.
 
     A simulated time comes in steps, and late: its true course is the earliest that it was seen at.
     Where the node's time is the system's, it is that.

@@ -14,12 +14,10 @@ _SETTLED = 2
 
 
 class BatteryGauge:
-    """
-    Converts readings to a charge of 0 to 1.
+    """Converts readings to a charge of 0 to 1.
 
     A reading above 2 is per cent. One of at most 2 is a fraction, unless several in per cent led
     down to it.
-
     """
 
     def __init__(self) -> None:
@@ -41,12 +39,10 @@ class BatteryGauge:
 
 
 class BatteryReadings:
-    """
-    Readings that wait for the steps after theirs, as a run in lockstep needs.
+    """Readings that wait for the steps after theirs, as a run in lockstep needs.
 
     Whether a reading comes before the odometry of its own step depends on the scheduler. It counts
     from the next step on, by when it is there.
-
     """
 
     def __init__(self) -> None:

@@ -11,8 +11,7 @@ from maasi_filter.ros.qos import sensor_reader
 
 
 class BatteryTopic:
-    """
-    Hands charges to `driver.take_charge`.
+    """Hands charges to `driver.take_charge`.
 
     Subscribes
     ----------
@@ -22,7 +21,6 @@ class BatteryTopic:
     ----------
     driver : RobotNode
         The robot's node.
-
     """
 
     def __init__(self, driver: RobotNode) -> None:

@@ -12,8 +12,7 @@ _PATIENCE = 10.0
 
 
 class BatteryWatch:
-    """
-    Keeps the last known charge, and compares it with `battery_minimum`.
+    """Keeps the last known charge, and compares it with `battery_minimum`.
 
     Parameters
     ----------
@@ -24,7 +23,6 @@ class BatteryWatch:
     ----------
     charge : float
         0 to 1; -1 where the last reading was unknown.
-
     """
 
     def __init__(self, driver: RobotNode) -> None:

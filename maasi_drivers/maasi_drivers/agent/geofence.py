@@ -19,8 +19,7 @@ MARGIN = 0.5
 def make_fence(
     given: list[list[float]] | None, bounds: FloatArray, radius: float, ground: float, start: float
 ) -> FloatArray:
-    """
-    Return the lowest and highest x, y, z (3, 2) of goals [m, map].
+    """Return the lowest and highest x, y, z (3, 2) of goals [m, map].
 
     Parameters
     ----------
@@ -44,8 +43,7 @@ def make_fence(
 def make_vehicle_fence(
     given: list[list[float]] | None, bounds: FloatArray, radius: float, ground: float, start: float
 ) -> FloatArray:
-    """
-    Return the lowest and highest x, y, z (3, 2) of the goals of a vehicle that may also dive.
+    """Return the lowest and highest x, y, z (3, 2) of the goals of a vehicle that may also dive.
 
     As `make_fence`; by default from 1 m below the lower to 1 m above the higher one of ground and
     start, but not below the ground for what starts above it.

@@ -10,14 +10,12 @@ BATTERY, STOP = 'battery', 'stop'
 
 
 class Health:
-    """
-    The present faults of a robot; without any it can follow goals.
+    """The present faults of a robot; without any it can follow goals.
 
     Parameters
     ----------
     on_fault : callable
         Called with the text of each new fault.
-
     """
 
     def __init__(self, on_fault: Callable[[str], None]) -> None:
@@ -37,8 +35,7 @@ class Health:
         return self._faults.get(kind, '')
 
     def begin(self, kind: str, text: str) -> bool:
-        """
-        Set a fault, or the text of one that is set; return whether it is new.
+        """Set a fault, or the text of one that is set; return whether it is new.
 
         Parameters
         ----------
@@ -46,7 +43,6 @@ class Health:
             To end it by.
         text : str
             The cause, for the planner.
-
         """
         new = kind not in self._faults
         self._faults[kind] = text

@@ -13,8 +13,7 @@ DataT = TypeVar('DataT')
 
 @dataclass(frozen=True)
 class MeasurementRequest:
-    """
-    A measurement that a robot is to take.
+    """A measurement that a robot is to take.
 
     Attributes
     ----------
@@ -24,7 +23,6 @@ class MeasurementRequest:
         The first image stamped at or after it is used [ns].
     measurement : int
         Index of this robot's measurement.
-
     """
 
     batch: int
@@ -41,8 +39,7 @@ class Frame(Generic[DataT]):
 
 
 class MeasurementQueue(Generic[DataT]):
-    """
-    Matches requests, images and poses, in any order of arrival.
+    """Matches requests, images and poses, in any order of arrival.
 
     An image answers one request at most: it is one measurement.
 
@@ -54,7 +51,6 @@ class MeasurementQueue(Generic[DataT]):
         Added to an image's stamp for the time of its pose [ns].
     frames, requests : int
         How many are kept; the oldest go first.
-
     """
 
     def __init__(
@@ -94,8 +90,7 @@ class MeasurementQueue(Generic[DataT]):
         self.latest = None
 
     def next(self) -> tuple[MeasurementRequest, Frame[DataT], StampedPose] | None:
-        """
-        Return the next request that can be answered, its image and the pose then.
+        """Return the next request that can be answered, its image and the pose then.
 
         The image is taken; the request stays until `answered`, so that another image can take the
         place of one that turns out bad. None while something is awaited.

@@ -27,8 +27,7 @@ _AHEAD = 2_000_000_000
 
 
 class MeasurementResponder:
-    """
-    Answers each batch that the robot is in by the detections of one image or sweep.
+    """Answers each batch that the robot is in by the detections of one image or sweep.
 
     Subscribes
     ----------
@@ -51,7 +50,6 @@ class MeasurementResponder:
     ----------
     left_out : Counter
         Detections that were not published: reason to number.
-
     """
 
     def __init__(self, driver: RobotNode, sensor: SensorInput, watchdog: Watchdog) -> None:

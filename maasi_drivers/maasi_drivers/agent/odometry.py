@@ -15,8 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StampedPose:
-    """
-    Where a robot was at a stamp.
+    """Where a robot was at a stamp.
 
     Attributes
     ----------
@@ -30,7 +29,6 @@ class StampedPose:
         Map frame [m/s].
     angular_velocity : ndarray, shape (3,)
         The robot's frame [rad/s].
-
     """
 
     stamp: int
@@ -50,8 +48,7 @@ def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 class MapOdometry:
-    """
-    Turns a robot's odometry, which starts at zero, into poses in the map.
+    """Turns a robot's odometry, which starts at zero, into poses in the map.
 
     Parameters
     ----------
@@ -60,7 +57,6 @@ class MapOdometry:
     origin : Pose, optional
         What the odometry showed then; without it, zero. A robot that was not restarted shows
         something else: give its first message.
-
     """
 
     def __init__(self, initial: Pose, origin: Pose | None = None) -> None:
@@ -75,8 +71,7 @@ class MapOdometry:
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
     ) -> StampedPose:
-        """
-        Place one odometry message in the map.
+        """Place one odometry message in the map.
 
         Parameters
         ----------
@@ -93,7 +88,6 @@ class MapOdometry:
         ------
         ValueError
             Where a number is not finite.
-
         """
         matrix = np.zeros((6, 6))
         if covariance is not None:
@@ -111,14 +105,12 @@ class MapOdometry:
 
 
 def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedPose:
-    """
-    Return the pose at a stamp between two others: position linear, orientation by slerp.
+    """Return the pose at a stamp between two others: position linear, orientation by slerp.
 
     Raises
     ------
     ValueError
         If the stamp is not between theirs.
-
     """
     if not first.stamp <= stamp <= second.stamp:
         raise ValueError(f'stamp: got {stamp}, allowed from {first.stamp} to {second.stamp} [ns]')
@@ -150,14 +142,12 @@ def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedP
 
 
 class PoseHistory:
-    """
-    A robot's latest poses, to look up its pose when an image was taken.
+    """A robot's latest poses, to look up its pose when an image was taken.
 
     Parameters
     ----------
     length : int
         How many are kept.
-
     """
 
     def __init__(self, length: int = 512) -> None:
@@ -191,8 +181,7 @@ class PoseHistory:
         self._poses.clear()
 
     def at(self, stamp: int) -> StampedPose | None:
-        """
-        Return the pose at a stamp [ns], interpolated between its neighbours.
+        """Return the pose at a stamp [ns], interpolated between its neighbours.
 
         None where the stamp is before the first pose kept or after the last one: nothing is
         extrapolated, the caller waits for the next odometry.

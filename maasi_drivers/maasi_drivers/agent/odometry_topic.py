@@ -19,8 +19,7 @@ from maasi_filter.ros.qos import sensor_reader
 
 
 class OdometryTopic:
-    """
-    Hands poses to `driver.take_pose`.
+    """Hands poses to `driver.take_pose`.
 
     Subscribes
     ----------
@@ -30,7 +29,6 @@ class OdometryTopic:
     ----------
     driver : RobotNode
         The robot's node.
-
     """
 
     def __init__(self, driver: RobotNode) -> None:

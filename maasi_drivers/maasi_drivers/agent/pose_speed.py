@@ -22,8 +22,7 @@ class PoseSpeed:
         self._before: tuple[int, Pose] | None = None
 
     def place(self, stamp: int, pose: Pose) -> StampedPose:
-        """
-        Return a pose with velocities by the difference from the one before; zero at first.
+        """Return a pose with velocities by the difference from the one before; zero at first.
 
         Parameters
         ----------

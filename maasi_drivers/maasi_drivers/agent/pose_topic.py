@@ -14,8 +14,7 @@ from maasi_filter.ros.qos import sensor_reader
 
 
 class PoseTopic:
-    """
-    Where a robot is by motion capture, SLAM or another localiser.
+    """Where a robot is by motion capture, SLAM or another localiser.
 
     Subscribes
     ----------
@@ -27,7 +26,6 @@ class PoseTopic:
         The robot's driver.
     on_pose : callable
         Takes stamp [ns] and pose in the map.
-
     """
 
     def __init__(

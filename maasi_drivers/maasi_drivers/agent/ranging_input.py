@@ -19,8 +19,7 @@ FloatArray = NDArray[np.float64]
 
 
 class RangingInput(SensorInput[Sweep]):
-    """
-    A sensor that measures range and direction of what is near.
+    """A sensor that measures range and direction of what is near.
 
     Subscribes
     ----------

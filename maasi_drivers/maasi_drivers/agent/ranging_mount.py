@@ -44,8 +44,7 @@ class RangingSettings(Settings):
 
 
 class RangingMount:
-    """
-    Turns sweeps of a mounted sensor into measurements from the robot's position.
+    """Turns sweeps of a mounted sensor into measurements from the robot's position.
 
     Parameters
     ----------
@@ -69,8 +68,7 @@ class RangingMount:
     def measurements(
         self, sweep: FloatArray, pose: StampedPose
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """
-        Return what the robot measured.
+        """Return what the robot measured.
 
         Parameters
         ----------

@@ -34,8 +34,7 @@ _NO_TYPE = (
 
 
 class RobotFrames:
-    """
-    The frames of one robot.
+    """The frames of one robot.
 
     Publishes
     ---------
@@ -58,7 +57,6 @@ class RobotFrames:
     ------
     SettingsError
         If poses are to come from tf and tf2_msgs is not installed.
-
     """
 
     def __init__(
@@ -131,8 +129,7 @@ class RobotFrames:
     # ---- what is published -------------------------------------------------------------------
 
     def publish(self, placed: StampedPose, map_from_odom: Pose) -> None:
-        """
-        Publish where the robot is, `tf_rate` times a second of its stamps at most.
+        """Publish where the robot is, `tf_rate` times a second of its stamps at most.
 
         Parameters
         ----------
@@ -236,8 +233,7 @@ class RobotFrames:
         self._on_pose(stamp, pose)
 
     def to_map(self, waypoint: PoseStamped, now: int) -> str | None:
-        """
-        Bring a waypoint into the map; return what is wrong where that is not possible.
+        """Bring a waypoint into the map; return what is wrong where that is not possible.
 
         A waypoint without a stamp is one in its frame as it is now.
 

@@ -16,8 +16,7 @@ _NOWHERE = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class FixedFrame:
-    """
-    A frame that is fixed on a robot.
+    """A frame that is fixed on a robot.
 
     Attributes
     ----------
@@ -27,7 +26,6 @@ class FixedFrame:
         Of the frame in its parent [m].
     rpy : tuple of 3 floats
         Roll, pitch, yaw about fixed axes of the parent [rad].
-
     """
 
     parent: str
@@ -46,8 +44,7 @@ def base_frame(robot: str, settings: DriverSettings) -> str:
 
 
 def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
-    """
-    Return the frames of a robot's sensors, as far as the settings say where these sit.
+    """Return the frames of a robot's sensors, as far as the settings say where these sit.
 
     Parameters
     ----------
@@ -74,8 +71,7 @@ def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
 
 
 def robot_description(robot: str, settings: DriverSettings) -> str:
-    """
-    Return the URDF of a robot: a cylinder of its radius, and the frames of its sensors.
+    """Return the URDF of a robot: a cylinder of its radius, and the frames of its sensors.
 
     Links have the names of the frames. The height is not known: it is drawn as the radius.
     """

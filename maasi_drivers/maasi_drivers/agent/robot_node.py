@@ -20,8 +20,7 @@ _POSE_NAMES = {'odometry': 'odometry', 'tf': 'pose on tf', 'pose': 'pose'}
 
 
 class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
-    """
-    The state that link, sensor and the parts of a driver share, and where they report to.
+    """The state that link, sensor and the parts of a driver share, and where they report to.
 
     All of it is made anew in *configure*.
 
@@ -47,7 +46,6 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         What its poses are called in messages.
     feed_peer : FeedPeer or None
         The only sender whose measurement feed is used; none: any.
-
     """
 
     follower: WaypointFollower
@@ -79,8 +77,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         return round(stamp * 1e-9 / self.settings.step)
 
     def is_new_pose(self, what: str, stamp: int) -> bool:
-        """
-        Return whether a pose of this stamp is to be used; one far back starts the driver anew.
+        """Return whether a pose of this stamp is to be used; one far back starts the driver anew.
 
         Parameters
         ----------
@@ -88,7 +85,6 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
             Topic and field, for messages.
         stamp : int
             [ns].
-
         """
         if not (self.settings.lockstep or self._gate.accepts(stamp)):
             self.drop(
@@ -126,8 +122,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
 
     @abstractmethod
     def take_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
-        """
-        Take an image or sweep.
+        """Take an image or sweep.
 
         Parameters
         ----------
@@ -150,8 +145,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         """Publish `state` with the fault of a robot that has no pose yet."""
 
     def judge(self, kind: str, problem: str, recovered: str) -> None:
-        """
-        Begin or end a fault by what a link reports.
+        """Begin or end a fault by what a link reports.
 
         Parameters
         ----------
@@ -161,7 +155,6 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
             Why the robot cannot follow goals; empty where it can.
         recovered : str
             Logged when the fault ends.
-
         """
         if problem:
             if self.health.begin(kind, problem):

@@ -12,8 +12,7 @@ STOPPED = 'stopped by the service stop, until the service release is called'
 
 
 class RobotStop:
-    """
-    A latched stop.
+    """A latched stop.
 
     It outlives *cleanup* and *configure* of its node, but not its process.
 
@@ -26,7 +25,6 @@ class RobotStop:
     ----------
     latched : bool
         Whether the stop is in force.
-
     """
 
     def __init__(self, on_stop: Callable[[], None], on_release: Callable[[], None]) -> None:

@@ -37,8 +37,7 @@ def scan_points(
     placed: StampedPose,
     mount: ArrayLike,
 ) -> FloatArray:
-    """
-    Return where the beams of a scan ended, (n, 2) in the map [m].
+    """Return where the beams of a scan ended, (n, 2) in the map [m].
 
     Parameters
     ----------
@@ -159,8 +158,7 @@ def way_around(
 
 
 class ScanUnicycle(Unicycle):
-    """
-    A ground robot that keeps clear of known obstacles and of what its scanner sees.
+    """A ground robot that keeps clear of known obstacles and of what its scanner sees.
 
     Ways around known obstacles are planned; what is seen beside them is driven around as it comes,
     so that a pocket can hold the robot: who sends it has to notice that it gets no nearer.

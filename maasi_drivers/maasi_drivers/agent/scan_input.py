@@ -21,8 +21,7 @@ _PROGRESS = 0.02
 
 
 class ScanInput:
-    """
-    Hands scans to the controller, and finds out whether they are silent or the robot is blocked.
+    """Hands scans to the controller, and finds out whether they are silent or the robot is blocked.
 
     Subscribes
     ----------
@@ -36,7 +35,6 @@ class ScanInput:
         Place of the scanner, and timeouts.
     motion : ScanUnicycle
         The controller.
-
     """
 
     def __init__(self, driver: RobotNode, settings: ScanSettings, motion: ScanUnicycle) -> None:

@@ -13,8 +13,7 @@ DataT = TypeVar('DataT')
 
 
 class SensorInput(ABC, Generic[DataT]):
-    """
-    Where images or sweeps come from, and how targets are detected in them.
+    """Where images or sweeps come from, and how targets are detected in them.
 
     Each image or sweep goes to `driver.take_frame`.
 
@@ -29,7 +28,6 @@ class SensorInput(ABC, Generic[DataT]):
         What it delivers, for messages.
     offset : int
         Added to the stamp of an image for the time of its pose [ns].
-
     """
 
     name = 'sweep'
@@ -47,14 +45,12 @@ class SensorInput(ABC, Generic[DataT]):
 
     @abstractmethod
     def detect(self, data: DataT, pose: StampedPose) -> SensorReading:
-        """
-        Return what an image or sweep shows.
+        """Return what an image or sweep shows.
 
         Raises
         ------
         ValueError
             If it cannot be used: the next one answers instead.
-
         """
 
     def close(self) -> None:

@@ -16,8 +16,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sweep:
-    """
-    What a ranging sensor returns at one instant.
+    """What a ranging sensor returns at one instant.
 
     Attributes
     ----------
@@ -25,7 +24,6 @@ class Sweep:
         Range [m], bearing and, in 3D, elevation [rad].
     labels : tuple of Label
         Class and identity of each; empty: none is known.
-
     """
 
     values: FloatArray
@@ -43,8 +41,7 @@ def selected(labels: tuple[Label, ...], keep: NDArray[np.bool_]) -> tuple[Label,
 
 @dataclass(frozen=True)
 class SensorReading:
-    """
-    Detections of one image or sweep.
+    """Detections of one image or sweep.
 
     Attributes
     ----------
@@ -58,7 +55,6 @@ class SensorReading:
         Detections left out: reason to count.
     labels : tuple of Label
         Class and identity of each detection; empty: none is known.
-
     """
 
     values: FloatArray
@@ -69,8 +65,7 @@ class SensorReading:
 
     @classmethod
     def of_sweep(cls, sweep: Sweep, sensor: Sensor, pose: Pose) -> SensorReading:
-        """
-        Return the detections of a ranging sensor that are in its field of view.
+        """Return the detections of a ranging sensor that are in its field of view.
 
         Parameters
         ----------
@@ -80,7 +75,6 @@ class SensorReading:
             Of the robot.
         pose : Pose
             Of the robot in the map.
-
         """
         positions = sensor.measurement.inverse(sweep.values, pose)
         reading = cls(sweep.values, None, positions, {}, sweep.labels)
@@ -96,7 +90,6 @@ class SensorReading:
             Its detection model and maximum range.
         pose : Pose
             q, of the robot in the map.
-
         """
         if not len(self.values):
             return self

@@ -11,8 +11,7 @@ from maasi_msgs.msg import AgentState
 
 
 class StatePublisher:
-    """
-    Publishes pose, goal and faults of a robot.
+    """Publishes pose, goal and faults of a robot.
 
     Publishes
     ---------
@@ -24,7 +23,6 @@ class StatePublisher:
         The robot's node.
     battery : BatteryWatch
         Its charge.
-
     """
 
     def __init__(self, driver: RobotNode, battery: BatteryWatch) -> None:

@@ -47,14 +47,12 @@ def _still(stamp: int, pose: Pose) -> StampedPose:
 
 
 class TransformBuffer:
-    """
-    Poses of frames in their parents, interpolated in time; nothing is extrapolated.
+    """Poses of frames in their parents, interpolated in time; nothing is extrapolated.
 
     Parameters
     ----------
     horizon : int
         How long transforms are kept, by their stamps [ns].
-
     """
 
     def __init__(self, horizon: int = 10_000_000_000) -> None:
@@ -68,8 +66,7 @@ class TransformBuffer:
     def add(
         self, parent: str, child: str, pose: Pose, stamp: int = 0, *, static: bool = False
     ) -> None:
-        """
-        Add a transform; a frame that has another parent from now on loses what was known of it.
+        """Add a transform; a frame that has another parent from now on loses what was known of it.
 
         A single stamp that jumps by more than the horizon is not added; the next one that follows
         it is, and what was before it is forgotten.
@@ -89,7 +86,6 @@ class TransformBuffer:
         ------
         ValueError
             On a name that cannot be one, a loop of frames, a negative stamp, or too many frames.
-
         """
         for name in (parent, child):
             if not 0 < len(name) <= _LONGEST_NAME:
@@ -154,8 +150,7 @@ class TransformBuffer:
         return ups, downs
 
     def latest(self, target: str, source: str) -> int | None:
-        """
-        Return the latest stamp [ns] at which all transforms between two frames are known.
+        """Return the latest stamp [ns] at which all transforms between two frames are known.
 
         None where all of them are static.
 
@@ -163,14 +158,12 @@ class TransformBuffer:
         ------
         TransformError
             If the frames are not connected.
-
         """
         ups, downs = self._between(target, source)
         return min((edge.stamps[-1] for edge in [*ups, *downs] if not edge.static), default=None)
 
     def pose(self, target: str, source: str, stamp: int | None = None) -> Pose:
-        """
-        Return the pose of frame `source` in frame `target`.
+        """Return the pose of frame `source` in frame `target`.
 
         Parameters
         ----------
@@ -183,7 +176,6 @@ class TransformBuffer:
         ------
         TransformError
             If the frames are not connected, or the stamp is before or after what is kept.
-
         """
         ups, downs = self._between(target, source)
         dynamic = [edge for edge in [*ups, *downs] if not edge.static]

@@ -23,8 +23,7 @@ _CLOCK_PATIENCE = 0.5
 
 
 class Watchdog:
-    """
-    Stops a robot without odometry, with a frozen pose or with a silent sensor.
+    """Stops a robot without odometry, with a frozen pose or with a silent sensor.
 
     Parameters
     ----------
@@ -43,7 +42,6 @@ class Watchdog:
     ----------
     moving : bool
         Whether the last command must change pose and images.
-
     """
 
     def __init__(

@@ -28,8 +28,7 @@ class GoalStatus(IntEnum):
 
 @dataclass(eq=False)
 class Goal:
-    """
-    A waypoint of a robot.
+    """A waypoint of a robot.
 
     Attributes
     ----------
@@ -47,7 +46,6 @@ class Goal:
         Its state.
     reason : str
         Why it ended without success.
-
     """
 
     id: int
@@ -60,8 +58,7 @@ class Goal:
 
 
 class WaypointFollower:
-    """
-    Steers a robot to its waypoints and holds it there.
+    """Steers a robot to its waypoints and holds it there.
 
     Without a goal a ground robot stands still; the controller of a flying one holds its position.
 
@@ -74,7 +71,6 @@ class WaypointFollower:
     ----------
     goal : Goal or None
         The last one that took effect.
-
     """
 
     def __init__(self, motion: MotionModel) -> None:
@@ -123,8 +119,7 @@ class WaypointFollower:
         return math.hypot(*offset[:2]) if self.on_ground else math.hypot(*offset)
 
     def update(self, state: RobotState, step: int | None = None) -> tuple[FloatArray, Goal | None]:
-        """
-        Do one control step.
+        """Do one control step.
 
         Parameters
         ----------
@@ -139,7 +134,6 @@ class WaypointFollower:
             vx, vy, vz [m/s, body], yaw rate [rad/s].
         reached : Goal or None
             The goal that is reached in this step.
-
         """
         position = state.pose.position
         if self._next is not None and (step is None or step > self._next.step):

@@ -24,8 +24,7 @@ _ROUNDS = 3
 
 @dataclass(frozen=True)
 class Observation:
-    """
-    What a sensor saw at one instant.
+    """What a sensor saw at one instant.
 
     Attributes
     ----------
@@ -41,8 +40,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """
-    A sensor's noise.
+    """A sensor's noise.
 
     Attributes
     ----------
@@ -93,8 +91,7 @@ def sensor_noise(
     target: ArrayLike | None = None,
     least_range: float = 0.05,
 ) -> SensorNoise:
-    """
-    Return a sensor's noise.
+    """Return a sensor's noise.
 
     In each observation the detection nearest to the target counts, unless it is eight times as far
     as the median.

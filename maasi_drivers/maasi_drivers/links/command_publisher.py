@@ -20,8 +20,7 @@ _TYPES: dict[str, type] = {
 
 
 class CommandPublisher:
-    """
-    Publishes commands as TwistStamped, as Twist, or as what is subscribed.
+    """Publishes commands as TwistStamped, as Twist, or as what is subscribed.
 
     TurtleBot3s of Jazzy listen to TwistStamped, those of Humble to Twist, on the same topic.
 

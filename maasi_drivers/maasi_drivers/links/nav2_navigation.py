@@ -18,8 +18,7 @@ from maasi_filter.ros.silence import Silence
 
 
 class Nav2Navigation:
-    """
-    Hands waypoints to Nav2's `navigate_to_pose` (nav2_msgs/NavigateToPose).
+    """Hands waypoints to Nav2's `navigate_to_pose` (nav2_msgs/NavigateToPose).
 
     Parameters
     ----------
@@ -86,8 +85,7 @@ class Nav2Navigation:
         return None
 
     def go(self, goal: Goal, heading: float) -> None:
-        """
-        Send the robot to a waypoint, to face `heading` there [rad].
+        """Send the robot to a waypoint, to face `heading` there [rad].
 
         Nav2 replaces the goal before, without a stop.
         """

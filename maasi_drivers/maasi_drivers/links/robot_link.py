@@ -25,8 +25,7 @@ _LEAST_SPEED, _LEAST_TURN = 0.02, 0.05
 
 
 class RobotLink(ABC):
-    """
-    The link to one robot.
+    """The link to one robot.
 
     A driver makes it in *configure*. Everything that comes in goes to `driver`: poses to
     `take_pose`, the charge to `take_charge`, faults to `judge`. No method waits, except `stop`.
@@ -35,7 +34,6 @@ class RobotLink(ABC):
     ----------
     driver : RobotNode
         The robot's node.
-
     """
 
     def __init__(self, driver: RobotNode) -> None:
@@ -49,8 +47,7 @@ class RobotLink(ABC):
 
     @abstractmethod
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
-        """
-        Send a velocity command, after each pose.
+        """Send a velocity command, after each pose.
 
         Parameters
         ----------
@@ -58,7 +55,6 @@ class RobotLink(ABC):
             Pose of the robot.
         command : sequence of float
             vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
-
         """
 
     @abstractmethod

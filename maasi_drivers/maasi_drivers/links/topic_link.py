@@ -20,8 +20,7 @@ _STOP_COMMANDS, _STOP_TIME = 3, 0.3
 
 
 class TopicLink(RobotLink):
-    """
-    A link by ROS topics.
+    """A link by ROS topics.
 
     Subscribes
     ----------

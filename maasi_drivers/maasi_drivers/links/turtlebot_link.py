@@ -20,8 +20,7 @@ from maasi_planner.obstacles import Obstacles
 
 
 class TurtlebotLink(TopicLink):
-    """
-    A differential drive; see `TopicLink`.
+    """A differential drive; see `TopicLink`.
 
     A TurtleBot has no time limit on commands: it executes the last one for ever. So zeros are
     published when the driver stops, loses odometry, camera or scan, or ends, and by `guard_node`

@@ -36,8 +36,7 @@ class OrderKind(IntEnum):
 
 @dataclass(frozen=True)
 class Order:
-    """
-    An order.
+    """An order.
 
     Attributes
     ----------
@@ -49,7 +48,6 @@ class Order:
         From where it took off: forward, left, up, axes of the heading then [m].
     yaw : float
         From the heading at take-off, anticlockwise [rad].
-
     """
 
     sequence: int
@@ -69,14 +67,12 @@ def encode(order: Order) -> bytes:
 
 
 def decode(data: bytes) -> Order:
-    """
-    Return the order of a datagram.
+    """Return the order of a datagram.
 
     Raises
     ------
     OrderError
         If it is damaged, of another version, or holds values that are not allowed.
-
     """
     size = _ORDER.size + _CHECKSUM.size
     if len(data) != size:
@@ -101,8 +97,7 @@ def decode(data: bytes) -> Order:
 
 
 class OrderSender:
-    """
-    Sends orders to one robot.
+    """Sends orders to one robot.
 
     Parameters
     ----------
@@ -110,7 +105,6 @@ class OrderSender:
         Of the robot.
     port : int
         UDP, on which it receives them.
-
     """
 
     def __init__(self, address: str, port: int) -> None:

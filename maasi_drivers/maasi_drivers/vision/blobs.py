@@ -12,8 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Blobs:
-    """
-    Connected marker pixels, in the order of their topmost and then leftmost pixel.
+    """Connected marker pixels, in the order of their topmost and then leftmost pixel.
 
     Attributes
     ----------
@@ -30,7 +29,6 @@ class Blobs:
         [px^2].
     identities : tuple of str
         Ids of fiducial markers; empty: the rule does not tell.
-
     """
 
     centroids: Array

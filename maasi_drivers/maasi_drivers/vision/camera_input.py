@@ -49,8 +49,7 @@ def _known(blobs: Blobs) -> Blobs:
 
 
 class CameraInput(SensorInput[Picture]):
-    """
-    A camera that sees markers on the floor.
+    """A camera that sees markers on the floor.
 
     Calibration: from the file of the parameter `calibration_file`, else from the parameters;
     a `camera_info` with a focal length replaces either.
@@ -72,7 +71,6 @@ class CameraInput(SensorInput[Picture]):
     ----------
     camera : CameraSettings
         With the calibration in use.
-
     """
 
     name = 'image'

@@ -99,8 +99,7 @@ def _undistort(pixels, matrix, k, largest_radius):
 
 @njit(cache=True)
 def _to_floor(points, by_pixel, centre, turn, origin, height):
-    """
-    Floor positions (n, 2) of ideal rays, derivatives by pixel (n, 2, 2) and by pose (n, 2, 6).
+    """Floor positions (n, 2) of ideal rays, derivatives by pixel (n, 2, 2) and by pose (n, 2, 6).
 
     A change w of a point on the ray moves where the ray meets the plane by w_xy - slope w_z.
     """
@@ -158,8 +157,7 @@ def _points(name: str, values: ArrayLike, columns: int) -> Array:
 
 @dataclass(frozen=True)
 class Camera:
-    """
-    A calibrated camera mounted on a robot.
+    """A calibrated camera mounted on a robot.
 
     Attributes
     ----------
@@ -173,7 +171,6 @@ class Camera:
         Optical centre in the robot's frame [m].
     rotation : ndarray, shape (3, 3)
         From the optical frame to the robot's.
-
     """
 
     width: int
@@ -209,8 +206,7 @@ class Camera:
         return np.asarray(pose.position) + pose.rotation() @ self.position
 
     def project(self, positions: ArrayLike, pose: Pose) -> Array:
-        """
-        Project positions in the map frame to pixels (001, eq. (17)).
+        """Project positions in the map frame to pixels (001, eq. (17)).
 
         Parameters
         ----------
@@ -224,7 +220,6 @@ class Camera:
         ndarray, shape (n, 2)
             Pixels, also outside the image; NaN for what is behind the camera or so far off its axis
             that the distortion model does not hold.
-
         """
         return np.asarray(
             project_points(
@@ -238,8 +233,7 @@ class Camera:
         )
 
     def undistort(self, pixels: ArrayLike) -> tuple[Array, Array]:
-        """
-        Invert intrinsics and distortion.
+        """Invert intrinsics and distortion.
 
         Returns
         -------
@@ -247,7 +241,6 @@ class Camera:
             Normalised image coordinates of ideal rays; NaN where the distortion has no inverse.
         jacobians : ndarray, shape (n, 2, 2)
             Derivatives of the points by the pixels [1/px].
-
         """
         points, jacobians = _undistort(
             _points('pixels', pixels, 2), self.matrix, self.distortion, self.largest_radius
@@ -257,8 +250,7 @@ class Camera:
     def back_project(
         self, pixels: ArrayLike, pose: Pose, height: float = 0.0
     ) -> tuple[Array, Array, Array]:
-        """
-        Back-project pixels to the plane z = height (001, eq. (17) with z_w known).
+        """Back-project pixels to the plane z = height (001, eq. (17) with z_w known).
 
         Parameters
         ----------
@@ -277,7 +269,6 @@ class Camera:
             Derivatives by the pixel [m/px].
         by_pose : ndarray, shape (n, 2, 6)
             Derivatives by x, y, z of the robot and by rotations about the map's axes [m/m, m/rad].
-
         """
         rotation = pose.rotation()
         points, by_pixel = self.undistort(pixels)
@@ -292,8 +283,7 @@ class Camera:
         return positions, jacobian_pixel, jacobian_pose
 
     def sees(self, positions: ArrayLike, pose: Pose, radius: float = 0.0) -> NDArray[np.bool_]:
-        """
-        Say which positions the camera sees.
+        """Say which positions the camera sees.
 
         Parameters
         ----------
@@ -307,7 +297,6 @@ class Camera:
         Returns
         -------
         ndarray of bool, shape (n,)
-
         """
         points = np.atleast_2d(np.asarray(positions, dtype=np.float64))
         if points.size == 0:
@@ -324,8 +313,7 @@ class Camera:
         return np.asarray(self.margin(points, pose) >= 0)
 
     def margin(self, positions: ArrayLike, pose: Pose) -> Array:
-        """
-        Return how far inside the image positions (n, 3) are seen, shape (n,) [px].
+        """Return how far inside the image positions (n, 3) are seen, shape (n,) [px].
 
         Negative outside, minus infinity where the camera cannot see at all.
         """

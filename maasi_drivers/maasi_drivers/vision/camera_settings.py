@@ -106,8 +106,7 @@ class SegmentationSettings(Settings):
 
 
 class MountSettings(Settings):
-    """
-    Where the camera sits on the robot (frames as in REP-103: x forward, y left, z up).
+    """Where the camera sits on the robot (frames as in REP-103: x forward, y left, z up).
 
     With ``rpy`` zero the camera looks along the robot's x axis, image top up. A pitch of pi/2 looks
     straight down, the image's top towards the robot's front.
@@ -128,8 +127,7 @@ class MountSettings(Settings):
 
 
 class CameraSettings(Settings):
-    """
-    A camera that sees the floor.
+    """A camera that sees the floor.
 
     The defaults are those of a drone at 1 m: 160 x 120 px, looking down, the image's width across
     the robot. With 260 px of focal length the papers' field of view of +-0.2 m lies in the image,
@@ -207,8 +205,7 @@ class CameraSettings(Settings):
         d: list[float],
         distortion_model: str = 'plumb_bob',
     ) -> CameraSettings:
-        """
-        Return these settings with the intrinsics of a ``sensor_msgs/CameraInfo``.
+        """Return these settings with the intrinsics of a ``sensor_msgs/CameraInfo``.
 
         Parameters
         ----------
@@ -225,7 +222,6 @@ class CameraSettings(Settings):
         ------
         ValueError
             On another distortion model, a skewed or non-finite matrix, or a wrong length.
-
         """
         if distortion_model not in ('plumb_bob', ''):
             raise ValueError(f"distortion_model: got '{distortion_model}', allowed 'plumb_bob'")
@@ -256,14 +252,12 @@ class CameraSettings(Settings):
 
 
 def load_calibration(path: str | Path, settings: CameraSettings) -> CameraSettings:
-    """
-    Return settings with the intrinsics of a calibration file of ROS's ``camera_calibration``.
+    """Return settings with the intrinsics of a calibration file of ROS's ``camera_calibration``.
 
     Raises
     ------
     ValueError
         Where a key is missing or a value is not allowed, with the file's name.
-
     """
     try:
         content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))

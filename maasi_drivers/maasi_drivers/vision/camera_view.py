@@ -16,8 +16,7 @@ def box_view_margin(
     robot_height: float,
     marker_radius: float = 0.0,
 ) -> float:
-    """
-    Return how far inside the image a box field of view lies, markers at its rim included.
+    """Return how far inside the image a box field of view lies, markers at its rim included.
 
     Parameters
     ----------
@@ -40,7 +39,6 @@ def box_view_margin(
     ------
     ValueError
         Where a bound is not finite, or a lower one is not below its upper one.
-
     """
     low = np.asarray(lower, dtype=np.float64)[:2]
     high = np.asarray(upper, dtype=np.float64)[:2]

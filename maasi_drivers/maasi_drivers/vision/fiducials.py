@@ -13,8 +13,7 @@ from maasi_drivers.vision.camera_settings import SegmentationSettings
 
 
 def segment_fiducials(image: NDArray[np.uint8], settings: SegmentationSettings) -> Blobs:
-    """
-    Find ArUco markers; their ids are the identities of the targets.
+    """Find ArUco markers; their ids are the identities of the targets.
 
     The detector finds whole markers only, so none is cut by the border. The centre is where the
     diagonals intersect, which perspective does not shift.
@@ -25,7 +24,6 @@ def segment_fiducials(image: NDArray[np.uint8], settings: SegmentationSettings) 
         R, G, B.
     settings : SegmentationSettings
         ``dictionary`` is used.
-
     """
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     found, ids, _ = _detector(settings.dictionary).detectMarkers(grey)

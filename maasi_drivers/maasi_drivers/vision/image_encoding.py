@@ -41,8 +41,7 @@ def image_to_array(
     step: int,
     data: bytes | bytearray | memoryview | array | NDArray[np.uint8],
 ) -> NDArray[np.uint8]:
-    """
-    Turn the fields of a ``sensor_msgs/Image`` into an RGB array.
+    """Turn the fields of a ``sensor_msgs/Image`` into an RGB array.
 
     Parameters
     ----------
@@ -66,7 +65,6 @@ def image_to_array(
     ValueError
         On a size of zero, an encoding without colour or unknown, an odd size where colours are
         subsampled, a step too short for the width, or data of another length.
-
     """
     for name, value in (('height', height), ('width', width)):
         if not 0 < value <= _MAXIMUM_SIDE:
@@ -104,8 +102,7 @@ def image_to_array(
 def decode_image(
     data: bytes | bytearray | array | NDArray[np.uint8], kind: str
 ) -> NDArray[np.uint8]:
-    """
-    Decode the data of a ``sensor_msgs/CompressedImage``.
+    """Decode the data of a ``sensor_msgs/CompressedImage``.
 
     Parameters
     ----------
@@ -123,7 +120,6 @@ def decode_image(
     ------
     ValueError
         If it is nothing that OpenCV decodes.
-
     """
     flat = np.frombuffer(data, np.uint8)
     image = cv2.imdecode(flat, cv2.IMREAD_COLOR) if flat.size else None

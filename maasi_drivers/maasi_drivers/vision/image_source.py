@@ -24,8 +24,7 @@ class ImageSourceError(ValueError):
 
 @dataclass(frozen=True)
 class VideoFrame:
-    """
-    One image.
+    """One image.
 
     Attributes
     ----------
@@ -35,7 +34,6 @@ class VideoFrame:
         When it was there, monotonic clock [s].
     number : int
         Of the frames of this source, from 1.
-
     """
 
     image: ImageArray
@@ -44,8 +42,7 @@ class VideoFrame:
 
 
 class VideoSource:
-    """
-    Reads a source in a thread of its own, and keeps the newest frame.
+    """Reads a source in a thread of its own, and keeps the newest frame.
 
     A stream or device that breaks off is opened again. A file is played at its own rate, once.
 
@@ -58,7 +55,6 @@ class VideoSource:
     ------
     ImageSourceError
         If it is none of these, or a file that cannot be read.
-
     """
 
     def __init__(self, source: str) -> None:

@@ -23,8 +23,7 @@ _LEAST_CUT = 0.4
 
 @dataclass(frozen=True)
 class MarkerDetections:
-    """
-    Markers seen in one image.
+    """Markers seen in one image.
 
     Attributes
     ----------
@@ -40,7 +39,6 @@ class MarkerDetections:
         Where they are in the image.
     dropped : dict
         Blobs left out: reason to count.
-
     """
 
     values: Array
@@ -55,8 +53,7 @@ class MarkerDetections:
 
 
 class MarkerDetector:
-    """
-    The camera as a sensor of range and bearing (001, section 6.1).
+    """The camera as a sensor of range and bearing (001, section 6.1).
 
     Parameters
     ----------
@@ -66,7 +63,6 @@ class MarkerDetector:
         Of the search: range and bearing, or with elevation.
     floor_height : float
         Of the plane on which the markers lie, in the map frame [m].
-
     """
 
     def __init__(
@@ -91,8 +87,7 @@ class MarkerDetector:
     def detect(
         self, image: NDArray[np.uint8], pose: Pose, pose_covariance: ArrayLike | None = None
     ) -> MarkerDetections:
-        """
-        Find the markers in an image.
+        """Find the markers in an image.
 
         Parameters
         ----------
@@ -111,19 +106,16 @@ class MarkerDetector:
         ------
         ValueError
             If the image has another size than the calibrated one, or the covariance is not finite.
-
         """
         return self.locate(self.segment(image), pose, pose_covariance)
 
     def segment(self, image: NDArray[np.uint8]) -> Blobs:
-        """
-        Return where markers are in an image, by the rule of the settings.
+        """Return where markers are in an image, by the rule of the settings.
 
         Raises
         ------
         ValueError
             If the image has another size than the calibrated one.
-
         """
         self.check_size(image)
         if self._own is not None:
@@ -142,14 +134,12 @@ class MarkerDetector:
     def locate(
         self, blobs: Blobs, pose: Pose, pose_covariance: ArrayLike | None = None
     ) -> MarkerDetections:
-        """
-        Find the markers that blobs in an image are; pose and covariance as in `detect`.
+        """Find the markers that blobs in an image are; pose and covariance as in `detect`.
 
         Raises
         ------
         ValueError
             If the covariance is not finite.
-
         """
         camera, settings = self.camera, self.settings
         if pose_covariance is None:

@@ -19,8 +19,7 @@ def read_markers(
     detector: MarkerDetector,
     sensor: Sensor,
 ) -> SensorReading:
-    """
-    Return the markers in a decoded image: segmentation, projection, field of view.
+    """Return the markers in a decoded image: segmentation, projection, field of view.
 
     Driver and in-process search call this same function.
 
@@ -39,7 +38,6 @@ def read_markers(
     ------
     ValueError
         If the image has another size than the calibrated one.
-
     """
     if not isinstance(picture, Blobs):
         picture = detector.segment(picture)

@@ -56,8 +56,7 @@ class FeedState(IntEnum):
 
 @dataclass(frozen=True)
 class FeedPose:
-    """
-    The robot's own estimate of its pose when the image was taken.
+    """The robot's own estimate of its pose when the image was taken.
 
     Attributes
     ----------
@@ -69,7 +68,6 @@ class FeedPose:
         Charge, 0 to 1; negative: not known.
     state : FeedState
         What it does.
-
     """
 
     position: np.ndarray
@@ -82,8 +80,7 @@ class FeedPose:
 
 @dataclass(frozen=True)
 class FeedPacket:
-    """
-    What was seen in one image.
+    """What was seen in one image.
 
     Attributes
     ----------
@@ -97,7 +94,6 @@ class FeedPacket:
         In that image.
     pose : FeedPose, optional
         Of the robot then; none: it does not send it.
-
     """
 
     sequence: int
@@ -109,14 +105,12 @@ class FeedPacket:
 
 
 def encode(packet: FeedPacket) -> bytes:
-    """
-    Return a packet as a datagram.
+    """Return a packet as a datagram.
 
     Raises
     ------
     FeedError
         If it holds too many blobs, or numbers that are not allowed.
-
     """
     blobs = packet.blobs
     if len(blobs) > MOST:
@@ -153,14 +147,12 @@ def encode(packet: FeedPacket) -> bytes:
 
 
 def decode(data: bytes) -> FeedPacket:
-    """
-    Return the packet of a datagram.
+    """Return the packet of a datagram.
 
     Raises
     ------
     FeedError
         If it is none, or damaged, or of another version, or holds what cannot be.
-
     """
     least = _HEADER.size + _CHECKSUM.size
     if len(data) < least:
@@ -251,8 +243,7 @@ class ReceivedPacket:
 
 @dataclass(frozen=True)
 class FeedPeer:
-    """
-    The robot that sends a feed.
+    """The robot that sends a feed.
 
     Attributes
     ----------
@@ -260,7 +251,6 @@ class FeedPeer:
         Of the only sender that is used.
     on_pose : callable
         Takes stamp [ns] and pose of each of its images.
-
     """
 
     address: str
@@ -268,8 +258,7 @@ class FeedPeer:
 
 
 class FeedReceiver:
-    """
-    Receives a feed; poll it often.
+    """Receives a feed; poll it often.
 
     Parameters
     ----------
@@ -291,7 +280,6 @@ class FeedReceiver:
     ------
     OSError
         If the port is taken.
-
     """
 
     def __init__(self, port: int, address: str = '127.0.0.1', sender: str | None = None) -> None:

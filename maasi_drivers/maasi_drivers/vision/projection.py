@@ -21,8 +21,7 @@ def propagate(
     by_pose: Array,
     pose_covariance: ArrayLike | None = None,
 ) -> Array:
-    """
-    Return the covariances (n, 2, 2) of floor positions, from those of pixels and pose [m^2].
+    """Return the covariances (n, 2, 2) of floor positions, from those of pixels and pose [m^2].
 
     Parameters
     ----------
@@ -37,7 +36,6 @@ def propagate(
     ------
     ValueError
         If the pose's covariance has another shape or is not finite.
-
     """
     pixel = np.asarray(pixel_covariances, dtype=np.float64)
     covariances = by_pixel @ pixel @ by_pixel.transpose(0, 2, 1)
@@ -84,7 +82,6 @@ def range_bearing(
     covariances : ndarray, shape (n, dimension, dimension)
         To first order. Right over a target the bearing says nothing: its variance is bounded by
         that of a uniform angle.
-
     """
     if dimension not in (2, 3):
         raise ValueError(f'dimension: got {dimension}, allowed 2 or 3')

@@ -1,5 +1,4 @@
-"""
-Blue markers in an image: the papers' rule, and one that adapts to the light.
+"""Blue markers in an image: the papers' rule, and one that adapts to the light.
 
 All rules take an RGB image and return `Blobs`; `segment` chooses by name.
 """
@@ -30,14 +29,12 @@ _DARK = 6.0
 
 
 def check_image(image: NDArray[np.generic]) -> Image:
-    """
-    Return an image fit for segmentation.
+    """Return an image fit for segmentation.
 
     Raises
     ------
     ValueError
         Unless it is an (h, w, 3) array of bytes with h, w of at least 1.
-
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise ValueError(
@@ -61,8 +58,7 @@ def _paper_mask(red, green, blue, limit, mask):
 
 
 def paper_mask(image: Image, threshold: float = 35.0) -> NDArray[np.uint8]:
-    """
-    Return 1 where B - R/2 - G/2 > threshold, else 0 (001, eq. (16)).
+    """Return 1 where B - R/2 - G/2 > threshold, else 0 (001, eq. (16)).
 
     Computed in whole numbers of half grey levels, so nothing is rounded or clipped.
     """
@@ -111,8 +107,7 @@ def _fill(marked, labels, members, starts, boxes):
 
 
 class _Components(NamedTuple):
-    """
-    The 8-connected components of a mask (h, w), in the order of rows.
+    """The 8-connected components of a mask (h, w), in the order of rows.
 
     Attributes
     ----------
@@ -124,7 +119,6 @@ class _Components(NamedTuple):
         Where each component's members start.
     boxes : ndarray, shape (n, 4)
         Left, top, width, height.
-
     """
 
     labels: NDArray[np.int32]
@@ -134,8 +128,7 @@ class _Components(NamedTuple):
 
 
 def _components(mask: NDArray[np.uint8]) -> _Components:
-    """
-    Return the components of a mask.
+    """Return the components of a mask.
 
     Markers are few pixels of an image: filling each from its first pixel beats the passes over the
     whole image that a general algorithm takes.
@@ -165,7 +158,6 @@ def segment_paper(image: Image, settings: SegmentationSettings) -> Blobs:
         R, G, B.
     settings : SegmentationSettings
         ``threshold`` and ``minimum_area`` are used.
-
     """
     mask = paper_mask(image, settings.threshold)
     _, members, starts, boxes = _components(mask)
@@ -269,8 +261,7 @@ def _excess(image, row, column, gains):
 
 @njit(cache=True)
 def _shape_of(image, components, blob, gains, values):
-    """
-    Fill `values` with the excess of each pixel; return mean, axes and peak blueness of the mask.
+    """Fill `values` with the excess of each pixel; return mean, axes and peak blueness of the mask.
 
     The lengths of the axes go as the roots of `long` and `short`, the principal second moments.
     """
@@ -325,8 +316,7 @@ def _surroundings(image, components, blob, gains):
 
 @njit(cache=True)
 def _weigh(image, components, blob, gains, background, contrast, mean):
-    """
-    Return sums over the blob and the ring of one pixel around it, other blobs left out.
+    """Return sums over the blob and the ring of one pixel around it, other blobs left out.
 
     Returns the sum of the weights, their moments about the box's corner, and the pixels' second
     moments about `mean`.
@@ -357,8 +347,7 @@ def _weigh(image, components, blob, gains, background, contrast, mean):
 
 
 class _Measures(NamedTuple):
-    """
-    Of each blob.
+    """Of each blob.
 
     Attributes
     ----------
@@ -368,7 +357,6 @@ class _Measures(NamedTuple):
         Weighted by the part of each pixel that is marker.
     variances : ndarray, shape (n, 2)
         Of the centroids, from the noise of the surroundings.
-
     """
 
     keep: NDArray[np.bool_]
@@ -410,8 +398,7 @@ def _measure_blobs(image, components, gains, gates, measures):
 
 
 def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
-    """
-    Find compact blobs that are bluer than the floor, whatever the light.
+    """Find compact blobs that are bluer than the floor, whatever the light.
 
     White balance from the median of the image (the floor); blueness (B - max(R, G)) over the mean
     of the channels, which neither gradients nor exposure change, and which tells purple and pale
@@ -426,7 +413,6 @@ def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
         R, G, B.
     settings : SegmentationSettings
         All but ``threshold`` and ``minimum_area`` are used.
-
     """
     image = check_image(image)
     gains, centre, deviation = _floor_statistics(image, _FLOOR_SAMPLES)
@@ -467,8 +453,7 @@ RULES: dict[str, Callable[[Image, SegmentationSettings], Blobs]] = {
 
 
 def segment(image: Image, settings: SegmentationSettings) -> Blobs:
-    """
-    Find marker blobs by the rule that the settings name.
+    """Find marker blobs by the rule that the settings name.
 
     Parameters
     ----------
@@ -481,6 +466,5 @@ def segment(image: Image, settings: SegmentationSettings) -> Blobs:
     ------
     ValueError
         If the image has another shape or type.
-
     """
     return RULES[settings.rule](image, settings)

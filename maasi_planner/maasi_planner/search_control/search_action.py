@@ -40,8 +40,7 @@ class Progress:
 
 
 class SearchAction:
-    """
-    Server of `search`.
+    """Server of `search`.
 
     A goal starts a search, or takes over a running one. A newer goal preempts an older one, which
     is aborted, while the robots continue, so that a dead client does not block the next one.
@@ -56,7 +55,6 @@ class SearchAction:
         Called when a search begins, and when the robots must stop.
     on_refusal : callable
         Called with the kind of a refusal, and its reason.
-
     """
 
     def __init__(

@@ -29,14 +29,12 @@ _ALLOWED: dict[str, tuple[frozenset[Mode] | None, Mode]] = {
 
 
 class SearchModes:
-    """
-    Mode of each robot, and its transitions by commands.
+    """Mode of each robot, and its transitions by commands.
 
     Parameters
     ----------
     names : iterable of str
         Robots.
-
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -53,8 +51,7 @@ class SearchModes:
         return any(mode in (Mode.SEARCHING, Mode.PAUSED, Mode.HOME) for mode in self.of.values())
 
     def command(self, word: str, names: Collection[str] | None = None) -> list[str]:
-        """
-        Apply a command to robots.
+        """Apply a command to robots.
 
         Parameters
         ----------
@@ -68,7 +65,6 @@ class SearchModes:
         list of str
             Robots that follow it, in order. The others keep their mode: a robot that was never
             started cannot be paused or resumed.
-
         """
         allowed, mode = _ALLOWED[word]
         follow = [

@@ -69,8 +69,7 @@ class _Sent:
 
 
 class TeamGoals:
-    """
-    Clients of the action `go_to` of all robots of a team.
+    """Clients of the action `go_to` of all robots of a team.
 
     In lockstep only states are used: they belong to a step, while results arrive at any time.
 
@@ -84,7 +83,6 @@ class TeamGoals:
         Whether results are ignored.
     on_answer : callable
         Called with robot and number of an answered goal, and whether it was accepted.
-
     """
 
     def __init__(

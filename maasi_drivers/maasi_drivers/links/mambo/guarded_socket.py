@@ -48,8 +48,7 @@ def frame_problem(data: bytes) -> str:
 
 
 class DroneSocket:
-    """
-    Receives datagrams of one drone alone.
+    """Receives datagrams of one drone alone.
 
     Parameters
     ----------

@@ -54,8 +54,7 @@ class MamboLinkError(RuntimeError):
 
 @dataclass(frozen=True)
 class PositionEvent:
-    """
-    The drone's own estimate of its position.
+    """The drone's own estimate of its position.
 
     Attributes
     ----------
@@ -65,7 +64,6 @@ class PositionEvent:
         From the heading at take-off, anticlockwise [rad].
     received : float
         Monotonic clock [s].
-
     """
 
     position: FloatArray
@@ -74,8 +72,7 @@ class PositionEvent:
 
 
 class MamboLink:
-    """
-    A connection to one Mambo.
+    """A connection to one Mambo.
 
     All calls return at once; a thread of its own talks to pyparrot, which sleeps in its commands. A
     piloting command is sent once. That thread is a dead man's switch too: once the caller has not
@@ -96,7 +93,6 @@ class MamboLink:
         Of 100 per cent climb [m/s]; the drone takes 0.5 to 2.
     land_after : float
         Time without its caller after which the drone is commanded to land, from when it hovers [s].
-
     """
 
     def __init__(
@@ -145,14 +141,12 @@ class MamboLink:
     # ---- what the caller asks for ------------------------------------------------------------
 
     def connect(self) -> None:
-        """
-        Begin to connect.
+        """Begin to connect.
 
         Raises
         ------
         MamboLinkError
             If it is clear at once that this cannot work.
-
         """
         make = self._make_drone()
         # pyparrot's own thread inherits that this one does not keep the process alive.
@@ -191,14 +185,12 @@ class MamboLink:
         self._want('land')
 
     def steer(self, forward: float, left: float, up: float, turn: float) -> None:
-        """
-        Send one piloting command, each as a share of the largest, -1 to 1; turn anticlockwise.
+        """Send one piloting command, each as a share of the largest, -1 to 1; turn anticlockwise.
 
         Raises
         ------
         ValueError
             If a number is not finite.
-
         """
         values = (-left, forward, -turn, up)
         if not all(math.isfinite(value) for value in values):
@@ -234,14 +226,12 @@ class MamboLink:
         self._wake.set()
 
     def check(self) -> Any:
-        """
-        Return pyparrot's module for such drones, if it can be used here.
+        """Return pyparrot's module for such drones, if it can be used here.
 
         Raises
         ------
         MamboLinkError
             If it cannot, with what can be done.
-
         """
         try:
             # Only a driver that has such a robot needs it.

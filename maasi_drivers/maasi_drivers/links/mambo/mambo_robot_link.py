@@ -37,8 +37,7 @@ _RISING = (Phase.TAKING_OFF, Phase.CLIMBING)
 
 
 class MamboRobotLink(RobotLink):
-    """
-    A Parrot Mambo that pyparrot talks to.
+    """A Parrot Mambo that pyparrot talks to.
 
     It takes off when the service `arm` was called and `mambo.arm` is true, flies by its own
     position events or by a topic of another system (`mambo.pose`), and lands at the end, on a low

@@ -30,8 +30,7 @@ _FLIGHT = 'flight'
 
 
 class OnboardLink(RobotLink):
-    """
-    A drone with a program of its own; see docs/measurement_feed.md.
+    """A drone with a program of its own; see docs/measurement_feed.md.
 
     The feed carries blobs and pose, orders go back ten times a second: be on the ground, hover, or
     fly to a waypoint.

@@ -85,8 +85,7 @@ class Phase(Enum):
 
 
 class MamboPilot:
-    """
-    Flies a Mambo from take-off to landing, and lands it on a fault.
+    """Flies a Mambo from take-off to landing, and lands it on a fault.
 
     Parameters
     ----------
@@ -107,7 +106,6 @@ class MamboPilot:
         Of the flight.
     problem : str
         Why it takes no goals now; empty where it does.
-
     """
 
     def __init__(
@@ -189,8 +187,7 @@ class MamboPilot:
     # ---- what it is to do --------------------------------------------------------------------
 
     def fly(self, command: FloatArray) -> None:
-        """
-        Fly a velocity command, once; without another one the drone hovers.
+        """Fly a velocity command, once; without another one the drone hovers.
 
         Parameters
         ----------
@@ -201,7 +198,6 @@ class MamboPilot:
         ------
         ValueError
             If a number is not finite; then it hovers.
-
         """
         if not np.isfinite(command).all():
             self.hover()

@@ -33,8 +33,7 @@ _STILL = np.zeros(4)
 
 
 class DeadReckoning:
-    """
-    Where the drone is between its position events.
+    """Where the drone is between its position events.
 
     Parameters
     ----------
@@ -49,7 +48,6 @@ class DeadReckoning:
     ----------
     course : Course
         Where it is now.
-
     """
 
     def __init__(self, model: TiltModel, origin: Pose, settings: MamboSettings) -> None:

@@ -40,8 +40,7 @@ class MeasurementError(RuntimeError):
 
 @dataclass(frozen=True)
 class MeasuredSpeed:
-    """
-    Result of a measuring flight.
+    """Result of a measuring flight.
 
     Attributes
     ----------
@@ -53,7 +52,6 @@ class MeasuredSpeed:
         Standard deviation of `full_speed`, as a share of it [1].
     misfit : float
         Root mean square of what the fit leaves [m].
-
     """
 
     full_speed: float
@@ -64,8 +62,7 @@ class MeasuredSpeed:
 
 @dataclass
 class Leg:
-    """
-    One leg: from rest, one way and back.
+    """One leg: from rest, one way and back.
 
     Attributes
     ----------
@@ -77,7 +74,6 @@ class Leg:
         Time of the command since `begin` [s], share of the largest tilt forward [1].
     events : list of (float, float)
         Time since `begin` [s], place forward of the take-off point [m].
-
     """
 
     begin: float
@@ -94,8 +90,7 @@ class MeasuringLink(Link, Protocol):
 
 
 class MeasuringFlight:
-    """
-    Flies the legs.
+    """Flies the legs.
 
     Parameters
     ----------
@@ -112,7 +107,6 @@ class MeasuringFlight:
     ----------
     legs : list of Leg
         Those flown.
-
     """
 
     def __init__(
@@ -128,14 +122,12 @@ class MeasuringFlight:
         self._event: PositionEvent | None = None
 
     def steps(self) -> Iterator[str]:
-        """
-        Take off and fly; yield, every control period, what it does. Landing is the caller's.
+        """Take off and fly; yield, every control period, what it does. Landing is the caller's.
 
         Raises
         ------
         MeasurementError
             If something speaks against going on.
-
         """
         link = self.link
         yield from self._await('connecting', lambda: link.connected)
@@ -211,8 +203,7 @@ class MeasuringFlight:
 
 
 def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
-    """
-    Return speed and delay that explain the legs best, by least squares.
+    """Return speed and delay that explain the legs best, by least squares.
 
     Parameters
     ----------
@@ -225,7 +216,6 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
     ------
     MeasurementError
         If the events are too few, or do not fit, or leave the speed open.
-
     """
     from scipy.optimize import least_squares
 

@@ -23,8 +23,7 @@ _HOVER_RATE = 2.0
 
 @dataclass(frozen=True)
 class Course:
-    """
-    Where a drone is and how it moves.
+    """Where a drone is and how it moves.
 
     Attributes
     ----------
@@ -32,7 +31,6 @@ class Course:
         In the map [m], [m/s].
     yaw : float
         From the map's x axis [rad].
-
     """
 
     position: FloatArray
@@ -42,8 +40,7 @@ class Course:
 
 @dataclass(frozen=True)
 class TiltModel:
-    """
-    What a Mambo does with piloting commands.
+    """What a Mambo does with piloting commands.
 
     Attributes
     ----------
@@ -53,7 +50,6 @@ class TiltModel:
         Steady speed under it [m/s].
     climb, turn : float
         Of 100 per cent [m/s], [rad/s].
-
     """
 
     tilt: float

@@ -42,8 +42,7 @@ class ModeChange:
 
 
 class Autopilot:
-    """
-    One autopilot, as its messages describe it.
+    """One autopilot, as its messages describe it.
 
     Parameters
     ----------
@@ -74,7 +73,6 @@ class Autopilot:
         Position, battery and fix.
     commands : CommandQueue
         Requests that are not answered yet.
-
     """
 
     def __init__(
@@ -111,8 +109,7 @@ class Autopilot:
     # ---- what comes in -----------------------------------------------------------------------
 
     def handle(self, message: Any, now: float) -> ModeChange | None:
-        """
-        Take a message; return what a heartbeat says.
+        """Take a message; return what a heartbeat says.
 
         Of other systems only heartbeats with the driver's own id count.
         """
@@ -233,8 +230,7 @@ class Autopilot:
         parameters: tuple[float, ...],
         on_accepted: Callable[[], None] | None = None,
     ) -> None:
-        """
-        Send a command until it is answered; report a refusal.
+        """Send a command until it is answered; report a refusal.
 
         Parameters
         ----------
@@ -244,7 +240,6 @@ class Autopilot:
             The first of seven; the others are zero.
         on_accepted : callable, optional
             Called when the autopilot accepts it.
-
         """
 
         def answer(result: int | None) -> None:

@@ -9,8 +9,7 @@ _REACHED, _PROGRESS = 0.2, 0.1
 
 
 class Climb:
-    """
-    Tells whether a climb, or a dive, is over or stalled.
+    """Tells whether a climb, or a dive, is over or stalled.
 
     Parameters
     ----------
@@ -21,7 +20,6 @@ class Climb:
     ----------
     accepted : bool
         Whether the autopilot has accepted the take-off: it refuses another one.
-
     """
 
     def __init__(self, timeout: float) -> None:

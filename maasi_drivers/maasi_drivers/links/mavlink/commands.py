@@ -24,8 +24,7 @@ class _Command:
 
 
 class CommandQueue:
-    """
-    COMMAND_LONG, in the order of the requests.
+    """COMMAND_LONG, in the order of the requests.
 
     Parameters
     ----------
@@ -33,7 +32,6 @@ class CommandQueue:
         System id of the vehicle.
     sender : MAVLink
         Packs messages and writes them to the wire.
-
     """
 
     def __init__(self, system: int, sender: Any) -> None:
@@ -51,8 +49,7 @@ class CommandQueue:
         parameters: tuple[float, ...],
         answer: Callable[[int | None], None],
     ) -> None:
-        """
-        Add a command.
+        """Add a command.
 
         Parameters
         ----------
@@ -62,7 +59,6 @@ class CommandQueue:
             The first of seven; the others are zero.
         answer : callable
             Takes the MAV_RESULT, None if it was never answered.
-
         """
         self._commands.append(_Command(number, parameters, answer))
 

@@ -27,8 +27,7 @@ _EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
 
 @dataclass(frozen=True)
 class Telemetry:
-    """
-    Pose of a vehicle, in the local frame of its autopilot turned to ENU.
+    """Pose of a vehicle, in the local frame of its autopilot turned to ENU.
 
     Attributes
     ----------
@@ -42,7 +41,6 @@ class Telemetry:
         Of FLU in ENU, w first.
     rates : ndarray, shape (3,)
         Angular velocity in FLU [rad/s].
-
     """
 
     number: int
@@ -54,8 +52,7 @@ class Telemetry:
 
 
 class Estimate:
-    """
-    The newest data of an autopilot.
+    """The newest data of an autopilot.
 
     Parameters
     ----------
@@ -78,7 +75,6 @@ class Estimate:
         Messages on batteries so far.
     dropped : Counter
         Messages that could not be used.
-
     """
 
     def __init__(self, settings: MavlinkSettings, on_restart: Callable[[], None]) -> None:

@@ -19,8 +19,7 @@ _WARNING, _INFO = 4, 6
 
 
 class FailsafeCheck:
-    """
-    Whether a vehicle stops by itself when the driver is gone.
+    """Whether a vehicle stops by itself when the driver is gone.
 
     ArduPilot's ground station failsafe checks the system id of heartbeats alone
     (`GCS::sysid_is_gcs`): any program with the driver's id keeps it from acting.

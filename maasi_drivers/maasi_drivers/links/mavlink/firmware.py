@@ -14,8 +14,7 @@ COPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
 
 @dataclass(frozen=True)
 class Failsafe:
-    """
-    A parameter of an autopilot that defines its reaction to a fault.
+    """A parameter of an autopilot that defines its reaction to a fault.
 
     Attributes
     ----------
@@ -25,7 +24,6 @@ class Failsafe:
         Values with which it does nothing that helps.
     guards_link : bool
         Whether it acts on the loss of the driver's heartbeats.
-
     """
 
     meaning: str
@@ -35,8 +33,7 @@ class Failsafe:
 
 @dataclass(frozen=True)
 class Firmware:
-    """
-    An autopilot's firmware.
+    """An autopilot's firmware.
 
     Attributes
     ----------
@@ -64,7 +61,6 @@ class Firmware:
         Parameters, one of which holds the system id of the ground station it listens to.
     ground_station_high : str
         Parameter with the highest of these ids, where newer versions have a range.
-
     """
 
     name: str
@@ -202,14 +198,12 @@ FIRMWARES = (ARDUCOPTER, ARDUSUB, PX4_COPTER)
 
 
 def identify(autopilot: int, vehicle_type: int) -> Firmware:
-    """
-    Return the firmware that a heartbeat tells of.
+    """Return the firmware that a heartbeat tells of.
 
     Raises
     ------
     ValueError
         If it is none that this driver knows.
-
     """
     kind = 'submarine' if vehicle_type == SUBMARINE else 'copter' if vehicle_type in COPTERS else ''
     for firmware in FIRMWARES:

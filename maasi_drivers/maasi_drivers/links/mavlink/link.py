@@ -23,14 +23,12 @@ class LinkError(RuntimeError):
 
 
 def open_connection(url: str, system: int, component: int, baud: int = 57600) -> Any:
-    """
-    Return pymavlink's connection, which speaks MAVLink 2.
+    """Return pymavlink's connection, which speaks MAVLink 2.
 
     Raises
     ------
     LinkError
         If it cannot be opened; the text has the cause.
-
     """
     if mavlink.WIRE_PROTOCOL_VERSION != '2.0':
         raise LinkError(
@@ -51,8 +49,7 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
 
 
 class VehicleLink:
-    """
-    A vehicle on a wire.
+    """A vehicle on a wire.
 
     A wire that cannot be opened is retried; `failure` has the cause meanwhile.
 
@@ -67,7 +64,6 @@ class VehicleLink:
     ----------
     failure : str
         What is wrong with the wire; empty where it works.
-
     """
 
     def __init__(self, settings: MavlinkSettings, height: float) -> None:
@@ -92,8 +88,7 @@ class VehicleLink:
             yield self._vehicle
 
     def finish(self, ending: Ending, patience: float) -> bool:
-        """
-        Have it hold or land; return whether it confirms within `patience` seconds.
+        """Have it hold or land; return whether it confirms within `patience` seconds.
 
         Where nothing flies there is nothing to wait for.
         """

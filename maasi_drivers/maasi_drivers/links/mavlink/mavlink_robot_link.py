@@ -37,8 +37,7 @@ _ERROR, _WARNING, _INFO = 3, 4, 6
 
 
 class MavlinkRobotLink(RobotLink):
-    """
-    A vehicle with an autopilot, which flies to set-points.
+    """A vehicle with an autopilot, which flies to set-points.
 
     Services
     --------

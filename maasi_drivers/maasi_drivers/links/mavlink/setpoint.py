@@ -17,8 +17,7 @@ _POSITION_AND_YAW, _NO_YAW = 0x9F8, 0x400
 
 
 class Setpoint:
-    """
-    Where an autopilot is to hold its vehicle.
+    """Where an autopilot is to hold its vehicle.
 
     Parameters
     ----------
@@ -33,7 +32,6 @@ class Setpoint:
         In the local frame of the autopilot, ENU [m].
     yaw : float or None
         From east [rad]; None: as it is.
-
     """
 
     def __init__(self, settings: MavlinkSettings, sender: Any) -> None:
@@ -70,14 +68,12 @@ class Setpoint:
 
 
 def checked_target(position: ArrayLike, yaw: float) -> NDArray[np.float64]:
-    """
-    Return a position (3,) [m].
+    """Return a position (3,) [m].
 
     Raises
     ------
     ValueError
         If a number is not finite: autopilots have crashed over that.
-
     """
     target = np.array(position, dtype=float)
     if target.shape != (3,) or not np.isfinite([*target, yaw]).all():

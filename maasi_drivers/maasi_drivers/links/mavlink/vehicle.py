@@ -32,8 +32,7 @@ _STREAM_AHEAD = 1.2
 
 
 class Vehicle:
-    """
-    One vehicle, from the first heartbeat to the end.
+    """One vehicle, from the first heartbeat to the end.
 
     Parameters
     ----------
@@ -50,7 +49,6 @@ class Vehicle:
         How far it is.
     active : bool
         Whether the driver is; while it is not, nothing is armed.
-
     """
 
     def __init__(self, settings: MavlinkSettings, height: float, sender: Any) -> None:
@@ -160,8 +158,7 @@ class Vehicle:
     # ---- what the driver wants ---------------------------------------------------------------
 
     def set_target(self, position: ArrayLike, yaw: float) -> None:
-        """
-        Have it go to a position and stay there.
+        """Have it go to a position and stay there.
 
         Parameters
         ----------
@@ -174,7 +171,6 @@ class Vehicle:
         ------
         ValueError
             If a number is not finite.
-
         """
         target = checked_target(position, yaw)
         if self.phase is Phase.FLYING:
@@ -188,7 +184,6 @@ class Vehicle:
         ----------
         now : float
             On the steady clock [s].
-
         """
         problem = self._objection(now)
         if problem:
