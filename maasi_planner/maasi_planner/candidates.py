@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from maasi_filter.models.detection import detection_probability_at
 from maasi_filter.models.pose import Pose
@@ -223,7 +224,6 @@ def unseen_parts(
     box = np.stack([box[:, 0] + margin, box[:, 1] - margin], axis=1)
     size = float((box[:, 1] - box[:, 0]).max())
     grid = UnexploredMap(box, size / (cells if len(box) == 2 else min(cells, 40)))
-    nodes = grid.nodes()
     values, lower, step = grid.kernel()
     seen = np.zeros(values.shape, dtype=np.bool_)
     members = list(viewers.values()) if isinstance(viewers, Mapping) else list(viewers)
@@ -232,7 +232,7 @@ def unseen_parts(
         kernel = viewer.sensor.detection.kernel()
         reach = reach_of(*kernel)
         _mark_seen(seen, (lower, step), places, yaws, grid.dimension, kernel, reach, probability)
-    return _parts(grid, seen, nodes)
+    return _parts(grid, seen)
 
 
 @njit(cache=True)
@@ -324,36 +324,19 @@ def _turns(viewer: Viewer, size: float) -> bool:
     )
 
 
-def _parts(grid: UnexploredMap, seen: NDArray[np.bool_], nodes: FloatArray) -> Unseen:
+def _parts(grid: UnexploredMap, seen: NDArray[np.bool_]) -> Unseen:
     """Return the connected parts of nodes not seen."""
     hidden = ~seen.reshape(grid.values.shape)
     volumes = grid.cell_volumes()
     fraction = float(volumes[hidden].sum() / volumes.sum())
-    labels = np.zeros(hidden.shape, dtype=int)
-    boxes: list[tuple[int, FloatArray]] = []
+    labels, number = ndimage.label(hidden)
+    sizes = np.bincount(labels.ravel(), minlength=number + 1)[1:]
+    axes = grid.axes()
     half = 0.5 * grid.step
-    for first in zip(*np.nonzero(hidden)):
-        if labels[first]:
-            continue
-        number = len(boxes) + 1
-        labels[first] = number
-        pending = [first]
-        members = []
-        while pending:
-            node = pending.pop()
-            members.append(node)
-            for axis in range(grid.dimension):
-                for change in (-1, 1):
-                    other = list(node)
-                    other[axis] += change
-                    key = tuple(other)
-                    if 0 <= key[axis] < hidden.shape[axis] and hidden[key] and not labels[key]:
-                        labels[key] = number
-                        pending.append(key)
-        flat = np.ravel_multi_index(tuple(np.array(members).T), hidden.shape)
-        inside = nodes[flat]
-        low = np.maximum(inside.min(axis=0) - half, grid.bounds[:, 0])
-        high = np.minimum(inside.max(axis=0) + half, grid.bounds[:, 1])
-        boxes.append((len(members), np.stack([low, high], axis=1)))
-    boxes.sort(key=lambda item: -item[0])
-    return Unseen(fraction, [box for _, box in boxes])
+    boxes = []
+    for region in ndimage.find_objects(labels):
+        ends = [[axis[part][0], axis[part][-1]] for axis, part in zip(axes, region)]
+        low, high = np.array(ends).T
+        low = np.maximum(low - half, grid.bounds[:, 0])
+        boxes.append(np.stack([low, np.minimum(high + half, grid.bounds[:, 1])], axis=1))
+    return Unseen(fraction, [boxes[i] for i in np.argsort(-sizes, kind='stable')])

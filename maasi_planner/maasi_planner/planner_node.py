@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from functools import partial
 from typing import Any
 
@@ -18,16 +17,13 @@ from maasi_filter.ros.conversions import (
     stamp_to_ros,
 )
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, run
-from maasi_filter.ros.qos import RELIABLE, UPDATES
+from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.silence import Silence
 from maasi_filter.ros.stamps import StampGate
 from maasi_msgs.action import SearchTargets
 from maasi_msgs.msg import (
     AgentState,
-    BatchMember,
-    FilterUpdate,
     LockstepStep,
-    MeasurementBatch,
     PlanDecision,
 )
 from maasi_planner import warm_up
@@ -37,7 +33,8 @@ from maasi_planner.conversions import (
 )
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.found_keeper import FoundKeeper
-from maasi_planner.node.checks import checked_state, checked_update
+from maasi_planner.node.batches import Batches
+from maasi_planner.node.checks import checked_state
 from maasi_planner.node.filter_guard import FilterGuard
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
@@ -55,8 +52,6 @@ _LOOK_PERIOD = 0.1
 _LAST_TASKS = 5
 # Period of republishing a batch without an update [s].
 _ANSWER_PATIENCE = 1.0
-# Measurements that are remembered, to recognise duplicate updates.
-_MEASUREMENTS_KEPT = 1000
 
 
 class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
@@ -103,6 +98,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._orders = Orders(self, self.coordinator, self.modes)
         self._others = OtherPlanners(self, self.coordinator.names, self._on_destination)
         self._guard = FilterGuard(self)
+        self._batches = Batches(self, self._guard, self._try_done)
         self._views = PlannerViews(self)
         self._begin_anew()
 
@@ -110,19 +106,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._heard: dict[str, HeardState] = {}
         self._gates: dict[str, StampGate] = {}
         self._away: set[str] = set(self.coordinator.names)
-        # Robot and index of the last measurements whose update was processed.
-        self._processed: deque[tuple[str, int]] = deque(maxlen=_MEASUREMENTS_KEPT)
         self._taken_step = -1
         self._expected: LockstepStep | None = None
-        self._waiting_batch = 0
-        self._batch_message = MeasurementBatch()
-        self._batch_at = time.monotonic()
-        self._batch = 0
-        self._batch_before = 0
-        self._used_batch = 0
-        self._found = 0
-        self._expected_number = 0.0
-        self._measurements = 0
+        self._batches.reset(self.coordinator)
         self._decisions = 0
         # Free running: why the robots are held; empty if they are not.
         self._held = ''
@@ -136,10 +122,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         names = self.coordinator.names
         # Before the publisher of batches: a filter with batches must discover the kept targets.
         self._keeper = FoundKeeper(self)
-        self._batch_publisher = self.create_publisher(
-            MeasurementBatch, 'measurement_batch', RELIABLE
-        )
-        self.expect_subscribers(self._batch_publisher, 1 + len(names))
+        self._batches.set_up()
         self._decision_publisher = self.create_publisher(PlanDecision, 'decisions', RELIABLE)
         self._views.set_up()
         self._path_publishers = {}
@@ -154,7 +137,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 RELIABLE,
             )
         self._others.set_up()
-        self.create_subscription(FilterUpdate, 'filter_update', self._on_update, UPDATES)
         self._guard.set_up()
         self._goals = self._orders.set_up(names, self._try_done)
         self._action = SearchAction(
@@ -246,7 +228,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             ),
             'robots': ', '.join(name for name in self.coordinator.names if name not in self._away),
             'decisions': self._decisions,
-            'batches': self._batch,
+            'batches': self._batches.last,
             'explored': f'{self.coordinator.exploration.explored_fraction():.3f}',
             'last planning [ms]': f'{1e3 * self._planning_time:.2f}',
         }
@@ -274,14 +256,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._expected = message
         self._try_step()
 
-    def _ask_again(self) -> None:
-        """Republish the pending batch; receivers ignore duplicates."""
-        if self._waiting_batch:
-            self._batch_at = time.monotonic()
-            self._batch_publisher.publish(self._batch_message)
-
     def _repeat_step(self) -> None:
-        self._ask_again()
+        self._batches.publish_again()
         # If such a robot does answer later, it gets a new goal.
         for name, _ in sorted(self._goals.waiting):
             self._orders.refuse(name)
@@ -333,38 +309,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         if self.settings.lockstep:
             self._try_step()
 
-    def _on_update(self, message: FilterUpdate) -> None:
-        if not self.active:
-            return
-        try:
-            clusters, poses = checked_update(
-                message, self.coordinator.names, self.settings, self._batch
-            )
-        except ValueError as error:
-            self.drop('bad update', f'filter_update.{error}')
-            return
-        if int(message.batch_id) > self._batch:
-            self._batch = self._batch_before = int(message.batch_id)
-        if int(message.batch_id) <= self._batch_before:
-            # An update of an earlier planner process: continue after its indices.
-            for member in message.members:
-                self.coordinator.skip_measurements(member.robot, int(member.measurement) + 1)
-            return
-        self._guard.watch.answered(int(message.batch_id))
-        measured = [(member.robot, int(member.measurement)) for member in message.members]
-        if measured and all(item in self._processed for item in measured):
-            # Duplicate, from a restarted filter.
-            return
-        self._processed.extend(measured)
-        self.coordinator.absorb(poses, clusters)
-        self._used_batch = max(self._used_batch, int(message.batch_id))
-        self._found = int(message.found)
-        self._expected_number = float(message.expected_number)
-        self._measurements += len(message.members)
-        if int(message.batch_id) == self._waiting_batch:
-            self._waiting_batch = 0
-            self._try_done()
-
     # ---- availability of robots and filter ---------------------------------------------------
 
     def _join_or_leave(self, name: str, status: int, reason: str) -> None:
@@ -393,8 +337,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                     self._leave(name, f'no {name}/state for {silent:.1f} s')
             self._watch_filter(now)
             self._try_free_step()
-        elif time.monotonic() - self._batch_at > _ANSWER_PATIENCE:
-            self._ask_again()
+        elif time.monotonic() - self._batches.published_at > _ANSWER_PATIENCE:
+            self._batches.publish_again()
         self._look_at_search()
 
     def _watch_filter(self, now: float) -> None:
@@ -406,8 +350,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         elif self._held and not problem:
             self.get_logger().warning('the filter answers again: the search goes on')
         self._held = problem
-        if problem and now - self._batch_at > _ANSWER_PATIENCE:
-            self._ask_again()
+        if problem and now - self._batches.published_at > _ANSWER_PATIENCE:
+            self._batches.publish_again()
 
     # ---- a step ------------------------------------------------------------------------------
 
@@ -479,22 +423,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._announce(decision, header)
         members = self.coordinator.measuring(step, robots, imaging)
         if members:
-            self._batch += 1
-            self._waiting_batch = self._batch
-            self._batch_message = MeasurementBatch(
-                id=self._batch,
-                step=step,
-                stamp=header.stamp,
-                members=[
-                    BatchMember(
-                        robot=item.robot, decision=item.decision, measurement=item.measurement
-                    )
-                    for item in members
-                ],
-            )
-            self._batch_at = time.monotonic()
-            self._guard.watch.asked(self._batch, self._batch_at)
-            self._batch_publisher.publish(self._batch_message)
+            self._batches.publish(step, members, header)
         self._views.publish(self.coordinator, robots, header, stamp * 1e-9)
 
     def _publish_destinations(self, header: Header, robots: dict[str, PresentRobot]) -> None:
@@ -514,7 +443,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 decision,
                 indices,
                 self.settings.planner.name,
-                self._used_batch,
+                self._batches.used,
                 self.coordinator.exploration.explored_fraction(),
                 header,
             )
@@ -535,7 +464,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             and self._expected is None
             and self._taken_step >= 0
             and not self._goals.waiting
-            and not self._waiting_batch
+            and not self._batches.waiting
         ):
             self.done(self._taken_step)
 
@@ -546,10 +475,10 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             Progress(
                 time=max(self._taken_step, 0) * self.settings.step,
                 feedback=SearchTargets.Feedback(
-                    found=self._found,
-                    measurements=self._measurements,
+                    found=self._batches.update.found,
+                    measurements=self._batches.measurements,
                     decisions=self._decisions,
-                    expected_number=self._expected_number,
+                    expected_number=self._batches.update.expected_number,
                     explored=self.coordinator.exploration.explored_fraction(),
                 ),
                 finished=self.coordinator.finished or '',

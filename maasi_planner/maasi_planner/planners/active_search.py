@@ -20,7 +20,7 @@ from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
     Options,
     Planner,
-    apart,
+    all_apart,
     check_team,
     explain,
     in_bounds,
@@ -172,16 +172,14 @@ class ActiveSearch(Planner):
         sequences: dict[str, Sequences],
         chosen: dict[str, int],
     ) -> bool:
-        taken: list[tuple[FloatArray, float]] = []
-        for name, row in chosen.items():
-            if row < 0:
-                continue
-            point = options[name].points[sequences[name].first[row]]
-            radius = team.robots[name].radius
-            if not apart(point, radius, taken):
-                return False
-            taken.append((point, radius))
-        return True
+        return all_apart(
+            team,
+            {
+                name: options[name].points[sequences[name].first[row]]
+                for name, row in chosen.items()
+                if row >= 0
+            },
+        )
 
     def _search(
         self, team: TeamView, options: dict[str, Options], sequences: dict[str, Sequences]

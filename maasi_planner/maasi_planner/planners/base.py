@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -78,12 +78,12 @@ class Planner(ABC):
         return self._settled(team, f'{100.0 * explored:.1f} % of the environment is explored')
 
     def _settled(self, team: TeamView, reason: str) -> str | None:
-        heavy = [
-            cluster for cluster in team.clusters if cluster.mass >= self.settings.mass_threshold
-        ]
-        if heavy:
-            return None
-        return f'{reason} and no potential target is left'
+        return None if self.heavy(team) else f'{reason} and no potential target is left'
+
+    def heavy(self, team: TeamView) -> list[Cluster]:
+        """Return the clusters that are worth a visit."""
+        least = self.settings.mass_threshold
+        return [cluster for cluster in team.clusters if cluster.mass >= least]
 
 
 def finite(*arrays: FloatArray) -> bool:
@@ -321,9 +321,29 @@ def options_of(
     return 'no candidate can be reached'
 
 
+def centres_of(team: TeamView, view: RobotView, clusters: Sequence[Cluster]) -> FloatArray:
+    """Return the centres of clusters as waypoints (n, 3); in 2D at the height of the candidates."""
+    centres = np.zeros((len(clusters), 3))
+    centres[:, 2] = view.candidates[0, 2] if len(view.candidates) else 0.0
+    for row, cluster in zip(centres, clusters):
+        row[: team.dimension] = cluster.position[: team.dimension]
+    return centres
+
+
 def apart(point: FloatArray, radius: float, others: list[tuple[FloatArray, float]]) -> bool:
     """Return whether a waypoint (3,) keeps the radii away from other places."""
     return bool(free_of_robots(point[None, :], radius, others)[0])
+
+
+def all_apart(team: TeamView, waypoints: Mapping[str, FloatArray]) -> bool:
+    """Return whether the waypoints (3,) of robots, by name, keep their radii apart."""
+    taken: list[tuple[FloatArray, float]] = []
+    for name, point in waypoints.items():
+        radius = team.robots[name].radius
+        if not apart(point, radius, taken):
+            return False
+        taken.append((point, radius))
+    return True
 
 
 def explain(decision: Decision) -> Decision:

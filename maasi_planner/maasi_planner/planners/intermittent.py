@@ -9,13 +9,14 @@ from maasi_planner.motion.base import Trajectories
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import (
     Planner,
+    centres_of,
     check_team,
     explain,
     options_of,
     waiting_places,
 )
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotDecision, TeamView, stay
+from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -83,25 +84,16 @@ class Intermittent(Planner):
             possible = objective.table.allowed[rows]
             self._prospects[name] = float(gains[possible].max(initial=0.0))
         if chosen[index] < 0:
-            result = stay(team.robots[name], 'stays: another robot is sent to every candidate')
-            best = -1
-        else:
-            best = int(chosen[index] - objective.start[index])
-            length = int(prediction.lengths[best])
-            result = RobotDecision(
-                chosen=best,
-                waypoint=points[best].copy(),
-                positions=prediction.positions[best, : length + 1].copy(),
-                yaws=prediction.yaws[best, : length + 1].copy(),
-                candidates=points,
-                control_cost=prediction.control_cost,
-                target_refinement=terms[:, 0],
-                exploration=terms[:, 1],
-                objective=terms[:, 2],
-                lengths=prediction.lengths,
-                measurements=objective.measurements[rows],
-                reason=_reason(terms[best], int(prediction.lengths[best]), len(points)),
-            )
+            return stay(team.robots[name], 'stays: another robot is sent to every candidate')
+        best = int(chosen[index] - objective.start[index])
+        refinement, exploration, value = terms[best]
+        reason = (
+            f'J = {value:.4g} with T = {refinement:.4g}, E = {exploration:.4g} over '
+            f'{prediction.lengths[best]} steps, the best of {len(points)}'
+        )
+        result = single_choice(points, prediction, best, reason)
+        result.target_refinement, result.exploration, result.objective = terms.T
+        result.measurements = objective.measurements[rows]
         return result
 
     def _centres(self, team: TeamView, name: str) -> FloatArray | None:
@@ -111,18 +103,8 @@ class Intermittent(Planner):
             wanted = self.settings.objective == 'information'
         if not wanted:
             return None
-        heavy = [
-            cluster for cluster in team.clusters if cluster.mass >= self.settings.mass_threshold
-        ]
-        if not heavy:
-            return None
-        view = team.robots[name]
-        centres = np.zeros((len(heavy), 3))
-        # In 2D a robot keeps the height of its waypoints.
-        centres[:, 2] = view.candidates[0, 2] if len(view.candidates) else 0.0
-        for row, cluster in zip(centres, heavy):
-            row[: team.dimension] = cluster.position[: team.dimension]
-        return centres
+        heavy = self.heavy(team)
+        return centres_of(team, team.robots[name], heavy) if heavy else None
 
     def finished(self, team: TeamView) -> str | None:
         """See `Planner.finished`; also when no candidate of any robot has an expected gain."""
@@ -141,10 +123,3 @@ class Intermittent(Planner):
             f'no candidate of any robot promises to show more ({explored:.1f} % of the '
             'environment is explored)',
         )
-
-
-def _reason(terms: FloatArray, length: int, number: int) -> str:
-    return (
-        f'J = {terms[2]:.4g} with T = {terms[0]:.4g}, E = {terms[1]:.4g} over {length} steps, '
-        f'the best of {number}'
-    )

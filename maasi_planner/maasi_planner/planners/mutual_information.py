@@ -24,7 +24,7 @@ from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
     Options,
     Planner,
-    apart,
+    all_apart,
     check_team,
     explain,
     options_of,
@@ -255,15 +255,8 @@ class MutualInformation(Planner):
         return best, max(best_value, 0.0), False, evaluated
 
     def _fits(self, team: TeamView, options: dict[str, Options], joint: dict[str, int]) -> bool:
-        taken: list[tuple[FloatArray, float]] = []
-        for name, index in joint.items():
-            if index < 0:
-                continue
-            point, radius = options[name].points[index], team.robots[name].radius
-            if not apart(point, radius, taken):
-                return False
-            taken.append((point, radius))
-        return True
+        points = {name: options[name].points[index] for name, index in joint.items() if index >= 0}
+        return all_apart(team, points)
 
     def _straight_on(self, view: RobotView, points: FloatArray, name: str) -> FloatArray:
         """Return how much each waypoint lies straight on, (W,)."""

@@ -12,6 +12,7 @@ from maasi_filter.records import Cluster
 from maasi_planner.planners.base import (
     Planner,
     apart,
+    centres_of,
     check_team,
     explain,
     options_of,
@@ -49,13 +50,8 @@ class NearestWidest(Planner):
         self, team: TeamView, name: str, taken: list[tuple[FloatArray, float]]
     ) -> RobotDecision:
         view = team.robots[name]
-        clusters = [
-            cluster for cluster in team.clusters if cluster.mass >= self.settings.mass_threshold
-        ]
-        centres = np.zeros((len(clusters), 3))
-        centres[:, 2] = view.candidates[0, 2] if len(view.candidates) else 0.0
-        for row, cluster in zip(centres, clusters):
-            row[: team.dimension] = cluster.position[: team.dimension]
+        clusters = self.heavy(team)
+        centres = centres_of(team, view, clusters)
         found = options_of(team, name, taken, centres)
         if isinstance(found, str):
             return stay(view, f'stays: {found}')
