@@ -276,11 +276,7 @@ class RecordedRobot:
                     decode_image(message.data, message.format)
                     if topic.endswith('/compressed')
                     else image_to_array(
-                        message.height,
-                        message.width,
-                        message.encoding,
-                        message.step,
-                        message.data,
+                        message.height, message.width, message.encoding, message.step, message.data
                     )
                 )
                 if placed is None:

@@ -347,10 +347,7 @@ class Coordinator:
         )
 
     def measuring(
-        self,
-        step: int,
-        robots: Mapping[str, PresentRobot],
-        able: Collection[str] | None = None,
+        self, step: int, robots: Mapping[str, PresentRobot], able: Collection[str] | None = None
     ) -> list[Member]:
         """Return M_k, the robots that measure at a step, in order of their names.
 

@@ -186,7 +186,7 @@ def next_point(
     out[2] = goal[2]
     if circles.shape[0] == 0:
         return straight
-    # Out of a circle first, in case the robot was pushed into one.
+    # Leave a circle first, in case the robot was pushed into one.
     for i in range(circles.shape[0]):
         ox = px - circles[i, 0]
         oy = py - circles[i, 1]
@@ -207,7 +207,7 @@ def next_point(
     if not is_clear(px, py, pz, goal[0], goal[1], goal[2], circles, 0.0, True):
         best = np.inf
         index = -1
-        # Beyond a vertex that is as good as reached, if what comes next is in sight already.
+        # Best vertex that is not as good as reached, if it is visible already.
         beyond = np.inf
         beyond_index = -1
         for i in range(vertices.shape[0]):
@@ -241,7 +241,7 @@ def next_point(
             out[2] = pz + share * dz
             left = math.sqrt(best * best + dz * dz)
             if slow:
-                # It has to be met closely, or what comes next stays hidden.
+                # The vertex must be approached closely: the next one is not visible yet.
                 left = min(left, 2.0 * near)
     # Around the first sphere in the way, on the side where the line passes its centre.
     first = -1
@@ -275,7 +275,7 @@ def next_point(
         nz = along * tz - cz
         size = math.sqrt(nx * nx + ny * ny + nz * nz)
         if size < 1e-6:
-            # Through the very centre: any side will do, always the same one.
+            # Through the centre: choose a fixed side.
             nx = -ty
             ny = tx
             nz = 0.0
@@ -328,7 +328,7 @@ def hold_back(position: FloatArray, circles: FloatArray, rate: float, velocity: 
                 velocity[1] += change * ny
                 velocity[2] += change * nz
             elif least <= 0.0:
-                # What one limit gives another one takes: standing still satisfies both.
+                # The limits conflict: scale down, as standing still satisfies all.
                 shrink = min(shrink, least / outwards)
         if not changed:
             break
@@ -374,10 +374,7 @@ class KeepOut:
             reach = (circle[3] + 0.9 * clearance) / math.cos(math.pi / CORNERS)
             for corner in range(CORNERS):
                 angle = 2.0 * math.pi * corner / CORNERS
-                point = (
-                    circle[0] + reach * math.cos(angle),
-                    circle[1] + reach * math.sin(angle),
-                )
+                point = (circle[0] + reach * math.cos(angle), circle[1] + reach * math.sin(angle))
                 if is_clear(*point, 0.0, *point, 0.0, self.circles, 0.5 * clearance, True):
                     corners.append(point)
         self.vertices = np.array(corners, dtype=float).reshape(-1, 2)

@@ -11,26 +11,15 @@ from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from maasi_filter.ros.conversions import (
-    stamp_from_ros,
-    stamp_of_step,
-    stamp_to_ros,
-)
+from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, run
 from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.silence import Silence
 from maasi_filter.ros.stamps import StampGate
 from maasi_msgs.action import SearchTargets
-from maasi_msgs.msg import (
-    AgentState,
-    LockstepStep,
-    PlanDecision,
-)
+from maasi_msgs.msg import AgentState, LockstepStep, PlanDecision
 from maasi_planner import warm_up
-from maasi_planner.conversions import (
-    decision_to_ros,
-    path_to_ros,
-)
+from maasi_planner.conversions import decision_to_ros, path_to_ros
 from maasi_planner.coordinator import Coordinator, PresentRobot
 from maasi_planner.found_keeper import FoundKeeper
 from maasi_planner.node.batches import Batches
@@ -393,11 +382,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             )
 
     def _plan_step(
-        self,
-        step: int,
-        stamp: int,
-        imaging: set[str] | None,
-        taken: list[tuple[FloatArray, float]],
+        self, step: int, stamp: int, imaging: set[str] | None, taken: list[tuple[FloatArray, float]]
     ) -> None:
         self._taken_step = step
         self.step = step

@@ -316,9 +316,7 @@ class AgentDriver(RobotNode):
 
 
 def run(
-    link: MakeLink | Mapping[str, MakeLink],
-    sensor: MakeSensor,
-    arguments: list[str] | None = None,
+    link: MakeLink | Mapping[str, MakeLink], sensor: MakeSensor, arguments: list[str] | None = None
 ) -> int:
     """Run the driver of a robot until it is asked to end; return the exit code.
 

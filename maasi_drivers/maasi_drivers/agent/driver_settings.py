@@ -87,8 +87,7 @@ class DriverSettings(NodeSettings):
         '(mavlink_driver)',
     )
     mambo: MamboSettings | None = Field(
-        default=None,
-        description='With a link mambo_...: how, and what it may be made to do',
+        default=None, description='With a link mambo_...: how, and what it may be made to do'
     )
     mavlink: MavlinkSettings | None = Field(
         default=None, description='With link mavlink: how, and what it may be made to do'
@@ -147,8 +146,7 @@ class DriverSettings(NodeSettings):
         'from a robot on the network',
     )
     image_transport: Literal['raw', 'compressed'] = Field(
-        default='raw',
-        description='Images as camera/image_raw, or as camera/image_raw/compressed',
+        default='raw', description='Images as camera/image_raw, or as camera/image_raw/compressed'
     )
     image_reliability: Literal['best_effort', 'reliable'] = Field(
         default='best_effort',

@@ -8,13 +8,7 @@ from nav_msgs.msg import Odometry
 from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.conversions import (
-    FARTHEST,
-    FASTEST,
-    bounded,
-    pose_from_ros,
-    stamp_from_ros,
-)
+from maasi_filter.ros.conversions import FARTHEST, FASTEST, bounded, pose_from_ros, stamp_from_ros
 from maasi_filter.ros.qos import sensor_reader
 
 

@@ -220,12 +220,6 @@ class ScanUnicycle(Unicycle):
         )
         out = np.zeros(4)
         out[0], out[3] = window_command(
-            here,
-            target_x,
-            target_y,
-            left,
-            self.limits,
-            circles,
-            self.keep_out.clearance,
+            here, target_x, target_y, left, self.limits, circles, self.keep_out.clearance
         )
         return out

@@ -39,11 +39,7 @@ class Nav2Navigation:
     """
 
     def __init__(
-        self,
-        node: Node,
-        frame: str,
-        timeout: float,
-        on_end: Callable[[Goal, bool, str], None],
+        self, node: Node, frame: str, timeout: float, on_end: Callable[[Goal, bool, str], None]
     ) -> None:
         try:
             from nav2_msgs.action import NavigateToPose

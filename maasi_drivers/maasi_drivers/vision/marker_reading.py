@@ -14,10 +14,7 @@ from maasi_filter.models.sensor import Sensor
 
 
 def read_markers(
-    picture: NDArray[np.uint8] | Blobs,
-    pose: StampedPose,
-    detector: MarkerDetector,
-    sensor: Sensor,
+    picture: NDArray[np.uint8] | Blobs, pose: StampedPose, detector: MarkerDetector, sensor: Sensor
 ) -> SensorReading:
     """Return the markers in a decoded image: segmentation, projection, field of view.
 

@@ -312,10 +312,7 @@ class SearchAgent:
         )
 
     def decide(
-        self,
-        heard: Sequence[Broadcast],
-        rng: np.random.Generator,
-        wanted: BoolArray | None = None,
+        self, heard: Sequence[Broadcast], rng: np.random.Generator, wanted: BoolArray | None = None
     ) -> Choice:
         """Decide for the step that was observed last.
 

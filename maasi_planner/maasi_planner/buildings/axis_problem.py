@@ -1,7 +1,7 @@
 """The quadratic problem of one axis: rows, costs, and a dual active-set method.
 
 Once it is fixed which cuboids are visited at which step and which faces of obstacles are kept
-away from, P2 of 004 falls apart into one problem for each axis: choose T forces u such that
+away from, P2 of 004 decomposes into one problem for each axis: choose T forces u such that
 positions, velocities, forces and the way to brake afterwards, all linear in u, stay in their
 bounds. The matrices are the same at every step of a mission; only bounds and the free motion
 change, so that the method works on the rows' Gram matrix alone.
@@ -131,7 +131,7 @@ def solve_axis(
     cutoff : float
         Objective at which to give up.
     y : (m,) array
-        Takes the values.
+        Output: the values.
     room : AxisRoom
         Scratch.
     """
@@ -217,7 +217,7 @@ def solve_axis(
                 multipliers[count] = sign * multiplier
                 count += 1
                 break
-            # The row that blocks leaves; the factor is made anew from there on.
+            # The blocking row leaves; recompute the factor from there on.
             count -= 1
             for a in range(leaving, count):
                 active[a] = active[a + 1]

@@ -3,7 +3,7 @@
 A node fixes visits in the order of their steps, and which faces of obstacles some segments of the
 trajectory stay beyond. Its relaxation is one quadratic problem for each axis. An *open* node
 stands for every plan that makes these visits and perhaps later ones, a *closed* one for those
-that make no other. Faces are branched on only where a trajectory gets in an obstacle's way.
+that make no other. Faces are branched on only where a trajectory crosses an obstacle.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FOUND, EXHAUSTED, UNFINISHED, FULL = 0, 1, 2, 3
 
 
 class Instance(NamedTuple):
-    """One problem, as the compiled search wants it; objectives scaled.
+    """One problem for the compiled search; objectives scaled.
 
     Attributes
     ----------
@@ -309,7 +309,7 @@ def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
 
 @njit(cache=True)
 def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
-    """Go on with a search for at most `most` nodes.
+    """Continue a search by at most `most` nodes.
 
     Returns
     -------
@@ -327,7 +327,7 @@ def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
             return UNFINISHED
         node = pop(tree)
         if tree.bound[node] >= tree.best[0] - GAP:
-            # All others are no better.
+            # No other node is better.
             free(tree, node)
             while tree.counts[0] > 0:
                 free(tree, tree.heap[tree.counts[0] - 1])

@@ -98,12 +98,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
     def _make_agent(self) -> SearchAgent:
         settings = self.settings
         return SearchAgent(
-            self.name,
-            self._search,
-            self._mission,
-            self._dynamics,
-            settings.hazard,
-            settings.start,
+            self.name, self._search, self._mission, self._dynamics, settings.hazard, settings.start
         )
 
     def _begin_anew(self) -> None:
@@ -270,8 +265,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             return
         if int(message.step) != self._wanted_step:
             self.drop(
-                'stale link',
-                f'link/rx.step: read {message.step}, allowed is {self._wanted_step}',
+                'stale link', f'link/rx.step: read {message.step}, allowed is {self._wanted_step}'
             )
             return
         self._heard = message

@@ -91,11 +91,7 @@ class Dynamics:
     def control_for(self, velocity: ArrayLike, wanted: ArrayLike) -> FloatArray:
         """Return the force (3,) [N] within its bounds that gets closest to a wanted velocity."""
         change = np.asarray(wanted, dtype=float) - self.retained * np.asarray(velocity, dtype=float)
-        return np.clip(
-            self.mass / self.step * change + self.weight,
-            -self.force,
-            self.force,
-        )
+        return np.clip(self.mass / self.step * change + self.weight, -self.force, self.force)
 
     def braking(self, velocity: ArrayLike) -> FloatArray:
         """Return the force (3,) [N] that stops the robot as fast as its bounds allow."""

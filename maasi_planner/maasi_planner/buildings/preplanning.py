@@ -226,12 +226,7 @@ def _boxes(key: str, items: Sequence[BoxSettings], area: FloatArray) -> FloatArr
 
 
 def _face_cells(
-    index: int,
-    face: str,
-    box: FloatArray,
-    distance: float,
-    side: float,
-    settings: CuboidSettings,
+    index: int, face: str, box: FloatArray, distance: float, side: float, settings: CuboidSettings
 ) -> tuple[list[Cell], float]:
     """Return the cells of a face, and the share of each that a snapshot covers."""
     number = FACES.index(face)  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ BoolArray = NDArray[np.bool_]
 
 
 class Tree(NamedTuple):
-    """Nodes of the search, best bound first; room for so many, used again and again.
+    """Nodes of the search, best bound first, in arrays that are reused.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Tree(NamedTuple):
     heap, spare : (n,) arrays
         Nodes by bound, and nodes that are free.
     counts : (6,) array
-        Sizes of `heap` and `spare`, nodes solved, the best node (-1: none), ways out, axes solved.
+        Sizes of `heap` and `spare`, nodes solved, best node (-1: none), out of nodes, axes solved.
     best : (1,) array
         Objective of the best node.
     scratch : (3, m) array
@@ -65,7 +65,7 @@ class Tree(NamedTuple):
 
 
 def make_tree(size: int, horizon: int, rows: int) -> Tree:
-    """Return room for `size` nodes."""
+    """Allocate `size` nodes."""
     n = horizon + 1
     return Tree(
         bound=np.empty(size),
@@ -126,7 +126,7 @@ def pop(tree: Tree) -> int:
 
 @njit(cache=True)
 def free(tree: Tree, node: int) -> None:
-    """Make the room of a node free."""
+    """Free a node."""
     tree.spare[tree.counts[1]] = node
     tree.counts[1] += 1
 

@@ -1,4 +1,4 @@
-"""What every motion model offers: prediction, the controller's command, and the body itself."""
+"""Interface of the motion models: prediction, controller and body."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Body(ABC):
 
     @abstractmethod
     def step(self, velocity_command: ArrayLike, dt: float) -> None:
-        """Go on for `dt` seconds.
+        """Advance by `dt` seconds.
 
         Parameters
         ----------
@@ -134,7 +134,7 @@ class MotionModel(ABC):
     settings : MotionSettings
         Limits and controller.
     obstacles : Obstacles, optional
-        To get around.
+        To avoid.
     radius : float
         Of the robot, metres; obstacles are inflated by it.
 
@@ -150,10 +150,7 @@ class MotionModel(ABC):
     Settings: ClassVar[type[BaseModel] | None] = None
 
     def __init__(
-        self,
-        settings: MotionSettings,
-        obstacles: Obstacles | None = None,
-        radius: float = 0.0,
+        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
     ) -> None:
         self.settings = settings
         self.keep_out = KeepOut(obstacles or Obstacles.none(), radius, settings.clearance)
@@ -194,9 +191,9 @@ class MotionModel(ABC):
     ) -> None:
         """Run controller and body against each other to each waypoint, and fill `out`.
 
-        Its rows are filled as far as each trajectory goes; one that does not arrive within the
-        room there is gets a length that does not fit. The models of the suite do this compiled;
-        here it is done with `command` and `body`, some ten microseconds for each step.
+        Rows are filled up to the length of each trajectory; one that does not arrive gets a length
+        beyond the last column. The models of the suite override this by compiled loops; this one
+        calls `command` and `body`, some ten microseconds per step.
         """
         limit = out.positions.shape[1] - 1
         for w, waypoint in enumerate(waypoints):
@@ -306,7 +303,7 @@ def check_waypoints(waypoints: ArrayLike) -> FloatArray:
     array = np.ascontiguousarray(waypoints, dtype=float)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f'waypoints: got shape {array.shape}, allowed is (W, 3)')
-    # A sum that is finite saves to look at each number.
+    # Fast path: a finite sum means that every number is finite.
     if not math.isfinite(array.sum()) and not np.isfinite(array).all():
         raise ValueError('waypoints: got a number that is not finite')
     return array
@@ -373,7 +370,7 @@ def _trim(
 def trimmed(out: Trajectories) -> Trajectories:
     """Return trajectories of equal width, each extended by its last position.
 
-    A length that does not fit marks a waypoint that was not reached.
+    A length beyond the last column marks a waypoint that was not reached.
     """
     longest = _trim(out.positions, out.yaws, out.lengths, out.reached)
     return Trajectories(

@@ -19,12 +19,7 @@ from maasi_planner.motion.base import (
     check_command,
     check_step,
 )
-from maasi_planner.motion.steering import (
-    Steering,
-    Surroundings,
-    sideways_command,
-    straight_command,
-)
+from maasi_planner.motion.steering import Steering, Surroundings, sideways_command, straight_command
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
 
@@ -75,15 +70,7 @@ def point_step(
         wy = vy + share * ay
         wz = vz + share * az
     half = 0.5 * dt
-    return (
-        x + half * (vx + wx),
-        y + half * (vy + wy),
-        z + half * (vz + wz),
-        wx,
-        wy,
-        wz,
-        turned,
-    )
+    return (x + half * (vx + wx), y + half * (vy + wy), z + half * (vz + wz), wx, wy, wz, turned)
 
 
 @njit(cache=True)
@@ -220,10 +207,7 @@ class ConstantSpeed(SteeredMotion):
     """Controller and prediction of `ConstantSpeedBody`; its input is the velocity command."""
 
     def __init__(
-        self,
-        settings: MotionSettings,
-        obstacles: Obstacles | None = None,
-        radius: float = 0.0,
+        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
     ) -> None:
         super().__init__(settings, obstacles, radius)
         rate = settings.approach_rate or APPROACH_RATE

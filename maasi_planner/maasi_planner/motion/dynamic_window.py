@@ -1,8 +1,8 @@
 """Dynamic window: the best of the speeds that a ground robot can reach next (000, section 7.2).
 
-Pairs of forward speed and turn rate within reach of the accelerations are followed as arcs for a
-while; those that could not stop before an obstacle are out, and of the others the one wins that
-brings the robot nearest to the point it is heading for, facing it, with room to obstacles.
+Pairs of forward speed and turn rate within the acceleration limits are simulated as arcs. Those
+that could not stop before an obstacle are discarded; of the others the one is chosen that ends
+nearest to the target point, facing it, with clearance from obstacles.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def window_command(
     circles : (n, 5) array
         Obstacles, inflated by the robot's radius.
     clearance : float
-        Room to obstacles beyond which more is not better, metres.
+        Distance from obstacles above which a larger one is not better, metres.
     """
     x, y, yaw, forward, turn = state
     fastest = min(limits[SPEED], limits[RATE] * left)
@@ -87,7 +87,7 @@ def window_command(
     best_forward = 0.0
     best_turn = 0.0
     for i in range(FORWARD_SAMPLES + 1):
-        # Standing is always among the choices: turning on the spot touches nothing.
+        # Zero forward speed is always a choice: turning on the spot is safe.
         v = 0.0
         if i > 0:
             v = low + (high - low) * (i - 1) / (FORWARD_SAMPLES - 1)
@@ -128,6 +128,6 @@ def window_command(
                 best = score
                 best_forward = v
                 best_turn = w
-    # Whatever the arcs say, never faster than the way straight ahead allows.
+    # Limit the speed by the free distance straight ahead.
     ahead = way_ahead(x, y, yaw, 4.0 * clearance + limits[SPEED], circles)
     return min(best_forward, limits[BRAKING] * ahead), best_turn

@@ -28,12 +28,7 @@ from maasi_planner.motion.base import (
     check_command,
     check_step,
 )
-from maasi_planner.motion.mambo_dynamics import (
-    ENTRIES,
-    closed_loop,
-    control_periods,
-    mambo_step,
-)
+from maasi_planner.motion.mambo_dynamics import ENTRIES, closed_loop, control_periods, mambo_step
 from maasi_planner.motion.mambo_gains import (
     GRAVITY,
     K_Q,
@@ -125,12 +120,7 @@ class MamboBody(Body):
             self._periods = (periods, h)
             self._table = closed_loop(self.parameters, periods, h)
         mambo_step(
-            self.state,
-            check_command(velocity_command),
-            self.parameters,
-            self._table,
-            periods,
-            h,
+            self.state, check_command(velocity_command), self.parameters, self._table, periods, h
         )
 
     def robot_state(self) -> RobotState:
@@ -172,10 +162,7 @@ class Mambo(SteeredMotion):
     """Controller and prediction of `MamboBody`."""
 
     def __init__(
-        self,
-        settings: MotionSettings,
-        obstacles: Obstacles | None = None,
-        radius: float = 0.0,
+        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
     ) -> None:
         super().__init__(settings, obstacles, radius)
         self.parameters = mambo_parameters(settings)

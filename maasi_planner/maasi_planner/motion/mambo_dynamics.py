@@ -37,12 +37,7 @@ MATRIX, TRAVEL, COST, BOUND, ENTRIES = 0, 9, 12, 21, 24
 
 @njit(cache=True)
 def _chain(
-    row: FloatArray,
-    gains: FloatArray,
-    gravity: float,
-    inertia: float,
-    periods: int,
-    h: float,
+    row: FloatArray, gains: FloatArray, gravity: float, inertia: float, periods: int, h: float
 ) -> None:
     """Fill one row of `closed_loop` from the response to each unit deviation."""
     states = np.zeros((3, 3))

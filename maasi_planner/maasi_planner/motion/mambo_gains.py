@@ -91,7 +91,7 @@ def double_integrator(inertia: float) -> tuple[FloatArray, FloatArray]:
 def lqr_gains(settings: MotionSettings) -> dict[str, FloatArray]:
     """Return the LQR gains by chain: `pitch` and `roll` (4,), `yaw` and `height` (2,).
 
-    The 12-state model falls apart into these chains, and with diagonal weights so does its LQR.
+    The 12-state model decomposes into these chains, and with diagonal weights so does its LQR.
     The paper prints four weights, 1/15, 1000, 1000, 100, and does not say which; read here as
     those of the inputs with the first one garbled (it would make roll 15,000 times cheaper than
     pitch), so that roll has the weight of pitch, and states have weight 1.

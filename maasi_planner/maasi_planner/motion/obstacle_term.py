@@ -1,7 +1,7 @@
 """The obstacle term of 001, eq. (14) and (15), for a robot that flies velocity commands.
 
 The paper subtracts k_obs from the input whenever an obstacle is nearer than d_l. With
-u = K_v (v - velocity) - ... that is the same as a change of the velocity command by k_obs / K_v,
+u = K_v (v - velocity) - ... that equals a change of the velocity command by k_obs / K_v,
 so it needs no access to the torques. As printed the term has no direction; `away` gives it the
 direction from the obstacle to the robot.
 """

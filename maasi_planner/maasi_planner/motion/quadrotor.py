@@ -259,10 +259,7 @@ class Quadrotor(SteeredMotion):
     """Controller and prediction of `QuadrotorBody`."""
 
     def __init__(
-        self,
-        settings: MotionSettings,
-        obstacles: Obstacles | None = None,
-        radius: float = 0.0,
+        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
     ) -> None:
         super().__init__(settings, obstacles, radius)
         self.limits = quadrotor_limits(settings)

@@ -274,13 +274,7 @@ def five_states(state: RobotState) -> FloatArray:
     yaw = state.pose.yaw
     forward = state.velocity[0] * math.cos(yaw) + state.velocity[1] * math.sin(yaw)
     return np.array(
-        [
-            state.pose.position[0],
-            state.pose.position[1],
-            yaw,
-            forward,
-            state.angular_velocity[2],
-        ]
+        [state.pose.position[0], state.pose.position[1], yaw, forward, state.angular_velocity[2]]
     )
 
 
@@ -294,10 +288,7 @@ class Unicycle(MotionModel):
     """Controller and prediction of `UnicycleBody`; the tolerance is horizontal."""
 
     def __init__(
-        self,
-        settings: MotionSettings,
-        obstacles: Obstacles | None = None,
-        radius: float = 0.0,
+        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
     ) -> None:
         super().__init__(settings, obstacles, radius)
         self.limits = unicycle_limits(settings)

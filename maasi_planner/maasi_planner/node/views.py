@@ -52,11 +52,7 @@ class PlannerViews:
         self._exploration = self._node.create_publisher(kind, 'exploration', LATCHED)
 
     def publish(
-        self,
-        coordinator: Coordinator,
-        robots: dict[str, PresentRobot],
-        header: Header,
-        now: float,
+        self, coordinator: Coordinator, robots: dict[str, PresentRobot], header: Header, now: float
     ) -> None:
         """Publish what is due at the time `now` [s]."""
         rate = self._node.settings.views_rate

@@ -20,11 +20,7 @@ IntArray = NDArray[np.int64]
 
 @njit(cache=True)
 def _information(
-    matrices: FloatArray,
-    probabilities: FloatArray,
-    first: int,
-    own: IntArray,
-    out: FloatArray,
+    matrices: FloatArray, probabilities: FloatArray, first: int, own: IntArray, out: FloatArray
 ) -> None:
     """Sum pi H' R^-1 H over measurements: matrices (W, H, C, d, d) into out (W, C, d, d)."""
     d = matrices.shape[3]

@@ -23,12 +23,7 @@ IntArray = NDArray[np.int64]
 
 @njit(cache=True)
 def centre_sum(
-    item: Events,
-    first: int,
-    centres: FloatArray,
-    dimension: int,
-    kernel: Kernel,
-    out: FloatArray,
+    item: Events, first: int, centres: FloatArray, dimension: int, kernel: Kernel, out: FloatArray
 ) -> None:
     """Write T of each candidate into `out`: the sum of pi at cluster centres (000, (19), (31))."""
     kind, parameters = kernel

@@ -191,7 +191,7 @@ def rows_of(planned: list[Events]) -> tuple[IntArray, IntArray, FloatArray, Floa
 
 def starts_of(counts: IntArray) -> IntArray:
     """Return where each of several parts begins, one after the other, and where the last ends."""
-    # For the few that there are quicker than NumPy's sums.
+    # Faster than NumPy's cumulative sum for the few parts.
     return np.array([0, *accumulate(counts.tolist())], np.int64)
 
 

@@ -246,11 +246,7 @@ class TeamObjective:
         )
 
     def _information(
-        self,
-        planned: list[_Measuring],
-        settled: list[_Measuring],
-        centres: FloatArray,
-        first: int,
+        self, planned: list[_Measuring], settled: list[_Measuring], centres: FloatArray, first: int
     ) -> tuple[FloatArray, FloatArray]:
         d = self.team.dimension
         number = len(centres)

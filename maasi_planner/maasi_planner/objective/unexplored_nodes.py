@@ -113,7 +113,7 @@ def apply_misses(
                 )
             values[i] = left
         return
-    # Many at a time: as much as there is room for.
+    # In blocks as large as the scratch array.
     room = np.empty((ROOM_ROWS, max(ROOM, number)))
     first = np.empty(times.shape[0], np.int64)
     begin = 0
@@ -284,8 +284,8 @@ def _nodes_around(
                     before[now, corner] = -1
                     if not weight > 0.0:
                         continue
-                    # The corner of the place before that is the same node, if any; without
-                    # branches, as none could be foretold.
+                    # Corner of the previous place at the same node, if any; branch-free, as the
+                    # branches would be mispredicted.
                     a, b, c = i + ci - pi, j + cj - pj, k + ck - pk
                     known = before[1 - now, (4 * a + 2 * b + c) & 7]
                     new = (((a | b | c) & ~1) != 0) | (known < 0)
@@ -323,7 +323,7 @@ def _keep_unseen(
     for q in range(measurement.shape[0]):
         left = entries.value[q]
         e = measurement[q] - margin
-        # The latest first: with a sharp view it ends the product at once.
+        # Latest first: with a hard-edged field of view the product ends early.
         while e >= 0 and left > 0.0:
             left *= 1.0 - detection_probability_at(
                 kind,

@@ -27,11 +27,7 @@ from maasi_planner.planners.base import (
     options_of,
     waiting_places,
 )
-from maasi_planner.planners.mutual_information import (
-    heading_to,
-    intensity,
-    mutual_information,
-)
+from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
 
 FloatArray = NDArray[np.float64]
@@ -233,11 +229,7 @@ class ActiveSearch(Planner):
         return best, not names, evaluated
 
     def _report(
-        self,
-        name: str,
-        option: Options,
-        sequences: dict[str, Sequences],
-        chosen: dict[str, int],
+        self, name: str, option: Options, sequences: dict[str, Sequences], chosen: dict[str, int]
     ) -> RobotDecision:
         """Return the decision of one robot: for each waypoint the best sequence through it."""
         mine = sequences[name]

@@ -1,4 +1,4 @@
-"""What all planners share: the interface, and getting candidates into shape."""
+"""Interface of the planners, and the choice of usable candidates."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Planner(ABC):
         """
 
     def reset(self) -> None:  # noqa: B027
-        """Forget everything about the search so far."""
+        """Reset for a new search."""
 
     def finished(self, team: TeamView) -> str | None:
         """Return why nothing is left to gain, or None while something is.
@@ -88,7 +88,7 @@ class Planner(ABC):
 
 def finite(*arrays: FloatArray) -> bool:
     """Return whether all numbers in some small arrays are finite."""
-    # A sum that is finite saves to look at each number.
+    # Fast path: a finite sum means that every number is finite.
     total = 0.0
     for array in arrays:
         total = sum(array.ravel().tolist(), total)
@@ -117,10 +117,7 @@ def check_team(team: TeamView) -> None:
             raise ValueError(
                 f'{name}: radius: got {view.radius}, allowed are finite numbers from 0 [m]'
             )
-        for field, value, width in (
-            ('candidates', view.candidates, 3),
-            ('tail', view.tail, 3),
-        ):
+        for field, value, width in (('candidates', view.candidates, 3), ('tail', view.tail, 3)):
             if value is None:
                 continue
             array = np.asarray(value, dtype=float)
@@ -199,7 +196,7 @@ def in_bounds(points: FloatArray, bounds: FloatArray) -> tuple[BoolArray, int]:
 def usable_candidates(
     team: TeamView, name: str, extra: FloatArray | None = None
 ) -> tuple[FloatArray, str]:
-    """Return a robot's candidates moved out of obstacles, and what was left out.
+    """Return a robot's candidates moved out of obstacles, and which were dropped.
 
     Parameters
     ----------
@@ -208,7 +205,7 @@ def usable_candidates(
     name : str
         The robot.
     extra : (n, 3) array, optional
-        Further waypoints; left out where they do not fit, without a word.
+        Further waypoints; dropped silently where they are not usable.
     """
     view = team.robots[name]
     points = np.ascontiguousarray(view.candidates, dtype=float).reshape(-1, 3)
@@ -264,7 +261,7 @@ def free_of_robots(
 
 @dataclass
 class Options:
-    """What one planning robot can choose from.
+    """Candidates of one planning robot.
 
     Attributes
     ----------
@@ -273,7 +270,7 @@ class Options:
     prediction : Trajectories
         To them.
     allowed : (W,) array of bool
-        Which can be reached, lead somewhere, and keep away from where others will stand.
+        Which are reachable, not the present place, and apart from where others will stand.
     """
 
     points: FloatArray
@@ -287,7 +284,7 @@ def options_of(
     places: list[tuple[FloatArray, float]],
     extra: FloatArray | None = None,
 ) -> Options | str:
-    """Return what a robot can choose from, or why it has to stay.
+    """Return the candidates of a robot, or why it has to stay.
 
     Parameters
     ----------
@@ -347,7 +344,7 @@ def all_apart(team: TeamView, waypoints: Mapping[str, FloatArray]) -> bool:
 
 
 def explain(decision: Decision) -> Decision:
-    """Put the robots in the order of their names and join their reasons."""
+    """Sort the robots by name and join their reasons."""
     decision.robots = {name: decision.robots[name] for name in sorted(decision.robots)}
     decision.reason = '; '.join(
         f'{name}: {robot.reason}' for name, robot in decision.robots.items()

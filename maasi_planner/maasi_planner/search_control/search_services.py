@@ -31,11 +31,7 @@ def offer_services(
 
 
 def _serve(
-    commander: Commander,
-    word: str,
-    names: list[str] | None,
-    _: Any,
-    response: Trigger.Response,
+    commander: Commander, word: str, names: list[str] | None, _: Any, response: Trigger.Response
 ) -> Trigger.Response:
     response.success, response.message = commander(word, names)
     return response

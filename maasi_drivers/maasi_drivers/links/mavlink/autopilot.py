@@ -76,11 +76,7 @@ class Autopilot:
     """
 
     def __init__(
-        self,
-        settings: MavlinkSettings,
-        sender: Any,
-        log: ReportLog,
-        on_restart: Callable[[], None],
+        self, settings: MavlinkSettings, sender: Any, log: ReportLog, on_restart: Callable[[], None]
     ) -> None:
         self.firmware: Firmware | None = None
         self.failsafes: FailsafeCheck | None = None

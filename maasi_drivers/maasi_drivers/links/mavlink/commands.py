@@ -44,10 +44,7 @@ class CommandQueue:
         return bool(self._commands)
 
     def ask(
-        self,
-        number: int,
-        parameters: tuple[float, ...],
-        answer: Callable[[int | None], None],
+        self, number: int, parameters: tuple[float, ...], answer: Callable[[int | None], None]
     ) -> None:
         """Add a command.
 
@@ -87,11 +84,7 @@ class CommandQueue:
             return
         parameters = [*command.parameters, *[0.0] * (7 - len(command.parameters))]
         self._sender.command_long_send(
-            self._system,
-            mavlink.MAV_COMP_ID_AUTOPILOT1,
-            command.number,
-            command.tries,
-            *parameters,
+            self._system, mavlink.MAV_COMP_ID_AUTOPILOT1, command.number, command.tries, *parameters
         )
         command.sent = now
         command.tries += 1

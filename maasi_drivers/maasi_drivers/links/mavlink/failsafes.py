@@ -156,8 +156,7 @@ class FailsafeCheck:
             state = 'is not known' if value is None else f'is {value:g}'
             state += ', which is off' if value is not None and off else ''
             self._report(
-                _WARNING if off else _INFO,
-                f'failsafe for when {failsafe.meaning}: {name} {state}',
+                _WARNING if off else _INFO, f'failsafe for when {failsafe.meaning}: {name} {state}'
             )
         problem = self._station_problem()
         if problem:
