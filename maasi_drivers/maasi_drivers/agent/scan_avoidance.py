@@ -1,4 +1,4 @@
-"""Driving clear of what a laser scanner sees: a dynamic window over the points of the scan."""
+"""Obstacle avoidance by a laser scan: a dynamic window over the points of the scan."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from maasi_planner.settings import MotionSettings
 
 FloatArray = NDArray[np.float64]
 
-# Points closer together than this count as one [m].
+# Size of the cells in which points count as one [m].
 _CELL = 0.03
-# Headings that are tried where the straight way is closed.
+# Number of headings that are tried where the straight way is blocked.
 _HEADINGS = 72
-# What a change of the heading chosen last costs, per radian of it, against one of the way.
+# Cost of a change of the last heading, relative to that of a detour [1/rad].
 _STEADINESS = 0.3
-# Below this distance the robot touches the point already: it may still leave it [m].
+# Below this distance the robot touches the point, and may still leave it [m].
 _SKIN = 1e-3
 
 
@@ -92,6 +92,14 @@ def scan_points(
 
 
 @njit(cache=True)
+def _is_free(x: float, y: float, heading: float, reach: float, circles: FloatArray) -> bool:
+    """Return whether a heading is free of circles for `reach` metres."""
+    end_x = x + reach * math.cos(heading)
+    end_y = y + reach * math.sin(heading)
+    return is_clear(x, y, 0.0, end_x, end_y, 0.0, circles, 0.0, False)
+
+
+@njit(cache=True)
 def way_around(
     x: float,
     y: float,
@@ -112,20 +120,9 @@ def way_around(
     away = math.hypot(dx, dy)
     straight = math.atan2(dy, dx)
     for part in (1.0, 0.5):
-        look = part * min(away, reach)
-        if is_clear(
-            x,
-            y,
-            0.0,
-            x + look * math.cos(straight),
-            y + look * math.sin(straight),
-            0.0,
-            circles,
-            0.0,
-            False,
-        ):
+        if _is_free(x, y, straight, part * min(away, reach), circles):
             return target_x, target_y, straight
-        # Around it, as far as it goes whatever is left to the target.
+        # Other headings, for the whole distance even if the target is nearer.
         look = part * reach
         best = np.inf
         chosen = np.nan
@@ -139,17 +136,7 @@ def way_around(
                 change = heading - before
                 change -= 2.0 * math.pi * math.floor((change + math.pi) / (2.0 * math.pi))
                 cost += _STEADINESS * abs(change)
-            if cost < best and is_clear(
-                x,
-                y,
-                0.0,
-                x + look * math.cos(heading),
-                y + look * math.sin(heading),
-                0.0,
-                circles,
-                0.0,
-                False,
-            ):
+            if cost < best and _is_free(x, y, heading, look, circles):
                 best = cost
                 chosen = heading
         if best < np.inf:
@@ -160,8 +147,8 @@ def way_around(
 class ScanUnicycle(Unicycle):
     """A ground robot that keeps clear of known obstacles and of what its scanner sees.
 
-    Ways around known obstacles are planned; what is seen beside them is driven around as it comes,
-    so that a pocket can hold the robot: who sends it has to notice that it gets no nearer.
+    Ways around known obstacles are planned; what is seen beside them is avoided locally, so that
+    the robot can get stuck in a pocket: the driver gives up a waypoint that gets no nearer.
 
     Parameters
     ----------
@@ -172,7 +159,7 @@ class ScanUnicycle(Unicycle):
     radius : float
         Of the robot [m].
     scan : ScanSettings
-        How far is looked.
+        Distance of avoidance.
     """
 
     def __init__(

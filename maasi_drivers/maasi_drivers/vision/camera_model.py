@@ -282,36 +282,6 @@ class Camera:
         )
         return positions, jacobian_pixel, jacobian_pose
 
-    def sees(self, positions: ArrayLike, pose: Pose, radius: float = 0.0) -> NDArray[np.bool_]:
-        """Say which positions the camera sees.
-
-        Parameters
-        ----------
-        positions : array_like, shape (n, 2) or (n, 3)
-            Map frame; z = 0 where it is not given [m].
-        pose : Pose
-            Of the robot in the map frame.
-        radius : float
-            Of horizontal discs around the positions that must be seen as a whole [m].
-
-        Returns
-        -------
-        ndarray of bool, shape (n,)
-        """
-        points = np.atleast_2d(np.asarray(positions, dtype=np.float64))
-        if points.size == 0:
-            return np.zeros(0, dtype=bool)
-        if points.shape[1] == 2:
-            points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
-        if radius > 0:
-            rim = np.zeros((RIM_POINTS, 3))
-            angles = np.arange(RIM_POINTS) * (2.0 * np.pi / RIM_POINTS)
-            rim[:, 0], rim[:, 1] = radius * np.cos(angles), radius * np.sin(angles)
-            outline = (points[:, None, :] + rim).reshape(-1, 3)
-            inside = np.asarray(self.margin(outline, pose) >= 0)
-            return np.asarray(inside.reshape(len(points), RIM_POINTS).all(axis=1))
-        return np.asarray(self.margin(points, pose) >= 0)
-
     def margin(self, positions: ArrayLike, pose: Pose) -> Array:
         """Return how far inside the image positions (n, 3) are seen, shape (n,) [px].
 
@@ -331,6 +301,3 @@ class Camera:
             [[(self.width - 1) / 2.0, (self.height - 1) / 2.0]], pose, 0.0
         )
         return float(1.0 / np.sqrt(np.abs(np.linalg.det(by_pixel[0]))))
-
-
-RIM_POINTS = 24

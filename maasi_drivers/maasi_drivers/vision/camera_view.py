@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_drivers.vision.camera_model import RIM_POINTS, Camera
+from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose
+
+# Points on the rim of a marker.
+_RIM_POINTS = 24
 
 
 def box_view_margin(
@@ -52,7 +55,7 @@ def box_view_margin(
     rim = np.concatenate(
         [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0))]
     )
-    angles = np.arange(RIM_POINTS) * (2.0 * np.pi / RIM_POINTS)
+    angles = np.arange(_RIM_POINTS) * (2.0 * np.pi / _RIM_POINTS)
     circle = marker_radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     outline = (rim[:, None, :] + circle).reshape(-1, 2)
     outline = np.concatenate([outline, np.zeros((len(outline), 1))], axis=1)

@@ -69,7 +69,7 @@ def paper_mask(image: Image, threshold: float = 35.0) -> NDArray[np.uint8]:
 
 
 def _planes(image: Image) -> list[Image]:
-    # The masks are computed plane by plane: that is what compilers make fast code of.
+    # Masks are computed plane by plane, which compilers vectorise.
     return [np.asarray(plane, dtype=np.uint8) for plane in cv2.split(image)]
 
 
@@ -130,8 +130,8 @@ class _Components(NamedTuple):
 def _components(mask: NDArray[np.uint8]) -> _Components:
     """Return the components of a mask.
 
-    Markers are few pixels of an image: filling each from its first pixel beats the passes over the
-    whole image that a general algorithm takes.
+    Markers are few pixels of an image: a fill from the first pixel of each is faster than the
+    passes over the whole image of a general algorithm.
     """
     marked = np.flatnonzero(mask.view(np.bool_))
     labels = np.full(mask.shape, _BACKGROUND, dtype=np.int32)
@@ -206,7 +206,7 @@ def _floor_statistics(image, samples):
     mean = (medians[0] + medians[1] + medians[2]) / 3.0
     gains = np.empty(3)
     for channel in range(3):
-        # A frame that is mostly a marker or a coloured sheet must not turn into the reference.
+        # Bounded, as an image of mostly marker or coloured sheet is no reference.
         gains[channel] = min(max(mean / medians[channel], 0.6), 1.7)
     # Blueness is between -3 and 3: bins of 1/256.
     blueness = np.zeros(1536, dtype=np.int64)
@@ -283,7 +283,7 @@ def _shape_of(image, components, blob, gains, values):
         peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
         values[index - first] = _excess(image, row, column, gains)
     mx, my = sx / count, sy / count
-    # A pixel is a square: it has a second moment of 1/12 of its own.
+    # Each pixel is a square with a second moment of 1/12.
     vxx = sxx / count - mx * mx + 1.0 / 12.0
     vyy = syy / count - my * my + 1.0 / 12.0
     vxy = sxy / count - mx * my
@@ -379,7 +379,7 @@ def _measure_blobs(image, components, gains, gates, measures):
             continue
         if count < gates[2] * 4.0 * np.pi * np.sqrt(long * short):
             continue
-        # The excess of a pixel that is all marker: the mean of the upper half inside the blob.
+        # The excess of a pixel inside a marker: the mean of the upper half of the blob.
         upper = np.sort(values)[count // 2 :].mean()
         background, noise = _surroundings(image, components, blob, gains)
         contrast = max(upper - background, 1e-6)
@@ -398,7 +398,7 @@ def _measure_blobs(image, components, gains, gates, measures):
 
 
 def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
-    """Find compact blobs that are bluer than the floor, whatever the light.
+    """Find compact blobs that are bluer than the floor, in any light.
 
     White balance from the median of the image (the floor); blueness (B - max(R, G)) over the mean
     of the channels, which neither gradients nor exposure change, and which tells purple and pale
