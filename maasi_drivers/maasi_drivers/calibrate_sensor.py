@@ -25,10 +25,10 @@ from maasi_filter.ros.parameters import parameter_fields, unflatten
 
 _IMAGES = ('camera/image_raw', 'camera/image_raw/compressed')
 _DETECTIONS = 'detections'
-# The driver's own idea of where the robot is comes first: it is that of its detections.
+# The driver's own poses come first: its detections are relative to them.
 _POSES = ('state', 'odom')
 _POSE_TYPES = ('AgentState', 'Odometry', 'PoseStamped')
-# A mean of errors so many times its own deviation is no accident.
+# Mean errors above this multiple of their standard deviation are significant.
 _CLEAR = 4.0
 
 
@@ -229,7 +229,7 @@ class RecordedRobot:
                 for item in reader.messages(topics):
                     yield item.topic, item.message
             except BagError as error:
-                # What comes before the damage is as good as ever.
+                # Messages before the damage are used.
                 self.recovered = f'{error}; what is before it is read'
 
     def observations(self) -> list[Observation]:

@@ -11,12 +11,12 @@ _WINDOW = 2.0
 class ArrivalClock:
     """The node's time at any instant of the steady clock.
 
-    A simulated time comes in steps, and late: its true course is the earliest that it was seen at.
-    Where the node's time is the system's, it is that.
+    Simulated time arrives in steps and late, so that its largest recent lead over the steady clock
+    is the true one. With system time the result is exact.
     """
 
     def __init__(self) -> None:
-        # Of the last while, falling: instants, and how far the node's time was ahead [s, ns].
+        # Recent instants [s] and leads of the node's time [ns], with falling leads.
         self._leads: deque[tuple[float, int]] = deque()
 
     def observe(self, now: float, time: int) -> None:

@@ -9,7 +9,7 @@ import math
 _FULL = 2.0
 # A battery in per cent gets below `_FULL` only from near there [%].
 _NEARLY_EMPTY = 20.0
-# Readings in a row above `_FULL` that settle that they are per cent.
+# Consecutive readings above `_FULL` after which the unit is per cent.
 _SETTLED = 2
 
 
@@ -39,10 +39,10 @@ class BatteryGauge:
 
 
 class BatteryReadings:
-    """Readings that wait for the steps after theirs, as a run in lockstep needs.
+    """Readings that are held back until a later step, for lockstep.
 
-    Whether a reading comes before the odometry of its own step depends on the scheduler. It counts
-    from the next step on, by when it is there.
+    Whether a reading arrives before the odometry of its own step depends on the scheduler; by the
+    next step it has arrived in any case.
     """
 
     def __init__(self) -> None:

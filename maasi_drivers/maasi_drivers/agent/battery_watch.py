@@ -7,7 +7,7 @@ import time
 from maasi_drivers.agent.health import BATTERY
 from maasi_drivers.agent.robot_node import RobotNode
 
-# Without a charge for so long a warning says that `battery_minimum` cannot act [s].
+# Time without a charge after which a warning says that `battery_minimum` cannot act [s].
 _PATIENCE = 10.0
 
 

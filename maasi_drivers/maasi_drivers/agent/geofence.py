@@ -33,11 +33,7 @@ def make_fence(
     ground, start : float
         Heights of the floor and of the start [m].
     """
-    if given is not None:
-        return np.array(given)
-    fence = np.array([[0.0, 0.0], [0.0, 0.0], [ground, start + _HEIGHT]])
-    fence[: len(bounds)] = bounds + np.array([-radius, radius])
-    return fence
+    return _fence(given, bounds, radius, (ground, start + _HEIGHT))
 
 
 def make_vehicle_fence(
@@ -48,14 +44,20 @@ def make_vehicle_fence(
     As `make_fence`; by default from 1 m below the lower to 1 m above the higher one of ground and
     start, but not below the ground for what starts above it.
     """
+    lowest = ground if start > ground else start - _HEIGHT
+    return _fence(given, bounds, radius, (lowest, max(ground, start) + _HEIGHT))
+
+
+def _fence(
+    given: list[list[float]] | None,
+    bounds: FloatArray,
+    radius: float,
+    heights: tuple[float, float],
+) -> FloatArray:
     if given is not None:
         return np.array(given)
-    fence = np.array(
-        [[0.0, 0.0], [0.0, 0.0], [min(ground, start) - _HEIGHT, max(ground, start) + _HEIGHT]]
-    )
+    fence = np.array([[0.0, 0.0], [0.0, 0.0], heights])
     fence[: len(bounds)] = bounds + np.array([-radius, radius])
-    if start > ground:
-        fence[2, 0] = max(fence[2, 0], ground)
     return fence
 
 
@@ -72,7 +74,7 @@ def goal_problem(fence: FloatArray, point: Sequence[float]) -> str | None:
 
 
 def outside(fence: FloatArray, position: FloatArray) -> str:
-    """Return where a robot is too far outside, or nothing; on the floor below nothing is wrong."""
+    """Return where a robot is too far outside, or nothing; below the fence it may land."""
     for axis, (low, high) in enumerate(fence.tolist()):
         lowest = -math.inf if axis == 2 else low - MARGIN
         if not lowest <= position[axis] <= high + MARGIN:

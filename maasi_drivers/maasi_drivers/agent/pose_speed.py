@@ -9,7 +9,7 @@ import numpy as np
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_filter.models.pose import Pose, compose, inverse
 
-# No difference over more than this is a velocity [ns].
+# Longest time over which a difference is a velocity [ns].
 _LONGEST = 1_000_000_000
 # Faster than this is a jump of the pose, not a movement [m/s, rad/s].
 _FASTEST = 50.0

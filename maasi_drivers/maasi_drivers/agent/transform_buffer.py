@@ -10,7 +10,7 @@ from maasi_drivers.agent.odometry import StampedPose, interpolate
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.stamps import StampGate
 
-# More frames than this come from no robot team.
+# Upper bound on frames, against floods.
 _MOST_FRAMES = 2000
 _MOST_STAMPS = 4096
 _LONGEST_NAME = 200
@@ -78,14 +78,14 @@ class TransformBuffer:
         pose : Pose
             Of the child in its parent.
         stamp : int
-            [ns]; of no meaning for a static transform.
+            [ns]; ignored for a static transform.
         static : bool
             Whether it holds at all times.
 
         Raises
         ------
         ValueError
-            On a name that cannot be one, a loop of frames, a negative stamp, or too many frames.
+            On an invalid name, a loop of frames, a negative stamp, or too many frames.
         """
         for name in (parent, child):
             if not 0 < len(name) <= _LONGEST_NAME:

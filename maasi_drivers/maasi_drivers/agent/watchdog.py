@@ -13,12 +13,12 @@ from maasi_drivers.agent.state_publisher import StatePublisher
 from maasi_drivers.links.robot_link import RobotLink
 
 PERIOD = 0.1
-# Checks from one state of a robot without odometry to the next.
+# Checks per published state of a robot without odometry.
 _CHECKS_PER_STATE = 2
-# Without a first pose for so long a warning is logged [s].
+# Time without a first pose after which a warning is logged [s].
 _PATIENCE = 3.0
-# A robot whose odometry is silent for so much longer than its timeout, in wall time, is stopped
-# without a fault: a simulated clock may be slow [s].
+# Wall time beyond its timeout after which a robot with silent odometry is stopped without a
+# fault: a simulated clock may be slow [s].
 _CLOCK_PATIENCE = 0.5
 
 

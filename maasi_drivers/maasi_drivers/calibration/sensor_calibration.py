@@ -13,9 +13,9 @@ from maasi_filter.models.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
 
-# Fewer observations say nothing of a covariance.
-LEAST_LOOKS = 10
-# What is so many times farther from the target than the median is something else.
+# Least number of observations for a covariance.
+LEAST_OBSERVATIONS = 10
+# Detections farther from the target than this multiple of the median are of something else.
 _FAR = 8.0
 # Below this all detections agree to rounding [m].
 _ROUNDING = 1e-9
@@ -53,13 +53,13 @@ class SensorNoise:
     ranges : tuple of float
         Smallest and largest range of the observations that were used [m].
     used : int
-        Looks from which R comes.
+        Observations from which R is estimated.
     near : int
-        Looks left out because the target was too near for a bearing.
+        Observations left out because the target was too near for a bearing.
     others : int
         Detections of something else.
     inside : int
-        Looks with the target in the field of view.
+        Observations with the target in the field of view.
     missed : int
         Of those, the ones that did not show it.
     """
@@ -105,7 +105,7 @@ def sensor_noise(
     target : array_like, shape (d,), optional
         Where it is [m, map]; none: the mean of where it was seen, which hides a bias.
     least_range : float
-        Looks nearer than this are left out: the bearing means nothing there [m].
+        Nearer observations are left out: the bearing means nothing there [m].
 
     Raises
     ------
@@ -123,7 +123,9 @@ def sensor_noise(
     else:
         every = np.concatenate([np.zeros((0, model.dimension)), *seen])
         if not len(every):
-            raise ValueError(f'target: it was seen 0 times, allowed is at least {LEAST_LOOKS}')
+            raise ValueError(
+                f'target: it was seen 0 times, allowed is at least {LEAST_OBSERVATIONS}'
+            )
         place = np.median(every, axis=0)
     nearest: list[int | None] = []
     # Without a given target, from the median to the mean of what is near it.
@@ -145,10 +147,10 @@ def sensor_noise(
             continue
         errors.append(model.residual(observation.values[index], expected))
         ranges.append(float(expected[0]))
-    if len(errors) < LEAST_LOOKS:
+    if len(errors) < LEAST_OBSERVATIONS:
         raise ValueError(
             f'target: it was seen {len(errors)} times from {least_range:g} m or farther, '
-            f'allowed is at least {LEAST_LOOKS}'
+            f'allowed is at least {LEAST_OBSERVATIONS}'
         )
     array = np.array(errors)
     return SensorNoise(

@@ -56,7 +56,7 @@ class Nav2Navigation:
         self._client = ActionClient(node, NavigateToPose, 'navigate_to_pose')
         self._goal: Goal | None = None
         self._handle: Any = None
-        # Of the goal before, until Nav2 has taken the present one instead.
+        # Handle of the replaced goal, until Nav2 has accepted the present one.
         self._replaced: Any = None
 
     @property

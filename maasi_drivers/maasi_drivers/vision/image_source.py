@@ -31,7 +31,7 @@ class VideoFrame:
     image : ndarray, shape (h, w, 3), uint8
         R, G, B.
     received : float
-        When it was there, monotonic clock [s].
+        Time of arrival, monotonic clock [s].
     number : int
         Of the frames of this source, from 1.
     """
@@ -86,7 +86,7 @@ class VideoSource:
         return frame
 
     def close(self) -> None:
-        """Let go of the source."""
+        """Close the source."""
         self._closing.set()
         self._thread.join(0.001 * _READ_TIMEOUT)
 

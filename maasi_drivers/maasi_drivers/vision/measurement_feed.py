@@ -141,7 +141,7 @@ def encode(packet: FeedPacket) -> bytes:
         ]
         data += _BLOB.pack(*numbers, BORDER_CUT if blobs.border_cut[index] else 0)
     data += _CHECKSUM.pack(zlib.crc32(data))
-    # What is sent can be read.
+    # Raises for what a receiver would refuse.
     decode(data)
     return data
 
@@ -152,7 +152,7 @@ def decode(data: bytes) -> FeedPacket:
     Raises
     ------
     FeedError
-        If it is none, or damaged, or of another version, or holds what cannot be.
+        If it is damaged, of another version, or holds values that are not allowed.
     """
     least = _HEADER.size + _CHECKSUM.size
     if len(data) < least:

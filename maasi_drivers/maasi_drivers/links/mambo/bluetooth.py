@@ -1,4 +1,4 @@
-"""What pyparrot's Bluetooth connection to a Mambo lacks. Without ROS.
+"""Additions to pyparrot's Bluetooth connection to a Mambo. Without ROS.
 
 pyparrot 1.5.20 (`pyparrot/networking/bleConnection.py`) cannot send one piloting command, only
 repeat one and wait meanwhile; and its acknowledged commands wait half a second at least. The

@@ -1,8 +1,8 @@
 """The UDP socket of pyparrot for a Mambo, guarded against other senders. Without ROS.
 
 pyparrot 1.5.20 (`pyparrot/networking/wifiConnection.py`) binds it to all interfaces, takes every
-datagram for one of the drone's, hands the last one out again after a timeout, and its listener
-dies of a frame that is cut short, or loops for ever over one whose size is zero.
+datagram for one of the drone's, returns the last one again after a timeout, and its listener
+dies on a truncated frame, or loops forever on one of size zero.
 """
 
 from __future__ import annotations
@@ -104,10 +104,10 @@ class DroneSocket:
 
 
 def guard(connection: Any, drone: str, port: int) -> None:
-    """Have a connection of pyparrot listen by a `DroneSocket`.
+    """Make a connection of pyparrot receive through a `DroneSocket`.
 
-    What the drone's frames hold may still be too short for pyparrot's parser: such a frame is
-    dropped instead of ending the listener.
+    The content of a frame may still be too short for pyparrot's parser: such a frame is dropped
+    instead of ending the listener.
     """
     handle = connection.handle_data
 
@@ -128,7 +128,7 @@ def guard(connection: Any, drone: str, port: int) -> None:
 
 
 def revive(connection: Any) -> bool:
-    """Start a connection's listener again if it has died; return whether it had."""
+    """Restart a connection's listener if it has died; return whether it had."""
     if not connection.is_listening or connection.listener_thread.is_alive():
         return False
     connection.listener_thread = threading.Thread(

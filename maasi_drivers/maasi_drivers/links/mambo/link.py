@@ -1,4 +1,4 @@
-"""The wire to a Parrot Mambo: pyparrot over WiFi or Bluetooth, behind one thread. Without ROS.
+"""Connection to a Parrot Mambo: pyparrot over WiFi or Bluetooth, in one thread. Without ROS.
 
 Over WiFi pyparrot keeps handing out its last packet after the link is cut, and the stamp in a
 position event is the time since the one before. So an event counts as new only when one of the
@@ -32,7 +32,7 @@ HANDSHAKE_PORT = 44444
 AIRBORNE = ('takingoff', 'hovering', 'flying', 'landing')
 
 _STAMPS = ('DroneSpeed_ts', 'DroneAltitude_ts', 'DroneQuaternion_ts')
-# Between two rounds of the thread [s]; what is handed over wakes it.
+# Period of the thread's loop [s]; requests wake it.
 _ROUND = 0.05
 # Silence of its caller after which the drone is commanded to hover [s].
 CALLER_TIMEOUT = 0.5
@@ -352,7 +352,7 @@ class MamboLink:
                 # Its last reported state may be outdated.
                 obeyed = False
             if wanted == 'take_off' and obeyed:
-                # Once is enough: one that lands by itself stays down.
+                # Request it once: a drone that lands by itself stays down.
                 self._wanted = ''
             if not wanted or obeyed or time.monotonic() - self._asked_at < _REPEAT:
                 return

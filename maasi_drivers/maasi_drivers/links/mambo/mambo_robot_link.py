@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 
 from maasi_drivers.agent import geofence
 from maasi_drivers.agent.arm_permission import offer_arm
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.odometry_topic import OdometryTopic
+from maasi_drivers.agent.pose_topic import PoseTopic
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
@@ -20,9 +20,7 @@ from maasi_drivers.links.mambo.pilot import MamboPilot, Phase, tilt_limit
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.robot_link import FloatArray, RobotLink
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros
 from maasi_filter.ros.lifecycle_node import SettingsError
-from maasi_filter.ros.qos import sensor_reader
 from maasi_planner.motion import MotionModel, RobotState
 
 # Longest time between two updates of the pilot [s].
@@ -102,8 +100,7 @@ class MamboRobotLink(RobotLink):
         if self._mambo.pose == 'odometry':
             OdometryTopic(driver)
         elif self._mambo.pose == 'pose':
-            quality = sensor_reader(driver.settings.lockstep)
-            driver.create_subscription(PoseStamped, 'pose', self._on_pose, quality)
+            PoseTopic(driver, self._take_pose)
         driver.expect(lambda: self._pilot is not None and self._pilot.phase is Phase.FLYING)
 
     def close(self) -> None:
@@ -236,24 +233,10 @@ class MamboRobotLink(RobotLink):
                 time.monotonic(), RobotState(placed.pose, placed.velocity, placed.angular_velocity)
             )
 
-    def _on_pose(self, message: PoseStamped) -> None:
+    def _take_pose(self, stamp: int, pose: Pose) -> None:
         driver = self.driver
-        if not driver.active:
-            return
-        stamp = stamp_from_ros(message.header.stamp)
-        if not driver.is_new_pose('pose.header.stamp', stamp):
-            return
-        frame = message.header.frame_id.lstrip('/')
-        try:
-            if frame != driver.settings.frame:
-                raise ValueError(
-                    f'header.frame_id: read {frame!r}, allowed is {driver.settings.frame!r}'
-                )
-            placed = self._with_velocity(stamp, pose_from_ros(message.pose))
-        except ValueError as error:
-            driver.drop('pose', f'pose: {error}')
-            return
-        driver.take_pose(placed)
+        if driver.active and driver.is_new_pose('pose.header.stamp', stamp):
+            driver.take_pose(self._with_velocity(stamp, pose))
 
     def _with_velocity(self, stamp: int, pose: Pose) -> StampedPose:
         latest = self.driver.history.latest

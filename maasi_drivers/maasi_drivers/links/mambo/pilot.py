@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maasi_drivers.agent import geofence
 from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission
-from maasi_drivers.links.mambo.link import PositionEvent
+from maasi_drivers.links.mambo.link import MamboLink, PositionEvent
 from maasi_drivers.links.mambo.reckoning import DeadReckoning
 from maasi_drivers.links.mambo.settings import LEAST_TILT, MOST_TILT, MamboSettings
 from maasi_drivers.links.mambo.tilt_model import Course, TiltModel
@@ -26,46 +25,18 @@ _SPEED_GAIN = 2.5
 # Acceleration of the desired speed: little tilt, as images are taken meanwhile [m/s^2].
 _RAMP = 0.4
 # A desired velocity older than this is discarded [s].
-_OLD_WISH = 0.5
+_DESIRED_AGE = 0.5
 # Share of the largest acceleration that stops it before the geofence: the rest is for wind.
 _BRAKE_SHARE = 0.5
-# Most speed for each metre to the geofence, well below what the speed follows by [1/s].
+# Largest speed per metre to the geofence, well below the bandwidth of the speed [1/s].
 _NEAR_RATE = 1.0
-# Assumed until the speed at the largest tilt is measured; it does not fly by it [m/s].
+# Placeholder until the speed at the largest tilt is measured; never used in flight [m/s].
 _UNKNOWN_SPEED = 1.0
 # How far from its altitude the drone counts as there after take-off [m].
 _ALTITUDE_TOLERANCE = 0.1
 # Under a command faster than this, an event equal to the bit is no new position [m/s].
 _LEAST_SPEED = 0.05
 _STILL = np.zeros(4)
-
-
-class Link(Protocol):
-    """What the pilot needs of a `MamboLink`."""
-
-    error: str
-    flying_state: str
-    battery: float
-    heard_at: float
-    tilt: float
-    climb: float
-
-    @property
-    def connected(self) -> bool:
-        """Whether the drone has answered."""
-
-    @property
-    def position(self) -> PositionEvent | None:
-        """The last position event, or None."""
-
-    def take_off(self) -> None:
-        """Have it take off."""
-
-    def land(self) -> None:
-        """Have it land."""
-
-    def steer(self, forward: float, left: float, up: float, turn: float) -> None:
-        """Send one piloting command, in shares of the largest."""
 
 
 def tilt_limit(motion: MotionSettings) -> float:
@@ -89,7 +60,7 @@ class MamboPilot:
 
     Parameters
     ----------
-    link : Link
+    link : MamboLink
         To the drone.
     motion : MotionModel
         Its controller and model.
@@ -110,7 +81,7 @@ class MamboPilot:
 
     def __init__(
         self,
-        link: Link,
+        link: MamboLink,
         motion: MotionModel,
         settings: MamboSettings,
         home: Pose,
@@ -139,11 +110,11 @@ class MamboPilot:
         self._command = _STILL
         self._now = -math.inf
         # Time [s] and value of the last desired velocity in the map [m/s].
-        self._wish: tuple[float, FloatArray] = (-math.inf, np.zeros(2))
+        self._desired: tuple[float, FloatArray] = (-math.inf, np.zeros(2))
         self._since = -math.inf
         self._lost_since: float | None = None
         self._cancelled_at: float | None = None
-        # Why it landed for good.
+        # Reason of the final landing.
         self._ended = ''
         self._permission = ArmPermission(settings.arm_timeout)
 
@@ -208,38 +179,38 @@ class MamboPilot:
     def hover(self) -> None:
         """Stop: the drone keeps its place by its own camera."""
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
-            self._wish = -math.inf, np.zeros(2)
+            self._desired = -math.inf, np.zeros(2)
             self._send(_STILL, _STILL)
 
     def _steer(self, command: FloatArray) -> None:
-        """Tilt it so that its speed comes to that of the command, as far as it can stop."""
+        """Steer towards the commanded speed, limited to what can be stopped."""
         model, course = self.reckoning.model, self.reckoning.ahead()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         turned = np.array([[cosine, sine], [-sine, cosine]])
         ramped = self._ramp(turned.T @ command[:2], course.velocity[:2])
-        self._wish = self._now, self._stoppable(course, ramped)
-        wish = turned @ self._wish[1]
+        self._desired = self._now, self._stoppable(course, ramped)
+        desired = turned @ self._desired[1]
         speed = turned @ course.velocity[:2]
-        tilts = model.shares(model.drag * wish + _SPEED_GAIN * (wish - speed))
+        tilts = model.shares(model.drag * desired + _SPEED_GAIN * (desired - speed))
         rest = [command[2] / model.climb, command[3] / model.turn]
         self._send(command, np.clip([*tilts, *rest], -1.0, 1.0))
 
-    def _ramp(self, wish: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return how far the wished velocity in the map (2,) has come towards a new one."""
-        passed = self._now - self._wish[0]
-        before = self._wish[1] if passed <= _OLD_WISH else velocity
-        change = wish - before
+    def _ramp(self, desired: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the desired velocity in the map (2,), ramped towards a new one."""
+        passed = self._now - self._desired[0]
+        before = self._desired[1] if passed <= _DESIRED_AGE else velocity
+        change = desired - before
         size = float(np.hypot(*change))
-        most = _RAMP * min(passed, _OLD_WISH)
+        most = _RAMP * min(passed, _DESIRED_AGE)
         return before + change * (min(size, most) / size if size > 0.0 else 0.0)
 
-    def _stoppable(self, course: Course, wish: FloatArray) -> FloatArray:
+    def _stoppable(self, course: Course, desired: FloatArray) -> FloatArray:
         """Return a velocity in the map (2,) that can be stopped before the geofence."""
         brake = 2.0 * _BRAKE_SHARE * self.reckoning.model.thrust
         room = np.abs(self.fence[:2].T - course.position[:2])
         inside = (course.position[:2] > self.fence[:2, 0], course.position[:2] < self.fence[:2, 1])
         most = inside * np.minimum(np.sqrt(brake * room), _NEAR_RATE * room)
-        return np.clip(wish, -most[0], most[1])
+        return np.clip(desired, -most[0], most[1])
 
     def _send(self, command: FloatArray, shares: FloatArray) -> None:
         self._command = command
@@ -334,7 +305,7 @@ class MamboPilot:
         return reason
 
     def _stand(self, now: float) -> str:
-        """Take off if nothing speaks against it."""
+        """Take off if nothing prevents it."""
         state = self.link.flying_state
         if self._ended:
             return f'{self._ended}, {UNTIL_ARM}'

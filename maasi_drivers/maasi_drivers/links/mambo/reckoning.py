@@ -24,9 +24,9 @@ FloatArray = NDArray[np.float64]
 # Share of the difference to an event by which position and velocity are corrected.
 _POSITION_GAIN, _VELOCITY_GAIN = 0.8, 0.25
 _EVENT_PERIOD = 0.5
-# A difference beyond this is no error of dead reckoning: the event is taken as it is [m].
+# Above this difference an event replaces the estimate [m].
 _JUMP = 0.5
-# Longest time that is reckoned at once [s].
+# Longest time of one prediction [s].
 _LONGEST = 1.0
 _HISTORY = 64
 _STILL = np.zeros(4)
@@ -83,13 +83,13 @@ class DeadReckoning:
         return np.diag([position] * 3 + [tilt, tilt, attitude])
 
     def _tilt_doubt(self) -> float:
-        """Return by how much the tilt may be another one because a command acts sooner or later."""
+        """Return the uncertainty of the tilt from the uncertain delay of commands [rad]."""
         now, delay = self._now or 0.0, self.settings.delay
         recent = [shares[:2] for acts, shares in self._sent if abs(now - acts) <= delay]
         if not recent:
             return 0.0
         spread = np.abs(np.array(recent) - self._acting()[:2]).max()
-        # The largest of a uniform distribution, as a deviation.
+        # Standard deviation of a uniform distribution of that half-width.
         return float(self.model.tilt * spread) / math.sqrt(3.0)
 
     def _acting(self) -> FloatArray:

@@ -1,8 +1,8 @@
 """Measures how fast a Mambo flies at its largest tilt: a flight to and fro, and a fit. Without ROS.
 
 Each leg is the largest tilt one way and then the other for the same time T, from rest. Without
-drag that would take it a way of g tan(tilt) T^2 and end at rest, with drag it goes less far: so
-the legs keep within a way that is known before, whatever the drone. Then it hovers, and goes back.
+drag a leg is g tan(tilt) T^2 long and ends at rest; with drag it is shorter, so that its length is
+bounded in advance for any drone. Then it hovers, and flies back.
 """
 
 from __future__ import annotations
@@ -10,25 +10,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_drivers.links.mambo.link import PositionEvent
-from maasi_drivers.links.mambo.pilot import Link
+from maasi_drivers.links.mambo.link import MamboLink, PositionEvent
 from maasi_drivers.links.mambo.tilt_model import Course, TiltModel
 
 FloatArray = NDArray[np.float64]
 
 # Rest before each leg: the first part for the firmware to stop it [s].
 _REST, _STOPPING = 3.0, 1.8
-# Beyond the planned way by this share it has not followed the command.
+# Above this multiple of the planned distance it has not followed the command.
 _EXCESS = 1.5
 # Longest silence, and longest waits for take-off and connection [s].
 _SILENCE, _PATIENCE = 1.5, 15.0
 _LEAST_BATTERY = 0.2
-# What a fit may leave [m], and how uncertain the speed may be [1].
+# Largest residual of a fit [m], and relative uncertainty of the speed [1].
 _MOST_MISFIT, _MOST_DOUBT = 0.05, 0.35
 # Drag [1/s] and delay [s] that are searched.
 _LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)
@@ -82,19 +80,12 @@ class Leg:
     events: list[tuple[float, float]] = field(default_factory=list)
 
 
-class MeasuringLink(Link, Protocol):
-    """What the flight needs of a `MamboLink`."""
-
-    def keep_alive(self) -> None:
-        """Note that the caller is alive."""
-
-
 class MeasuringFlight:
     """Flies the legs.
 
     Parameters
     ----------
-    link : MeasuringLink
+    link : MamboLink
         To the drone, which stands on the floor.
     way : float
         That a leg may take at most [m].
@@ -109,9 +100,7 @@ class MeasuringFlight:
         Those flown.
     """
 
-    def __init__(
-        self, link: MeasuringLink, way: float, legs: int, clock: Callable[[], float]
-    ) -> None:
+    def __init__(self, link: MamboLink, way: float, legs: int, clock: Callable[[], float]) -> None:
         self.link = link
         self.way = way
         self.number = legs
@@ -127,7 +116,7 @@ class MeasuringFlight:
         Raises
         ------
         MeasurementError
-            If something speaks against going on.
+            If the flight has to be aborted.
         """
         link = self.link
         yield from self._await('connecting', lambda: link.connected)
@@ -180,7 +169,7 @@ class MeasuringFlight:
         self.link.steer(0.0, 0.0, 0.0, 0.0)
 
     def _look(self) -> PositionEvent | None:
-        """Look after the link; return a new position event, or None."""
+        """Check the link; return a new position event, or None."""
         link, now = self.link, self.clock()
         link.keep_alive()
         event = link.position

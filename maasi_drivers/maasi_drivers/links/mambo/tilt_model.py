@@ -1,9 +1,9 @@
-"""How a Mambo flies under piloting commands, as its driver has it. Without ROS.
+"""Model of a Mambo under piloting commands. Without ROS.
 
 Roll and pitch of a command are shares of the largest tilt. A tilt accelerates by g tan(tilt), and
-drag holds against the speed, in proportion to it (R. Mahony, V. Kumar, P. Corke, "Multirotor
-aerial vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). So one measured number says
-all: the steady speed at the largest tilt. A command acts after a delay.
+drag opposes the speed, in proportion to it (R. Mahony, V. Kumar, P. Corke, "Multirotor
+aerial vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). So one measured number is
+enough: the steady speed at the largest tilt. A command acts after a delay.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _GRAVITY = 9.81
-# Without roll and pitch the firmware brakes by itself; about how fast [1/s].
+# Approximate rate at which the firmware brakes without roll and pitch [1/s].
 _HOVER_RATE = 2.0
 
 
@@ -40,7 +40,7 @@ class Course:
 
 @dataclass(frozen=True)
 class TiltModel:
-    """What a Mambo does with piloting commands.
+    """Response of a Mambo to piloting commands.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class TiltModel:
             ]
         )
         lag = course.velocity - steady
-        # The vertical speed is the firmware's business: it is there at once.
+        # The firmware controls the vertical speed: no lag is assumed.
         lag[2] = 0.0
         decay = math.exp(-rate * h)
         return Course(

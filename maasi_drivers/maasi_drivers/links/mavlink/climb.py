@@ -9,7 +9,7 @@ _REACHED, _PROGRESS = 0.2, 0.1
 
 
 class Climb:
-    """Tells whether a climb, or a dive, is over or stalled.
+    """Detects the end or a stall of a climb or dive.
 
     Parameters
     ----------
@@ -29,12 +29,12 @@ class Climb:
     def begin(self, now: float) -> None:
         """Begin, at `now` on the steady clock [s]."""
         self.accepted = False
-        # Least way left so far [m], and when [s].
+        # Smallest distance left so far [m], and its time [s].
         self._least = math.inf
         self._progress_at = now
 
     def update(self, left: float, now: float) -> None:
-        """Take the way left [m]."""
+        """Update with the distance left [m]."""
         if left < self._least - _PROGRESS:
             self._least, self._progress_at = left, now
 

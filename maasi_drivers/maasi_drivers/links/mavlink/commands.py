@@ -1,4 +1,4 @@
-"""Commands to an autopilot: one at a time, sent again until it is answered."""
+"""Commands to an autopilot: one at a time, resent until answered."""
 
 from __future__ import annotations
 

@@ -198,12 +198,12 @@ FIRMWARES = (ARDUCOPTER, ARDUSUB, PX4_COPTER)
 
 
 def identify(autopilot: int, vehicle_type: int) -> Firmware:
-    """Return the firmware that a heartbeat tells of.
+    """Return the firmware of a heartbeat.
 
     Raises
     ------
     ValueError
-        If it is none that this driver knows.
+        If it is not supported.
     """
     kind = 'submarine' if vehicle_type == SUBMARINE else 'copter' if vehicle_type in COPTERS else ''
     for firmware in FIRMWARES:

@@ -1,4 +1,4 @@
-"""The wire to a vehicle: one connection and one thread that alone reads and writes it."""
+"""Connection to a vehicle, which one thread alone reads and writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happened to a vehicle, for the driver's log, and the recent texts of its autopilot."""
+"""Reports on a vehicle for the driver's log, and recent texts of its autopilot."""
 
 from __future__ import annotations
 

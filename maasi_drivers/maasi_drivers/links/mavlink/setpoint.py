@@ -1,4 +1,4 @@
-"""The set-point of a vehicle: a position and a yaw, sent again and again."""
+"""The set-point of a vehicle: position and yaw, sent periodically."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def checked_target(position: ArrayLike, yaw: float) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        If a number is not finite: autopilots have crashed over that.
+        If a number is not finite: such set-points have crashed autopilots.
     """
     target = np.array(position, dtype=float)
     if target.shape != (3,) or not np.isfinite([*target, yaw]).all():

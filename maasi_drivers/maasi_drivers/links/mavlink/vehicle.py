@@ -23,11 +23,11 @@ from maasi_drivers.links.mavlink.settings import Ending, MavlinkSettings
 
 FloatArray = NDArray[np.float64]
 
-# The mode in which it is to end is requested until it shows [s].
+# Period of requests for the final mode [s].
 _ENDING_PERIOD = 0.3
-# Between two tries to arm; the autopilot reports why not [s].
+# Period of attempts to arm; the autopilot reports refusals [s].
 _ARMING_PERIOD = 2.0
-# How long set-points are sent before the mode, where they must be [s].
+# Time for which set-points are sent before a mode that needs them [s].
 _STREAM_AHEAD = 1.2
 
 
