@@ -121,7 +121,7 @@ class Play:
 
     def lead(self, ahead, direction=(1.0, 0.0, 0.0)):
         if self.vehicle.phase is Phase.FLYING:
-            position = self.vehicle.telemetry.position
+            position = self.vehicle.estimate.telemetry.position
             self.vehicle.set_target(position + ahead * np.array(direction), 0.3)
 
     def until_lost(self):

@@ -92,7 +92,7 @@ def test_it_flies_to_a_target_and_stays_there(firmware):
     play.run(12.0)
     assert_allclose(play.autopilot.body.position, target, atol=0.05)
     assert play.autopilot.body.yaw == pytest.approx(-1.0, abs=0.01)
-    telemetry = play.vehicle.telemetry
+    telemetry = play.vehicle.estimate.telemetry
     assert_allclose(telemetry.position, target, atol=0.08)
     assert Pose(np.zeros(3), telemetry.orientation).yaw == pytest.approx(-1.0, abs=0.01)
     assert play.autopilot.crashed == ''
@@ -192,7 +192,7 @@ def test_a_barometer_that_drifts_before_arming_does_not_keep_it_at_its_take_off(
     play.run(4.0)
     # Above the ground, whatever the barometer says.
     assert play.autopilot.body.position[2] == pytest.approx(HEIGHTS['arducopter'], abs=0.1)
-    assert play.vehicle.origin[2] == pytest.approx(play.autopilot._height_error, abs=0.05)
+    assert play.vehicle.estimate.origin[2] == pytest.approx(play.autopilot._height_error, abs=0.05)
     assert len(play.commands(mavlink.MAV_CMD_NAV_TAKEOFF)) == 1
 
 
@@ -271,7 +271,7 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
     assert 'the autopilot has restarted' in play.said
     # Messages, parameters and origin are those of the new start.
     assert 'FS_GCS_ENABLE is 0' in play.vehicle.fault
-    assert_allclose(play.vehicle.origin[:2], [3.0, 4.0], atol=0.05)
+    assert_allclose(play.vehicle.estimate.origin[:2], [3.0, 4.0], atol=0.05)
     play.autopilot.parameters['FS_GCS_ENABLE'] = 5.0
     play.autopilot.restart()
     play.run(12.0)
@@ -378,12 +378,12 @@ def test_two_batteries_are_two():
     seen = set()
     for _ in range(500):
         play.turn()
-        seen.add(round(play.vehicle.charge, 2))
+        seen.add(round(play.vehicle.estimate.charge, 2))
     assert seen - {-1.0} <= {0.05, 0.8}
-    assert play.vehicle.charge == pytest.approx(0.05)
+    assert play.vehicle.estimate.charge == pytest.approx(0.05)
     first = Play(autopilot={'charge': 0.8, 'more_batteries': [0.05]}, battery=0)
     first.run(5.0)
-    assert first.vehicle.charge == pytest.approx(0.8)
+    assert first.vehicle.estimate.charge == pytest.approx(0.8)
 
 
 def test_reasons_against_arming_are_shown():
@@ -473,19 +473,19 @@ def test_a_frozen_position_is_no_news():
     play = Play().fly()
     play.autopilot.freeze()
     play.run(0.2)
-    number = play.vehicle.telemetry.number
+    number = play.vehicle.estimate.telemetry.number
     play.run(AT_MOST)
-    assert play.vehicle.telemetry.number == number
-    assert play.vehicle.dropped['LOCAL_POSITION_NED that is frozen'] > 10
+    assert play.vehicle.estimate.telemetry.number == number
+    assert play.vehicle.estimate.dropped['LOCAL_POSITION_NED that is frozen'] > 10
 
 
 def test_a_position_that_is_not_finite_is_dropped():
     play = Play().fly()
-    number = play.vehicle.telemetry.number
+    number = play.vehicle.estimate.telemetry.number
     play.autopilot.reports.frozen = (math.nan, *[0.0] * 5)
     play.run(1.0)
-    assert play.vehicle.telemetry.number - number <= 1
-    assert play.vehicle.dropped['LOCAL_POSITION_NED that is not finite'] > 10
+    assert play.vehicle.estimate.telemetry.number - number <= 1
+    assert play.vehicle.estimate.dropped['LOCAL_POSITION_NED that is not finite'] > 10
     play.autopilot.reports.frozen = None
 
 
@@ -583,7 +583,7 @@ def test_a_vehicle_that_stands_elsewhere_counts_heights_from_there():
     play = Play(origin='here', autopilot={'estimator_time': 0.5})
     play.autopilot.body.position[:2] = [3.0, 4.0]
     play.fly()
-    assert_allclose(play.vehicle.origin, [3.0, 4.0, 0.0], atol=0.05)
+    assert_allclose(play.vehicle.estimate.origin, [3.0, 4.0, 0.0], atol=0.05)
 
 
 def test_commands_that_are_lost_are_said_again():

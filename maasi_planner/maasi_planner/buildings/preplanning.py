@@ -262,11 +262,10 @@ def _usable(
         [np.maximum(cell.box[:, 0], area[:, 0]), np.minimum(cell.box[:, 1], area[:, 1])], axis=1
     )
     if (box[:, 1] - box[:, 0] < _THINNEST).any():
-        for axis, words in ((2, ('below the floor', 'above the ceiling')),):
-            if cell.box[axis, 1] < area[axis, 0] + _THINNEST:
-                return box, f'a cuboid is {words[0]}'
-            if cell.box[axis, 0] > area[axis, 1] - _THINNEST:
-                return box, f'a cuboid is {words[1]}'
+        if cell.box[2, 1] < area[2, 0] + _THINNEST:
+            return box, 'a cuboid is below the floor'
+        if cell.box[2, 0] > area[2, 1] - _THINNEST:
+            return box, 'a cuboid is above the ceiling'
         return box, 'a cuboid is outside the area'
     for solid in solids:
         wall = np.stack(

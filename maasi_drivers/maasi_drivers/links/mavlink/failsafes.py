@@ -9,13 +9,13 @@ from typing import Any
 
 from maasi_drivers.links.mavlink.firmware import Firmware
 from maasi_drivers.links.mavlink.protocol import mavlink
+from maasi_drivers.links.mavlink.report_log import INFO, WARNING
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 
 # Period and number of requests for a parameter that is not answered [s, 1].
 _ANSWER_TIMEOUT, _TRIES = 0.5, 5
 # A heartbeat with our system id counts for this time [s].
 _FOREIGN_AGE = 5.0
-_WARNING, _INFO = 4, 6
 
 
 class FailsafeCheck:
@@ -71,7 +71,7 @@ class FailsafeCheck:
     def hear_own_id(self, now: float) -> None:
         """Note a heartbeat of another program that has the driver's system id."""
         if now - self._foreign_at > _FOREIGN_AGE:
-            self._report(_WARNING, self._foreign_text())
+            self._report(WARNING, self._foreign_text())
         self._foreign_at = now
 
     def read(self, now: float) -> None:
@@ -156,8 +156,8 @@ class FailsafeCheck:
             state = 'is not known' if value is None else f'is {value:g}'
             state += ', which is off' if value is not None and off else ''
             self._report(
-                _WARNING if off else _INFO, f'failsafe for when {failsafe.meaning}: {name} {state}'
+                WARNING if off else INFO, f'failsafe for when {failsafe.meaning}: {name} {state}'
             )
         problem = self._station_problem()
         if problem:
-            self._report(_WARNING, problem)
+            self._report(WARNING, problem)

@@ -17,6 +17,7 @@ from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.links.mavlink.estimate import Telemetry
 from maasi_drivers.links.mavlink.link import VehicleLink
+from maasi_drivers.links.mavlink.report_log import ERROR, INFO, WARNING
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_drivers.links.robot_link import FloatArray, RobotLink
 from maasi_filter.models.pose import Pose, compose
@@ -32,8 +33,6 @@ _STOP_TIME = 1.0
 _LONGEST_LAG = 300_000_000
 # Closer than this to its target, the vehicle keeps its heading [m].
 _TURNING = 0.3
-# Of MAVLink's MAV_SEVERITY: up to here errors, warnings, information; the rest is for debugging.
-_ERROR, _WARNING, _INFO = 3, 4, 6
 
 
 class MavlinkRobotLink(RobotLink):
@@ -169,7 +168,7 @@ class MavlinkRobotLink(RobotLink):
             return {
                 'vehicle': vehicle.phase.name,
                 **{f'parameter {key}': item for key, item in vehicle.parameters.items()},
-                **{f'ignored: {key}': number for key, number in vehicle.dropped.items()},
+                **{f'ignored: {key}': number for key, number in vehicle.estimate.dropped.items()},
             }
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
@@ -191,9 +190,9 @@ class MavlinkRobotLink(RobotLink):
             return
         with link.vehicle() as vehicle:
             vehicle.active = driver.active and not self._ending
-            fault, charge = vehicle.fault, vehicle.charge
-            reports = vehicle.charge_reports
-            telemetry, self._local_origin = vehicle.telemetry, vehicle.origin
+            fault, estimate = vehicle.fault, vehicle.estimate
+            charge, reports = estimate.charge, estimate.charge_reports
+            telemetry, self._local_origin = estimate.telemetry, estimate.origin
         if link.failure:
             fault = f'link: {link.failure}'
         self._log_reports()
@@ -219,11 +218,11 @@ class MavlinkRobotLink(RobotLink):
             reports = vehicle.reports()
         logger = self.driver.get_logger()
         for severity, text in reports:
-            if severity <= _ERROR:
+            if severity <= ERROR:
                 logger.error(text)
-            elif severity <= _WARNING:
+            elif severity <= WARNING:
                 logger.warning(text)
-            elif severity <= _INFO:
+            elif severity <= INFO:
                 logger.info(text)
             else:
                 logger.debug(text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission
 from maasi_drivers.links.mavlink.autopilot import Autopilot, ModeChange
 from maasi_drivers.links.mavlink.climb import Climb
-from maasi_drivers.links.mavlink.estimate import Telemetry
 from maasi_drivers.links.mavlink.firmware import Firmware
 from maasi_drivers.links.mavlink.phase import COMMANDED, Phase
 from maasi_drivers.links.mavlink.protocol import mavlink
@@ -49,6 +47,9 @@ class Vehicle:
         How far it is.
     active : bool
         Whether the driver is; while it is not, nothing is armed.
+    estimate : Estimate
+        Pose, battery and fix. The height of its origin is that of the ground when a copter is
+        armed: the estimate drifts until then.
     """
 
     def __init__(self, settings: MavlinkSettings, height: float, sender: Any) -> None:
@@ -58,7 +59,7 @@ class Vehicle:
         self.active = False
         self._log = ReportLog()
         self._autopilot = Autopilot(settings, sender, self._log, self._on_restart)
-        self._estimate = self._autopilot.estimate
+        self.estimate = self._autopilot.estimate
         self._permission = ArmPermission(settings.arm_timeout)
         self._setpoint = Setpoint(settings, sender)
         self._climb = Climb(settings.rise_timeout)
@@ -78,34 +79,6 @@ class Vehicle:
     def flying(self) -> bool:
         """Whether it follows set-points, with a link that works."""
         return self.phase is Phase.FLYING and not self._autopilot.lost
-
-    @property
-    def telemetry(self) -> Telemetry | None:
-        """Newest pose; None before it is known."""
-        return self._estimate.telemetry
-
-    @property
-    def origin(self) -> FloatArray:
-        """Of the settings, in the local frame of the autopilot, ENU, (3,) [m].
-
-        Its height is that of the ground when a copter is armed: the estimate drifts until then.
-        """
-        return self._estimate.origin
-
-    @property
-    def dropped(self) -> Counter[str]:
-        """Messages that could not be used: kind to number."""
-        return self._estimate.dropped
-
-    @property
-    def charge(self) -> float:
-        """Of the battery that counts, 0 to 1; -1 where it is not known."""
-        return self._estimate.charge
-
-    @property
-    def charge_reports(self) -> int:
-        """Messages on batteries so far."""
-        return self._estimate.charge_reports
 
     @property
     def parameters(self) -> Mapping[str, float | None]:
@@ -128,7 +101,7 @@ class Vehicle:
         if self._autopilot.lost:
             return f'link: nothing heard from system {self.settings.system}'
         if self.phase is Phase.FLYING:
-            problem = self._estimate.problem(self._fix_needed)
+            problem = self.estimate.problem(self._fix_needed)
             if problem:
                 return f'vehicle: {problem}'
         what = ': '.join(part for part in (self.phase.value, self._detail) if part)
@@ -146,10 +119,11 @@ class Vehicle:
     @property
     def _top(self) -> float:
         """Height to which it rises, in its local frame [m]."""
-        return float(self.origin[2]) + self.height
+        return float(self.estimate.origin[2]) + self.height
 
     def _position(self) -> FloatArray:
-        return np.zeros(3) if self.telemetry is None else self.telemetry.position.copy()
+        telemetry = self.estimate.telemetry
+        return np.zeros(3) if telemetry is None else telemetry.position.copy()
 
     def reports(self) -> list[tuple[int, str]]:
         """Return what happened since the last call: severity as in MAVLink, and text."""
@@ -349,19 +323,16 @@ class Vehicle:
             self._phase_at = now
         if self._permission.expired(now):
             self._on_expired(now)
-        phase = self.phase
-        if phase is Phase.PREPARING:
-            self._prepare(now)
-        elif phase is Phase.WAITING:
-            self._wait(now)
-        elif phase is Phase.STARTING:
-            self._take_mode(now)
-        elif phase is Phase.ARMING:
-            self._arm(now)
-        elif phase is Phase.RISING:
-            self._rise(now)
-        elif phase is Phase.ENDING:
-            self._end(now)
+        work = {
+            Phase.PREPARING: self._prepare,
+            Phase.WAITING: self._wait,
+            Phase.STARTING: self._take_mode,
+            Phase.ARMING: self._arm,
+            Phase.RISING: self._rise,
+            Phase.ENDING: self._end,
+        }.get(self.phase)
+        if work is not None:
+            work(now)
 
     def _is_due(self, now: float, period: float) -> bool:
         """Return whether a request may be sent again, and note that it is."""
@@ -383,7 +354,7 @@ class Vehicle:
     def _prepare(self, now: float) -> None:
         self._detail = self._log.recent_text(now)
         assert self._autopilot.failsafes is not None
-        if self._autopilot.failsafes.complete and self._estimate.ready:
+        if self._autopilot.failsafes.complete and self.estimate.ready:
             self._enter(Phase.WAITING)
             self._wait(now)
 
@@ -398,7 +369,7 @@ class Vehicle:
         elif autopilot.armed and permitted:
             self._log.add(INFO, f'it is armed, in {name}: taken over')
             self._permission.end()
-            if self._estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND:
+            if self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND:
                 self._begin_rising(now)
             else:
                 self._begin_flying()
@@ -438,19 +409,20 @@ class Vehicle:
         self._setpoint.position = self._position()
         if self._firmware.kind == 'copter':
             # On the ground; the barometer may have drifted since the estimator started.
-            self._estimate.origin[2] = self._setpoint.position[2]
+            self.estimate.origin[2] = self._setpoint.position[2]
         self._climb.begin(now)
         self._enter(Phase.RISING)
 
     def _rise(self, now: float) -> None:
         firmware, climb = self._firmware, self._climb
-        assert self.telemetry is not None and self._setpoint.position is not None
-        height = float(self.telemetry.position[2])
+        telemetry = self.estimate.telemetry
+        assert telemetry is not None and self._setpoint.position is not None
+        height = float(telemetry.position[2])
         left = abs(height - self._top)
         climb.update(left, now)
         # The autopilot's home may be elsewhere: the rest after its take-off is flown by set-point.
         taken_off = (
-            firmware.rise == 'command' and self._estimate.landed == mavlink.MAV_LANDED_STATE_IN_AIR
+            firmware.rise == 'command' and self.estimate.landed == mavlink.MAV_LANDED_STATE_IN_AIR
         )
         if climb.is_over(left) or taken_off:
             self._begin_flying()
@@ -479,7 +451,7 @@ class Vehicle:
             position[2] = self._top
         self._setpoint.hold(position)
         if self.phase is not Phase.FLYING:
-            self._fix_needed = self._estimate.has_fix
+            self._fix_needed = self.estimate.has_fix
         self._autopilot.commands.clear()
         self._enter(Phase.FLYING)
 
