@@ -17,7 +17,7 @@ from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1
 # Between two checks of the subscriptions: zeros must not wait for the discovery of a publisher [s].
-_LOOK_PERIOD = 0.5
+_REFRESH_PERIOD = 0.5
 
 
 class GuardNode(LockstepLifecycleNode[GuardSettings]):
@@ -52,7 +52,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             self, 'cmd_vel', self.settings.command_type, self.settings.lockstep
         )
         self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
-        self.create_wall_timer(_LOOK_PERIOD, self._publisher.refresh)
+        self.create_wall_timer(_REFRESH_PERIOD, self._publisher.refresh)
         lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
         quality = liveliness_reader(lease)
         # Of the messages only the last one is used, and only once no other comes.

@@ -36,7 +36,7 @@ from maasi_planner.search_control.team_goals import HeardState
 
 FloatArray = NDArray[np.float64]
 
-_LOOK_PERIOD = 0.1
+_CHECK_PERIOD = 0.1
 # At shutdown: executor rounds for sending results.
 _LAST_TASKS = 5
 # Period of republishing a batch without an update [s].
@@ -136,7 +136,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self.drop,
         )
         offer_services(self, names, self.team_topic, self._command)
-        self.create_wall_timer(_LOOK_PERIOD, self._look_around)
+        self.create_wall_timer(_CHECK_PERIOD, self._check_team)
 
     def start(self) -> None:
         """Start the search, unless it has to wait for a command."""
@@ -314,7 +314,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._orders.leave(name)
         self.get_logger().warning(f'{name} does not take part any more: {reason}')
 
-    def _look_around(self) -> None:
+    def _check_team(self) -> None:
         """Remove silent robots from planning; check filter and action."""
         if not self.active:
             return
@@ -328,7 +328,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._try_free_step()
         elif time.monotonic() - self._batches.published_at > _ANSWER_PATIENCE:
             self._batches.publish_again()
-        self._look_at_search()
+        self._update_action()
 
     def _watch_filter(self, now: float) -> None:
         """Hold the robots while the filter is silent."""
@@ -455,8 +455,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     # ---- the action --------------------------------------------------------------------------
 
-    def _look_at_search(self) -> None:
-        self._action.look(
+    def _update_action(self) -> None:
+        self._action.update(
             Progress(
                 time=max(self._taken_step, 0) * self.settings.step,
                 feedback=SearchTargets.Feedback(

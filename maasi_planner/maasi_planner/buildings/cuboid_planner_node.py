@@ -105,14 +105,14 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._state: tuple[int, Pose, np.ndarray] | None = None
         self._wanted_step = -1
         self._board = MarkerBoard()
-        self._told_step = -1
+        self._sent_step = -1
         # Whether the agent has observed the state of that step, but not decided.
         self._observed = False
         self._decided_step = -1
         self._link: SearchLink | None = None
         self._heard: SearchLinkArray | None = None
         self._command: TwistStamped | None = None
-        self._told_at = 0.0
+        self._sent_at = 0.0
         self._solve_time = 0.0
         # Snapshots of the agent that were published. A step may pass without a decision.
         self._published_shots = 0
@@ -147,7 +147,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self.expect_publisher(self._odometry.topic_name)
         offer_services(self, [self.name], self.team_topic, self._take_command)
         if not lockstep:
-            self.create_wall_timer(0.02, self._look_at_the_time)
+            self.create_wall_timer(0.02, self._check_link)
         for cell, reason in self._mission.lost:
             self.get_logger().warning(
                 f'the {cell.face} face of object {cell.target} is not searched whole: {reason}'
@@ -271,13 +271,13 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         self._heard = message
         self._try_step()
 
-    def _look_at_the_time(self) -> None:
+    def _check_link(self) -> None:
         """Decide without other robots if the link is silent for too long."""
-        if not self.active or self._told_step != self._wanted_step:
+        if not self.active or self._sent_step != self._wanted_step:
             return
         patience = self.settings.link_patience * self.settings.step
-        if self._decided_step < self._told_step and time.monotonic() - self._told_at > patience:
-            self.warn_throttled('link', f'step {self._told_step}: nothing on link/rx')
+        if self._decided_step < self._sent_step and time.monotonic() - self._sent_at > patience:
+            self.warn_throttled('link', f'step {self._sent_step}: nothing on link/rx')
             self._decide([])
 
     # ---- the step ----------------------------------------------------------------------------
@@ -290,8 +290,8 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         step = self._wanted_step
         if self._state is None or self._state[0] != step or step < 0:
             return
-        if self._told_step != step:
-            self._tell(step)
+        if self._sent_step != step:
+            self._broadcast(step)
         elif self._decided_step == step and self.settings.lockstep:
             # Duplicate step, after a restart of another node: resend the outputs.
             if self._link is not None and self._command is not None:
@@ -300,9 +300,9 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
                 self.done(step)
             return
         if self._decided_step != step and self._heard is not None and self._heard.step == step:
-            self._decide(self._understood(self._heard))
+            self._decide(self._decoded(self._heard))
 
-    def _tell(self, step: int) -> None:
+    def _broadcast(self, step: int) -> None:
         assert self._state is not None
         _, pose, velocity = self._state
         self._observed = self._searching
@@ -318,14 +318,14 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             )
         else:
             self._link = broadcast_to_ros(broadcast, self._header(step))
-        self._told_step = step
-        self._told_at = time.monotonic()
+        self._sent_step = step
+        self._sent_at = time.monotonic()
         self._link_publisher.publish(self._link)
 
-    def _understood(self, message: SearchLinkArray) -> list[Broadcast]:
+    def _decoded(self, message: SearchLinkArray) -> list[Broadcast]:
         heard = []
         for item in message.messages:
-            if item.robot == self.name or int(item.step) != self._told_step:
+            if item.robot == self.name or int(item.step) != self._sent_step:
                 self.drop('stale link', f'link/rx: from {item.robot} of step {item.step}')
                 continue
             try:
@@ -335,7 +335,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         return heard
 
     def _decide(self, heard: list[Broadcast]) -> None:
-        step = self._told_step
+        step = self._sent_step
         if not self._observed:
             self._stand(step)
             return

@@ -12,8 +12,8 @@ from maasi_planner.filter_watch import FilterWatch
 from maasi_planner.node_settings import PlannerNodeSettings
 
 # A longer gap between two checks means that the planner itself was suspended [s].
-_LONGEST_LOOK = 1.0
-# Period of looks for the names of filters [s].
+_LONGEST_GAP = 1.0
+# Period of updates of the names of filters [s].
 _NAMES_PERIOD = 1.0
 
 
@@ -40,7 +40,7 @@ class FilterGuard:
         self.watch = FilterWatch(self._node.settings.filter_timeout)
         self.names: set[str] = set()
         self._names_at = -math.inf
-        self._looked_at = time.monotonic()
+        self._checked_at = time.monotonic()
 
     def set_up(self) -> None:
         """Subscribe to heartbeats, where they are used."""
@@ -56,8 +56,8 @@ class FilterGuard:
 
     def problem(self, now: float) -> str:
         """Return why the filter counts as absent at a wall time [s]; empty if it does not."""
-        since, self._looked_at = now - self._looked_at, now
-        if since > _LONGEST_LOOK:
+        since, self._checked_at = now - self._checked_at, now
+        if since > _LONGEST_GAP:
             self.watch.stalled(since)
         if now - self._names_at >= _NAMES_PERIOD:
             self._names_at = now

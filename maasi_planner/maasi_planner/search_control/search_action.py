@@ -89,7 +89,7 @@ class SearchAction:
         """Whether a client has a goal."""
         return self._goal is not None
 
-    def look(self, progress: Progress) -> None:
+    def update(self, progress: Progress) -> None:
         """Publish feedback, and conclude the goal when the search has ended."""
         goal = self._goal
         if goal is None:
