@@ -29,8 +29,8 @@ _STATUS = {
     AgentState.ABORTED: 'goal given up',
     AgentState.UNAVAILABLE: 'cannot go on',
 }
-# For the answer to a cancelled goal [s].
-_FAREWELL = 5.0
+# Longest wait for the answer to a cancelled goal [s].
+_CANCEL_TIME = 5.0
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -126,7 +126,7 @@ class _User:
             self._wait(result.done)
         except KeyboardInterrupt:
             self._cancel(answer, handle)
-            if result is None or not self._wait(result.done, _FAREWELL):
+            if result is None or not self._wait(result.done, _CANCEL_TIME):
                 print('cancelled; nothing was heard of its end')
                 return FAILED
         assert result is not None
@@ -134,7 +134,7 @@ class _User:
 
     def _cancel(self, answer: Any, handle: Any) -> None:
         """Cancel a goal, also one whose answer has not come yet."""
-        if handle is None and self._wait(answer.done, _FAREWELL):
+        if handle is None and self._wait(answer.done, _CANCEL_TIME):
             handle = answer.result()
         if handle is not None and handle.accepted:
             handle.cancel_goal_async()
