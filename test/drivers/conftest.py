@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import yaml
+from marker_view import sees_whole
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import KINDS, TURTLEBOT, Team, parameters_of
 
@@ -105,7 +106,7 @@ def sequence(
         )
         offset = (world.targets - pose.position[:2]) @ level.rotation()[:2, :2]
         in_box = np.all(np.abs(offset) <= BOX, axis=1)
-        in_box &= camera.sees(world.targets, pose, 0.5 * floor.marker_diameter)
+        in_box &= sees_whole(camera, world.targets, pose, 0.5 * floor.marker_diameter)
         yield Frame(image, pose, world.targets[in_box], world.targets)
 
 

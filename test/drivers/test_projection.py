@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from marker_view import sees_whole
 from numpy.testing import assert_allclose
 
 from maasi_drivers.vision.camera_model import Camera, rotation_from_rpy
@@ -241,11 +242,8 @@ def test_the_margin_of_a_box_is_that_of_its_worst_marker(changes):
     margin = box_view_margin(view, low, high, height, 0.015)
     generator = np.random.default_rng(0)
     inside = generator.uniform(low, high, (500, 2))
-    angles = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-    rims = inside[:, None, :] + 0.015 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    world = np.zeros((rims.size // 2, 3))
-    world[:, :2] = pose.position[:2] + rims.reshape(-1, 2) @ pose.rotation()[:2, :2].T
-    assert (margin >= 0) == (view.margin(world, pose) >= 0).all()
+    world = pose.position[:2] + inside @ pose.rotation()[:2, :2].T
+    assert (margin >= 0) == sees_whole(view, world, pose, 0.015).all()
 
 
 @pytest.mark.parametrize(
