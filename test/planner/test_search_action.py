@@ -31,7 +31,7 @@ def found(world, number):
     """Publish an update of the filter that has found so many targets."""
     message = FilterUpdate(batch_id=0, found=number)
     message.header.frame_id = 'map'
-    message.batch_id = world.planner._batch
+    message.batch_id = world.planner._batches.last
     message.members = []
     world.updates.publish(message)
 
@@ -41,9 +41,9 @@ def test_a_goal_is_executing_and_ends_as_it_says():
         handle, result = world.ask(targets=12)
         world.until(world.moving)
         world.until(lambda: handle.status == GoalStatus.STATUS_EXECUTING)
-        world.until(lambda: world.planner._batch > 0)
+        world.until(lambda: world.planner._batches.last > 0)
         found(world, 11)
-        world.until(lambda: world.planner._found == 11)
+        world.until(lambda: world.planner._batches.update.found == 11)
         world.pass_steps(5)
         assert not result.done() and handle.status == GoalStatus.STATUS_EXECUTING
         found(world, 12)

@@ -44,8 +44,11 @@ def make_vehicle_fence(
     As `make_fence`; by default from 1 m below the lower to 1 m above the higher one of ground and
     start, but not below the ground for what starts above it.
     """
-    lowest = ground if start > ground else start - _HEIGHT
-    return _fence(given, bounds, radius, (lowest, max(ground, start) + _HEIGHT))
+    heights = (min(ground, start) - _HEIGHT, max(ground, start) + _HEIGHT)
+    fence = _fence(given, bounds, radius, heights)
+    if given is None and start > ground:
+        fence[2, 0] = max(fence[2, 0], ground)
+    return fence
 
 
 def _fence(
