@@ -153,8 +153,8 @@ def add_information(
     if len(needed):
         jacobian = sensor.measurement.jacobian(flat[needed], Pose(np.zeros(3)))
         matrices[needed] = _whitened(jacobian, sensor.covariance)
-    matrices = matrices.reshape(*probabilities.shape, dimension, dimension)
-    _information(matrices, probabilities, first, item.own, out)
+    blocks = matrices.reshape(*probabilities.shape, dimension, dimension)
+    _information(blocks, probabilities, first, item.own, out)
 
 
 def _whitened(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -60,8 +60,8 @@ def apply_settled_misses(
 ) -> None:
     """Multiply the entries by what a robot whose trajectory is settled will have seen."""
     begin = 0
-    for w in range(entries.count.shape[0]):
-        end = begin + entries.count[w]
+    for w in range(entries.counts.shape[0]):
+        end = begin + entries.counts[w]
         nodes, until = entries.node[begin:end], entries.time[begin:end]
         apply_misses(nodes, until, measured, dimension, kernel, entries.value[begin:end])
         begin = end

@@ -48,8 +48,8 @@ class Events(NamedTuple):
 
     def present(self) -> Events:
         """Return the first planned measurement of the first trajectory, if there is any."""
-        first = Events(*(array[:1] for array in self))
-        return first._replace(own=np.minimum(first.own, 1))
+        own = np.minimum(self.own[:1], 1)
+        return Events(self.times[:1], self.places[:1], self.turns[:1], own, self.total[:1])
 
     def expected(self) -> Measurements:
         """Return the measurements that others expect on the first trajectory."""

@@ -179,7 +179,7 @@ class TeamObjective:
                 if len(names) > 1:
                     rows = rows_of([robot.item for robot in planned])
         pairs = number if len(entries.value) and len(names) > 1 else 0
-        longest = int(entries.count.max(initial=0)) if pairs else 0
+        longest = int(entries.counts.max(initial=0)) if pairs else 0
         parameters = np.zeros((len(names), PARAMETERS))
         for index, robot in enumerate(planned):
             parameters[index] = robot.kernel[1]
@@ -205,7 +205,7 @@ class TeamObjective:
             event_turn=rows[3],
             kind=np.array([robot.kernel[0] for robot in planned], np.int64),
             parameters=parameters,
-            entry_start=starts_of(entries.count),
+            entry_start=starts_of(entries.counts),
             entry_value=entries.value,
             entry_node=entries.node,
             entry_time=entries.time,
@@ -234,12 +234,12 @@ class TeamObjective:
                 np.empty(most, np.int64),
             )
             number = entries_of(item, first, self.weights.own, dimension, kernel, grid, part)
-            part = Entries(part.count, *(array[:number] for array in part[1:]))
+            part = Entries(part.counts, part.value[:number], part.node[:number], part.time[:number])
             for other in settled:
                 apply_settled_misses(part, other.item.expected(), dimension, other.kernel)
             parts.append(part)
         return Entries(
-            joined([part.count for part in parts], np.int64),
+            joined([part.counts for part in parts], np.int64),
             joined([part.value for part in parts], float),
             stacked([part.node for part in parts], 3),
             joined([part.time for part in parts], np.int64),
@@ -298,9 +298,9 @@ class TeamObjective:
             left *= miss.reshape(left.shape)
         flat = left.ravel()
         columns = np.flatnonzero(flat > 0.0)
-        index = np.full(flat.shape, -1, np.int64)
-        index[columns] = np.arange(len(columns))
-        unseen = every._replace(index=index.reshape(shape))
+        column = np.full(flat.shape, -1, np.int64)
+        column[columns] = np.arange(len(columns))
+        unseen = every._replace(column=column.reshape(shape))
         miss = np.ones((int(self.start[-1]), len(columns)))
         for i, robot in enumerate(planned):
             self._miss(robot, first, unseen, miss[self.start[i] : self.start[i + 1]])

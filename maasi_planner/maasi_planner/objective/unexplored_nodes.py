@@ -23,11 +23,11 @@ ROOM_ROWS = 4
 class Entries(NamedTuple):
     """Nodes of (22), the candidates one after the other.
 
-    count (W,) nodes of each candidate; of each node value (n,): its weight times what is unseen,
+    counts (W,) nodes of each candidate; of each node value (n,): its weight times what is unseen,
     node (n, 3) [m], and time (n,): that of the measurement [steps from now].
     """
 
-    count: IntArray
+    counts: IntArray
     value: FloatArray
     node: FloatArray
     time: IntArray
@@ -46,9 +46,9 @@ class _Corners(NamedTuple):
 
 
 class _Products(NamedTuple):
-    """Scratch of `_apply_own_misses`: count, begin (n + 2,), rank (8 n,), work (4, 8 n), room."""
+    """Scratch of `_apply_own_misses`: counts, begin (n + 2,), rank (8 n,), work (4, 8 n), room."""
 
-    count: IntArray
+    counts: IntArray
     begin: IntArray
     rank: IntArray
     work: FloatArray
@@ -56,11 +56,11 @@ class _Products(NamedTuple):
 
 
 class NodeGrid(NamedTuple):
-    """Nodes of a grid: the first and the distances [m], and index (nx, ny, nz), -1: left out."""
+    """Nodes of a grid: the first and the distances [m], and column (nx, ny, nz), -1: left out."""
 
     start: FloatArray
     step: FloatArray
-    index: IntArray
+    column: IntArray
 
 
 @njit(cache=True)
@@ -171,7 +171,7 @@ def _apply_own_misses(
     """
     shared, time = corners.shared[:number], corners.measurement[:number]
     nodes, values = entries.node[:number], entries.value[:number]
-    count, begin, rank, work, room = scratch
+    counts, begin, rank, work, room = scratch
     measurements = places.shape[0]
     unique = 0
     for q in range(number):
@@ -179,16 +179,16 @@ def _apply_own_misses(
         rank[shared[q]] = time[q]
         unique = max(unique, shared[q] + 1)
     # Sorted by their last measurement, the nodes that a measurement concerns are one slice.
-    count[: measurements + 2] = 0
+    counts[: measurements + 2] = 0
     for u in range(unique):
-        count[rank[u] + 1] += 1
+        counts[rank[u] + 1] += 1
     for m in range(measurements):
-        count[m + 1] += count[m]
-        begin[m] = count[m]
+        counts[m + 1] += counts[m]
+        begin[m] = counts[m]
     for u in range(unique):
         last = rank[u]
-        rank[u] = count[last]
-        count[last] += 1
+        rank[u] = counts[last]
+        counts[last] += 1
     x, y, z = work[0, :unique], work[1, :unique], work[2, :unique]
     left = work[3, :unique]
     left[:] = 1.0
@@ -377,7 +377,7 @@ def entries_of(
     margin = 0 if own_counts else 1
     number = 0
     for w in range(item.own.shape[0]):
-        rest = Entries(out.count, out.value[number:], out.node[number:], out.time[number:])
+        rest = Entries(out.counts, out.value[number:], out.node[number:], out.time[number:])
         found = _nodes_around(item, w, first, dimension, grid, corners, rest)
         if not together:
             measurement = corners.measurement[:found]
@@ -385,7 +385,7 @@ def entries_of(
         elif found:
             places = item.places[w, : item.own[w]]
             _apply_own_misses(corners, rest, found, places, margin, dimension, kernel, scratch)
-        out.count[w] = found
+        out.counts[w] = found
         number += found
     return number
 
@@ -425,21 +425,21 @@ def miss_at_nodes(
 ) -> None:
     """Multiply `miss` (W, L) by 1 - pi of each measurement from `first` on at the nodes.
 
-    The index of a node is its column. Only nodes within `reach` of a measurement are visited.
+    Only nodes within `reach` of a measurement are visited.
     """
     kind, parameters = kernel
-    start, step, index = grid
+    start, step, columns = grid
     box = np.zeros((2, 3), np.int64)
     for w in range(item.own.shape[0]):
         for m in range(first, item.own[w]):
             place = item.places[w, m]
-            box_within(place, reach, start, step, index.shape, box)
+            box_within(place, reach, start, step, columns.shape, box)
             for i in range(box[0, 0], box[1, 0]):
                 dx = start[0] + i * step[0] - place[0]
                 for j in range(box[0, 1], box[1, 1]):
                     dy = start[1] + j * step[1] - place[1]
                     for k in range(box[0, 2], box[1, 2]):
-                        column = index[i, j, k]
+                        column = columns[i, j, k]
                         if column < 0:
                             continue
                         dz = 0.0
