@@ -8,7 +8,6 @@ from maasi_filter.metrics import (
     RestrictedMean,
     gospa,
     match_targets,
-    ospa,
     restricted_mean,
 )
 from maasi_filter.models.detection import (
@@ -74,7 +73,6 @@ __all__ = [
     'load_filter',
     'make_filter',
     'match_targets',
-    'ospa',
     'restricted_mean',
     'warm_up',
     'wrap_angle',

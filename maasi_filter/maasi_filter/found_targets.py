@@ -49,11 +49,7 @@ class FoundTargets:
     def take_over(
         self, robot: str, targets: Sequence[FoundTarget]
     ) -> tuple[list[FoundTarget], list[FoundTarget]]:
-        """Merge targets found by another filter; return those that are new, and that changed.
-
-        A target that two robots found belongs to the robot that found it first (ties: first by
-        name), and follows the estimate of that robot (002, section 4).
-        """
+        """Merge targets found by another filter; return those that are new, and that changed."""
         added: list[FoundTarget] = []
         changed: list[FoundTarget] = []
         for target in targets:
@@ -76,10 +72,7 @@ class FoundTargets:
         return added, changed
 
     def keep(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before a restart; return the new ones.
-
-        They keep their ids, except that an id in use is replaced by the next free one.
-        """
+        """Add targets that were found before a restart; return the new ones."""
         own = {target.id: target for target in self.targets}
         kept = {target.id for target in targets}
         since = [target for target in self.targets if target.id not in kept]

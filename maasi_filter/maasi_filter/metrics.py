@@ -103,24 +103,6 @@ def gospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 
     return Gospa(float(total), localisation, float(missed), float(false), pairs)
 
 
-def ospa(estimates: ArrayLike, truth: ArrayLike, cutoff: float, power: float = 2.0) -> float:
-    """Return the OSPA metric between two sets of points (Schuhmacher, Vo and Vo, 2008).
-
-    Arguments as for `gospa`. The distance of two empty sets is 0, that of an empty and a non-empty
-    set `cutoff`.
-    """
-    _positive('cutoff', cutoff)
-    _positive('power', power, 1.0)
-    apart = _distances(estimates, truth)
-    larger = max(apart.shape)
-    if larger == 0:
-        return 0.0
-    cost = np.minimum(apart, cutoff) ** power
-    rows, columns = _assign(cost)
-    total = float(cost[rows, columns].sum()) + cutoff**power * (larger - min(apart.shape))
-    return float((total / larger) ** (1.0 / power))
-
-
 @dataclass(frozen=True)
 class Match:
     """One-to-one matching of found targets to true ones.
@@ -163,11 +145,6 @@ def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Matc
         false_found=apart.shape[0] - len(pairs),
         rmse=math.sqrt(float(squares.mean())) if len(squares) else math.nan,
     )
-
-
-def cardinality_error(expected_number: float, found: int, truth: int) -> float:
-    """Return expected number of targets, found ones included, minus the true number."""
-    return float(expected_number) + found - truth
 
 
 def normalised_error(error: ArrayLike, covariance: ArrayLike) -> float:

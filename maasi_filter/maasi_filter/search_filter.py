@@ -70,13 +70,40 @@ class SearchFilter(Protocol):
         """Return the found targets that this filter found itself."""
 
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Merge targets found by the filter of another robot; return whether anything changed."""
+        """Merge targets found by the filter of another robot; return whether anything changed.
+
+        A target that two robots found belongs to the robot that found it first (ties: first by
+        name), and follows the estimate of that robot (002, section 4).
+
+        Parameters
+        ----------
+        robot : str
+            Robot of that filter.
+        targets : sequence of FoundTarget
+            All targets that its filter found itself; call before `step`.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite, or dimensions do not fit. The filter is then unchanged.
+        """
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets found before this filter was created; return those that are new."""
+        """Add targets found before this filter was created; return those that are new.
+
+        They keep their ids, except that an id in use is replaced by the next free one.
+
+        Parameters
+        ----------
+        targets : sequence of FoundTarget
+            With finite positions and covariances of this dimension.
+        """
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the whole state, random generator included, to one file."""
+        """Write the whole state, random generator included, to one file.
+
+        The file is replaced atomically: a crash leaves the old one or the new one.
+        """
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return the whole state, random generator included, as arrays for a file."""

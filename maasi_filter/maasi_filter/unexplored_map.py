@@ -12,11 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_filter.models.detection import (
-    DetectionModel,
-    detection_probability_at,
-    fill_probabilities,
-)
+from maasi_filter.models.detection import DetectionModel, fill_probabilities
 from maasi_filter.models.pose import Pose
 
 FloatArray = NDArray[np.float64]
@@ -104,43 +100,6 @@ def _decrease(  # type: ignore[no-untyped-def]
         plane = values[i].reshape(size)
         for j in range(size):
             plane[j] *= 1.0 - probability[j]
-
-
-@njit(cache=True, error_model='numpy')
-def _expected_unseen_seen(
-    values: FloatArray,
-    cell: FloatArray,
-    lower: FloatArray,
-    step: FloatArray,
-    kind: int,
-    parameters: FloatArray,
-    sensor_positions: FloatArray,
-    yaws: FloatArray,
-    dimension: int,
-) -> float:
-    cos_yaw = np.cos(yaws)
-    sin_yaw = np.sin(yaws)
-    total = 0.0
-    for i in range(values.shape[0]):
-        x = lower[0] + i * step[0]
-        for j in range(values.shape[1]):
-            y = lower[1] + j * step[1]
-            for k in range(values.shape[2]):
-                z = lower[2] + k * step[2]
-                missed = 1.0
-                for m in range(sensor_positions.shape[0]):
-                    dz = z - sensor_positions[m, 2] if dimension == 3 else 0.0
-                    missed *= 1.0 - detection_probability_at(
-                        kind,
-                        parameters,
-                        x - sensor_positions[m, 0],
-                        y - sensor_positions[m, 1],
-                        dz,
-                        cos_yaw[m],
-                        sin_yaw[m],
-                    )
-                total += cell[i, j, k] * values[i, j, k] * (1.0 - missed)
-    return total
 
 
 def check_bounds(bounds: ArrayLike) -> FloatArray:
@@ -285,56 +244,10 @@ class UnexploredMap:
         """
         return self._volumes
 
-    def unseen_fraction(self) -> float:
-        """Return the mean of e over the environment, in [0, 1]."""
-        volumes = self.cell_volumes()
-        return float((volumes * self.values).sum() / volumes.sum())
-
     def explored_fraction(self) -> float:
         """Return 1 - mean of e over the environment, in [0, 1]."""
-        return 1.0 - self.unseen_fraction()
-
-    def expected_unseen(self, expected_targets: float) -> float:
-        """Return how many of `expected_targets`, uniform a priori, are expected to be unseen.
-
-        N0 / V times the integral of e.
-        """
-        return float(expected_targets) * self.unseen_fraction()
-
-    def expected_new(
-        self,
-        detection: DetectionModel,
-        positions: ArrayLike,
-        yaws: ArrayLike,
-        expected_targets: float,
-    ) -> float:
-        """Return the expected number of new targets seen from poses (E_vol).
-
-        (N0 / V) sum over nodes of e (1 - prod(1 - pi)) times the node's volume.
-
-        Parameters
-        ----------
-        positions : (m, 3) array
-            Sensor positions of the measurements, metres.
-        yaws : (m,) array
-            Headings, radians.
-        expected_targets : float
-            N0.
-        """
-        sensors = np.ascontiguousarray(np.atleast_2d(np.asarray(positions, dtype=float)))
-        headings = np.ascontiguousarray(np.atleast_1d(np.asarray(yaws, dtype=float)))
         volumes = self.cell_volumes()
-        total = _expected_unseen_seen(
-            self._values,
-            volumes.reshape(self._values.shape),
-            self._lower,
-            self._step,
-            *detection.kernel(),
-            sensors,
-            headings,
-            self.dimension,
-        )
-        return float(expected_targets) * total / float(volumes.sum())
+        return 1.0 - float((volumes * self.values).sum() / volumes.sum())
 
     def copy(self) -> UnexploredMap:
         """Return an independent copy."""

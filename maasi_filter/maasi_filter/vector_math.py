@@ -17,10 +17,6 @@ MAGIC = 6755399441055744.0
 LOG2_E = 1.4426950408889634
 LOG_2_HIGH = 6.93147180369123816490e-01
 LOG_2_LOW = 1.90821492927058770002e-10
-# pi / 2 in three parts, the first two with few digits.
-HALF_PI_HIGH = 1.57079632673412561417e00
-HALF_PI_MIDDLE = 6.07710050630396597660e-11
-HALF_PI_LOW = 2.02226624879595063154e-21
 # Below this exp(x) is taken as 0.
 LEAST_EXPONENT = -708.0
 
@@ -47,21 +43,6 @@ def _generate_float_of(context: Any, bits: Any) -> Any:
 
 
 _float_of: Any = intrinsic(_generate_float_of)
-
-
-def _generate_lesser(context: Any, x: Any, y: Any) -> Any:
-    """Return the smaller of two numbers, in a form that makes a running minimum vectors."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        flags = ['nnan', 'nsz']
-        first, second = arguments
-        smaller = builder.fcmp_ordered('<', first, second, flags=flags)
-        return builder.select(smaller, first, second, flags=flags)
-
-    return types.float64(types.float64, types.float64), generate
-
-
-lesser: Any = intrinsic(_generate_lesser)
 
 
 def _generate_wide_vectors(context: Any) -> Any:
@@ -113,40 +94,6 @@ def arctan2(y: float, x: float) -> float:
     angle = 0.5 * math.pi - angle if ay > ax else angle
     angle = math.pi - angle if x < 0.0 else angle
     return angle if y >= 0.0 else -angle
-
-
-@njit(cache=True, error_model='numpy', fastmath={'contract'})
-def sines(x, number, sine, cosine):  # type: ignore[no-untyped-def]
-    """Fill sine and cosine of the first `number` of `x`, of some thousand radians at most.
-
-    To about one unit in the last place of 1; fdlibm's polynomials.
-    """
-    use_wide_vectors()
-    for i in range(number):
-        k = (x[i] * (2.0 / math.pi) + MAGIC) - MAGIC
-        r = ((x[i] - k * HALF_PI_HIGH) - k * HALF_PI_MIDDLE) - k * HALF_PI_LOW
-        z = r * r
-        s = 1.58969099521155010221e-10
-        s = s * z - 2.50507602534068634195e-08
-        s = s * z + 2.75573137070700676789e-06
-        s = s * z - 1.98412698298579493134e-04
-        s = s * z + 8.33333333332248946124e-03
-        s = s * z - 1.66666666666666324348e-01
-        s = r + r * (z * s)
-        c = -1.13596475577881948265e-11
-        c = c * z + 2.08757232129817482790e-09
-        c = c * z - 2.75573143513906633035e-07
-        c = c * z + 2.48015872894767294178e-05
-        c = c * z - 1.38888888888741095749e-03
-        c = c * z + 4.16666666666666019037e-02
-        c = 1.0 - 0.5 * z + z * z * c
-        # The quarter of the circle, -2 to 2.
-        quarter = k - 4.0 * ((k * 0.25 + MAGIC) - MAGIC)
-        turned = abs(quarter) == 1.0
-        a = c if turned else s
-        b = s if turned else c
-        sine[i] = -a if quarter == -1.0 or abs(quarter) == 2.0 else a
-        cosine[i] = -b if quarter == 1.0 or abs(quarter) == 2.0 else b
 
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})

@@ -42,8 +42,6 @@ def warm_up() -> None:
                     search.step(
                         [AgentMeasurement('warm_up', pose, sensor, values, None, step)], 1, step
                     )
-                positions = np.full((1, 3), 3.0)
-                search.exploration.expected_new(sensor.detection, positions, np.zeros(1), 1.0)
-                search.exploration.at(positions)
+                search.exploration.at(np.full((1, 3), 3.0))
     origin = np.zeros(3)
     detection_probability(0, np.zeros(PARAMETERS), origin, origin, 0.0)

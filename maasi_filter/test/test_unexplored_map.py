@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from maasi_filter import BoxDetection, ExponentialDetection, Pose, UnexploredMap
+from maasi_filter import ExponentialDetection, Pose, UnexploredMap
 
 BOUNDS = np.array([[0.0, 100.0], [-20.0, 50.0], [0.0, 30.0]])
 MODEL = ExponentialDetection(0.98, [25.0, 25.0, 25.0])
@@ -47,25 +47,6 @@ def test_interpolation_is_multilinear_and_clamped(dimension):
     positions = generator.uniform(-50.0, 150.0, (300, dimension))
     inside = np.clip(positions, BOUNDS[:dimension, 0], BOUNDS[:dimension, 1])
     np.testing.assert_allclose(exploration.at(positions), reference(inside), atol=1e-12)
-
-
-def test_expected_unseen_goes_down_from_all_targets():
-    exploration = UnexploredMap(BOUNDS, 5.0)
-    assert exploration.expected_unseen(12.0) == pytest.approx(12.0)
-    assert exploration.explored_fraction() == pytest.approx(0.0)
-    pose = Pose([50.0, 10.0, 15.0])
-    new = exploration.expected_new(MODEL, [pose.position], [0.0], 12.0)
-    exploration.update(MODEL, pose)
-    assert exploration.expected_unseen(12.0) == pytest.approx(12.0 - new)
-    assert exploration.explored_fraction() == pytest.approx(new / 12.0)
-
-
-def test_expected_new_of_several_measurements_counts_each_place_once():
-    exploration = UnexploredMap(BOUNDS[:2], 5.0)
-    box = BoxDetection([-20.0, -20.0], [20.0, 20.0])
-    once = exploration.expected_new(box, [[50.0, 15.0, 1.0]], [0.0], 12.0)
-    twice = exploration.expected_new(box, [[50.0, 15.0, 1.0]] * 2, [0.0, 0.0], 12.0)
-    assert twice == pytest.approx(once)
 
 
 def test_a_copy_is_independent():

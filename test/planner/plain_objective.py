@@ -178,12 +178,15 @@ def plain_information_terms(team, settings, trajectories, choice):
         steps = measured[name]
         exploration = 0.0
         if steps:
-            exploration = explored.expected_new(
-                team.robots[name].sensor.detection,
-                np.array([entry[1] for entry in steps]),
-                np.array([entry[2] for entry in steps]),
-                settings.expected_targets,
-            )
+            # (N0 / V) sum over nodes of e (1 - prod(1 - pi)) times the node's volume.
+            missed = np.ones(explored.values.size)
+            for _, position, yaw, _ in steps:
+                pose = Pose.from_yaw(position, yaw)
+                missed *= 1.0 - team.robots[name].sensor.detection.probability(
+                    explored.nodes(), pose
+                )
+            share = (explored.cell_volumes() * explored.values).ravel() / explored.volume
+            exploration = settings.expected_targets * float(share @ (1.0 - missed))
         cost = float(trajectories[name].control_cost[choice[name]])
         norm = float(trajectories[name].lengths[choice[name]])
         value = (

@@ -297,37 +297,14 @@ class IcPhdFilter:
         return self._found.own()
 
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Merge targets found by the filter of another robot; return whether anything changed.
-
-        Independent robots share their found targets (002, section 4).
-
-        Parameters
-        ----------
-        robot : str
-            Robot of that filter.
-        targets : sequence of FoundTarget
-            All targets that its filter found itself; call before `step`.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite, or dimensions do not fit. The filter is then unchanged.
-        """
+        """Merge targets found by the filter of another robot; return whether anything changed."""
         check_taken(robot, targets, self.dimension)
         added, changed = self._found.take_over(robot, targets)
         self._forget(added)
         return bool(added or changed)
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before this filter was created; return the new ones.
-
-        They keep their ids, except that an id in use is replaced by the next free one.
-
-        Parameters
-        ----------
-        targets : sequence of FoundTarget
-            With finite positions and covariances of this dimension.
-        """
+        """Add targets that were found before this filter was created; return the new ones."""
         added = self._found.keep(targets)
         self._forget(added)
         return added
@@ -342,10 +319,7 @@ class IcPhdFilter:
     # Saved state.
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the whole state, random generator included, to one file.
-
-        The file is replaced atomically: a crash leaves the old one or the new one.
-        """
+        """Write the whole state, random generator included, to one file."""
         write_state(path, self.state())
 
     def state(self) -> dict[str, NDArray[Any]]:

@@ -222,9 +222,7 @@ def views(components: Sequence[Component], scan: Scan, births: Births) -> list[V
     radii = np.array([item.density.radius for item in components])[:, None]
     apart = np.sqrt(np.square(means - scan.pose.position[:d]).sum(axis=1))[:, None]
     gates = np.abs(scan.ranges - apart) < GATE * (scan.deviations + radii)
-    owners, detections = np.nonzero(gates)
-    gated = np.split(detections, np.searchsorted(owners, np.arange(1, len(components))))
-    return [item.view(scan, own, births) for item, own in zip(components, gated)]
+    return [item.view(scan, gate.nonzero()[0], births) for item, gate in zip(components, gates)]
 
 
 def same_place(one: Component, other: Component, distance: float) -> bool:

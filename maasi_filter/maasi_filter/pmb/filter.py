@@ -387,23 +387,7 @@ class PmbFilter:
         return [target for target in self.found_targets if not target.origin]
 
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Merge targets found by the filter of another robot; return whether anything changed.
-
-        A target that two robots found belongs to the robot that found it first (ties: first by
-        name), and follows the estimate of that robot.
-
-        Parameters
-        ----------
-        robot : str
-            Robot of that filter.
-        targets : sequence of FoundTarget
-            All targets that its filter found itself; call before `step`.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite, or dimensions do not fit. The filter is then unchanged.
-        """
+        """Merge targets found by the filter of another robot; return whether anything changed."""
         check_taken(robot, targets, self.dimension)
         found = FoundTargets(self.found_targets, self._last_id)
         added, changed = found.take_over(robot, targets)
@@ -411,15 +395,7 @@ class PmbFilter:
         return bool(added or changed)
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before this filter was created; return the new ones.
-
-        They keep their ids, except that an id in use is replaced by the next free one.
-
-        Parameters
-        ----------
-        targets : sequence of FoundTarget
-            With finite positions and covariances of this dimension.
-        """
+        """Add targets that were found before this filter was created; return the new ones."""
         found = FoundTargets(self.found_targets, self._last_id)
         added = found.keep(targets)
         self._place(added, found.last_id)
@@ -448,10 +424,7 @@ class PmbFilter:
     # Saved state.
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the whole state, random generator included, to one file.
-
-        The file is replaced atomically: a crash leaves the old one or the new one.
-        """
+        """Write the whole state, random generator included, to one file."""
         write_state(path, self.state())
 
     def state(self) -> dict[str, NDArray[Any]]:

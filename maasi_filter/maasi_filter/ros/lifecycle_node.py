@@ -15,7 +15,7 @@ from typing import Any, Generic
 
 import rclpy
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException
@@ -27,11 +27,13 @@ from rclpy.utilities import get_default_context
 
 from maasi_filter.ros.bad_requests import survive_bad_requests
 from maasi_filter.ros.clock_watch import ClockWatch
+from maasi_filter.ros.diagnostics import key_values, level_of
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.node_entities import NodeEntities
 from maasi_filter.ros.node_help import node_help
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.ros.qos import LATCHED, RELIABLE
+from maasi_filter.ros.readiness import subscribers_connected, unpublished_topics
 from maasi_filter.ros.stamps import stamp_problem
 from maasi_msgs.msg import LockstepDone, LockstepStep
 
@@ -43,15 +45,11 @@ _DIAGNOSTICS_PERIOD = 1.0
 _WARNING_PERIOD = 2.0
 # From activation until a node says what it waits for [s].
 _NOTICE_DELAY = 1.0
-_EVERYWHERE = ('/parameter_events', '/clock', '/diagnostics')
 # Period of the check for signals [s].
 _SIGNAL_PERIOD = 0.1
 
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-
-# Longest time from the discovery of a subscription to its connection [s].
-_CONNECTION_PATIENCE = 5.0
 
 
 class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
@@ -279,28 +277,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         names : collection of str
             Nodes that have to be among them, without namespace.
         """
-        get = publisher if callable(publisher) else lambda: publisher
-        known_since: list[float] = []
-
-        def heard() -> bool:
-            present = get()
-            if present is None:
-                return False
-            kind: Any = present.msg_type
-            known = [
-                info.node_name
-                for info in self.get_subscriptions_info_by_topic(present.topic_name)
-                if info.topic_type == f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
-            ]
-            if not set(names) <= set(known) or sum(map(_takes_part, known)) < number:
-                return False
-            known_since.append(time.monotonic())
-            # An observer with an incompatible quality of service never connects.
-            late = known_since[-1] - known_since[0] > _CONNECTION_PATIENCE
-            del known_since[1:]
-            return late or present.get_subscription_count() >= len(known)
-
-        self.expect(heard)
+        self.expect(subscribers_connected(self, publisher, number, frozenset(names)))
 
     def expect_publisher(self, topic: str) -> None:
         """Be ready only with a publisher of a topic."""
@@ -319,13 +296,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         if self._notice_timer is not None:
             self.destroy_timer(self._notice_timer)
             self._notice_timer = None
-        missing = sorted(
-            {
-                item.topic_name
-                for item in self.subscriptions
-                if item.topic_name not in _EVERYWHERE and not self.count_publishers(item.topic_name)
-            }
-        )
+        missing = unpublished_topics(self)
         if self.active and missing:
             self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
 
@@ -438,28 +409,19 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         return ''
 
     def warnings(self) -> list[str]:
-        """Return the present fault for the diagnostics."""
+        """Return the present warnings for the diagnostics."""
         return []
 
     def _publish_diagnostics(self) -> None:
         self._clock_watch.look()
-        dropped = sum(self.dropped.values())
-        shown = self.status() if self.configured else {}
         fault = self.fault() if self.active else ''
         warnings = self.warnings() if self.active else []
-        level = DiagnosticStatus.WARN if dropped or warnings else DiagnosticStatus.OK
         status = DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if fault else level,
+            level=level_of(fault, bool(warnings or sum(self.dropped.values()))),
             name=self.get_fully_qualified_name(),
             message='; '.join([fault or ('active' if self.active else 'not active'), *warnings]),
             hardware_id='',
-            values=[
-                *(KeyValue(key=key, value=str(value)) for key, value in shown.items()),
-                *(
-                    KeyValue(key=f'dropped: {reason}', value=str(number))
-                    for reason, number in sorted(self.dropped.items())
-                ),
-            ],
+            values=key_values(self.status() if self.configured else {}, self.dropped),
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.stamp_of_diagnostics()
@@ -470,21 +432,12 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         return self.get_clock().now().to_msg()
 
 
-def _takes_part(name: str) -> bool:
-    """Return whether a subscribing node is a peer, not a mere observer."""
-    return name not in ('recorder', 'guard', 'rosbag2_recorder') and not name.startswith('_')
-
-
 def _configure(node: LockstepLifecycleNode[Any]) -> bool:
     """Configure a node; return whether it is configured."""
     done = node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     if not done:
         print(f'error: {node.problem}', file=sys.stderr)
     return done
-
-
-def _activate(node: LockstepLifecycleNode[Any]) -> bool:
-    return node.trigger_activate() == TransitionCallbackReturn.SUCCESS
 
 
 def run(
@@ -529,7 +482,7 @@ def run(
         if node.get_parameter('autostart').value and not asked:
             if not _configure(node):
                 return 2 if node.problem else 1
-            if not asked and not _activate(node):
+            if not asked and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
                 return 1
         # Objects created so far are permanent: exclude them from garbage collection.
         gc.collect()
