@@ -11,8 +11,9 @@ from rclpy.serialization import deserialize_message
 
 from maasi_drivers.agent.driver_settings import LOCKSTEP_LEASE, GuardSettings
 from maasi_drivers.links.command_publisher import CommandPublisher
-from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import liveliness_reader
+from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1

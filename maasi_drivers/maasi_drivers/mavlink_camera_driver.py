@@ -8,7 +8,7 @@ from maasi_drivers.agent.agent_driver import AgentDriver
 from maasi_drivers.links.mavlink.mavlink_robot_link import MavlinkRobotLink
 from maasi_drivers.links.topic_link import TopicLink
 from maasi_drivers.vision.camera_input import CameraInput
-from maasi_filter.ros.lifecycle_node import run
+from maasi_filter.ros.run_node import run
 
 
 class MavlinkCameraDriver(AgentDriver):

@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     if '--check' in words[:end]:
         return 0
-    from maasi_filter.ros.lifecycle_node import run
+    from maasi_filter.ros.run_node import run
 
     helping = [word for word in ('-h', '--help') if word in words[:end]]
     return run(driver, [*helping, *words[end:]])

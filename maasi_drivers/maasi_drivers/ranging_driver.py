@@ -7,7 +7,7 @@ from typing import Any
 from maasi_drivers.agent.agent_driver import AgentDriver
 from maasi_drivers.agent.ranging_input import RangingInput
 from maasi_drivers.links.topic_link import TopicLink
-from maasi_filter.ros.lifecycle_node import run
+from maasi_filter.ros.run_node import run
 
 
 class RangingDriver(AgentDriver):

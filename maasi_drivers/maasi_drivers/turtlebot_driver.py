@@ -7,7 +7,7 @@ from typing import Any
 from maasi_drivers.agent.agent_driver import AgentDriver
 from maasi_drivers.links.turtlebot_link import TurtlebotLink
 from maasi_drivers.vision.camera_input import CameraInput
-from maasi_filter.ros.lifecycle_node import run
+from maasi_filter.ros.run_node import run
 
 
 class TurtlebotDriver(AgentDriver):

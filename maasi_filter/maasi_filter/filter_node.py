@@ -25,9 +25,10 @@ from maasi_filter.ros.conversions import (
     found_target_to_ros,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
+from maasi_filter.ros.run_node import run
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import unsuitable_lengths
 from maasi_filter.state_file import StateFileError

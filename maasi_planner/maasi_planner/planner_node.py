@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
-from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE
+from maasi_filter.ros.run_node import run
 from maasi_filter.ros.silence import Silence
 from maasi_filter.ros.stamps import StampGate
 from maasi_msgs.action import SearchTargets

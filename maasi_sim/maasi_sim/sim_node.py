@@ -18,8 +18,9 @@ from maasi_filter.ros.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
+from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.emulators.linked_robots import LinkedRobot, linked_robot
 from maasi_sim.ros.connections import Connections

@@ -26,7 +26,7 @@ from maasi_drivers.links.robot_link import RobotLink
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.lifecycle_node import SettingsError
-from maasi_filter.ros.lifecycle_node import run as run_node
+from maasi_filter.ros.run_node import run as run_node
 from maasi_msgs.msg import LockstepStep
 from maasi_planner.motion import RobotState
 

@@ -21,9 +21,10 @@ from maasi_filter.ros.conversions import (
     stamp_of_step,
     stamp_to_ros,
 )
-from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError, run
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.marker_board import MarkerBoard
 from maasi_filter.ros.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
+from maasi_filter.ros.run_node import run
 from maasi_filter.ros.stamps import JUMP, StampGate
 from maasi_msgs.msg import AgentState, CuboidDecision, LockstepStep, SearchLink, SearchLinkArray
 from maasi_planner.buildings.agent import Activity, Broadcast, SearchAgent, decision_stream

@@ -10,8 +10,8 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 
 from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
-from maasi_filter.ros.lifecycle_node import run
 from maasi_filter.ros.qos import RELIABLE
+from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import SearchLink, SearchLinkArray
 from maasi_sim.buildings.scenario import load_cuboid_scenario
 from maasi_sim.buildings.simulation import CuboidSimulation

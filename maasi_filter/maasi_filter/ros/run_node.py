@@ -1,0 +1,95 @@
+"""Runs a node as a process: command line, signals, clean end."""
+
+from __future__ import annotations
+
+import gc
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import get_default_context
+
+from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_filter.ros.node_help import node_help
+
+# Period of the check for signals [s].
+_SIGNAL_PERIOD = 0.1
+
+
+def _configure(node: LockstepLifecycleNode[Any]) -> bool:
+    """Configure a node; return whether it is configured."""
+    done = node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    if not done:
+        print(f'error: {node.problem}', file=sys.stderr)
+    return done
+
+
+def run(
+    make_node: Callable[[], LockstepLifecycleNode[Any]],
+    arguments: list[str] | None = None,
+    kind: type[LockstepLifecycleNode[Any]] | None = None,
+) -> int:
+    """Run a node until it is asked to end; return the exit code.
+
+    SIGINT and SIGTERM stop all motion before the node is destroyed.
+
+    Parameters
+    ----------
+    make_node : callable
+        Makes the node; often its class.
+    arguments : list of str, optional
+        Of the command line.
+    kind : type, optional
+        The class that `--help` explains, where `make_node` is none.
+    """
+    if {'-h', '--help'} & set(sys.argv[1:] if arguments is None else arguments):
+        explained = kind or (make_node if isinstance(make_node, type) else LockstepLifecycleNode)
+        print(node_help(explained, Path(sys.argv[0]).name, LockstepLifecycleNode))
+        return 0
+    # The handler only sets a flag: an exception raised inside a call into rclpy's C++ surfaces as
+    # a different one. A second signal raises at once.
+    asked = False
+
+    def interrupt(number: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    node: LockstepLifecycleNode[Any] | None = None
+    try:
+        signal.signal(signal.SIGINT, interrupt)
+        signal.signal(signal.SIGTERM, interrupt)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        node = make_node()
+        executor = executor_of(node)
+        if node.get_parameter('autostart').value and not asked:
+            if not _configure(node):
+                return 2 if node.problem else 1
+            if not asked and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+                return 1
+        # Objects created so far are permanent: exclude them from garbage collection.
+        gc.collect()
+        gc.freeze()
+        while rclpy.ok() and not asked:
+            executor.spin_once(_SIGNAL_PERIOD)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if node is not None:
+            if rclpy.ok() and node.configured:
+                node.halt()
+            node.destroy_node()
+        rclpy.try_shutdown()
+        # Explicit: a forked process ends with `os._exit`, without clean-up by the interpreter.
+        get_default_context(shutting_down=True).destroy()
+    return 0
