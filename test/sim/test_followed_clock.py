@@ -2,13 +2,13 @@
 
 import pytest
 from rosgraph_msgs.msg import Clock
-from test_sim_node import STEP, context, make_team, seconds, steps_of
+from test_sim_node import STEP, make_team, seconds, steps_of
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.sim_node import SimNode
 
-__all__ = ['context', 'make_team']
+__all__ = ['make_team']
 
 SECOND = 1_000_000_000
 
