@@ -77,7 +77,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         return round(stamp * 1e-9 / self.settings.step)
 
     def is_new_pose(self, what: str, stamp: int) -> bool:
-        """Return whether a pose of this stamp is to be used; one far back starts the driver anew.
+        """Return whether a pose of this stamp is to be used; one far back restarts the driver.
 
         Parameters
         ----------

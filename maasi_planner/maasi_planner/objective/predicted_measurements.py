@@ -69,7 +69,7 @@ class Timing(NamedTuple):
     arrival : bool
         Whether the measurement on arrival belongs to the trajectory, too.
     extend : bool
-        Whether a robot goes on measuring where its trajectory ends (000, section 6: appended
+        Whether a robot keeps measuring where its trajectory ends (000, section 6: appended
         constant states), which others see in e but which it does not count for itself.
     """
 

@@ -74,7 +74,7 @@ class MessageEvents:
         self._begin = begin
         self._on_restart = on_restart
         self._team: set[str] | None = None
-        # Time of the last message of each topic that says how time goes on [s].
+        # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
         self._cuboids: dict[str, None] = {}
@@ -100,7 +100,7 @@ class MessageEvents:
         self._takers[type_name.rpartition('/')[2]](topic, message)
 
     def _now(self, topic: str, message: Any) -> float:
-        """Return the time of a message that says how time goes on; begin again if it jumps back.
+        """Return the time of a message with the time of the run; begin again if it jumps back.
 
         Of each topic by itself, as messages of a bag that is played fast overtake each other.
         """
