@@ -19,6 +19,8 @@ def count_dropped(dropped: dict[str, int], reason: str, number: int) -> None:
 def within_range(member: CheckedMeasurement, dropped: dict[str, int]) -> CheckedMeasurement:
     """Return a measurement without detections beyond the range of its sensor."""
     reach = member.values[:, 0] <= member.sensor.maximum_range
+    if reach.all():
+        return member
     count_dropped(dropped, 'range', int((~reach).sum()))
     return member.only(reach)
 

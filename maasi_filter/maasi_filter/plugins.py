@@ -10,6 +10,7 @@ import sys
 import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -22,6 +23,12 @@ _NAME = r'[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*'
 _REFERENCE = re.compile(f'{_NAME}:{_NAME}')
 # Folders that modules named in `module:Class` are looked for in, the last added first.
 _folders: list[str] = []
+
+
+@cache
+def _entry_points(path: tuple[str, ...]) -> Any:
+    """Return the entry points on a search path; their type depends on the version of Python."""
+    return entry_points()
 
 
 class PluginError(ValueError):
@@ -129,7 +136,7 @@ class PluginGroup:
         return model
 
     def _installed(self) -> dict[str, EntryPoint]:
-        return {item.name: item for item in entry_points(group=self.group)}
+        return {item.name: item for item in _entry_points(tuple(sys.path)).select(group=self.group)}
 
     def _unknown(self, name: str, known: list[str]) -> str:
         close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)

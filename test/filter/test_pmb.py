@@ -179,7 +179,7 @@ def test_moves_leave_the_density_invariant():
     for _ in range(20):
         products, last = density._logs(density.particles)
         density._move(1.0, products, last, search.generator)
-    density._measure()
+    density._update_moments()
     scale = np.sqrt(np.diagonal(covariance).max())
     np.testing.assert_allclose(density.mean, mean, atol=0.1 * scale)
     np.testing.assert_allclose(density.covariance, covariance, atol=0.12 * scale**2)

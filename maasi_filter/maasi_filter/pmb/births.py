@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.pmb.density import Density
+from maasi_filter.pmb.density import Density, fill_moments
 from maasi_filter.pmb.factors import (
     FIRST,
     LEAST_UNEXPLORED,
@@ -29,9 +29,12 @@ LEAST_SUPPORT = 10.0
 
 @njit(cache=True, error_model='numpy')
 def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    origins, cartesian, roots, volume, sensor_position, particles, jacobian
+    origins, cartesian, roots, volume, sensor_position, bounds, particles, jacobian
 ):
-    """Turn standard normal numbers (m, n, d) into positions, and fill |dx/dz| at each (m, n)."""
+    """Turn standard normal numbers (m, n, d) into positions, and fill |dx/dz| at each (m, n).
+
+    It is 0 outside the bounds, behind the sensor and beyond straight up: nothing points there.
+    """
     d = origins.shape[1]
     z = np.zeros(3)
     for m in range(particles.shape[0]):
@@ -44,17 +47,19 @@ def _draw(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                 for a in range(d):
                     particles[m, i, a] = z[a]
                 jacobian[m, i] = volume[m]
-                continue
-            level = z[0] * math.cos(z[2]) if d == 3 else z[0]
-            particles[m, i, 0] = sensor_position[0] + level * math.cos(z[1])
-            particles[m, i, 1] = sensor_position[1] + level * math.sin(z[1])
-            jacobian[m, i] = z[0]
-            if d == 3:
-                particles[m, i, 2] = sensor_position[2] + z[0] * math.sin(z[2])
-                jacobian[m, i] = z[0] * level
-            # No detection points behind the sensor, nor beyond straight up.
-            if not (z[0] > 0.0 and level > 0.0):
-                jacobian[m, i] = 0.0
+            else:
+                level = z[0] * math.cos(z[2]) if d == 3 else z[0]
+                particles[m, i, 0] = sensor_position[0] + level * math.cos(z[1])
+                particles[m, i, 1] = sensor_position[1] + level * math.sin(z[1])
+                jacobian[m, i] = z[0]
+                if d == 3:
+                    particles[m, i, 2] = sensor_position[2] + z[0] * math.sin(z[2])
+                    jacobian[m, i] = z[0] * level
+                if not (z[0] > 0.0 and level > 0.0):
+                    jacobian[m, i] = 0.0
+            for a in range(d):
+                if not bounds[a, 0] <= particles[m, i, a] <= bounds[a, 1]:
+                    jacobian[m, i] = 0.0
 
 
 @dataclass(frozen=True)
@@ -109,19 +114,20 @@ def draw_births(
         scan.roots,
         scan.volume,
         scan.pose.position,
+        exploration.bounds,
         particles,
         volume,
     )
     flat = particles.reshape(-1, d)
-    inside = ((flat >= exploration.bounds[:, 0]) & (flat <= exploration.bounds[:, 1])).all(axis=1)
     probability = np.minimum(scan.detection.probability(flat, scan.pose), MOST_PROBABLE)
-    volume *= (probability * inside).reshape(count, number)
+    volume *= probability.reshape(count, number)
     unseen = np.maximum(exploration.at(flat), LEAST_UNEXPLORED).reshape(count, number)
     weights = unseen * volume
     intensity = expected_targets / exploration.volume * weights.mean(axis=1)
-    means = particles.mean(axis=1)
-    spread = particles - means[:, None]
-    covariances = np.einsum('mia,mib->mab', spread, spread) / number
+    means, covariances = np.empty((count, d)), np.empty((count, d, d))
+    even = np.full(number, 1.0 / number)
+    for draws, mean, covariance in zip(particles, means, covariances):
+        fill_moments(draws, even, mean, covariance)
     return Births(particles, volume, weights, means, covariances, intensity)
 
 

@@ -24,6 +24,8 @@ GATE = 6.0
 # Largest squared normalised distance for draws from a detection with too few particles.
 SUPPORT_DISTANCE = 36.0
 SUPPORT_DRAWS = 100
+# Association probability above which such draws replace particles.
+LEAST_DRAWN_SHARE = 0.05
 # Association probabilities and changes of the log density below these are neglected.
 LEAST_SHARE = 1e-4
 LEAST_CHANGE = 1e-3
@@ -128,7 +130,7 @@ class Component:
         for k in range(len(gated)):
             total, squares = sums[:, k]
             if not (total > 0.0 and total * total >= LEAST_SUPPORT * squares):
-                self._support(view, k, births)
+                self._likelihood_of_draws(view, k, births)
         return view
 
     def odds(self, view: View) -> FloatArray:
@@ -161,30 +163,28 @@ class Component:
         head = scan.head.copy()
         head[MISS] = nothing / ((1.0 - detected) * self.existence)
         scale = share[taken] / view.likelihood[taken]
-        terms = scan.terms[view.gated[taken]]
-        terms[:, SCALE] += np.log(scale)
         logs = np.empty(len(view.probability))
         spread = log_factor(head[MISS], view.probability, scale, view.seen[taken], logs)
-        drawn = [k for k in taken.tolist() if k in view.drawn and share[k] > 0.05]
+        if not len(taken) and spread <= LEAST_CHANGE:
+            return False
+        terms = scan.terms[view.gated[taken]]
+        terms[:, SCALE] += np.log(scale)
+        drawn = [k for k in view.drawn if share[k] > LEAST_DRAWN_SHARE]
         if drawn:
             self._restart(head, terms, view, drawn, share, births, generator)
-        elif len(taken) or spread > LEAST_CHANGE:
-            self.density.absorb(head, terms, logs, generator)
         else:
-            return False
+            self.density.multiply(head, terms, logs, generator)
         most = MOST_FACTORS if self.target is None else MOST_FACTORS_FOUND
         if len(self.density.heads) > most:
             self.density.condense()
         self.stale = True
         return True
 
-    def _support(self, view: View, k: int, births: Births) -> None:
+    def _likelihood_of_draws(self, view: View, k: int, births: Births) -> None:
         """Estimate a likelihood from draws of the detection, as particles are too sparse."""
         j = view.gated[k]
-        offset = births.means[j] - self.density.mean
-        if squared_distance(offset, self.density.covariance + births.covariances[j]) > (
-            SUPPORT_DISTANCE
-        ):
+        total = self.density.covariance + births.covariances[j]
+        if squared_distance(births.means[j] - self.density.mean, total) > SUPPORT_DISTANCE:
             return
         logs = self.density.log_at(births.particles[j, :SUPPORT_DRAWS])
         drawn = np.exp(np.minimum(logs, 600.0)) * births.volume[j, :SUPPORT_DRAWS]

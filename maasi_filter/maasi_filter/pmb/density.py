@@ -70,27 +70,27 @@ def _exponent(weights, logs, most, least_effective):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, error_model='numpy')
-def _reweigh(weights, logs, exponent):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Multiply weights by f to an exponent, in place; they sum to 1."""
+def _reweigh(weights, logs, exponent, least_effective):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Multiply weights by f to an exponent, in place, if that leaves enough effective particles.
+
+    They sum to 1. Returns whether it does.
+    """
     largest = -np.inf
     for i in range(len(weights)):
         if weights[i] > 0.0:
             largest = max(largest, logs[i])
+    changed = np.empty(len(weights))
     total = 0.0
+    squares = 0.0
     for i in range(len(weights)):
-        weights[i] *= math.exp(exponent * (logs[i] - largest))
-        total += weights[i]
+        changed[i] = weights[i] * math.exp(exponent * (logs[i] - largest))
+        total += changed[i]
+        squares += changed[i] * changed[i]
+    if total * total < least_effective * squares:
+        return False
     for i in range(len(weights)):
-        weights[i] /= total
-
-
-@njit(cache=True, error_model='numpy')
-def _reweigh_if(weights, logs, least_effective):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Multiply weights by f if that leaves enough effective particles; return whether it does."""
-    enough = _effective(weights, logs, 1.0) >= least_effective
-    if enough:
-        _reweigh(weights, logs, 1.0)
-    return enough
+        weights[i] = changed[i] / total
+    return True
 
 
 @njit(cache=True, error_model='numpy')
@@ -141,7 +141,7 @@ def _sweep(heads, terms, grid, frame, exponent, particles, products, last, draws
 
 
 @njit(cache=True, error_model='numpy')
-def _moments(particles, weights, mean, covariance):  # type: ignore[no-untyped-def]  # pragma: no cover
+def fill_moments(particles, weights, mean, covariance):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill mean and covariance; return the root mean square distance from the mean."""
     number, d = particles.shape
     trace = 0.0
@@ -207,7 +207,7 @@ class Density:
         self.mean: FloatArray = np.empty(d)
         self.covariance: FloatArray = np.empty((d, d))
         self.radius = 0.0
-        self._measure()
+        self._update_moments()
 
     @classmethod
     def normal(
@@ -233,14 +233,14 @@ class Density:
         products, last = self._logs(positions)
         return products + last
 
-    def absorb(
+    def multiply(
         self, head: FloatArray, terms: FloatArray, logs: FloatArray, generator: np.random.Generator
     ) -> None:
         """Multiply by a factor, whose log at the particles is `logs`."""
         self._append(head, terms)
-        if not _reweigh_if(self.weights, logs, LEAST_EFFECTIVE * len(self.weights)):
+        if not _reweigh(self.weights, logs, 1.0, LEAST_EFFECTIVE * len(self.weights)):
             self._temper(generator)
-        self._measure()
+        self._update_moments()
 
     def restart(
         self,
@@ -257,12 +257,12 @@ class Density:
         self.weights = np.full(len(index), 1.0 / len(index))
         products, last = self._logs(self.particles)
         self._move(1.0, products, last, generator)
-        self._measure()
+        self._update_moments()
 
     def replace_particles(self, particles: FloatArray) -> None:
         """Put others in place of the particles, with the same weights."""
         self.particles = particles
-        self._measure()
+        self._update_moments()
 
     def shift(self, way: FloatArray) -> None:
         """Move the whole density, factors included, by `way` (d,), metres."""
@@ -271,7 +271,7 @@ class Density:
         self.heads[:, SENSOR : SENSOR + d] += way
         cartesian = self.terms[:, CARTESIAN] > 0.5
         self.terms[cartesian, CENTRE : CENTRE + d] += way
-        self._measure()
+        self._update_moments()
 
     def condense(self) -> None:
         """Replace all factors by a normal density with the particles' moments."""
@@ -280,10 +280,10 @@ class Density:
         self.grid = np.empty((0, 0, 0))
 
     def _append(self, head: FloatArray, terms: FloatArray) -> None:
-        row = head.copy()
-        row[FIRST], row[TERMS] = len(self.terms), len(terms)
-        self.heads = np.concatenate([self.heads, row[None]])
-        self.terms = np.concatenate([self.terms, terms])
+        head[FIRST], head[TERMS] = len(self.terms), len(terms)
+        self.heads = np.concatenate([self.heads, head[None]])
+        if len(terms):
+            self.terms = np.concatenate([self.terms, terms])
 
     def _logs(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         products, last = np.empty(len(positions)), np.empty(len(positions))
@@ -298,7 +298,7 @@ class Density:
         while taken < 1.0:
             step = _exponent(self.weights, last, 1.0 - taken, LEAST_EFFECTIVE * number)
             taken = 1.0 if taken + step > 1.0 - 1e-9 else taken + step
-            _reweigh(self.weights, last, step)
+            _reweigh(self.weights, last, step, 0.0)
             index = _systematic(self.weights, number, generator.random())
             self.particles = self.particles[index]
             self.weights = np.full(number, 1.0 / number)
@@ -329,5 +329,5 @@ class Density:
             if accepted >= number:
                 break
 
-    def _measure(self) -> None:
-        self.radius = _moments(self.particles, self.weights, self.mean, self.covariance)
+    def _update_moments(self) -> None:
+        self.radius = fill_moments(self.particles, self.weights, self.mean, self.covariance)

@@ -16,10 +16,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_filter.models.detection import PARAMETERS, fill_probabilities, offsets
+from maasi_filter.models.detection import PARAMETERS, fill_probabilities
 from maasi_filter.models.measurement import TWO_PI
 from maasi_filter.unexplored_map import interpolate_at
-from maasi_filter.vector_math import arctan2, exponential
+from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
 
 FloatArray = NDArray[np.float64]
 
@@ -74,10 +74,12 @@ def gaussian_factor(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArra
 
 
 @njit(cache=True, error_model='numpy')
-def _look(head, positions, offset, probability):  # type: ignore[no-untyped-def]
-    """Fill offsets (3, n) from a scan's sensor and pi (n,), capped."""
-    number = positions.shape[0]
-    offsets(positions, 0, number, head[SENSOR : SENSOR + 3], offset[0], offset[1], offset[2])
+def _detection_probabilities(head, axes, offset, probability):  # type: ignore[no-untyped-def]
+    """Fill offsets (3, n) of positions (d, n) from a scan's sensor, and pi (n,), capped."""
+    number = axes.shape[1]
+    for a in range(axes.shape[0]):
+        for i in range(number):
+            offset[a, i] = axes[a, i] - head[SENSOR + a]
     if head[KIND] == ALWAYS:
         probability[:] = 1.0
         return
@@ -97,9 +99,10 @@ def _look(head, positions, offset, probability):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})
-def _point(offset, solid, measured):  # type: ignore[no-untyped-def]
+def _range_and_angles(offset, solid, measured):  # type: ignore[no-untyped-def]
     """Fill range, bearing and elevation (3, n) of offsets; in 2D the elevation is 0."""
-    x, y, z = offset
+    # Rows, not the array, are unpacked: iteration yields strided ones, which are not vectorised.
+    x, y, z = offset[0], offset[1], offset[2]
     for i in range(x.shape[0]):
         level = math.sqrt(x[i] * x[i] + y[i] * y[i])
         measured[0, i] = math.sqrt(level * level + z[i] * z[i])
@@ -108,8 +111,9 @@ def _point(offset, solid, measured):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})
-def _add_term(term, sensor, origin, factor, out):  # type: ignore[no-untyped-def]
+def _add_likelihood(term, sensor, origin, factor, out):  # type: ignore[no-untyped-def]
     """Add factor c_j g(z_j | x) (n,); `origin` is measured (3, n), or offsets if Cartesian."""
+    use_wide_vectors()
     cartesian = term[CARTESIAN] > 0.5
     shift = sensor if cartesian else np.zeros(3)
     turn = 0.0 if cartesian else 1.0 / TWO_PI
@@ -117,7 +121,7 @@ def _add_term(term, sensor, origin, factor, out):  # type: ignore[no-untyped-def
     scale = term[SCALE]
     i00, i01, i02 = term[INFORMATION], term[INFORMATION + 1], term[INFORMATION + 2]
     i11, i12, i22 = term[INFORMATION + 4], term[INFORMATION + 5], term[INFORMATION + 8]
-    u, v, w = origin
+    u, v, w = origin[0], origin[1], origin[2]
     for i in range(out.shape[0]):
         a = u[i] - z0
         b = v[i] - z1
@@ -131,14 +135,16 @@ def _add_term(term, sensor, origin, factor, out):  # type: ignore[no-untyped-def
 def add_log_factors(heads, terms, first, last, positions, out):  # type: ignore[no-untyped-def]
     """Add the logs of the factors from `first` to before `last` at positions (n, d) to `out`."""
     number, d = positions.shape
-    offset = np.empty((3, number))
+    axes = positions.T.copy()
+    # In two dimensions the height of the sensor plays no part.
+    offset = np.zeros((3, number))
     measured = np.empty((3, number))
     probability = np.empty(number)
     total = np.empty(number)
     product = np.ones(number)
     for k in range(first, last):
         head = heads[k]
-        _look(head, positions, offset, probability)
+        _detection_probabilities(head, axes, offset, probability)
         for i in range(number):
             total[i] = head[MISS] * (1.0 - probability[i])
         begin = int(head[FIRST])
@@ -147,10 +153,10 @@ def add_log_factors(heads, terms, first, last, positions, out):  # type: ignore[
         for j in range(begin, end):
             spherical = spherical or terms[j, CARTESIAN] < 0.5
         if spherical:
-            _point(offset, d == 3, measured)
+            _range_and_angles(offset, d == 3, measured)
         for j in range(begin, end):
             origin = offset if terms[j, CARTESIAN] > 0.5 else measured
-            _add_term(terms[j], head[SENSOR : SENSOR + 3], origin, probability, total)
+            _add_likelihood(terms[j], head[SENSOR : SENSOR + 3], origin, probability, total)
         for i in range(number):
             product[i] *= max(total[i], LEAST_FACTOR)
         # A product of four factors neither overflows nor vanishes; one logarithm serves it.
@@ -189,15 +195,15 @@ def likelihoods(head, terms, positions, weights, probability, seen, sums):  # ty
     `sums` (2, m) becomes sum w pi g_j, and the sum of the squares of w pi g_j.
     """
     number, d = positions.shape
-    offset = np.empty((3, number))
+    offset = np.zeros((3, number))
     measured = np.empty((3, number))
-    _look(head, positions, offset, probability)
+    _detection_probabilities(head, positions.T.copy(), offset, probability)
     if terms.shape[0]:
-        _point(offset, d == 3, measured)
+        _range_and_angles(offset, d == 3, measured)
     for j in range(terms.shape[0]):
         origin = offset if terms[j, CARTESIAN] > 0.5 else measured
         seen[j] = 0.0
-        _add_term(terms[j], head[SENSOR : SENSOR + 3], origin, probability, seen[j])
+        _add_likelihood(terms[j], head[SENSOR : SENSOR + 3], origin, probability, seen[j])
         sums[:, j] = 0.0
         for i in range(number):
             share = weights[i] * seen[j, i]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -317,11 +316,17 @@ class PmbFilter:
 
     def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
         """Return a target with the moments of its particles and the position error of the robot."""
-        error = item.pose_error**2 * np.eye(self.dimension) + self._offsets.covariance_of(target.id)
-        return replace(
-            target,
-            position=item.density.mean.copy(),
-            covariance=item.density.covariance + error,
+        covariance = item.density.covariance.copy()
+        covariance.flat[:: self.dimension + 1] += item.pose_error**2
+        if self._offsets.active:
+            covariance += self._offsets.covariance_of(target.id)
+        return FoundTarget(
+            target.id,
+            item.density.mean.copy(),
+            covariance,
+            target.robot,
+            target.measurement,
+            target.time,
             label=item.labels.label,
         )
 
