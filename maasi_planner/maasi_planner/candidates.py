@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from maasi_filter.models.detection import detection_probability_at
 from maasi_filter.models.pose import Pose
@@ -327,6 +326,11 @@ def _turns(viewer: Viewer, size: float) -> bool:
 def _parts(grid: UnexploredMap, seen: NDArray[np.bool_]) -> Unseen:
     """Return the connected parts of nodes not seen."""
     hidden = ~seen.reshape(grid.values.shape)
+    if not hidden.any():
+        return Unseen(0.0, [])
+    # Deferred: SciPy takes long to import.
+    from scipy import ndimage
+
     volumes = grid.cell_volumes()
     fraction = float(volumes[hidden].sum() / volumes.sum())
     labels, number = ndimage.label(hidden)

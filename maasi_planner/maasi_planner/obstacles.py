@@ -160,6 +160,138 @@ def goal_distances(
     return out
 
 
+# Inlined: counting references to array arguments costs more than these functions themselves.
+@njit(cache=True, forceinline=True)
+def _leave_circle(
+    position: FloatArray, goal: FloatArray, circles: FloatArray, clearance: float, out: FloatArray
+) -> bool:
+    """Write the way out of the first circle that the position is in; return whether there is one.
+
+    A robot can be in one if it was pushed.
+    """
+    for i in range(circles.shape[0]):
+        sphere = circles[i, 4] > 0.5
+        ox = position[0] - circles[i, 0]
+        oy = position[1] - circles[i, 1]
+        oz = (position[2] - circles[i, 2]) if sphere else 0.0
+        distance = math.sqrt(ox * ox + oy * oy + oz * oz)
+        if distance < circles[i, 3]:
+            if distance < 1e-9:
+                ox, oy, oz, distance = 1.0, 0.0, 0.0, 1.0
+            reach = (circles[i, 3] + clearance) / distance
+            out[0] = circles[i, 0] + ox * reach
+            out[1] = circles[i, 1] + oy * reach
+            out[2] = circles[i, 2] + oz * reach if sphere else goal[2]
+            return True
+    return False
+
+
+@njit(cache=True, forceinline=True)
+def _best_vertex(
+    px: float,
+    py: float,
+    circles: FloatArray,
+    vertices: FloatArray,
+    to_goal: FloatArray,
+    clearance: float,
+) -> tuple[int, float, bool]:
+    """Return the visible vertex on the shortest way, its length, and whether to approach closely.
+
+    A vertex that is as good as reached gives way to the next one, if that is visible already;
+    otherwise it must be approached closely. -1 where no vertex is visible.
+    """
+    best = np.inf
+    index = -1
+    beyond = np.inf
+    beyond_index = -1
+    for i in range(vertices.shape[0]):
+        vx = vertices[i, 0]
+        vy = vertices[i, 1]
+        near = math.sqrt((vx - px) * (vx - px) + (vy - py) * (vy - py))
+        total = near + to_goal[i]
+        if total < best or (near >= 0.5 * clearance and total < beyond):
+            if not is_clear(px, py, 0.0, vx, vy, 0.0, circles, 0.0, True):
+                continue
+            if total < best:
+                best = total
+                index = i
+            if near >= 0.5 * clearance and total < beyond:
+                beyond = total
+                beyond_index = i
+    if beyond_index == index:
+        return index, best, False
+    if beyond <= best + 0.5 * clearance:
+        return beyond_index, beyond, False
+    return index, best, True
+
+
+@njit(cache=True, forceinline=True)
+def _first_sphere(
+    position: FloatArray, target: FloatArray, circles: FloatArray
+) -> tuple[int, float]:
+    """Return the nearest sphere that the way to `target` hits, or -1, and its centre's distance."""
+    px, py, pz = position[0], position[1], position[2]
+    first = -1
+    nearest = np.inf
+    for i in range(circles.shape[0]):
+        if circles[i, 4] > 0.5:
+            gap = segment_distance(px, py, pz, target[0], target[1], target[2], circles[i])
+            if gap < circles[i, 3]:
+                away = math.sqrt(
+                    (circles[i, 0] - px) ** 2
+                    + (circles[i, 1] - py) ** 2
+                    + (circles[i, 2] - pz) ** 2
+                )
+                if away < nearest:
+                    nearest = away
+                    first = i
+    return first, nearest
+
+
+@njit(cache=True, forceinline=True)
+def _pass_sphere(
+    position: FloatArray, sphere: FloatArray, distance: float, clearance: float, target: FloatArray
+) -> float:
+    """Move `target` beside a sphere, on the side where the line passes its centre; return its way.
+
+    `distance`: of the centre [m].
+    """
+    px, py, pz = position[0], position[1], position[2]
+    tx = target[0] - px
+    ty = target[1] - py
+    tz = target[2] - pz
+    length = math.sqrt(tx * tx + ty * ty + tz * tz)
+    tx /= length
+    ty /= length
+    tz /= length
+    cx = sphere[0] - px
+    cy = sphere[1] - py
+    cz = sphere[2] - pz
+    along = cx * tx + cy * ty + cz * tz
+    nx = along * tx - cx
+    ny = along * ty - cy
+    nz = along * tz - cz
+    size = math.sqrt(nx * nx + ny * ny + nz * nz)
+    if size < 1e-6:
+        # Through the centre: choose a fixed side.
+        nx, ny, nz = -ty, tx, 0.0
+        size = math.hypot(nx, ny)
+        if size < 1e-6:
+            nx, ny, size = 1.0, 0.0, 1.0
+    reach = sphere[3] + clearance
+    # Head for the tangent cone: the point beside the centre, scaled out when close.
+    away = max(distance, reach * 1.0000001)
+    widen = reach * away / math.sqrt(away * away - sphere[3] ** 2)
+    widen = min(widen, 5.0 * reach)
+    ax = cx + widen * nx / size
+    ay = cy + widen * ny / size
+    az = cz + widen * nz / size
+    target[0] = px + ax
+    target[1] = py + ay
+    target[2] = pz + az
+    return math.sqrt(ax * ax + ay * ay + az * az)
+
+
 @njit(cache=True)
 def next_point(
     position: FloatArray,
@@ -174,9 +306,7 @@ def next_point(
 
     The point is the goal itself where the straight line is clear.
     """
-    px = position[0]
-    py = position[1]
-    pz = position[2]
+    px, py, pz = position[0], position[1], position[2]
     dx = goal[0] - px
     dy = goal[1] - py
     dz = goal[2] - pz
@@ -186,52 +316,12 @@ def next_point(
     out[2] = goal[2]
     if circles.shape[0] == 0:
         return straight
-    # Leave a circle first, in case the robot was pushed into one.
-    for i in range(circles.shape[0]):
-        ox = px - circles[i, 0]
-        oy = py - circles[i, 1]
-        oz = (pz - circles[i, 2]) if circles[i, 4] > 0.5 else 0.0
-        distance = math.sqrt(ox * ox + oy * oy + oz * oz)
-        if distance < circles[i, 3]:
-            if distance < 1e-9:
-                ox = 1.0
-                oy = 0.0
-                oz = 0.0
-                distance = 1.0
-            reach = (circles[i, 3] + clearance) / distance
-            out[0] = circles[i, 0] + ox * reach
-            out[1] = circles[i, 1] + oy * reach
-            out[2] = circles[i, 2] + oz * reach if circles[i, 4] > 0.5 else goal[2]
-            return straight + clearance
+    if _leave_circle(position, goal, circles, clearance, out):
+        return straight + clearance
     left = straight
     if not is_clear(px, py, pz, goal[0], goal[1], goal[2], circles, 0.0, True):
-        best = np.inf
-        index = -1
-        # Best vertex that is not as good as reached, if it is visible already.
-        beyond = np.inf
-        beyond_index = -1
-        for i in range(vertices.shape[0]):
-            vx = vertices[i, 0]
-            vy = vertices[i, 1]
-            near = math.sqrt((vx - px) * (vx - px) + (vy - py) * (vy - py))
-            total = near + to_goal[i]
-            if total < best or (near >= 0.5 * clearance and total < beyond):
-                if not is_clear(px, py, 0.0, vx, vy, 0.0, circles, 0.0, True):
-                    continue
-                if total < best:
-                    best = total
-                    index = i
-                if near >= 0.5 * clearance and total < beyond:
-                    beyond = total
-                    beyond_index = i
+        index, best, closely = _best_vertex(px, py, circles, vertices, to_goal, clearance)
         if index >= 0:
-            slow = False
-            if beyond_index != index:
-                if beyond <= best + 0.5 * clearance:
-                    best = beyond
-                    index = beyond_index
-                else:
-                    slow = True
             vx = vertices[index, 0]
             vy = vertices[index, 1]
             near = math.sqrt((vx - px) * (vx - px) + (vy - py) * (vy - py))
@@ -240,63 +330,11 @@ def next_point(
             out[1] = vy
             out[2] = pz + share * dz
             left = math.sqrt(best * best + dz * dz)
-            if slow:
-                # The vertex must be approached closely: the next one is not visible yet.
+            if closely:
                 left = min(left, 2.0 * near)
-    # Around the first sphere in the way, on the side where the line passes its centre.
-    first = -1
-    nearest = np.inf
-    for i in range(circles.shape[0]):
-        if circles[i, 4] > 0.5:
-            gap = segment_distance(px, py, pz, out[0], out[1], out[2], circles[i])
-            if gap < circles[i, 3]:
-                away = math.sqrt(
-                    (circles[i, 0] - px) ** 2
-                    + (circles[i, 1] - py) ** 2
-                    + (circles[i, 2] - pz) ** 2
-                )
-                if away < nearest:
-                    nearest = away
-                    first = i
+    first, distance = _first_sphere(position, out, circles)
     if first >= 0:
-        tx = out[0] - px
-        ty = out[1] - py
-        tz = out[2] - pz
-        length = math.sqrt(tx * tx + ty * ty + tz * tz)
-        tx /= length
-        ty /= length
-        tz /= length
-        cx = circles[first, 0] - px
-        cy = circles[first, 1] - py
-        cz = circles[first, 2] - pz
-        along = cx * tx + cy * ty + cz * tz
-        nx = along * tx - cx
-        ny = along * ty - cy
-        nz = along * tz - cz
-        size = math.sqrt(nx * nx + ny * ny + nz * nz)
-        if size < 1e-6:
-            # Through the centre: choose a fixed side.
-            nx = -ty
-            ny = tx
-            nz = 0.0
-            size = math.hypot(nx, ny)
-            if size < 1e-6:
-                nx = 1.0
-                ny = 0.0
-                size = 1.0
-        reach = circles[first, 3] + clearance
-        # Head for the tangent cone: the point beside the centre, scaled out when close.
-        away = max(nearest, reach * 1.0000001)
-        widen = reach * away / math.sqrt(away * away - circles[first, 3] ** 2)
-        widen = min(widen, 5.0 * reach)
-        ax = cx + widen * nx / size
-        ay = cy + widen * ny / size
-        az = cz + widen * nz / size
-        part = math.sqrt(ax * ax + ay * ay + az * az)
-        out[0] = px + ax
-        out[1] = py + ay
-        out[2] = pz + az
-        left = max(left, part)
+        left = max(left, _pass_sphere(position, circles[first], distance, clearance, out))
     return left
 
 

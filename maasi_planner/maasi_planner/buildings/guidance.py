@@ -6,7 +6,6 @@ import heapq
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from maasi_planner.buildings.preplanning import segment_cuts
 
@@ -31,6 +30,9 @@ def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntAr
     """
     if not len(unvisited):
         return None
+    # Deferred: SciPy takes long to import, and searches for targets do not need it.
+    from scipy.optimize import linear_sum_assignment
+
     cost = np.sqrt(((places[:, None, :] - centres[unvisited][None, :, :]) ** 2).sum(axis=2))
     rows, columns = linear_sum_assignment(cost)
     chosen = np.flatnonzero(rows == own)

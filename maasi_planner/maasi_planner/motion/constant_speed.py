@@ -122,11 +122,10 @@ def _roll_out(
     wanted = np.zeros(4)
     position = np.zeros(3)
     obstacles = around.circles.shape[0] > 0
-    rate, speed, yaw_rate = steering.rate, steering.speed, steering.yaw_rate
-    face_travel, tolerance = steering.face_travel, steering.tolerance
+    speed, yaw_rate, tolerance = steering.speed, steering.yaw_rate, steering.tolerance
     # The same limit brakes and accelerates.
     acceleration = steering.deceleration
-    plain = not obstacles and not face_travel and acceleration == np.inf
+    plain = not obstacles and not steering.face_travel and acceleration == np.inf
     limit = out.positions.shape[1] - 1
     for w in range(waypoints.shape[0]):
         goal = waypoints[w]
@@ -152,7 +151,7 @@ def _roll_out(
                 sideways_command(position, yaw, goal, tables[w], steering, around, work, wanted)
                 command = (wanted[0], wanted[1], wanted[2], wanted[3])
             else:
-                command = straight_command(dx, dy, dz, yaw, rate, speed, face_travel, yaw_rate)
+                command = straight_command(dx, dy, dz, yaw, steering)
             cost += command[0] ** 2 + command[1] ** 2 + command[2] ** 2 + command[3] ** 2
             state = point_step(state, command, speed, acceleration, yaw_rate, dt)
         out.lengths[w] = length

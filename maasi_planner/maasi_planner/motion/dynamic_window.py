@@ -47,6 +47,38 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray)
 
 
 @njit(cache=True)
+def _arc(
+    state: UnicycleState,
+    v: float,
+    w: float,
+    time: float,
+    stopping: float,
+    circles: FloatArray,
+) -> tuple[float, float, float, float]:
+    """Return x, y and heading at the end of an arc, and the least distance from circles on it.
+
+    Minus infinity if the robot could not stop within `stopping` before a circle.
+    """
+    px, py, heading = state[0], state[1], state[2]
+    room = np.inf
+    dt = time / ARC_STEPS
+    for k in range(ARC_STEPS):
+        heading += 0.5 * w * dt
+        px += v * dt * math.cos(heading)
+        py += v * dt * math.sin(heading)
+        heading += 0.5 * w * dt
+        travelled = v * dt * (k + 1)
+        for c in range(circles.shape[0]):
+            gap = math.hypot(px - circles[c, 0], py - circles[c, 1]) - circles[c, 3]
+            room = min(room, gap)
+            if gap < 0.0 and v > 0.0 and travelled <= stopping + v * dt:
+                return px, py, heading, -np.inf
+        if room < 0.0 and v > 0.0:
+            break
+    return px, py, heading, room
+
+
+@njit(cache=True)
 def window_command(
     state: UnicycleState,
     target_x: float,
@@ -94,28 +126,8 @@ def window_command(
         stopping = 0.5 * v * v / deceleration + v * WINDOW
         for j in range(TURN_SAMPLES):
             w = turn_low + (turn_high - turn_low) * j / (TURN_SAMPLES - 1)
-            px = x
-            py = y
-            heading = yaw
-            room = np.inf
-            free = True
-            dt = time / ARC_STEPS
-            for k in range(ARC_STEPS):
-                heading += 0.5 * w * dt
-                px += v * dt * math.cos(heading)
-                py += v * dt * math.sin(heading)
-                heading += 0.5 * w * dt
-                travelled = v * dt * (k + 1)
-                for c in range(circles.shape[0]):
-                    gap = math.hypot(px - circles[c, 0], py - circles[c, 1]) - circles[c, 3]
-                    room = min(room, gap)
-                    if gap < 0.0 and v > 0.0 and travelled <= stopping + v * dt:
-                        free = False
-                if not free:
-                    break
-                if room < 0.0 and v > 0.0:
-                    break
-            if not free:
+            px, py, heading, room = _arc(state, v, w, time, stopping, circles)
+            if room == -np.inf:
                 continue
             gap = math.hypot(target_x - px, target_y - py)
             off = math.atan2(target_y - py, target_x - px) - heading

@@ -78,9 +78,9 @@ def _roll_out(
             if gap <= steering.tolerance:
                 length = k
                 break
-            sideways_command(state[:3], state[5], goal, tables[w], steering, around, work, command)
+            sideways_command(state, state[5], goal, tables[w], steering, around, work, command)
             if term.kind > 0:
-                add_obstacle_term(state[:3], state[5], term, parameters, command)
+                add_obstacle_term(state, state[5], term, parameters, command)
             cost += mambo_step(state, command, parameters, table, periods, h)
         out.lengths[w] = length
         out.control_cost[w] = cost

@@ -29,6 +29,8 @@ from maasi_planner.motion.mambo_gains import (
 )
 
 FloatArray = NDArray[np.float64]
+# vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+Command = tuple[float, float, float, float]
 
 # Rows of the tables of `closed_loop`: the chains, and the entries of each.
 PITCH_CHAIN, ROLL_CHAIN, HEIGHT_CHAIN = range(3)
@@ -93,6 +95,12 @@ def closed_loop(parameters: FloatArray, periods: int, h: float) -> FloatArray:
 
 
 @njit(cache=True)
+def _most(row: FloatArray, v: float, a: float, w: float) -> float:
+    """Return the largest |velocity - command| of one chain on the way."""
+    return row[BOUND] * abs(v) + row[BOUND + 1] * abs(a) + row[BOUND + 2] * abs(w)
+
+
+@njit(cache=True)
 def _lateral(
     row: FloatArray, v: float, a: float, w: float
 ) -> tuple[float, float, float, float, float]:
@@ -131,9 +139,7 @@ def mambo_step(
     table : (3, 24) array
         From `closed_loop` for the same periods: where no limit acts, all periods at once.
     """
-    cx = command[0]
-    cy = command[1]
-    cz = command[2]
+    cx, cy, cz = command[0], command[1], command[2]
     size = math.sqrt(cx * cx + cy * cy + cz * cz)
     if size > parameters[SPEED]:
         scale = parameters[SPEED] / size
@@ -141,21 +147,69 @@ def mambo_step(
         cy *= scale
         cz *= scale
     cr = min(max(command[3], -parameters[YAW_RATE]), parameters[YAW_RATE])
-    x = state[0]
-    y = state[1]
-    z = state[2]
-    roll = state[3]
-    pitch = state[4]
-    yaw = state[5]
-    vz = state[8]
-    p = state[9]
-    q = state[10]
-    r = state[11]
+    wanted = (cx, cy, cz, cr)
+    if cr == 0.0 and state[11] == 0.0:
+        cost = _step_at_once(state, wanted, parameters, table, periods * h)
+        if cost >= 0.0:
+            return cost
+    return _step_in_periods(state, wanted, parameters, periods, h)
+
+
+@njit(cache=True)
+def _step_at_once(
+    state: FloatArray, wanted: Command, parameters: FloatArray, table: FloatArray, time: float
+) -> float:
+    """Fly all periods without turning, in place; return the sum of u'u.
+
+    -1, with the state as it was, if a limit would act on the way.
+    """
+    cx, cy, cz, _ = wanted
+    cos_yaw = math.cos(state[5])
+    sin_yaw = math.sin(state[5])
+    # Deviations of the velocity along the heading, to its left, and upwards.
+    df = cos_yaw * state[6] + sin_yaw * state[7] - cx
+    dl = cos_yaw * state[7] - sin_yaw * state[6] - cy
+    dz = state[8] - cz
+    front = table[PITCH_CHAIN]
+    side = table[ROLL_CHAIN]
+    up = table[HEIGHT_CHAIN]
+    most_pitch = abs(parameters[K_VX] / parameters[K_PITCH]) * _most(front, df, state[4], state[10])
+    most_roll = abs(parameters[K_VY] / parameters[K_ROLL]) * _most(side, dl, state[3], state[9])
+    most_force = parameters[K_VZ] * abs(dz)
+    tilt = parameters[TILT]
+    if not (most_pitch <= tilt and most_roll <= tilt and most_force <= parameters[LIFT]):
+        return -1.0
+    df, state[4], state[10], forward, pitch_cost = _lateral(front, df, state[4], state[10])
+    dl, state[3], state[9], left, roll_cost = _lateral(side, dl, state[3], state[9])
+    cost = pitch_cost + roll_cost + parameters[COUNT_FORCE] * up[COST] * dz * dz
+    forward += cx * time
+    left += cy * time
+    vf = cx + df
+    vl = cy + dl
+    state[0] = state[0] + cos_yaw * forward - sin_yaw * left
+    state[1] = state[1] + sin_yaw * forward + cos_yaw * left
+    state[2] = state[2] + cz * time + up[TRAVEL] * dz
+    state[6] = cos_yaw * vf - sin_yaw * vl
+    state[7] = sin_yaw * vf + cos_yaw * vl
+    state[8] = cz + up[MATRIX] * dz
+    return cost
+
+
+@njit(cache=True)
+def _step_in_periods(
+    state: FloatArray, wanted: Command, parameters: FloatArray, periods: int, h: float
+) -> float:
+    """Fly one period after the other within the limits, in place; return the sum of u'u."""
+    cx, cy, cz, cr = wanted
+    x, y, z = state[0], state[1], state[2]
+    roll, pitch, yaw = state[3], state[4], state[5]
+    p, q, r = state[9], state[10], state[11]
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
-    # Velocity along the heading and to its left.
+    # Velocity along the heading, to its left, and upwards.
     vf = cos_yaw * state[6] + sin_yaw * state[7]
     vl = cos_yaw * state[7] - sin_yaw * state[6]
+    vz = state[8]
     to_pitch = parameters[K_VX] / parameters[K_PITCH]
     to_roll = parameters[K_VY] / parameters[K_ROLL]
     tilt = parameters[TILT]
@@ -164,43 +218,6 @@ def mambo_step(
     h4 = h * h * h * h / 24.0
     turning = cr != 0.0 or r != 0.0
     cost = 0.0
-    if not turning:
-        df = vf - cx
-        dl = vl - cy
-        dz = vz - cz
-        front = table[PITCH_CHAIN]
-        side = table[ROLL_CHAIN]
-        up = table[HEIGHT_CHAIN]
-        most_front = (
-            front[BOUND] * abs(df) + front[BOUND + 1] * abs(pitch) + front[BOUND + 2] * abs(q)
-        )
-        most_side = side[BOUND] * abs(dl) + side[BOUND + 1] * abs(roll) + side[BOUND + 2] * abs(p)
-        if (
-            abs(to_pitch) * most_front <= tilt
-            and abs(to_roll) * most_side <= tilt
-            and parameters[K_VZ] * abs(dz) <= parameters[LIFT]
-        ):
-            time = periods * h
-            df, pitch, q, forward, spent = _lateral(front, df, pitch, q)
-            cost += spent
-            dl, roll, p, left, spent = _lateral(side, dl, roll, p)
-            cost += spent
-            cost += parameters[COUNT_FORCE] * up[COST] * dz * dz
-            forward += cx * time
-            left += cy * time
-            state[0] = x + cos_yaw * forward - sin_yaw * left
-            state[1] = y + sin_yaw * forward + cos_yaw * left
-            state[2] = z + cz * time + up[TRAVEL] * dz
-            vf = cx + df
-            vl = cy + dl
-            state[3] = roll
-            state[4] = pitch
-            state[6] = cos_yaw * vf - sin_yaw * vl
-            state[7] = sin_yaw * vf + cos_yaw * vl
-            state[8] = cz + up[MATRIX] * dz
-            state[9] = p
-            state[10] = q
-            return cost
     for _ in range(periods):
         pitch_wanted = min(max(to_pitch * (cx - vf), -tilt), tilt)
         roll_wanted = min(max(to_roll * (cy - vl), -tilt), tilt)
@@ -234,23 +251,15 @@ def mambo_step(
             # The velocity stays what it is in the map while the axes turn under it.
             ct = math.cos(turn)
             st = math.sin(turn)
-            forward = ct * vf + st * vl
-            vl = ct * vl - st * vf
-            vf = forward
+            vf, vl = ct * vf + st * vl, ct * vl - st * vf
             cos_yaw = math.cos(yaw)
             sin_yaw = math.sin(yaw)
-    state[0] = x
-    state[1] = y
-    state[2] = z
-    state[3] = roll
-    state[4] = pitch
-    state[5] = yaw
+    state[0], state[1], state[2] = x, y, z
+    state[3], state[4], state[5] = roll, pitch, yaw
     state[6] = cos_yaw * vf - sin_yaw * vl
     state[7] = sin_yaw * vf + cos_yaw * vl
     state[8] = vz
-    state[9] = p
-    state[10] = q
-    state[11] = r
+    state[9], state[10], state[11] = p, q, r
     return cost
 
 

@@ -109,28 +109,30 @@ def lqr_gains(settings: MotionSettings) -> dict[str, FloatArray]:
     return {'pitch': pitch, 'roll': roll, 'height': height, 'yaw': yaw}
 
 
+def _dot(a: list[float], b: list[float]) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
 def _response_size(a: FloatArray, b: FloatArray, gain: FloatArray) -> tuple[FloatArray, float]:
     """Return the impulse response from velocity command to velocity, and the tilt's peak gain."""
-    state = np.zeros(3)
-    a3, b3 = a[1:, 1:], b[1:]
+    # Lists: many small steps are slow in NumPy.
+    rows, inputs, weights = a[1:, 1:].tolist(), b[1:].tolist(), gain.tolist()
+    state = [0.0, 0.0, 0.0]
     responses = []
     tilt = 0.0
-    drive = gain[0]
     for k in range(40_000):
-        push = -sum(float(gain[i] * state[i]) for i in range(3)) + (drive if k == 0 else 0.0)
-        state = np.array(
-            [sum(float(a3[i, j] * state[j]) for j in range(3)) + b3[i] * push for i in range(3)]
-        )
-        responses.append(float(state[0]))
-        if k > 400 and abs(state).max() < 1e-12:
+        push = -_dot(weights, state) + (weights[0] if k == 0 else 0.0)
+        state = [_dot(row, state) + size * push for row, size in zip(rows, inputs, strict=True)]
+        responses.append(state[0])
+        if k > 400 and max(map(abs, state)) < 1e-12:
             break
-    angle = np.zeros(2)
+    angle, rate = 0.0, 0.0
     for k in range(4000):
-        push = -float(gain[1] * angle[0] + gain[2] * angle[1])
+        push = -(weights[1] * angle + weights[2] * rate)
         if k == 0:
-            push += float(gain[1])
-        angle = np.array([angle[0] + a3[1, 2] * angle[1] + b3[1] * push, angle[1] + b3[2] * push])
-        tilt += abs(float(angle[0]))
+            push += weights[1]
+        angle, rate = angle + rows[1][2] * rate + inputs[1] * push, rate + inputs[2] * push
+        tilt += abs(angle)
     return np.array(responses), tilt
 
 

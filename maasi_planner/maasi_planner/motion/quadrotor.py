@@ -38,12 +38,120 @@ from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
 
 FloatArray = NDArray[np.float64]
+Vector = tuple[float, float, float]
 
 MASS = 1.2
 INERTIA = (0.0123, 0.0123, 0.0224)
 C1, C2, C3, C4 = 0.8, 2.5, 10.0, 45.0
 # Entries of the array of limits.
-SPEED, LEVEL, VERTICAL, TILT, YAW_RATE, COUNT_FORCE = range(6)
+SPEED, LEVEL, VERTICAL, SLOPE, YAW_RATE, COUNT_FORCE = range(6)
+
+
+@njit(cache=True, forceinline=True)
+def _rotation(state: FloatArray) -> tuple[Vector, Vector, Vector]:
+    """Return the body axes forward, left and up in the map: columns of the rotation matrix."""
+    w, x, y, z = state[3], state[4], state[5], state[6]
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+        (2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
+        (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+@njit(cache=True, forceinline=True)
+def _force(state: FloatArray, command: FloatArray, limits: FloatArray) -> Vector:
+    """Return the force per mass that a velocity command asks for, within the limits [m/s^2]."""
+    size = math.sqrt(command[0] ** 2 + command[1] ** 2 + command[2] ** 2)
+    scale = 1.0
+    if size > limits[SPEED]:
+        scale = limits[SPEED] / size
+    b1x, b1y, _ = _rotation(state)[0]
+    level = math.sqrt(b1x * b1x + b1y * b1y)
+    cos_yaw = b1x / level if level > 1e-9 else 1.0
+    sin_yaw = b1y / level if level > 1e-9 else 0.0
+    vx = scale * (cos_yaw * command[0] - sin_yaw * command[1])
+    vy = scale * (sin_yaw * command[0] + cos_yaw * command[1])
+    vz = scale * command[2]
+    ax = C2 * (vx - state[7])
+    ay = C2 * (vy - state[8])
+    az = C2 * (vz - state[9])
+    az = min(max(az, -limits[VERTICAL]), limits[VERTICAL])
+    most = min(limits[LEVEL], limits[SLOPE] * (GRAVITY + az))
+    asked = math.sqrt(ax * ax + ay * ay)
+    if asked > most:
+        ax *= most / asked
+        ay *= most / asked
+    return ax, ay, GRAVITY + az
+
+
+@njit(cache=True, forceinline=True)
+def _inputs(state: FloatArray, force: Vector, turn: float) -> tuple[float, Vector]:
+    """Return thrust [N] and torques [N m] that turn the thrust towards `force`."""
+    (b1x, b1y, b1z), (b2x, b2y, b2z), (b3x, b3y, b3z) = _rotation(state)
+    ax, ay, fz = force
+    strength = math.sqrt(ax * ax + ay * ay + fz * fz)
+    nx = ax / strength
+    ny = ay / strength
+    nz = fz / strength
+    thrust = MASS * max(0.0, ax * b3x + ay * b3y + fz * b3z)
+    # The way from b3 to the force, b3 x n, in body axes.
+    ex = b3y * nz - b3z * ny
+    ey = b3z * nx - b3x * nz
+    ez = b3x * ny - b3y * nx
+    wanted_x = C3 * (b1x * ex + b1y * ey + b1z * ez)
+    wanted_y = C3 * (b2x * ex + b2y * ey + b2z * ez)
+    p, q, r = state[10], state[11], state[12]
+    return thrust, (
+        INERTIA[0] * C4 * (wanted_x - p) + (INERTIA[2] - INERTIA[1]) * q * r,
+        INERTIA[1] * C4 * (wanted_y - q) + (INERTIA[0] - INERTIA[2]) * r * p,
+        INERTIA[2] * C4 * (turn - r) + (INERTIA[1] - INERTIA[0]) * p * q,
+    )
+
+
+@njit(cache=True, forceinline=True)
+def _move(state: FloatArray, thrust: float, torque: Vector, h: float) -> None:
+    """Integrate the rigid body for `h` seconds, in place: speeds before positions."""
+    p, q, r = state[10], state[11], state[12]
+    new_p = p + h * (torque[0] - (INERTIA[2] - INERTIA[1]) * q * r) / INERTIA[0]
+    new_q = q + h * (torque[1] - (INERTIA[0] - INERTIA[2]) * r * p) / INERTIA[1]
+    new_r = r + h * (torque[2] - (INERTIA[1] - INERTIA[0]) * p * q) / INERTIA[2]
+    b3x, b3y, b3z = _rotation(state)[2]
+    dvx = h * thrust / MASS * b3x
+    dvy = h * thrust / MASS * b3y
+    dvz = h * (thrust / MASS * b3z - GRAVITY)
+    state[0] += h * (state[7] + 0.5 * dvx)
+    state[1] += h * (state[8] + 0.5 * dvy)
+    state[2] += h * (state[9] + 0.5 * dvz)
+    state[7] += dvx
+    state[8] += dvy
+    state[9] += dvz
+    # Turn by the mean rate over the period.
+    _rotate(state, 0.5 * (p + new_p), 0.5 * (q + new_q), 0.5 * (r + new_r), h)
+    state[10] = new_p
+    state[11] = new_q
+    state[12] = new_r
+
+
+@njit(cache=True, forceinline=True)
+def _rotate(state: FloatArray, p: float, q: float, r: float, h: float) -> None:
+    """Turn the attitude in place by constant rates p, q, r [rad/s, body] for `h` seconds."""
+    w, x, y, z = state[3], state[4], state[5], state[6]
+    rate = math.sqrt(p * p + q * q + r * r)
+    half = 0.5 * rate * h
+    c = math.cos(half)
+    s = 0.5 * h if half < 1e-9 else math.sin(half) / rate
+    gx = p * s
+    gy = q * s
+    gz = r * s
+    nw = w * c - x * gx - y * gy - z * gz
+    nx = w * gx + x * c + y * gz - z * gy
+    ny = w * gy - x * gz + y * c + z * gx
+    nz = w * gz + x * gy - y * gx + z * c
+    norm = math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
+    state[3] = nw / norm
+    state[4] = nx / norm
+    state[5] = ny / norm
+    state[6] = nz / norm
 
 
 @njit(cache=True)
@@ -59,98 +167,18 @@ def quadrotor_step(
     command : (4,) array
         vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
     limits : (6,) array
-        Speed, level and vertical acceleration, tilt, yaw rate, and whether the force counts.
+        Speed, level and vertical acceleration, tangent of the tilt, yaw rate, and whether the
+        force counts.
     """
-    size = math.sqrt(command[0] ** 2 + command[1] ** 2 + command[2] ** 2)
-    scale = 1.0
-    if size > limits[SPEED]:
-        scale = limits[SPEED] / size
     turn = min(max(command[3], -limits[YAW_RATE]), limits[YAW_RATE])
-    steepest = math.tan(limits[TILT])
     cost = 0.0
     for _ in range(periods):
-        w, x, y, z = state[3], state[4], state[5], state[6]
-        # Columns of the rotation matrix: forward, left, up.
-        b1x = 1.0 - 2.0 * (y * y + z * z)
-        b1y = 2.0 * (x * y + w * z)
-        b3x = 2.0 * (x * z + w * y)
-        b3y = 2.0 * (y * z - w * x)
-        b3z = 1.0 - 2.0 * (x * x + y * y)
-        level = math.sqrt(b1x * b1x + b1y * b1y)
-        cos_yaw = b1x / level if level > 1e-9 else 1.0
-        sin_yaw = b1y / level if level > 1e-9 else 0.0
-        vx = scale * (cos_yaw * command[0] - sin_yaw * command[1])
-        vy = scale * (sin_yaw * command[0] + cos_yaw * command[1])
-        vz = scale * command[2]
-        ax = C2 * (vx - state[7])
-        ay = C2 * (vy - state[8])
-        az = C2 * (vz - state[9])
-        az = min(max(az, -limits[VERTICAL]), limits[VERTICAL])
-        most = min(limits[LEVEL], steepest * (GRAVITY + az))
-        asked = math.sqrt(ax * ax + ay * ay)
-        if asked > most:
-            ax *= most / asked
-            ay *= most / asked
-        fz = GRAVITY + az
-        strength = math.sqrt(ax * ax + ay * ay + fz * fz)
-        nx = ax / strength
-        ny = ay / strength
-        nz = fz / strength
-        thrust = MASS * max(0.0, ax * b3x + ay * b3y + fz * b3z)
-        # The way from b3 to the force, b3 x n, in body axes.
-        ex = b3y * nz - b3z * ny
-        ey = b3z * nx - b3x * nz
-        ez = b3x * ny - b3y * nx
-        b2x = 2.0 * (x * y - w * z)
-        b2y = 1.0 - 2.0 * (x * x + z * z)
-        b2z = 2.0 * (y * z + w * x)
-        b1z = 2.0 * (x * z - w * y)
-        wanted_x = C3 * (b1x * ex + b1y * ey + b1z * ez)
-        wanted_y = C3 * (b2x * ex + b2y * ey + b2z * ez)
-        wanted_z = turn
-        p, q, r = state[10], state[11], state[12]
-        tx = INERTIA[0] * C4 * (wanted_x - p) + (INERTIA[2] - INERTIA[1]) * q * r
-        ty = INERTIA[1] * C4 * (wanted_y - q) + (INERTIA[0] - INERTIA[2]) * r * p
-        tz = INERTIA[2] * C4 * (wanted_z - r) + (INERTIA[1] - INERTIA[0]) * p * q
+        thrust, torque = _inputs(state, _force(state, command, limits), turn)
+        tx, ty, tz = torque
         cost += tx * tx + ty * ty + tz * tz
         extra = thrust - MASS * GRAVITY
         cost += limits[COUNT_FORCE] * extra * extra
-        # Accelerations of the body, then speeds before positions.
-        new_p = p + h * (tx - (INERTIA[2] - INERTIA[1]) * q * r) / INERTIA[0]
-        new_q = q + h * (ty - (INERTIA[0] - INERTIA[2]) * r * p) / INERTIA[1]
-        new_r = r + h * (tz - (INERTIA[1] - INERTIA[0]) * p * q) / INERTIA[2]
-        dvx = h * thrust / MASS * b3x
-        dvy = h * thrust / MASS * b3y
-        dvz = h * (thrust / MASS * b3z - GRAVITY)
-        state[0] += h * (state[7] + 0.5 * dvx)
-        state[1] += h * (state[8] + 0.5 * dvy)
-        state[2] += h * (state[9] + 0.5 * dvz)
-        state[7] += dvx
-        state[8] += dvy
-        state[9] += dvz
-        # Turn by the mean rate over the period.
-        mp = 0.5 * (p + new_p)
-        mq = 0.5 * (q + new_q)
-        mr = 0.5 * (r + new_r)
-        rate = math.sqrt(mp * mp + mq * mq + mr * mr)
-        half = 0.5 * rate * h
-        c = math.cos(half)
-        s = 0.5 * h if half < 1e-9 else math.sin(half) / rate
-        gx = mp * s
-        gy = mq * s
-        gz = mr * s
-        nw = w * c - x * gx - y * gy - z * gz
-        nqx = w * gx + x * c + y * gz - z * gy
-        nqy = w * gy - x * gz + y * c + z * gx
-        nqz = w * gz + x * gy - y * gx + z * c
-        norm = math.sqrt(nw * nw + nqx * nqx + nqy * nqy + nqz * nqz)
-        state[3] = nw / norm
-        state[4] = nqx / norm
-        state[5] = nqy / norm
-        state[6] = nqz / norm
-        state[10] = new_p
-        state[11] = new_q
-        state[12] = new_r
+        _move(state, thrust, torque, h)
     return cost
 
 
@@ -191,7 +219,7 @@ def _roll_out(
             if square <= steering.tolerance * steering.tolerance:
                 length = k
                 break
-            sideways_command(state[:3], yaw, goal, tables[w], steering, around, work, command)
+            sideways_command(state, yaw, goal, tables[w], steering, around, work, command)
             cost += quadrotor_step(state, command, limits, periods, h)
         out.lengths[w] = length
         out.control_cost[w] = cost
@@ -214,7 +242,7 @@ def quadrotor_limits(settings: MotionSettings) -> FloatArray:
     acceleration = settings.acceleration or math.inf
     out[LEVEL] = min(0.8 * acceleration, 100.0)
     out[VERTICAL] = min(0.5 * acceleration, 0.5 * GRAVITY)
-    out[TILT] = settings.tilt / 1.03
+    out[SLOPE] = math.tan(settings.tilt / 1.03)
     out[YAW_RATE] = settings.yaw_rate
     out[COUNT_FORCE] = 1.0 if settings.control_inputs == 'all' else 0.0
     return out
@@ -263,9 +291,7 @@ class Quadrotor(SteeredMotion):
     ) -> None:
         super().__init__(settings, obstacles, radius)
         self.limits = quadrotor_limits(settings)
-        slowing = min(
-            self.limits[LEVEL], GRAVITY * math.tan(self.limits[TILT]), self.limits[VERTICAL]
-        )
+        slowing = min(self.limits[LEVEL], GRAVITY * self.limits[SLOPE], self.limits[VERTICAL])
         self.rate = float(min(settings.approach_rate or C1, slowing / settings.speed))
         self.barrier = float(min(0.15 * C2, 0.5 * slowing / settings.speed))
         self.steering = Steering(

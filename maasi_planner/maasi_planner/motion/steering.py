@@ -72,33 +72,36 @@ def turn_towards(dx: float, dy: float, yaw: float, yaw_rate: float) -> float:
 
 @njit(cache=True)
 def straight_command(
-    dx: float,
-    dy: float,
-    dz: float,
-    yaw: float,
-    rate: float,
-    speed: float,
-    face_travel: bool,
-    yaw_rate: float,
+    dx: float, dy: float, dz: float, yaw: float, steering: Steering
 ) -> tuple[float, float, float, float]:
     """Return the command vx, vy, vz (body axes), yaw rate towards a waypoint at (dx, dy, dz).
 
     The speed is `rate` times the distance, at most `speed`.
     """
     size = math.sqrt(dx * dx + dy * dy + dz * dz)
-    scale = rate
-    if rate * size > speed:
-        scale = speed / size
+    scale = steering.rate
+    if scale * size > steering.speed:
+        scale = steering.speed / size
     vx = scale * dx
     vy = scale * dy
     turn = 0.0
-    if face_travel and dx * dx + dy * dy > 1e-6:
-        turn = turn_towards(dx, dy, yaw, yaw_rate)
+    if steering.face_travel and dx * dx + dy * dy > 1e-6:
+        turn = turn_towards(dx, dy, yaw, steering.yaw_rate)
     if yaw == 0.0:
         return vx, vy, scale * dz, turn
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
     return cos_yaw * vx + sin_yaw * vy, cos_yaw * vy - sin_yaw * vx, scale * dz, turn
+
+
+@njit(cache=True, forceinline=True)
+def _room(position: FloatArray, circles: FloatArray) -> float:
+    """Return the distance of a position (3,) from the nearest circle, negative inside."""
+    x, y, z = position[0], position[1], position[2]
+    room = np.inf
+    for i in range(circles.shape[0]):
+        room = min(room, segment_distance(x, y, z, x, y, z, circles[i]) - circles[i, 3])
+    return room
 
 
 @njit(cache=True)
@@ -116,7 +119,9 @@ def sideways_command(
 
     Parameters
     ----------
-    position, goal : (3,) array
+    position : array
+        Begins with x, y, z [m, map].
+    goal : (3,) array
         Metres, frame `map`.
     yaw : float
         Heading, radians.
@@ -129,21 +134,28 @@ def sideways_command(
     work : (2, 3) array
         Scratch.
     """
-    circles = around.circles
-    rate = steering.rate
-    speed = steering.speed
-    if circles.shape[0] == 0:
+    if around.circles.shape[0] == 0:
         out[0], out[1], out[2], out[3] = straight_command(
-            goal[0] - position[0],
-            goal[1] - position[1],
-            goal[2] - position[2],
-            yaw,
-            rate,
-            speed,
-            steering.face_travel,
-            steering.yaw_rate,
+            goal[0] - position[0], goal[1] - position[1], goal[2] - position[2], yaw, steering
         )
-        return
+    else:
+        _command_among(position, yaw, goal, to_goal, steering, around, work, out)
+
+
+@njit(cache=True, forceinline=True)
+def _command_among(
+    position: FloatArray,
+    yaw: float,
+    goal: FloatArray,
+    to_goal: FloatArray,
+    steering: Steering,
+    around: Surroundings,
+    work: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the command among obstacles, see `sideways_command`."""
+    circles = around.circles
+    speed = steering.speed
     target = work[0]
     velocity = work[1]
     left = next_point(position, goal, circles, around.vertices, to_goal, around.clearance, target)
@@ -152,25 +164,11 @@ def sideways_command(
     dz = target[2] - position[2]
     size = math.sqrt(dx * dx + dy * dy + dz * dz)
     if steering.deceleration < np.inf:
-        room = np.inf
-        for i in range(circles.shape[0]):
-            room = min(
-                room,
-                segment_distance(
-                    position[0],
-                    position[1],
-                    position[2],
-                    position[0],
-                    position[1],
-                    position[2],
-                    circles[i],
-                )
-                - circles[i, 3],
-            )
-        speed = min(speed, math.sqrt(steering.deceleration * max(room, 0.0)) + 0.05 * speed)
+        room = max(_room(position, circles), 0.0)
+        speed = min(speed, math.sqrt(steering.deceleration * room) + 0.05 * speed)
     scale = 0.0
     if size > 0.0:
-        scale = min(rate * left, speed) / size
+        scale = min(steering.rate * left, speed) / size
     velocity[0] = scale * dx
     velocity[1] = scale * dy
     velocity[2] = scale * dz

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +104,8 @@ class TeamObjective:
         self.team = team
         self.settings = settings
         self.weights = resolve(settings)
+        # The first measurement that counts: the present one does not depend on the choice.
+        self.first = 0 if self.weights.present else 1
         self.names = [name for name in team.planning() if len(candidates[name])]
         counts = np.array([len(candidates[name]) for name in self.names], np.int64)
         self.start = starts_of(counts)
@@ -118,20 +120,7 @@ class TeamObjective:
         allowed: Mapping[str, BoolArray],
     ) -> None:
         team, weights, names = self.team, self.weights, self.names
-        horizon = max((int(trajectories[name].lengths.max(initial=0)) for name in names), default=0)
-        planned = []
-        settled = []
-        for name in team.names():
-            view = team.robots[name]
-            if name in names:
-                way = trajectories[name]
-                timing = Timing(0, view.period_steps, horizon, weights.arrival, weights.extend)
-                item = events(way.positions, way.yaws, way.lengths, timing)
-                planned.append(_Measuring(view, view.sensor.detection.kernel(), item))
-            else:
-                item = tail_events(view, horizon, weights.extend)
-                settled.append(_Measuring(view, view.sensor.detection.kernel(), item))
-        first = 0 if weights.present else 1
+        planned, settled = self._measuring(trajectories)
         lengths = joined([trajectories[name].lengths for name in names], np.int64)
         if weights.per_distance:
             norm = joined([trajectories[name].distances() for name in names], float)
@@ -139,47 +128,9 @@ class TeamObjective:
             norm = lengths.astype(float)
         self.lengths = lengths
         self.measurements = joined([robot.item.own for robot in planned], np.int64)
-        number = int(self.start[-1])
-        clusters = team.clusters
-        dimension = team.dimension
-        centres = np.zeros((len(clusters), 3))
-        for index, cluster in enumerate(clusters):
-            centres[index, :dimension] = cluster.position[:dimension]
-        refinement = np.zeros(number)
-        entries = Entries(
-            np.zeros(number, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64)
-        )
-        rows = (
-            np.zeros(number + 1, np.int64),
-            np.zeros(0, np.int64),
-            np.zeros((0, 3)),
-            np.zeros((0, 2)),
-        )
-        d = dimension
-        mass = np.zeros(0)
-        covariance = np.zeros((0, d, d))
-        base = np.zeros((0, d, d))
-        gain = np.zeros((number, 0, d, d))
-        unseen = np.zeros(0)
-        miss = np.zeros((number, 0))
-        if weights.information:
-            mass = np.array([min(1.0, max(0.0, cluster.mass)) for cluster in clusters])
-            covariance = np.zeros((len(clusters), d, d))
-            for index, cluster in enumerate(clusters):
-                covariance[index] = cluster.covariance[:d, :d]
-            base, gain = self._information(planned, settled, centres, first)
-            if weights.beta > 0.0:
-                unseen, miss = self._new_targets(planned, settled, first)
-        else:
-            for index, robot in enumerate(planned):
-                part = refinement[self.start[index] : self.start[index + 1]]
-                centre_sum(robot.item, first, centres, dimension, robot.kernel, part)
-            if weights.beta > 0.0:
-                entries = self._entries(planned, settled, first)
-                if len(names) > 1:
-                    rows = rows_of([robot.item for robot in planned])
-        pairs = number if len(entries.value) and len(names) > 1 else 0
-        longest = int(entries.counts.max(initial=0)) if pairs else 0
+        centres = np.zeros((len(team.clusters), 3))
+        for index, cluster in enumerate(team.clusters):
+            centres[index, : team.dimension] = cluster.position[: team.dimension]
         parameters = np.zeros((len(names), PARAMETERS))
         for index, robot in enumerate(planned):
             parameters[index] = robot.kernel[1]
@@ -197,30 +148,98 @@ class TeamObjective:
             beta=float(weights.beta),
             control_weight=float(weights.control),
             information=weights.information,
-            dimension=dimension,
-            refinement=refinement,
-            event_start=rows[0],
-            event_time=rows[1],
-            event_place=rows[2],
-            event_turn=rows[3],
+            dimension=team.dimension,
             kind=np.array([robot.kernel[0] for robot in planned], np.int64),
             parameters=parameters,
-            entry_start=starts_of(entries.counts),
-            entry_value=entries.value,
-            entry_node=entries.node,
-            entry_time=entries.time,
-            slot=np.full((pairs, pairs), -1, np.int32),
-            cache=np.empty((min(CACHE_ROWS, pairs * pairs), longest)),
             used=np.zeros(1, np.int64),
-            mass=mass,
-            covariance=covariance,
-            base=base,
-            gain=gain,
-            unseen=unseen,
-            miss=miss,
+            **self._paper_terms(planned, settled, centres),
+            **self._information_terms(planned, settled, centres),
         )
 
-    def _entries(self, planned: list[_Measuring], settled: list[_Measuring], first: int) -> Entries:
+    def _measuring(
+        self, trajectories: Mapping[str, Trajectories]
+    ) -> tuple[list[_Measuring], list[_Measuring]]:
+        """Return predicted measurements of the planning robots, and of the others."""
+        team, weights, names = self.team, self.weights, self.names
+        horizon = max((int(trajectories[name].lengths.max(initial=0)) for name in names), default=0)
+        planned = []
+        settled = []
+        for name in team.names():
+            view = team.robots[name]
+            kernel = view.sensor.detection.kernel()
+            if name in names:
+                way = trajectories[name]
+                timing = Timing(0, view.period_steps, horizon, weights.arrival, weights.extend)
+                item = events(way.positions, way.yaws, way.lengths, timing)
+                planned.append(_Measuring(view, kernel, item))
+            else:
+                item = tail_events(view, horizon, weights.extend)
+                settled.append(_Measuring(view, kernel, item))
+        return planned, settled
+
+    def _paper_terms(
+        self, planned: list[_Measuring], settled: list[_Measuring], centres: FloatArray
+    ) -> dict[str, Any]:
+        """Return the fields of the table for the objective of the papers, empty without it."""
+        weights, dimension, number = self.weights, self.team.dimension, int(self.start[-1])
+        several = len(planned) > 1
+        refinement = np.zeros(number)
+        entries = Entries(
+            np.zeros(number, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64)
+        )
+        rows = (
+            np.zeros(number + 1, np.int64),
+            np.zeros(0, np.int64),
+            np.zeros((0, 3)),
+            np.zeros((0, 2)),
+        )
+        if not weights.information:
+            for index, robot in enumerate(planned):
+                part = refinement[self.start[index] : self.start[index + 1]]
+                centre_sum(robot.item, self.first, centres, dimension, robot.kernel, part)
+            if weights.beta > 0.0:
+                entries = self._entries(planned, settled)
+                if several:
+                    rows = rows_of([robot.item for robot in planned])
+        pairs = number if len(entries.value) and several else 0
+        longest = int(entries.counts.max(initial=0)) if pairs else 0
+        return {
+            'refinement': refinement,
+            'event_start': rows[0],
+            'event_time': rows[1],
+            'event_place': rows[2],
+            'event_turn': rows[3],
+            'entry_start': starts_of(entries.counts),
+            'entry_value': entries.value,
+            'entry_node': entries.node,
+            'entry_time': entries.time,
+            'slot': np.full((pairs, pairs), -1, np.int32),
+            'cache': np.empty((min(CACHE_ROWS, pairs * pairs), longest)),
+        }
+
+    def _information_terms(
+        self, planned: list[_Measuring], settled: list[_Measuring], centres: FloatArray
+    ) -> dict[str, Any]:
+        """Return the fields of the table for the objective of information, empty without it."""
+        d = self.team.dimension
+        clusters = self.team.clusters if self.weights.information else []
+        covariance = np.zeros((len(clusters), d, d))
+        for index, cluster in enumerate(clusters):
+            covariance[index] = cluster.covariance[:d, :d]
+        base, gain = self._information(planned, settled, centres[: len(clusters)])
+        unseen, miss = np.zeros(0), np.zeros((int(self.start[-1]), 0))
+        if self.weights.information and self.weights.beta > 0.0:
+            unseen, miss = self._new_targets(planned, settled)
+        return {
+            'mass': np.array([min(1.0, max(0.0, cluster.mass)) for cluster in clusters], float),
+            'covariance': covariance,
+            'base': base,
+            'gain': gain,
+            'unseen': unseen,
+            'miss': miss,
+        }
+
+    def _entries(self, planned: list[_Measuring], settled: list[_Measuring]) -> Entries:
         grid = self.team.exploration.kernel()
         dimension = self.team.dimension
         corners = 4 if dimension == 2 else 8
@@ -233,7 +252,7 @@ class TeamObjective:
                 np.empty((most, 3)),
                 np.empty(most, np.int64),
             )
-            number = entries_of(item, first, self.weights.own, dimension, kernel, grid, part)
+            number = entries_of(item, self.first, self.weights.own, dimension, kernel, grid, part)
             part = Entries(part.counts, part.value[:number], part.node[:number], part.time[:number])
             for other in settled:
                 apply_settled_misses(part, other.item.expected(), dimension, other.kernel)
@@ -246,7 +265,7 @@ class TeamObjective:
         )
 
     def _information(
-        self, planned: list[_Measuring], settled: list[_Measuring], centres: FloatArray, first: int
+        self, planned: list[_Measuring], settled: list[_Measuring], centres: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         d = self.team.dimension
         number = len(centres)
@@ -260,16 +279,15 @@ class TeamObjective:
             base += out[0]
         for index, (view, kernel, item) in enumerate(planned):
             rows = slice(int(self.start[index]), int(self.start[index + 1]))
-            add_information(view, kernel, item, first, centres, d, gain[rows])
-            if first:
-                # The present measurement does not depend on the choice.
+            add_information(view, kernel, item, self.first, centres, d, gain[rows])
+            if self.first:
                 out = np.zeros((1, number, d, d))
                 add_information(view, kernel, item.present(), 0, centres, d, out)
                 base += out[0]
         return base, gain
 
     def _new_targets(
-        self, planned: list[_Measuring], settled: list[_Measuring], first: int
+        self, planned: list[_Measuring], settled: list[_Measuring]
     ) -> tuple[FloatArray, FloatArray]:
         exploration = self.team.exploration
         values, lower, step = exploration.kernel()
@@ -291,7 +309,9 @@ class TeamObjective:
             start[2] = 0.0
         every = NodeGrid(start, step * stride, np.arange(left.size, dtype=np.int64).reshape(shape))
         # What does not depend on the choice: settled robots, and the present measurements.
-        given = settled + [robot._replace(item=robot.item.present()) for robot in planned if first]
+        given = settled + [
+            robot._replace(item=robot.item.present()) for robot in planned if self.first
+        ]
         for robot in given:
             miss = np.ones((1, left.size))
             self._miss(robot, 0, every, miss)
@@ -303,7 +323,7 @@ class TeamObjective:
         unseen = every._replace(column=column.reshape(shape))
         miss = np.ones((int(self.start[-1]), len(columns)))
         for i, robot in enumerate(planned):
-            self._miss(robot, first, unseen, miss[self.start[i] : self.start[i + 1]])
+            self._miss(robot, self.first, unseen, miss[self.start[i] : self.start[i + 1]])
         return flat[columns], miss
 
     def _miss(self, robot: _Measuring, first: int, grid: NodeGrid, miss: FloatArray) -> None:

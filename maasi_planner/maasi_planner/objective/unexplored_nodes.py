@@ -414,6 +414,41 @@ def box_within(
 
 
 @njit(cache=True)
+def _miss_at_all_nodes(
+    item: Events, first: int, grid: NodeGrid, dimension: int, kernel: Kernel, miss: FloatArray
+) -> None:
+    """Do what `miss_at_nodes` does, all nodes of a measurement at a time."""
+    start, step, columns = grid
+    number = miss.shape[1]
+    x, y, z = np.empty(number), np.empty(number), np.zeros(number)
+    for i in range(columns.shape[0]):
+        for j in range(columns.shape[1]):
+            for k in range(columns.shape[2]):
+                column = columns[i, j, k]
+                if column >= 0:
+                    x[column] = start[0] + i * step[0]
+                    y[column] = start[1] + j * step[1]
+                    if dimension == 3:
+                        z[column] = start[2] + k * step[2]
+    room = np.empty((ROOM_ROWS, number))
+    dx, dy, dz = room[0], room[1], room[2]
+    dz[:] = 0.0
+    for w in range(item.own.shape[0]):
+        left = miss[w]
+        for m in range(first, item.own[w]):
+            x0, y0, z0 = item.places[w, m]
+            for i in range(number):
+                dx[i] = x[i] - x0
+                dy[i] = y[i] - y0
+            if dimension == 3:
+                for i in range(number):
+                    dz[i] = z[i] - z0
+            chances = fill_detection(kernel, number, room)
+            for i in range(number):
+                left[i] *= 1.0 - chances[i]
+
+
+@njit(cache=True)
 def miss_at_nodes(
     item: Events,
     first: int,
@@ -429,6 +464,9 @@ def miss_at_nodes(
     """
     kind, parameters = kernel
     start, step, columns = grid
+    if is_vectorised(kind):
+        _miss_at_all_nodes(item, first, grid, dimension, kernel, miss)
+        return
     box = np.zeros((2, 3), np.int64)
     for w in range(item.own.shape[0]):
         for m in range(first, item.own[w]):
