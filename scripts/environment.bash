@@ -97,7 +97,7 @@ maasi_build() {
       $(maasi_own_interfaces) \
       --build-base "$maasi_workspace/build" --install-base "$maasi_workspace/install" \
       --cmake-args "-DPython3_EXECUTABLE=$maasi_venv/bin/python" -DBUILD_TESTING=OFF \
-      -DJOIN_SOURCES=ON --no-warn-unused-cli
+      -DJOIN_SOURCES=ON ${MAASI_WHEELS:+-DWITHOUT_CPP=ON} --no-warn-unused-cli
   ) > "$log" 2>&1; then
     tail -n 30 "$log" >&2
     maasi_fail "the build failed; the whole log: $log"

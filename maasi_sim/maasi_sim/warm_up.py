@@ -1,8 +1,10 @@
-"""Compilation of what the nodes use, before anything waits for it."""
+"""What nodes need at their start, done once before they are forked from a process."""
 
 from __future__ import annotations
 
 import gc
+import importlib
+import inspect
 from collections.abc import Callable
 from importlib.metadata import distribution
 from typing import Any
@@ -10,15 +12,47 @@ from typing import Any
 import maasi_filter
 import maasi_planner
 from maasi_drivers.warm_up import warm_up as warm_up_drivers
+from maasi_planner.settings import PLANNERS
 from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.world.simulation import simulated_robot
 
+# What most nodes exchange; importing messages starts no threads.
+_MESSAGES = (
+    'diagnostic_msgs',
+    'lifecycle_msgs',
+    'maasi_msgs',
+    'nav_msgs',
+    'rcl_interfaces',
+    'rosgraph_msgs',
+    'sensor_msgs',
+    'tf2_msgs',
+    'visualization_msgs',
+)
 _PACKAGES = ('maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
 
 
 def warm_up() -> None:
-    """Compile, or load from the cache, all kernels of simulated robots, by playing one of each."""
+    """Compile, or load from the cache, all kernels of simulations."""
+    _play_robots()
+    warm_up_buildings()
+
+
+def warm_up_search() -> None:
+    """Compile, or load from the cache, the kernels of searches for targets."""
+    maasi_filter.warm_up()
+    maasi_planner.warm_up()
+    warm_up_drivers()
+    _play_robots()
+
+
+def warm_up_buildings() -> None:
+    """Compile, or load from the cache, the kernels of searches of buildings."""
+    mission_of(load_cuboid_scenario('buildings_four')).run(1)
+
+
+def _play_robots() -> None:
+    """Play one simulated robot of each kind."""
     for name in ('mambo_turtlebot_obstacles', 'ranging_pair_3d'):
         scenario = load_scenario(name)
         world = scenario.world(scenario.seed)
@@ -26,15 +60,18 @@ def warm_up() -> None:
             robot = simulated_robot(robot_name, scenario, world, scenario.seed)
             robot.warm_up()
             robot.step(1, scenario.step)
-    mission_of(load_cuboid_scenario('buildings_four')).run(1)
 
 
-def warm_up_all() -> None:
-    """Compile, or load from the cache, the kernels of all packages."""
-    maasi_filter.warm_up()
-    maasi_planner.warm_up()
-    warm_up_drivers()
-    warm_up()
+def prepare_copies() -> None:
+    """Do once what every node would do at its start, for copies of this process."""
+    for package in _MESSAGES:
+        importlib.import_module(f'{package}.msg')
+    # Messages import it at their first use.
+    importlib.import_module('rosidl_generator_py')
+    # Searches of all installed packages and of all modules, which a node needs for its parameters
+    # and for its first log message.
+    PLANNERS.names()
+    inspect.getmodule(inspect.currentframe())
     # What is there now stays: copies of this process share it.
     gc.collect()
     gc.freeze()

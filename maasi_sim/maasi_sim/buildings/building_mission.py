@@ -11,6 +11,7 @@ from maasi_sim.buildings.observer import CuboidObserver, CuboidRecord
 from maasi_sim.buildings.report import build_cuboid_report, cuboid_summary
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.run.node_plan import NodePlan, RunSettings
+from maasi_sim.warm_up import warm_up_buildings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,6 +40,10 @@ class BuildingMission:
     def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
         """See `Mission.plan_nodes`."""
         return plan_nodes(self.scenario, run)
+
+    def warm_up(self) -> None:
+        """See `Mission.warm_up`."""
+        warm_up_buildings()
 
     def cameras(self) -> list[str]:
         """Return nothing: snapshots are simulated by the planners."""

@@ -95,7 +95,7 @@ class ScenarioRun:
                 self.display.say(f'warning: {text}')
             # An interruption here is reported once the session starts.
             with contextlib.suppress(KeyboardInterrupt), self.interruption.at_once():
-                self.supervisor.load()
+                self.supervisor.load(self.mission.warm_up)
             return self._execute(domain)
 
     def _plan(self) -> list[NodePlan]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.run_folder import ResultsError, write_text
 from maasi_sim.run.run_options import Options
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.warm_up import main_of, warm_up_all
+from maasi_sim.warm_up import main_of, prepare_copies
 
 if TYPE_CHECKING:
     from maasi_sim.run.recorder_node import Recorder
@@ -91,12 +91,19 @@ class Supervisor:
             plan.full_name: _process(plan, parameters, folder, options.log_level) for plan in plans
         }
 
-    def load(self) -> None:
-        """Import and compile the shared code once, for nodes that are forked from this process."""
+    def load(self, warm_up: Callable[[], None]) -> None:
+        """Import and compile the shared code once, for nodes that are forked from this process.
+
+        Parameters
+        ----------
+        warm_up : callable
+            Compiles the kernels of the mission, or loads them.
+        """
         for plan in self.plans:
             self.processes[plan.full_name].main = main_of(plan.package, plan.executable)
         if any(process.main is not None for process in self.processes.values()):
-            warm_up_all()
+            warm_up()
+            prepare_copies()
 
     def start(self) -> None:
         """Start all nodes."""
