@@ -100,7 +100,7 @@ def summary(results: Sequence[Result], seed: int, left_out: int) -> dict[str, An
     for item in results:
         case = item.case
         kind = (
-            f'{"buildings" if case.buildings else "search"} '
+            f'{case.kind} '
             f'{"lockstep" if case.lockstep else "free"} '
             f'{"respawn" if case.respawn else "end"} {case.fault} {case.when} '
             f'{"two" if len(case.nodes) > 1 else "one"}'

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from maasi_sim.emulators.mambo.fake_mambo import free_port
+
+Kind = Literal['search', 'mavlink', 'buildings']
 Fault = Literal['kill', 'pause', 'hang']
 When = Literal['start', 'middle']
 
@@ -17,6 +20,7 @@ SEARCH_NODES = (
     '/filter_node',
     '/planner_node',
 )
+MAVLINK_NODES = ('/drone/driver', '/filter_node', '/planner_node')
 BUILDING_NODES = ('/sim_node', '/red/cuboid_planner')
 _PAIRS = (
     ('/filter_node', '/planner_node'),
@@ -30,6 +34,7 @@ PAUSE = 3.0
 
 _GRID = {'grid': [6, 6], 'spacing': 0.45, 'corner': [-0.1, -0.1]}
 # One target is in view at the start, so that a result can be lost; the last one is far.
+# Robots pass their waypoints.
 _SEARCH: dict[str, Any] = {
     'version': 1,
     'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
@@ -46,6 +51,23 @@ _SEARCH: dict[str, Any] = {
         'removal_distance': 0.05,
         'jitter_deviation': 0.003,
     },
+    'planner': {'name': 'maasi', 'measurement': 'periodic'},
+}
+_MAVLINK: dict[str, Any] = {
+    'version': 1,
+    'environment': {'bounds': [[0.0, 40.0], [0.0, 40.0]]},
+    'step': 0.1,
+    'targets': {'positions': [[6.0, 6.0], [30.0, 30.0], [36.0, 5.0], [5.0, 36.0]]},
+    'robots': {
+        'drone': {
+            'type': 'mavlink_drone',
+            'link': 'mavlink',
+            'start': [4.0, 4.0, 3.0],
+            'candidates': {'grid': [4, 4], 'spacing': 10.0, 'corner': [5.0, 5.0]},
+            'mavlink': {'arm': True},
+        }
+    },
+    'filter': {'method': 'pmb'},
     'planner': {'name': 'maasi', 'measurement': 'periodic'},
 }
 _BUILDINGS: dict[str, Any] = {
@@ -81,8 +103,8 @@ class Case:
         As soon as their processes exist; once a target is found (a cell is visited).
     lockstep, respawn : bool
         Mode of the run.
-    buildings : bool
-        Whether it is the search of buildings.
+    kind : {'search', 'mavlink', 'buildings'}
+        What runs: a search by two robots under topics, by a drone under MAVLink, or of buildings.
     """
 
     fault: Fault
@@ -90,14 +112,14 @@ class Case:
     when: When
     lockstep: bool
     respawn: bool
-    buildings: bool = False
+    kind: Kind = 'search'
 
     @property
     def name(self) -> str:
         """Unique name, for the command line."""
         return '-'.join(
             (
-                'buildings' if self.buildings else 'search',
+                self.kind,
                 'lockstep' if self.lockstep else 'free',
                 'respawn' if self.respawn else 'end',
                 self.fault,
@@ -130,10 +152,16 @@ class Case:
         if not self.ends_the_run and not self.lockstep:
             # Long enough for a restart on a busy machine.
             limits['time'] = 16.0 if self.fault == 'pause' else 20.0
-        if self.buildings:
+        if self.kind != 'search':
             limits['time'] *= 3.0
+        content = {'search': _SEARCH, 'mavlink': _MAVLINK, 'buildings': _BUILDINGS}[self.kind]
+        if self.kind == 'mavlink':
+            # Each run has a port of its own.
+            drone = content['robots']['drone']
+            link = drone['mavlink'] | {'url': f'udpin:127.0.0.1:{free_port()}'}
+            content = {**content, 'robots': {'drone': {**drone, 'mavlink': link}}}
         return {
-            **(_BUILDINGS if self.buildings else _SEARCH),
+            **content,
             'stop': 'all_found',
             'on_exit': 'respawn' if self.respawn else 'end',
             'limits': limits,
@@ -143,7 +171,7 @@ class Case:
         """Return the options of its run."""
         if self.lockstep:
             return ['--lockstep']
-        return ['--rate', '3'] if self.buildings else []
+        return ['--rate', '3'] if self.kind == 'buildings' else []
 
 
 def all_cases() -> list[Case]:
@@ -166,8 +194,14 @@ def all_cases() -> list[Case]:
             if fault == 'pause' and respawn:
                 continue
             cases += [
-                Case(fault, (node,), 'middle', lockstep, respawn, buildings=True)
+                Case(fault, (node,), 'middle', lockstep, respawn, kind='buildings')
                 for node in BUILDING_NODES
+            ]
+    for fault in every:
+        for respawn in (True, False) if fault != 'pause' else (False,):
+            cases += [
+                Case(fault, (node,), 'middle', False, respawn, kind='mavlink')
+                for node in MAVLINK_NODES
             ]
     for lockstep in (False, True):
         cases += [Case('hang', pair, 'middle', lockstep, False) for pair in _PAIRS]

@@ -19,6 +19,8 @@ FloatArray = NDArray[np.float64]
 DRIVER_STOP, FILTER_STOP = 2.5, 7.0
 # Without the guard the run itself stops the robot, after 5 s [s].
 UNGUARDED_STOP = 7.0
+# A drone that flies at 3 m/s brakes for longer [s].
+DRONE_BRAKING = 4.0
 # Below this speed, noise of odometry, a robot is at rest [m/s].
 STANDING = 0.06
 _CODES = {True: (3,), False: (0, 1)}
@@ -60,7 +62,7 @@ def _judge_bag(case: Case, bag: Bag) -> list[str]:
         return ['recording: holds no time']
     robots = list(case.scenario()['robots'])
     problems = []
-    if not case.buildings:
+    if case.kind != 'buildings':
         problems += _judge_found(bag)
         if not case.lockstep:
             problems += _judge_gaps(case, bag, robots)
@@ -96,6 +98,7 @@ def _judge_gaps(case: Case, bag: Bag, robots: list[str]) -> list[str]:
     problems = []
     updates = _times(bag, '/filter_update')
     end = max(_times(bag, '/clock'), default=0.0)
+    held = FILTER_STOP + (DRONE_BRAKING if case.kind == 'mavlink' else 0.0)
     for name in robots:
         speeds = _speeds(bag, name)
         patience = UNGUARDED_STOP if f'/{name}/guard' in case.nodes else DRIVER_STOP
@@ -104,8 +107,8 @@ def _judge_gaps(case: Case, bag: Bag, robots: list[str]) -> list[str]:
             for since, until in _gaps(_times(bag, f'/{name}/state'), end, patience)
         ]
         silences += [
-            (since + FILTER_STOP, until, f'the filter is silent since {since:.1f} s')
-            for since, until in _gaps(updates, end, FILTER_STOP)
+            (since + held, until, f'the filter is silent since {since:.1f} s')
+            for since, until in _gaps(updates, end, held)
             if '/planner_node' not in case.nodes
         ]
         for begin, until, text in silences:
@@ -131,11 +134,17 @@ def _times(bag: Bag, topic: str) -> list[float]:
 
 
 def _speeds(bag: Bag, robot: str) -> FloatArray:
-    """Return time [s] and speed [m/s] of a robot's odometry, (n, 2)."""
-    rows = []
-    for item in bag.messages([f'/{robot}/odom']):
-        stamp, linear = item.message.header.stamp, item.message.twist.twist.linear
-        rows.append((stamp.sec + 1e-9 * stamp.nanosec, math.hypot(linear.x, linear.y, linear.z)))
+    """Return time [s] and speed [m/s] of a robot, (n, 2).
+
+    From its odometry, or, where it has none, its state; that of an autopilot may land it.
+    """
+    rows: list[tuple[float, float]] = []
+    for topic, up in ((f'/{robot}/odom', 1.0), (f'/{robot}/state', 0.0)):
+        for item in () if rows else bag.messages([topic]):
+            stamp, twist = item.message.header.stamp, item.message.twist
+            linear = getattr(twist, 'twist', twist).linear
+            speed = math.hypot(linear.x, linear.y, up * linear.z)
+            rows.append((stamp.sec + 1e-9 * stamp.nanosec, speed))
     return np.array(rows, dtype=float).reshape(-1, 2)
 
 

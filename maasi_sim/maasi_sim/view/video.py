@@ -265,3 +265,21 @@ def _draw_robots(axes: Any, moments: Moments, time: float, spatial: bool) -> Non
             *np.array(place)[:size, None], marker=marker, color=colour, ms=8 if spatial else 13
         )
         axes.text(*place[:size], f'   {name}', fontsize=9, weight='bold')
+        fence = moments.log.scene.get('robots', {}).get(name, {}).get('fence')
+        if fence:
+            _draw_fence(axes, fence, colour, spatial)
+
+
+def _draw_fence(axes: Any, fence: list[list[float]], colour: str, spatial: bool) -> None:
+    """Draw the edges of a geofence (3, 2) [m]."""
+    (left, right), (low, high), heights = fence
+    corners = [(left, low), (right, low), (right, high), (left, high)]
+    ring = np.array([*corners, corners[0]])
+    style = {'color': colour, 'lw': 0.9, 'alpha': 0.7, 'linestyle': '-.'}
+    if not spatial:
+        axes.plot(*ring.T, **style)
+        return
+    for z in heights:
+        axes.plot(*ring.T, np.full(len(ring), z), **style)
+    for x, y in corners:
+        axes.plot([x, x], [y, y], heights, **style)
