@@ -33,3 +33,13 @@ def context(domain):
     )
     yield made
     rclpy.shutdown(context=made)
+
+
+@pytest.fixture
+def ros(domain):
+    """Initialise rclpy's global context in a domain of its own."""
+    import rclpy
+
+    rclpy.init(domain_id=domain.number)
+    yield
+    rclpy.try_shutdown()

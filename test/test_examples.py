@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from maasi_filter import plugins
+from maasi_sim.run.bag import Bag
 from maasi_sim.run.processes import Domain, find_executable
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search
@@ -119,7 +120,10 @@ def test_a_recording_is_read_without_our_packages(run):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert re.search(r'/scout/state: \d+ poses, from 0.0', done.stdout)
+    with Bag(run / 'out') as bag:
+        stamps = [item.message.header.stamp for item in bag.messages(['/scout/state'])]
+    first = stamps[0].sec + 1e-9 * stamps[0].nanosec
+    assert f'/scout/state: {len(stamps)} poses, from {first:.1f} to' in done.stdout
     report = json.loads((run / 'out' / 'report.json').read_text())
     assert done.stdout.count('target ') == len(report['found'])
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from quality_conditions import CONDITIONS, SEEDS
+from quality_conditions import CONDITIONS, SCENARIOS, SEEDS
 from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
@@ -29,13 +29,16 @@ from maasi_sim.experiments.statistics import paired_difference
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
+from maasi_sim.targets.scoring import scoring_radius
 
 METHODS = ('ic_phd', 'pmb')
-SCENARIO = 'ranging_drone_3d'
+CUBE = 'ranging_drone_3d'
+# Measurements after which a search in the cube ends; of other scenarios, whose images are many.
 CAP = 400
+CAP_OF_SCENARIOS = 6000
 # A planner that never ends a search.
 PERSISTENT = {'explored_threshold': 1.0, 'gain_threshold': 0.0}
-# A found target is true within this distance of a true one, one to one, metres.
+# A found target in the cube is true within this distance of a true one, one to one, metres.
 RADIUS = 5.0
 HEAD = (
     '| condition | method | complete | false found per run | RMSE [m] | NEES | measurements '
@@ -78,19 +81,24 @@ class Run:
 
 
 @cache
-def _content() -> dict[str, Any]:
-    return load_scenario(SCENARIO).model_dump(by_alias=True, exclude_unset=True)
+def _content(scenario: str) -> dict[str, Any]:
+    return load_scenario(scenario).model_dump(by_alias=True, exclude_unset=True)
+
+
+def _cap(condition: str) -> int:
+    return CAP_OF_SCENARIOS if condition in SCENARIOS else CAP
 
 
 def prepared(
     condition: str, method: str, seed: int, settings: dict[str, Any] | None = None
 ) -> Scenario:
     """Return the scenario of one run, with no limit but the number of measurements."""
-    content: dict[str, Any] = json.loads(json.dumps(_content()))
+    content: dict[str, Any] = json.loads(json.dumps(_content(SCENARIOS.get(condition, CUBE))))
     content['planner'] = {**content['planner'], **PERSISTENT}
     content['filter']['method'] = method
     content['limits'] = {**content.get('limits', {}), 'time': 1e4}
-    content['scoring'] = {**content.get('scoring', {}), 'radius': RADIUS}
+    if condition not in SCENARIOS:
+        content['scoring'] = {**content.get('scoring', {}), 'radius': RADIUS}
     for change in CONDITIONS[condition]:
         change(content, seed)
     content['filter'].update(settings or {})
@@ -98,12 +106,12 @@ def prepared(
 
 
 def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | None = None) -> Run:
-    """Run one search up to CAP measurements."""
+    """Run one search up to its number of measurements."""
     scenario = prepared(condition, method, seed, settings)
-    result = search(scenario, seed, CAP)
+    result = search(scenario, seed, _cap(condition))
     d = scenario.dimension
     found = np.array([target.position for target in result.found_targets]).reshape(-1, d)
-    match = match_targets(found, result.truth, RADIUS)
+    match = match_targets(found, result.truth, scoring_radius(scenario, result.truth))
     normalised = sum(
         normalised_error(found[i] - result.truth[j], result.found_targets[i].covariance)
         for i, j in match.pairs
@@ -120,7 +128,7 @@ def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | N
     )
 
 
-def summary(runs: Sequence[Run]) -> dict[str, Any]:
+def summary(runs: Sequence[Run], cap: int) -> dict[str, Any]:
     """Return the figures of a row, with 95 % intervals.
 
     Complete runs: Clopper and Pearson. False found targets: Poisson. Measurements: restricted
@@ -132,7 +140,7 @@ def summary(runs: Sequence[Run]) -> dict[str, Any]:
     found = max(sum(run.found for run in runs), 1)
     times = restricted_mean(
         [run.measurements if run.finished else None for run in runs],
-        CAP,
+        cap,
         [float(run.measurements) for run in runs],
     )
     return {
@@ -152,15 +160,15 @@ def summary(runs: Sequence[Run]) -> dict[str, Any]:
     }
 
 
-def difference(runs: Sequence[Run], others: Sequence[Run]) -> tuple[float, float]:
+def difference(runs: Sequence[Run], others: Sequence[Run], cap: int) -> tuple[float, float]:
     """Return the mean difference in measurements on the same seeds, and half its 95 % interval.
 
-    A run that did not finish counts as CAP.
+    A run that did not finish counts as `cap`.
     """
-    theirs = {run.seed: run.measurements if run.finished else CAP for run in others}
+    theirs = {run.seed: run.measurements if run.finished else cap for run in others}
     paired = [run for run in runs if run.seed in theirs]
     gap = paired_difference(
-        [run.measurements if run.finished else CAP for run in paired],
+        [run.measurements if run.finished else cap for run in paired],
         [theirs[run.seed] for run in paired],
     )
     return gap.mean, gap.half_width
@@ -252,8 +260,10 @@ def main(arguments: list[str] | None = None) -> int:
                 done[method] = [there[seed] for seed in seeds]
                 gap = None
                 if method != 'ic_phd' and 'ic_phd' in done:
-                    gap = difference(done[method], done['ic_phd'])
-                print(show(condition, method, summary(done[method]), gap), flush=True)
+                    gap = difference(done[method], done['ic_phd'], _cap(condition))
+                print(
+                    show(condition, method, summary(done[method], _cap(condition)), gap), flush=True
+                )
     print(f'{time.perf_counter() - begin:.0f} s', file=sys.stderr)
     return 0
 

@@ -120,6 +120,17 @@ def two_drones() -> Change:
     return change
 
 
+def two_turtlebots() -> Change:
+    """Two TurtleBots in opposite corners of the demo's floor."""
+
+    def change(content: Content, seed: int) -> None:
+        robot = content['robots']['turtlebot']
+        other = {**json.loads(json.dumps(robot)), 'start': [2.1, 2.1, 0.0], 'yaw': 3.14}
+        content['robots'] = {'turtlebot1': robot, 'turtlebot2': other}
+
+    return change
+
+
 def filter_settings(**values: Any) -> Change:
     """Other settings of the filter."""
 
@@ -190,4 +201,15 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
     'pairs at 3 m, identified': (DEGREES, pairs(3.0), targets(identified=True)),
     'walk 0.1 m/sqrt(s), told': (DEGREES, walk(0.1)),
     'walk 0.3 m/sqrt(s), told': (DEGREES, walk(0.3)),
+    'demo': (),
+    'mambo': (),
+    'drone_rov': (),
+    'two TurtleBots': (two_turtlebots(),),
+}
+# Conditions that are no changes of the cube, by the scenario that they change.
+SCENARIOS = {
+    'demo': 'mambo_turtlebot',
+    'mambo': 'mambo',
+    'drone_rov': 'drone_rov',
+    'two TurtleBots': 'mambo_turtlebot',
 }

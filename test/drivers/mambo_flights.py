@@ -5,7 +5,6 @@ import socket
 
 import numpy as np
 from robot_team import MAMBO, Team, image_message
-from std_srvs.srv import Trigger
 
 from maasi_drivers.vision.measurement_feed import FeedPacket, encode
 from maasi_filter.models.pose import Pose
@@ -90,15 +89,9 @@ class Flight:
 
     def permit(self):
         """Call the service `arm` until it is granted."""
-        client = self.team.create_client(Trigger, 'arm')
-        self.until(client.service_is_ready)
-        granted = False
-        while not granted:
-            answer = client.call_async(Trigger.Request())
-            self.until(answer.done)
-            granted = answer.result().success
+        while not self.team.call('arm', self.until).success:
+            pass
         self.permitted = True
-        self.team.destroy_client(client)
 
     def up(self):
         """Let it take off, and wait until it is in the air and takes goals."""

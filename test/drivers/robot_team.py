@@ -11,6 +11,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, CameraInfo, Image
+from std_srvs.srv import Trigger
 
 from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.guard_node import GuardNode
@@ -239,6 +240,16 @@ class Team(Node):
             'the goal is not answered',
         )
         return not result.done() or result.result().status != GoalStatus.STATUS_ABORTED
+
+    def call(self, name, until=None):
+        """Call a service of the driver, and return its answer; `until` waits as `Team.until`."""
+        until = until or self.until
+        client = self.create_client(Trigger, name)
+        until(client.service_is_ready, f'no service {name}')
+        future = client.call_async(Trigger.Request())
+        until(future.done, f'no answer of {name}')
+        self.destroy_client(client)
+        return future.result()
 
     def ask(self, stamp, robots=('rover',), step=0):
         self.batch += 1

@@ -1,6 +1,7 @@
 """A drone with a program of its own: the feed carries its pose, waypoints go back."""
 
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ from numpy.testing import assert_allclose
 from onboard_program import AIR, GROUND, OnboardProgram
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, Team, parameters_of
-from std_srvs.srv import Trigger
 
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
 from maasi_drivers.links.waypoint_orders import Order, OrderError, OrderKind
@@ -65,23 +65,14 @@ class Flight:
     def reason(self):
         return self.team.state.reason if self.team.states else ''
 
-    def until(self, condition):
-        self.team.until(condition, f'{self.reason!r}, {self.drone.state}')
-
-    def permit(self):
-        client = self.team.create_client(Trigger, 'arm')
-        self.until(client.service_is_ready)
-        granted = False
-        while not granted:
-            answer = client.call_async(Trigger.Request())
-            self.until(answer.done)
-            granted = answer.result().success
-        self.team.destroy_client(client)
+    def until(self, condition, what=''):
+        self.team.until(condition, f'{what} {self.reason!r}, {self.drone.state}')
 
     def up(self):
         self.until(lambda: UNTIL_ARM in self.reason)
         assert self.drone.take_offs == 0
-        self.permit()
+        while not self.team.call('arm', self.until).success:
+            pass
         self.until(lambda: self.team.states and self.team.state.goal_status == AgentState.IDLE)
         return self
 
@@ -175,14 +166,21 @@ def test_a_goal_outside_the_geofence_is_refused(fly):
     assert flight.drone.state == AIR
 
 
+def wait_idle(condition):
+    """Wait for the drone while the driver's executor stands still."""
+    end = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def test_a_driver_that_hangs_is_a_drone_that_hovers_then_lands(fly):
     """Orders come from the executor alone: one that stands still says nothing."""
     flight = fly()
     flight.on_its_way()
-    flight.drone._ended.wait(1.0)
-    assert np.linalg.norm(flight.drone.model.velocity) < 0.01 and flight.drone.state == AIR
-    flight.drone._ended.wait(5.0)
-    assert flight.drone.state == GROUND
+    wait_idle(lambda: np.linalg.norm(flight.drone.model.velocity) < 0.01)
+    assert flight.drone.state == AIR
+    wait_idle(lambda: flight.drone.state == GROUND)
 
 
 # ---- the datagrams ---------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from geometry_msgs.msg import PoseStamped
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
-from std_srvs.srv import Trigger
 
 from maasi_drivers.agent import battery_watch
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
@@ -102,17 +101,8 @@ class Flight:
     def why(self):
         return f'{self.mode}, {self.team.states[-1:]}'
 
-    def call(self, name):
-        """Call a service of the driver, and return its answer."""
-        client = self.team.create_client(Trigger, f'/rover/{name}')
-        self.until(client.service_is_ready, f'no service {name}')
-        future = client.call_async(Trigger.Request())
-        self.until(future.done, f'no answer of {name}')
-        self.team.destroy_client(client)
-        return future.result()
-
     def fly(self):
-        answer = self.call('arm')
+        answer = self.team.call('arm')
         assert answer.success, answer.message
         return self.wait_for_flight()
 
@@ -256,8 +246,8 @@ def test_a_localiser_says_where_the_frame_of_the_autopilot_is(fly):
         flight.until(lambda: say() or condition())
 
     flight.until(lambda: UNTIL_ARM in flight.driver.health.text)
-    assert flight.call('arm').message == 'no pose'
-    until(lambda: flight.team.states and flight.call('arm').success)
+    assert flight.team.call('arm').message == 'no pose'
+    until(lambda: flight.team.states and flight.team.call('arm').success)
     until(lambda: flight.state.goal_status != AgentState.UNAVAILABLE)
     goal = [3.0, -1.0, 1.0]
     assert flight.team.takes(goal, live=say)
@@ -320,12 +310,12 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
     flight = fly()
     flight.until(lambda: flight.team.states and UNTIL_ARM in flight.state.reason)
     assert flight.state.goal_status == AgentState.UNAVAILABLE
-    assert flight.call('stop').success
-    answer = flight.call('arm')
+    assert flight.team.call('stop').success
+    answer = flight.team.call('arm')
     assert (answer.success, answer.message) == (False, STOPPED_BY_SERVICE)
-    assert flight.call('release').success
+    assert flight.team.call('release').success
     flight.fly()
-    answer = flight.call('arm')
+    answer = flight.team.call('arm')
     assert (answer.success, answer.message) == (False, 'it is in the air already')
     with flight.vehicle._lock:
         flight.vehicle.autopilot._disarm('Crash: Disarming')
@@ -349,7 +339,7 @@ def test_an_autopilot_that_restarts_is_said(fly, capfd):
     flight.until(lambda: 'the autopilot has restarted' in flight.state.reason)
     flight.until(result.done)
     assert 'is disarmed: the autopilot has restarted' in capfd.readouterr().err
-    assert not flight.call('arm').success
+    assert not flight.team.call('arm').success
 
 
 def test_what_the_autopilot_does_by_itself_is_shown(fly, capfd):
@@ -450,7 +440,7 @@ def test_a_sensor_that_falls_silent(fly):
         if flight.team.states:
             flight.team.ranges.publish(RangeArray(header=flight.state.header))
 
-    assert flight.call('arm').success
+    assert flight.team.call('arm').success
     flight.until(
         lambda: (
             sweep() or (flight.team.states and flight.state.goal_status != AgentState.UNAVAILABLE)

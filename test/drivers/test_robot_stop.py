@@ -4,20 +4,9 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_array_equal
-from std_srvs.srv import Trigger
 
 from maasi_drivers.agent.robot_stop import STOPPED
 from maasi_msgs.msg import AgentState
-
-
-def call(team, name):
-    """Call a service of the driver, and return its answer."""
-    client = team.create_client(Trigger, name)
-    team.until(client.service_is_ready, f'no service {name}')
-    future = client.call_async(Trigger.Request())
-    team.until(future.done, f'no answer of {name}')
-    team.destroy_client(client)
-    return future.result()
 
 
 @pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
@@ -29,7 +18,7 @@ def test_a_stopped_robot_stands_and_refuses_goals_until_it_is_released(play, kin
     team.move(20)
     assert np.any(team.command[:3] != 0.0)
     known = len(team.commands)
-    assert call(team, 'stop').success
+    assert team.call('stop').success
     team.until(result.done)
     assert result.result().status == GoalStatus.STATUS_ABORTED
     assert result.result().result.reason == STOPPED
@@ -48,6 +37,6 @@ def test_a_stopped_robot_stands_and_refuses_goals_until_it_is_released(play, kin
     team.connect()
     team.awaken()
     assert STOPPED in team.refused(goal)
-    assert call(team, 'release').success
+    assert team.call('release').success
     team.until(lambda: team.move() or team.state.goal_status != AgentState.UNAVAILABLE)
     assert team.takes(goal, live=team.move)

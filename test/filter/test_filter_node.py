@@ -98,8 +98,6 @@ def running(**changes):
         rclpy.init(context=context, domain_id=domain.number)
         settings = SETTINGS.model_copy(update=changes)
         node = FilterNode(context=context, parameter_overrides=overrides(settings))
-        assert node.trigger_configure().name == 'SUCCESS', node.problem
-        node.trigger_activate()
         team = Team(context)
         own = executor_of(node, context)
         other = SingleThreadedExecutor(context=context)
@@ -112,15 +110,19 @@ def running(**changes):
                 own.spin_once(0.01)
                 other.spin_once(timeout_sec=0.01)
 
-        until(lambda: team.batch.get_subscription_count() == 1)
-        until(lambda: all(item.get_subscription_count() for item in team.detections.values()))
-        until(lambda: team.node.count_publishers('/filter_update') == 1)
-        yield node, team, until
-        own.shutdown()
-        other.shutdown()
-        node.destroy_node()
-        team.node.destroy_node()
-        rclpy.shutdown(context=context)
+        try:
+            assert node.trigger_configure().name == 'SUCCESS', node.problem
+            node.trigger_activate()
+            until(lambda: team.batch.get_subscription_count() == 1)
+            until(lambda: all(item.get_subscription_count() for item in team.detections.values()))
+            until(lambda: team.node.count_publishers('/filter_update') == 1)
+            yield node, team, until
+        finally:
+            own.shutdown()
+            other.shutdown()
+            node.destroy_node()
+            team.node.destroy_node()
+            rclpy.shutdown(context=context)
 
 
 @pytest.fixture

@@ -178,14 +178,16 @@ def running(**changes):
                 own.spin_once(0.01)
                 other.spin_once(timeout_sec=0.01)
 
-        until(lambda: team.connected)
-        until(lambda: all(client.server_is_ready() for client in node._goals.clients.values()))
-        yield node, team, until
-        node.destroy_node()
-        own.shutdown()
-        other.shutdown()
-        team.node.destroy_node()
-        rclpy.shutdown(context=context)
+        try:
+            until(lambda: team.connected)
+            until(lambda: all(item.server_is_ready() for item in node._goals.clients.values()))
+            yield node, team, until
+        finally:
+            node.destroy_node()
+            own.shutdown()
+            other.shutdown()
+            team.node.destroy_node()
+            rclpy.shutdown(context=context)
 
 
 @pytest.fixture

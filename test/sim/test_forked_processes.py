@@ -42,6 +42,22 @@ def play(tmp_path, code):
     return done.stdout
 
 
+def ended(tmp_path, body):
+    """Return what is printed of a node whose function is `body`, and after it."""
+    out = play(
+        tmp_path,
+        f"""
+        def main():
+            {body}
+        try:
+            print(end(node(main)).code)
+        finally:
+            print('the run goes on')
+        """,
+    )
+    return out.splitlines()
+
+
 @pytest.mark.parametrize(
     ('body', 'code', 'words'),
     [
@@ -54,18 +70,7 @@ def play(tmp_path, code):
     ],
 )
 def test_it_ends_with_what_its_function_says(tmp_path, body, code, words):
-    out = play(
-        tmp_path,
-        f"""
-        def main():
-            {body}
-        try:
-            print(end(node(main)).code)
-        finally:
-            print('the run goes on')
-        """,
-    )
-    assert out.splitlines() == [code, 'the run goes on']
+    assert ended(tmp_path, body) == [code, 'the run goes on']
     assert words in (tmp_path / 'log').read_text()
 
 
@@ -79,18 +84,7 @@ def test_it_ends_with_what_its_function_says(tmp_path, body, code, words):
 )
 def test_it_ends_where_its_log_cannot_be_written(tmp_path, body, code):
     (tmp_path / 'log').symlink_to('/dev/full')
-    out = play(
-        tmp_path,
-        f"""
-        def main():
-            {body}
-        try:
-            print(end(node(main)).code)
-        finally:
-            print('the run goes on')
-        """,
-    )
-    assert out.splitlines() == [code, 'the run goes on']
+    assert ended(tmp_path, body) == [code, 'the run goes on']
 
 
 def test_output_arguments_and_environment_are_its_own(tmp_path):

@@ -163,10 +163,13 @@ class Team:
         self.filter.listen('/clock', Clock, RELIABLE)
         self.filter.listen('/ground_truth/targets', PoseArray, LATCHED)
         self.filter.listen('/ground_truth/markers', MarkerArray, LATCHED)
+        self.thread = threading.Thread(target=self.spin_sim)
+
+    def start(self):
         assert self.sim.trigger_configure().name == 'SUCCESS', self.sim.problem
         assert self.sim.trigger_activate().name == 'SUCCESS'
-        self.thread = threading.Thread(target=self.spin_sim)
         self.thread.start()
+        return self
 
     def spin_sim(self):
         executor = SingleThreadedExecutor(context=self.context)
@@ -210,8 +213,9 @@ class Team:
         if self.closed:
             return
         self.closed = True
-        self.thread.join()
-        self.sim.halt()
+        if self.thread.is_alive():
+            self.thread.join()
+            self.sim.halt()
         self.executor.shutdown()
         for node in (*self.members, self.sim):
             node.destroy_node()
@@ -222,8 +226,9 @@ def make_team(context, tmp_path):
     teams = []
 
     def make(content=SCENARIO, **options):
+        # Known before it starts: nodes that are not destroyed keep the log topic of their name.
         teams.append(Team(context, tmp_path, content, **options))
-        return teams[-1]
+        return teams[-1].start()
 
     yield make
     for team in teams:

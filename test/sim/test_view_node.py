@@ -2,29 +2,17 @@
 
 import time
 
-import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray
 from maasi_sim.run.bag import load_types
-from maasi_sim.run.processes import Domain
 from maasi_sim.view.live_view import LiveView, MessageFeed
 from maasi_sim.view.scene import empty_scene
 from maasi_sim.view.view_node import ViewNode, main
 
 PATIENCE = 60.0
-
-
-@pytest.fixture
-def ros(monkeypatch):
-    with Domain() as domain:
-        for name, value in domain.environment().items():
-            monkeypatch.setenv(name, value)
-        rclpy.init(domain_id=domain.number)
-        yield
-        rclpy.try_shutdown()
 
 
 def test_a_node_that_comes_late_shows_what_is_there(ros):

@@ -65,6 +65,16 @@ def test_a_video_of_a_search_in_space(log, tmp_path):
     assert frames(tmp_path / 'run.mp4')[0].shape == (576, 768, 3)
 
 
+def test_a_video_shows_geofences(tmp_path):
+    log = planar()
+    log.scene['robots']['mambo'].pop('fence', None)
+    write_video(log, tmp_path / 'without.mp4', speed=1e3)
+    log.scene['robots']['mambo']['fence'] = [[0.4, 2.0], [0.4, 2.0], [0.0, 2.0]]
+    write_video(log, tmp_path / 'with.mp4', speed=1e3)
+    without, fenced = (frames(tmp_path / f'{name}.mp4')[0] for name in ('without', 'with'))
+    assert np.abs(without.astype(int) - fenced).max() > 50
+
+
 def test_a_video_of_another_kind_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main([str(tmp_path), '--video', 'run.avi'])

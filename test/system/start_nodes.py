@@ -18,9 +18,10 @@ import sys
 from pathlib import Path
 
 from maasi_sim.run.processes import NodeProcess, find_executable
-from maasi_sim.warm_up import main_of, warm_up_all
+from maasi_sim.warm_up import main_of, prepare_copies, warm_up_search
 
-warm_up_all()
+warm_up_search()
+prepare_copies()
 processes = []
 for item in json.loads(Path(sys.argv[1]).read_text()):
     command = [str(find_executable(item['package'], item['executable'])), *item['arguments']]

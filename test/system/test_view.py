@@ -13,7 +13,6 @@ from scenario_runs import PATIENCE, Run, command, of_topic
 
 from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.bag import Bag, BagWriter, load_types
-from maasi_sim.run.processes import Domain
 from maasi_sim.view.bag_events import read_events
 from maasi_sim.view.live_view import LiveView, MessageFeed
 from maasi_sim.view.messages import is_shown
@@ -267,16 +266,6 @@ def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
         assert sum(event[1] == kind for event in log.events) == sum(
             event[1] == kind for event in whole.events
         )
-
-
-@pytest.fixture
-def ros(monkeypatch):
-    with Domain() as domain:
-        for name, value in domain.environment().items():
-            monkeypatch.setenv(name, value)
-        rclpy.init(domain_id=domain.number)
-        yield
-        rclpy.try_shutdown()
 
 
 def test_the_view_node_shows_a_bag_that_is_played_and_begins_again_with_it(run, ros):
