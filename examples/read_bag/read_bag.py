@@ -11,11 +11,12 @@ from rosbags.highlevel import AnyReader
 found, ways = {}, {}
 # The definitions of all messages are in the recording.
 with AnyReader([Path(sys.argv[1])]) as reader:
-    for connection, time, data in reader.messages():
+    for connection, _, data in reader.messages():
         if connection.topic.endswith('/state'):
             state = reader.deserialize(data, connection.msgtype)
-            place = state.pose.pose.position
-            ways.setdefault(connection.topic, []).append((time * 1e-9, place.x, place.y, place.z))
+            stamp, place = state.header.stamp, state.pose.pose.position
+            time = stamp.sec + 1e-9 * stamp.nanosec
+            ways.setdefault(connection.topic, []).append((time, place.x, place.y, place.z))
         elif connection.topic.endswith('found_targets'):
             message = reader.deserialize(data, connection.msgtype)
             found |= {item.id: item for item in message.targets}

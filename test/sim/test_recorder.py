@@ -11,9 +11,11 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_msgs.msg import AgentState, LockstepStep
 from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.recorder_node import Recorder
+from maasi_sim.run.run_record import RunEnd
 
 PATIENCE = 120.0
 RELIABLE = QoSProfile(
@@ -21,6 +23,7 @@ RELIABLE = QoSProfile(
 )
 SCENARIO = {
     'version': 1,
+    'step': 0.1,
     'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
     'targets': {'positions': [[0.5, 0.5]]},
     'robots': {
@@ -144,3 +147,27 @@ def test_the_share_explored_is_that_of_the_planners_diagnostics(session):
         publisher.publish(DiagnosticArray(status=[DiagnosticStatus(name=name, values=values)]))
     session.until(lambda: '/camera' in session.recorder.heartbeats)
     assert session.recorder.explored == 0.25
+
+
+def test_a_state_of_the_last_step_counts_also_after_the_end(session):
+    steps = session.node.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)
+    states = session.node.create_publisher(AgentState, '/rover/state', RELIABLE)
+    session.until(
+        lambda: (
+            not session.recorder.missing(['/lockstep/step', '/rover/state'])
+            and steps.get_subscription_count()
+            and states.get_subscription_count()
+        )
+    )
+    stamps = {step: stamp_to_ros(step * 10**8) for step in (3, 4)}
+    steps.publish(LockstepStep(step=3, robots=['rover'], stamp=stamps[3]))
+    session.until(lambda: session.recorder.step == 3)
+    session.recorder.finish()
+    for step in (4, 3):
+        state = AgentState(step=step, robot='rover')
+        state.header.stamp = stamps[step]
+        state.pose.pose.position.x = 0.1 * step
+        states.publish(state)
+    session.until(lambda: '/rover/state' in session.recorder.last_seen)
+    record = session.recorder.observer.record(RunEnd('time_limit', 10.0, 1.0))
+    assert [place[1] for place in record.trajectories['rover']] == pytest.approx([0.3])

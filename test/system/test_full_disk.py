@@ -25,16 +25,16 @@ from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_sim.run.bag import Bag
 
 pytestmark = pytest.mark.system
-# The run takes more steps than it records before its disk is full.
+# So far from each other that the run lasts much longer than until its disk is full.
 SCENARIO = {
     'version': 1,
-    'environment': {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]},
-    'targets': {'positions': [[0.0, 0.0]]},
+    'environment': {'bounds': [[-0.3, 6.0], [-0.3, 6.0]]},
+    'targets': {'positions': [[0.0, 0.0], [5.5, 5.5], [0.0, 5.5]]},
     'robots': {
         'mambo': {
             'type': 'mambo',
             'start': [1.9, 1.9, 1.0],
-            'candidates': {'grid': [7, 7], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
+            'candidates': {'grid': [16, 16], 'spacing': 0.384, 'corner': [-0.1, -0.1]},
         }
     },
     'filter': {'method': 'pmb'},
@@ -95,7 +95,7 @@ def check(process, folder):
     """Return what a run said whose recording could not be finished."""
     output, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 4, output
-    assert 'of 1 targets found' in output
+    assert 'of 3 targets found' in output
     assert 'bag: writing failed: File too large' in output
     assert 'Traceback' not in output
     assert not processes_with(f'{folder}/')

@@ -219,12 +219,18 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
             self.halt()
         self.active = False
         self._end_peer_timer()
+        self._end_notice_timer()
 
     def _end_peer_timer(self) -> None:
         if self._peer_timer is not None:
             self._peer_timer.cancel()
             self.destroy_timer(self._peer_timer)
             self._peer_timer = None
+
+    def _end_notice_timer(self) -> None:
+        if self._notice_timer is not None:
+            self.destroy_timer(self._notice_timer)
+            self._notice_timer = None
 
     def _disconnect(self) -> None:
         self.active = False
@@ -281,9 +287,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
 
     def _say_what_is_missing(self) -> None:
         """Name, once after activation, the topics that nobody publishes."""
-        if self._notice_timer is not None:
-            self.destroy_timer(self._notice_timer)
-            self._notice_timer = None
+        self._end_notice_timer()
         missing = unpublished_topics(self)
         if self.active and missing:
             self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')

@@ -91,7 +91,6 @@ class CuboidObserver:
 
     #: There are no filters.
     update_topics: Sequence[str] = ()
-    result_topics: Sequence[str] = ()
 
     def __init__(self, name: str, scenario: CuboidScenario, seed: int, types: Typestore) -> None:
         self.name = name

@@ -45,10 +45,6 @@ class Observer(Protocol[RecordOut]):
         """Of these, filter updates: taken before, and added after, the messages they refer to."""
 
     @property
-    def result_topics(self) -> Sequence[str]:
-        """Of these, topics whose messages of the last step may arrive after the end of the run."""
-
-    @property
     def found(self) -> int:
         """Number of targets or cuboids found so far."""
 

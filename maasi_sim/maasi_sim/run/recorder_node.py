@@ -304,8 +304,8 @@ class Recorder:
                 for status in deserialize_message(data, DiagnosticArray).status:
                     self.heartbeats[status.name] = now
                     self._note_explored(status)
-            if not self._finished or topic in self.observer.result_topics:
-                self.observer.add(topic, data)
+            # Also those of the last step that arrive after the end.
+            self.observer.add(topic, data)
             if self.listener is not None and topic in self._shown:
                 self.listener(topic, self._shown[topic], data)
         self.observer.settle()

@@ -75,14 +75,9 @@ class TargetObserver:
         return list(self._update_topics)
 
     @property
-    def result_topics(self) -> list[str]:
-        """Topics of the filters' updates and found targets."""
-        return [*self._update_topics, *self._found_topics]
-
-    @property
     def topics(self) -> list[str]:
         """Topics that it needs."""
-        return [*self.result_topics, STEP, *self._kept]
+        return [*self._update_topics, *self._found_topics, STEP, *self._kept]
 
     @property
     def progress(self) -> list[Progress]:
