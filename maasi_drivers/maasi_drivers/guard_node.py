@@ -89,11 +89,11 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             self._end_stop()
         elif self.active and self._stop_timer is None:
             self.get_logger().warning('the driver is dead or hangs: zeros on cmd_vel')
-            self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._stop)
+            self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._command_zeros)
             if self._nav2.service_is_ready():
                 # Without an id: all its goals.
                 self._nav2.call_async(CancelGoal.Request())
-            self._stop()
+            self._command_zeros()
 
     def _end_stop(self) -> None:
         if self._stop_timer is not None:
@@ -101,7 +101,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             self.destroy_timer(self._stop_timer)
             self._stop_timer = None
 
-    def _stop(self) -> None:
+    def _command_zeros(self) -> None:
         if self._stop_timer is None:
             return
         command = TwistStamped()

@@ -64,3 +64,6 @@ def test_a_driver_that_hangs_leaves_zeros(guarded):
     team.until(lambda: len(team.commands) >= known + 3)
     assert not np.any([numbers(item) for item in team.commands[known:]])
     assert driver.poll() is None
+    # The last command stays; one that is not active publishes nothing.
+    assert guard.trigger_deactivate().name == 'SUCCESS'
+    assert not guard.active and not guard.status()['stopping']

@@ -105,6 +105,18 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     node.destroy_node()
 
 
+@pytest.mark.parametrize('kind', KINDS)
+def test_an_activation_that_is_short_leaves_no_timer(context, kind):
+    node = KINDS[kind].make(context)
+    assert node.trigger_configure().name == 'SUCCESS', node.problem
+    before = made_by(node)['timers']
+    for _ in range(2):
+        assert node.trigger_activate().name == 'SUCCESS', node.problem
+        assert node.trigger_deactivate().name == 'SUCCESS', node.problem
+    assert made_by(node)['timers'] == before
+    node.destroy_node()
+
+
 def test_a_parameter_that_is_set_after_cleanup_counts_from_the_next_configure(context):
     node = KINDS['filter'].make(context)
     assert node.trigger_configure().name == 'SUCCESS'
