@@ -22,7 +22,8 @@ def say(event, pose):
     place = pose.pose.position
     turn = pose.pose.orientation
     line = {'event': event, 'frame': pose.header.frame_id, 'position': [place.x, place.y, place.z]}
-    print(json.dumps(line | {'turn': [turn.z, turn.w]}), flush=True)
+    # Written at once: several threads say something.
+    print(json.dumps(line | {'turn': [turn.z, turn.w]}) + '\n', end='', flush=True)
 
 
 present = []
