@@ -47,10 +47,6 @@ An experiment without runs in the folder keeps the tables that the page has; the
 "from an earlier campaign", of an earlier version of the code. So do single cases: their rows are
 marked "(earlier)".
 
-**No row of 000 to 003 has been run with the present filters yet.** All are of those up to commit
-36e1ea3: `recommended` is a PHD filter with ten additions, which `pmb` has since replaced; the other
-rows are of the papers' PHD filter before its lower bound of clutter and its repaired removal.
-
 Each experiment leaves in `runs/reproduction/NAME/`: `runs/` (one file per run, with a checksum),
 `steps.csv` (a row per run and step), `runs.csv` (a row per run), `table.md`, `table.csv`,
 `figure.png`, and `configuration.yaml` with every setting and seed.
