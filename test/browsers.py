@@ -3,11 +3,11 @@
 import contextlib
 import os
 import shutil
-import time
 from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import sync_playwright
+from waiting import PATIENCE, wait_until
 
 CHROMIUM = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
 
@@ -43,12 +43,10 @@ class Page:
         self.page.evaluate(f'maasi.seek({seconds})')
         self.settle()
 
-    def until(self, condition, patience=30.0):
+    def until(self, condition, limit=PATIENCE):
         """Wait until an expression is true; the page lets nothing be evaluated inside it."""
-        end = time.monotonic() + patience
-        while not self.page.evaluate(condition):
-            assert time.monotonic() < end, condition
-            self.page.wait_for_timeout(50)
+        evaluate, rest = self.page.evaluate, self.page.wait_for_timeout
+        wait_until(lambda: evaluate(condition), lambda: rest(50), condition, limit)
 
     def settle(self):
         """Wait until what was asked for is drawn."""

@@ -1,7 +1,6 @@
 """A robot and a team that the tests of the drivers play, over real topics."""
 
 import math
-import time
 
 import numpy as np
 from action_msgs.msg import GoalStatus
@@ -12,6 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, CameraInfo, Image
 from std_srvs.srv import Trigger
+from waiting import wait_until
 
 from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.guard_node import GuardNode
@@ -42,8 +42,6 @@ from maasi_sim.world.world import TargetSettings, World
 
 STEP = 0.05
 NANOSECONDS = round(STEP * 1e9)
-# Longest wait for anything; the machine may be busy.
-LIMIT = 60.0
 BOUNDS = [[-0.3, 2.4], [-0.3, 2.4]]
 TURTLEBOT = {
     'step': STEP,
@@ -135,11 +133,8 @@ class Team(Node):
         self.go_to = ActionClient(self, GoToWaypoint, 'go_to')
         self.batch = 0
 
-    def until(self, condition, what=''):
-        end = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < end, what or 'nothing came of it'
-            self.executor_used.spin_once(timeout_sec=0.02)
+    def until(self, condition, *what):
+        wait_until(condition, lambda: self.executor_used.spin_once(timeout_sec=0.02), *what)
 
     def until_done(self, steps):
         self.until(

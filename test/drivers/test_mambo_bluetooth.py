@@ -6,6 +6,7 @@ import fake_bluepy
 import numpy as np
 import pytest
 from simulated_mambo import FENCE, HOME, MOTION, TILT, full_speed
+from waiting import wait_until
 
 from maasi_drivers.links.mambo.link import MamboLink
 from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
@@ -14,8 +15,6 @@ from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
 from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware
 
-# Longest wait for anything; the machine may be busy.
-LIMIT = 30.0
 # Between two looks [s]; the radio is asked as often.
 PERIOD = 0.05
 
@@ -46,10 +45,8 @@ class Flight:
         time.sleep(PERIOD)
 
     def until(self, condition):
-        end = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < end, (self.pilot.phase, self.pilot.problem, self.link.error)
-            self.step()
+        pilot, link = self.pilot, self.link
+        wait_until(condition, self.step, lambda: (pilot.phase, pilot.problem, link.error))
 
 
 @pytest.fixture(params=['hover', 'land'])

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from types import SimpleNamespace
 
 import cv2
@@ -18,6 +17,7 @@ from mambo_flights import GOAL, START, YAW, Flight, noise_image, send_feed
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, parameters_of, rendered
+from waiting import wait_until
 
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
 from maasi_drivers.agent.driver_settings import DriverSettings
@@ -320,18 +320,12 @@ def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
     # Not by its own watchdog: the last command would be flown for ever.
     firmware.settings = firmware.settings.model_copy(update={'command_timeout': math.inf})
     flight.on_its_way()
-
-    def await_without_the_executor(condition):
-        deadline = time.monotonic() + 30.0
-        while not condition():
-            assert time.monotonic() < deadline, flight.fake.snapshot()
-            time.sleep(0.02)
-
     assert flight.speed > 0.1
-    await_without_the_executor(lambda: flight.speed < 0.05)
+    # Nothing spins the executor meanwhile.
+    wait_until(lambda: flight.speed < 0.05, what=flight.fake.snapshot)
     # It was told so before it lands.
     assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
-    await_without_the_executor(lambda: flight.flying_state == FlyingState.LANDED)
+    wait_until(lambda: flight.flying_state == FlyingState.LANDED, what=flight.fake.snapshot)
     # Once it is looked after again, it is said why it does not go on.
     flight.until(lambda: flight.status == AgentState.UNAVAILABLE and 'Mambo is' in flight.reason)
 

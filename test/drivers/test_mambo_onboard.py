@@ -1,7 +1,6 @@
 """A drone with a program of its own: the feed carries its pose, waypoints go back."""
 
 import struct
-import time
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from numpy.testing import assert_allclose
 from onboard_program import AIR, GROUND, OnboardProgram
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, Team, parameters_of
+from waiting import wait_until
 
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
 from maasi_drivers.links.waypoint_orders import Order, OrderError, OrderKind
@@ -166,21 +166,13 @@ def test_a_goal_outside_the_geofence_is_refused(fly):
     assert flight.drone.state == AIR
 
 
-def wait_idle(condition):
-    """Wait for the drone while the driver's executor stands still."""
-    end = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def test_a_driver_that_hangs_is_a_drone_that_hovers_then_lands(fly):
     """Orders come from the executor alone: one that stands still says nothing."""
     flight = fly()
     flight.on_its_way()
-    wait_idle(lambda: np.linalg.norm(flight.drone.model.velocity) < 0.01)
+    wait_until(lambda: np.linalg.norm(flight.drone.model.velocity) < 0.01)
     assert flight.drone.state == AIR
-    wait_idle(lambda: flight.drone.state == GROUND)
+    wait_until(lambda: flight.drone.state == GROUND)
 
 
 # ---- the datagrams ---------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from waiting import PATIENCE, wait_until
 
 from maasi_drivers.measurement_feed_sender import main
 from maasi_drivers.vision.blobs import Blobs
@@ -26,9 +27,6 @@ from maasi_drivers.vision.measurement_feed import (
     encode,
 )
 from maasi_drivers.vision.segmentation import segment
-
-# Longest wait for anything; the machine may be busy.
-LIMIT = 30.0
 
 
 def blobs(number, seed=1):
@@ -140,7 +138,7 @@ def test_what_cannot_be_sent_is_refused():
 
 
 def received(receiver, number):
-    end, packets = time.monotonic() + LIMIT, []
+    end, packets = time.monotonic() + PATIENCE, []
     while len(packets) < number:
         assert time.monotonic() < end, (len(packets), receiver.counts)
         packets += receiver.take()
@@ -226,7 +224,7 @@ def video(tmp_path_factory):
 
 def test_a_video_is_played_at_its_rate_in_rgb(video):
     source = VideoSource(str(video))
-    frames, end = [], time.monotonic() + LIMIT
+    frames, end = [], time.monotonic() + PATIENCE
     while not source.ended:
         assert time.monotonic() < end
         frame = source.take()
@@ -253,10 +251,7 @@ def test_a_source_that_is_not_there_is_said(tmp_path):
 
 def test_a_device_that_is_not_there_is_tried_again():
     source = VideoSource('/dev/video77')
-    end = time.monotonic() + LIMIT
-    while not source.error:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    wait_until(lambda: source.error)
     assert 'cannot open' in source.error
     assert source.take() is None and not source.ended
     source.close()
@@ -275,7 +270,7 @@ def test_the_reference_sender_sends_what_it_sees(feed, video):
     )
     # On a busy machine it skips images, as for a camera.
     packets = received(receiver, 1)
-    output, _ = sender.communicate(timeout=LIMIT)
+    output, _ = sender.communicate(timeout=PATIENCE)
     assert sender.returncode == 0 and 'images sent' in output
     packets += receiver.take()
     for item in packets:

@@ -5,11 +5,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from numpy.testing import assert_allclose
 from simulated_mambo import TILT, Flight, full_speed, measure
+from waiting import wait_until
 
 from maasi_drivers.links.mambo.speed_measurement import (
     Leg,
@@ -120,10 +120,7 @@ def test_the_command_measures_through_pyparrot_and_lands(drone):
 
 def test_the_command_lands_when_it_is_interrupted(drone):
     process = command(drone, '--fly')
-    end = time.monotonic() + LIMIT
-    while drone.snapshot()[1] != FlyingState.HOVERING:
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    wait_until(lambda: drone.snapshot()[1] == FlyingState.HOVERING)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=LIMIT)
     assert process.returncode == 1

@@ -1,7 +1,6 @@
 """Requests to the services that rclpy makes, on which it raises: the node answers and goes on."""
 
 import threading
-import time
 
 import pytest
 import rclpy
@@ -11,13 +10,12 @@ from rcl_interfaces.srv import GetParameterTypes, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from waiting import wait_until
 
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_sim.run.processes import Domain
-
-PATIENCE = 120.0
 
 
 @pytest.fixture
@@ -59,18 +57,15 @@ def ask(context, node):
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(user)
 
-    def until(condition, what):
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert not node.raised, node.raised
-            assert time.monotonic() < deadline, what
-            executor.spin_once(timeout_sec=0.05)
+    def turn():
+        assert not node.raised, node.raised
+        executor.spin_once(timeout_sec=0.05)
 
     def call(kind, service, request):
         client = user.create_client(kind, service)
-        until(client.service_is_ready, f'no {service}')
+        wait_until(client.service_is_ready, turn, f'no {service}')
         answer = client.call_async(request)
-        until(answer.done, f'no answer of {service}')
+        wait_until(answer.done, turn, f'no answer of {service}')
         return answer.result()
 
     yield call

@@ -3,6 +3,7 @@
 import math
 import time
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from waiting import PATIENCE, wait_until
 
 from maasi_filter import FilterSettings, make_filter
 from maasi_filter.filter_node import FilterNode
@@ -29,7 +31,6 @@ from maasi_msgs.msg import (
 )
 from maasi_sim.run.processes import Domain
 
-PATIENCE = 120.0
 BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}
 NOISE = {'range': 0.01, 'bearing': 0.03}
 SETTINGS = FilterNodeSettings.model_validate(
@@ -103,12 +104,11 @@ def running(**changes):
         other = SingleThreadedExecutor(context=context)
         other.add_node(team.node)
 
-        def until(condition):
-            deadline = time.monotonic() + PATIENCE
-            while not condition():
-                assert time.monotonic() < deadline
-                own.spin_once(0.01)
-                other.spin_once(timeout_sec=0.01)
+        def turn():
+            own.spin_once(0.01)
+            other.spin_once(timeout_sec=0.01)
+
+        until = partial(wait_until, turn=turn)
 
         try:
             assert node.trigger_configure().name == 'SUCCESS', node.problem

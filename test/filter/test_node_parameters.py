@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 
 import pytest
 import rclpy
@@ -13,13 +12,13 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
+from waiting import PATIENCE, wait_until
 
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_sim.run.processes import Domain
 
-PATIENCE = 120.0
 SETTINGS = FilterNodeSettings.model_validate(
     {
         'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
@@ -91,10 +90,7 @@ class Tool:
         self.client = AsyncParameterClient(self.node, '/filter_node')
 
     def result(self, future):
-        end = time.monotonic() + PATIENCE
-        while not future.done():
-            assert time.monotonic() < end
-            self.executor.spin_once(timeout_sec=0.05)
+        wait_until(future.done, lambda: self.executor.spin_once(timeout_sec=0.05))
         return future.result()
 
     def dump(self):

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 from test_planner_node import ROBOTS, SETTINGS, START
+from waiting import wait_until
 
 from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
@@ -31,7 +32,6 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planner_node import PlannerNode
 from maasi_sim.run.processes import Domain
 
-PATIENCE = 120.0
 STEP = 0.05
 # Wall time of a step of the robots, where odometry is lost at most [s].
 TURN, LONGEST_TURN = 0.01, 1.0
@@ -171,19 +171,13 @@ class World:
                 self.status = {item.key: item.value for item in status.values}
                 self.status |= {'level': status.level, 'message': status.message}
 
-    def until(self, condition, what=''):
+    def until(self, condition, *what):
         """Let the robots move until something is true."""
-        self._repeat(self.turn, condition, what)
+        wait_until(condition, self.turn, *what)
 
-    def listen(self, condition, what=''):
+    def listen(self, condition, *what):
         """Let the robots get hardly any further until something is true."""
-        self._repeat(lambda: self.turn(SLOW), condition, what)
-
-    def _repeat(self, function, condition, what):
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < end, what or 'nothing came of it'
-            function()
+        wait_until(condition, lambda: self.turn(SLOW), *what)
 
     def turn(self, share=1.0):
         """Do one step of the robots, or a share of one, and what follows from it."""

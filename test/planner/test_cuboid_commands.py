@@ -1,7 +1,5 @@
 """The planner of buildings moves its robot only after `start`, and stops it by the services."""
 
-import time
-
 import pytest
 import rclpy
 from geometry_msgs.msg import TwistStamped
@@ -11,6 +9,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
+from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.executor import executor_of
@@ -68,12 +67,12 @@ class Flight:
             )
         )
 
+    def turn(self):
+        self.own.spin_once(0.005)
+        self.executor.spin_once(timeout_sec=0.005)
+
     def until(self, condition):
-        end = time.monotonic() + 60.0
-        while not condition():
-            assert time.monotonic() < end
-            self.own.spin_once(0.005)
-            self.executor.spin_once(timeout_sec=0.005)
+        wait_until(condition, self.turn)
 
     def move(self):
         """Do a step with the last command, until the robot has told its state to the others."""

@@ -1,8 +1,8 @@
 """The planner node over real topics: decisions, trouble, and what it says of it."""
 
 import math
-import time
 from contextlib import contextmanager
+from functools import partial
 
 import pytest
 import rclpy
@@ -14,6 +14,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from waiting import wait_until
 
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.parameters import flatten
@@ -33,7 +34,6 @@ from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
 from maasi_sim.run.processes import Domain
 
-PATIENCE = 120.0
 ROBOTS = ('a', 'b')
 START = {'a': (0.5, 0.5), 'b': (1.5, 1.5)}
 BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}
@@ -171,12 +171,11 @@ def running(**changes):
         other = SingleThreadedExecutor(context=context)
         other.add_node(team.node)
 
-        def until(condition):
-            deadline = time.monotonic() + PATIENCE
-            while not condition():
-                assert time.monotonic() < deadline
-                own.spin_once(0.01)
-                other.spin_once(timeout_sec=0.01)
+        def turn():
+            own.spin_once(0.01)
+            other.spin_once(timeout_sec=0.01)
+
+        until = partial(wait_until, turn=turn)
 
         try:
             until(lambda: team.connected)

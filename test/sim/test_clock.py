@@ -18,6 +18,7 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
+from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
@@ -52,11 +53,8 @@ class World(Node):
             self.statuses.append(status)
             self.stamps[status.name] = message.header.stamp
 
-    def until(self, condition, what=''):
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < end, what
-            self.listen()
+    def until(self, condition, *what):
+        wait_until(condition, self.listen, *what, limit=PATIENCE)
 
     def listen(self):
         """Take all that comes for a moment: what is said more often is heard late."""

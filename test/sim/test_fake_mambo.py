@@ -14,6 +14,7 @@ import time
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from waiting import PATIENCE, wait_until
 
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_filter.models.pose import Pose
@@ -28,8 +29,6 @@ from maasi_sim.emulators.mambo.frames import Frame, FrameError, frames
 from maasi_sim.emulators.mambo.tilt_body import TiltBody, TiltBodySettings, TiltCommand
 from maasi_sim.world.robots import BatterySettings
 
-# Longest wait for anything; the machine may be busy.
-LIMIT = 120.0
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
 # Of this process, so that several can be tested at a time on one host.
 _NUMBERS = itertools.count(os.getpid() % 1000 * 20)
@@ -44,13 +43,6 @@ def free_port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as test:
         test.bind(('0.0.0.0', 0))
         return test.getsockname()[1]
-
-
-def until(condition, what='nothing came of it'):
-    end = time.monotonic() + LIMIT
-    while not condition():
-        assert time.monotonic() < end, what
-        time.sleep(0.01)
 
 
 def firmware(**changes):
@@ -254,7 +246,7 @@ def pair():
         started.extend([link, fake])
         if connect:
             link.connect()
-            until(lambda: link.connected or link.error)
+            wait_until(lambda: link.connected or link.error)
             assert not link.error
         return fake, link
 
@@ -265,33 +257,33 @@ def pair():
 
 def test_pyparrot_flies_it(pair):
     fake, link = pair(battery=BatterySettings(charge=0.5))
-    until(lambda: link.battery == 0.5 and link.flying_state == 'landed')
-    until(lambda: link.position is not None)
+    wait_until(lambda: link.battery == 0.5 and link.flying_state == 'landed')
+    wait_until(lambda: link.position is not None)
     assert_allclose(link.position.position, 0.0, atol=0.011)
     assert fake.heard[(0, 4, 0)] == 1
     assert_allclose(fake.firmware.limits.tilt, 0.1, rtol=1e-5)
     assert fake.firmware.take_offs == 0
     link.take_off()
-    until(lambda: link.flying_state == 'hovering')
+    wait_until(lambda: link.flying_state == 'hovering')
     end = time.monotonic() + 2.0
     while time.monotonic() < end:
         link.steer(0.5, 0.25, 0.0, 0.0)
         time.sleep(0.05)
-    until(lambda: link.position.position[0] > 0.1)
+    wait_until(lambda: link.position.position[0] > 0.1)
     forward, left, up = link.position.position
     assert 0.02 < left < forward and up > 0.6
     link.hover()
     link.land()
-    until(lambda: link.flying_state == 'landed')
+    wait_until(lambda: link.flying_state == 'landed')
     assert fake.refused == 0
     # Acknowledged commands are not repeated.
     assert fake.heard[(2, 0, 1)] == 1 and fake.heard[(2, 0, 3)] == 1
-    until(lambda: not fake._unacked)
+    wait_until(lambda: not fake._unacked)
 
 
 def test_a_packet_that_is_repeated_is_not_believed(pair):
     fake, link = pair()
-    until(lambda: link.position is not None)
+    wait_until(lambda: link.position is not None)
     handle = link._drone.drone_connection.handle_data
     packets = []
 
@@ -301,17 +293,17 @@ def test_a_packet_that_is_repeated_is_not_believed(pair):
         handle(data)
 
     link._drone.drone_connection.handle_data = keep
-    until(lambda: len(packets) > 20)
+    wait_until(lambda: len(packets) > 20)
     fake.cut_down = True
     # Those on their way have come when nothing is heard for a while.
-    until(lambda: time.monotonic() - link.heard_at > 1.0)
+    wait_until(lambda: time.monotonic() - link.heard_at > 1.0)
     heard, received = link.heard_at, link.position.received
     handle(packets[-1])
     for packet in packets[-3:]:
         handle(packet)
     assert link.heard_at == heard and link.position.received == received
     fake.cut_down = False
-    until(lambda: link.position.received > received)
+    wait_until(lambda: link.position.received > received)
 
 
 BAD_FRAMES = [
@@ -328,19 +320,19 @@ BAD_FRAMES = [
 
 def test_datagrams_that_are_not_the_drones_or_are_cut_short_do_not_end_the_link(pair):
     fake, link = pair()
-    until(lambda: link.position is not None)
+    wait_until(lambda: link.position is not None)
     receiver = link._drone.drone_connection.udp_receive_sock
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.bind((own_address(), 0))
         for data in BAD_FRAMES:
             stranger.sendto(data, ('127.0.0.1', link.port))
-        until(lambda: receiver.dropped['foreign sender'] == len(BAD_FRAMES))
+        wait_until(lambda: receiver.dropped['foreign sender'] == len(BAD_FRAMES))
         # The same from the drone's own address.
         for data in BAD_FRAMES:
             fake._air.sendto(data, ('127.0.0.1', link.port))
-    until(lambda: receiver.dropped['bad frame'] + receiver.dropped['bad content'] >= 7)
+    wait_until(lambda: receiver.dropped['bad frame'] + receiver.dropped['bad content'] >= 7)
     received = link.position.received
-    until(lambda: link.position.received > received)
+    wait_until(lambda: link.position.received > received)
     assert link.connected and not link.error
     assert link.dropped == receiver.dropped
 
@@ -348,7 +340,7 @@ def test_datagrams_that_are_not_the_drones_or_are_cut_short_do_not_end_the_link(
 @pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
 def test_a_listener_that_dies_is_started_again(pair):
     _, link = pair()
-    until(lambda: link.position is not None)
+    wait_until(lambda: link.position is not None)
     connection = link._drone.drone_connection
     handle, dead = connection.handle_data, connection.listener_thread
 
@@ -358,10 +350,10 @@ def test_a_listener_that_dies_is_started_again(pair):
         raise SystemExit
 
     connection.handle_data = die
-    until(lambda: link.revived == 1)
+    wait_until(lambda: link.revived == 1)
     assert not dead.is_alive()
     received = link.position.received
-    until(lambda: link.position.received > received)
+    wait_until(lambda: link.position.received > received)
 
 
 def test_the_drone_is_heard_on_the_address_that_faces_it_alone(pair):
@@ -373,30 +365,30 @@ def test_the_drone_is_heard_on_the_address_that_faces_it_alone(pair):
 def test_a_landing_is_asked_for_again_when_commands_are_lost(pair):
     fake, link = pair(settings=FirmwareSettings(landing_timeout=60.0))
     link.take_off()
-    until(lambda: link.flying_state == 'hovering')
+    wait_until(lambda: link.flying_state == 'hovering')
     fake.cut_up = True
     link.land()
     time.sleep(1.0)
     assert fake.firmware.flying_state == FlyingState.HOVERING
     fake.cut_up = False
-    until(lambda: fake.firmware.flying_state == FlyingState.LANDED)
+    wait_until(lambda: fake.firmware.flying_state == FlyingState.LANDED)
 
 
 def test_one_that_lands_by_itself_is_not_told_to_take_off_again(pair):
     fake, link = pair()
     link.take_off()
-    until(lambda: link.flying_state == 'hovering')
+    wait_until(lambda: link.flying_state == 'hovering')
     fake.firmware.land()
-    until(lambda: link.flying_state == 'landed')
+    wait_until(lambda: link.flying_state == 'landed')
     time.sleep(1.5)
     assert fake.firmware.take_offs == 1 and link.flying_state == 'landed'
 
 
 def test_position_events_that_are_no_numbers_are_left_out(pair):
     fake, link = pair()
-    until(lambda: link.position is not None)
+    wait_until(lambda: link.position is not None)
     fake.position_sent = 'nan'
-    until(lambda: link.bad_events >= 2)
+    wait_until(lambda: link.bad_events >= 2)
     assert np.isfinite(link.position.position).all()
     with pytest.raises(ValueError, match='finite'):
         link.steer(math.nan, 0.0, 0.0, 0.0)
@@ -413,7 +405,7 @@ def test_a_port_that_is_taken_is_refused(pair):
 def test_no_drone_and_no_bluetooth_are_said():
     link = MamboLink('wifi', own_address(), free_port())
     link.connect()
-    until(lambda: link.error)
+    wait_until(lambda: link.error)
     assert link.address in link.error and 'refused' in link.error.lower()
     link.close()
     with pytest.raises(MamboLinkError, match='bluepy is not installed'):
@@ -423,7 +415,7 @@ def test_no_drone_and_no_bluetooth_are_said():
 def test_the_fake_refuses_what_is_no_handshake(pair):
     fake, _ = pair(connect=False)
     for request, status in ((b'hello', -1), (b'{"d2c_port": 43210}', 0)):
-        with socket.create_connection((fake.address, 44444), timeout=LIMIT) as client:
+        with socket.create_connection((fake.address, 44444), timeout=PATIENCE) as client:
             client.sendall(request)
             answer = client.recv(4096)
         assert answer[-1:] == b'\0'
@@ -450,11 +442,11 @@ def test_the_command_runs_a_fake_that_a_link_finds():
     try:
         lines.append(process.stdout.readline())
         link.connect()
-        until(lambda: link.battery == 0.4)
+        wait_until(lambda: link.battery == 0.4)
     finally:
         link.close()
         process.send_signal(signal.SIGINT)
         output = process.stdout.read()
-        process.wait(LIMIT)
+        process.wait(PATIENCE)
     assert process.returncode == 0
     assert address in lines[0] and 'landed' in output

@@ -33,7 +33,7 @@ def test_robots_stand_until_all_are_ready_and_go_with_the_clock(team):
     # Between two steps: the last one counts.
     team.spin_until(lambda: reached(7 * SECOND + SECOND // 100) or team.filter.steps)
     assert team.filter.steps[0].step == round(7.0 / STEP)
-    team.spin_until(lambda: reached(8 * SECOND), 30.0)
+    team.spin_until(lambda: reached(8 * SECOND))
     steps = [message.step for message in team.filter.steps]
     assert steps == list(range(round(7.0 / STEP), round(8.0 / STEP) + 1))
     assert [round(seconds(item.stamp) / STEP) for item in team.filter.steps] == steps

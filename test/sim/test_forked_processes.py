@@ -1,14 +1,13 @@
 """Nodes that are copies of the run's process: as separate as those that are started anew."""
 
-import os
 import signal
 import subprocess
 import sys
 import textwrap
-import time
 from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 LIMIT = 120.0
 BEGIN = """
@@ -159,10 +158,7 @@ def test_it_does_not_outlive_a_killed_run(tmp_path):
     run.kill()
     run.wait(LIMIT)
     run.stdout.close()
-    deadline = time.monotonic() + LIMIT
-    while _alive(pid):
-        assert time.monotonic() < deadline
-        os.sched_yield()
+    wait_until(lambda: not _alive(pid))
 
 
 def _alive(pid):

@@ -8,11 +8,11 @@ import rclpy
 from node_kinds import KINDS
 from rclpy.context import Context
 from rclpy.parameter import Parameter
+from waiting import wait_until
 
 from maasi_filter.ros.executor import executor_of
 from maasi_sim.run.processes import Domain
 
-PATIENCE = 120.0
 CYCLES = 20
 
 
@@ -65,13 +65,6 @@ def is_known(node):
     return all(counts[key] == number for key, number in own.items() if '/_' not in key[1])
 
 
-def until(condition, wait=lambda: time.sleep(0.01), what=lambda: ''):
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, what()
-        wait()
-
-
 @pytest.mark.parametrize('kind', KINDS)
 def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     node = KINDS[kind].make(context)
@@ -80,10 +73,10 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     def spin():
         executor.spin_once(0.01)
 
-    until(lambda: is_known(node))
+    wait_until(lambda: is_known(node))
     unconfigured = made_by(node), in_graph(node)
     assert node.trigger_configure().name == 'SUCCESS', node.problem
-    until(lambda: is_known(node))
+    wait_until(lambda: is_known(node))
     configured = made_by(node), in_graph(node)
     assert configured[0]['publishers'] > unconfigured[0]['publishers']
     # The recorder looks for topics after it has heard the last publisher of each node.
@@ -94,13 +87,13 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
         for step in ('activate', 'deactivate', 'cleanup', 'configure'):
             assert getattr(node, f'trigger_{step}')().name == 'SUCCESS', (step, node.problem)
             executor.spin_once(0.0)
-    until(
+    wait_until(
         lambda: (made_by(node), in_graph(node)) == configured,
         spin,
         lambda: f'{made_by(node)}, {in_graph(node)}, configured: {configured}',
     )
     assert node.trigger_cleanup().name == 'SUCCESS'
-    until(lambda: (made_by(node), in_graph(node)) == unconfigured, spin)
+    wait_until(lambda: (made_by(node), in_graph(node)) == unconfigured, spin)
     executor.shutdown()
     node.destroy_node()
 
@@ -143,7 +136,7 @@ def test_robots_can_be_added_between_cleanup_and_configure(context):
     assert node.set_parameters([Parameter(name, value=0.25)])[0].successful
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     assert node.settings.robots['scout'].sensor.period == 0.25
-    until(lambda: node.count_subscribers('/scout/detections') == 1)
+    wait_until(lambda: node.count_subscribers('/scout/detections') == 1)
     node.destroy_node()
 
 
@@ -169,13 +162,13 @@ def test_a_timer_that_is_destroyed_is_not_called_any_more(context):
         while timers:
             node.destroy_timer(timers.pop())
 
-    until(lambda: is_known(node))
+    wait_until(lambda: is_known(node))
     executor.spin_once(0.1)
     timers += [node.create_wall_timer(0.05, fire) for _ in range(5)]
     executor.spin_once(0.0)
     # All are due at once, and the first one that is called destroys the others.
     time.sleep(0.2)
-    until(lambda: called, lambda: executor.spin_once(0.01))
+    wait_until(lambda: called, lambda: executor.spin_once(0.01))
     for _ in range(20):
         executor.spin_once(0.01)
     assert called == [5]

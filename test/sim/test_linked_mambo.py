@@ -5,14 +5,13 @@ from copy import deepcopy
 
 import pytest
 from numpy.testing import assert_allclose
+from waiting import wait_until
 
 from maasi_drivers.links.mambo.link import MamboLink
 from maasi_sim.emulators.linked_robots import linked_robot, with_addresses
 from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.scenario.schema import ScenarioError
 
-# Longest wait for anything; the machine may be busy.
-LIMIT = 120.0
 SCENARIO = {
     'version': 1,
     'environment': {'bounds': [[-0.3, 1.2], [-0.3, 1.2]]},
@@ -37,13 +36,6 @@ def changed(**changes):
     return content
 
 
-def until(condition):
-    end = time.monotonic() + LIMIT
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def test_it_stands_below_its_start_and_flies_as_its_link_says():
     scenario = with_addresses(scenario_from_values(SCENARIO, 'test'))
     robot = scenario.robots['mambo']
@@ -51,21 +43,21 @@ def test_it_stands_below_its_start_and_flies_as_its_link_says():
     link = MamboLink('wifi', robot.mambo.address, robot.mambo.port)
     link.connect()
     try:
-        until(lambda: link.connected)
+        wait_until(lambda: link.connected)
         assert_allclose(drone.state.pose.position, [0.2, 0.6, 0.1])
         assert drone.state.pose.yaw == pytest.approx(0.5)
         assert not drone.obeys
         link.take_off()
-        until(lambda: link.flying_state == 'hovering')
+        wait_until(lambda: link.flying_state == 'hovering')
         assert drone.obeys
         assert_allclose(drone.state.pose.position, [0.2, 0.6, 0.5], atol=0.15)
         drone.cut()
         # Nothing is heard any more; its firmware has it hover.
-        until(lambda: time.monotonic() - link.heard_at > 1.0)
+        wait_until(lambda: time.monotonic() - link.heard_at > 1.0)
         assert drone.obeys
         drone.cut(False)
         link.land()
-        until(lambda: link.flying_state == 'landed')
+        wait_until(lambda: link.flying_state == 'landed')
         assert not drone.obeys
     finally:
         link.close()

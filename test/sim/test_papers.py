@@ -8,11 +8,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
 import yaml
+from waiting import wait_until
 
 from maasi_sim.experiments import reproduce, results, searches, terrain
 from maasi_sim.experiments.campaign import SerialExecutor, carry_out, plan
@@ -128,10 +128,7 @@ def test_cluster_makes_the_same_runs(tmp_path):
         running('scheduler', *scheduler, '--scheduler-file', address, folder=tmp_path),
         running('worker', '--scheduler-file', address, *worker, folder=tmp_path),
     ):
-        deadline = time.monotonic() + 60.0
-        while not address.exists():
-            assert time.monotonic() < deadline, (tmp_path / 'scheduler.log').read_text()
-            time.sleep(0.05)
+        wait_until(address.exists, what=(tmp_path / 'scheduler.log').read_text)
         where = yaml.safe_load(address.read_text())['address']
         arguments = ['000-fig7', '--small', '--out', str(tmp_path / 'there'), '--cluster', where]
         assert reproduce.main(arguments) == 0

@@ -5,22 +5,12 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from waiting import PATIENCE, wait_until
 
 from maasi_sim.run.processes import Domain, NodeProcess, ProcessError, find_executable, stop
-
-LIMIT = 120.0
-
-
-def until(condition):
-    """Wait for a condition; a minute that never ends is a failure."""
-    deadline = time.monotonic() + LIMIT
-    while not condition():
-        assert time.monotonic() < deadline
-        os.sched_yield()
 
 
 def alive(pid):
@@ -49,7 +39,7 @@ IGNORE_ALL = IGNORE_INTERRUPT.replace(
 
 def started(process):
     process.start()
-    until(lambda: 'ready' in process.last_words())
+    wait_until(lambda: 'ready' in process.last_words())
     return process
 
 
@@ -110,7 +100,9 @@ def test_the_lock_ends_with_the_process(tmp_path):
         'import os, sys\nfrom pathlib import Path\nfrom maasi_sim.run.processes import Domain\n'
         'Domain(33, Path(sys.argv[1]))\nos.kill(os.getpid(), 9)\n'
     )
-    done = subprocess.run([sys.executable, '-c', code, str(tmp_path)], check=False, timeout=LIMIT)
+    done = subprocess.run(
+        [sys.executable, '-c', code, str(tmp_path)], check=False, timeout=PATIENCE
+    )
     assert done.returncode == -signal.SIGKILL
     Domain(33, tmp_path).release()
 
@@ -118,7 +110,7 @@ def test_the_lock_ends_with_the_process(tmp_path):
 def test_a_process_writes_its_log_and_says_how_it_ended(tmp_path):
     process = python(tmp_path, 'print("hello"); raise SystemExit(3)')
     process.start()
-    until(lambda: not process.running)
+    wait_until(lambda: not process.running)
     assert process.code == 3
     assert process.how_it_ended() == 'exited with 3'
     assert process.last_words() == 'hello'
@@ -127,9 +119,9 @@ def test_a_process_writes_its_log_and_says_how_it_ended(tmp_path):
 def test_a_restart_goes_on_in_the_same_log(tmp_path):
     process = python(tmp_path, 'print("hello")')
     process.start()
-    until(lambda: not process.running)
+    wait_until(lambda: not process.running)
     process.restart()
-    until(lambda: not process.running)
+    wait_until(lambda: not process.running)
     assert process.restarts == 1
     assert process.last_words().splitlines() == ['hello', '--- start number 2 ---', 'hello']
 
@@ -140,7 +132,7 @@ def test_environment_is_passed_on(tmp_path):
         '/node', [sys.executable, '-c', code], tmp_path / 'log', {'ROS_DOMAIN_ID': '44'}
     )
     process.start()
-    until(lambda: not process.running)
+    wait_until(lambda: not process.running)
     assert process.last_words() == '44'
 
 
@@ -159,13 +151,13 @@ def test_interrupt_ends_what_listens(tmp_path):
 
 def test_what_does_not_listen_is_told_again(tmp_path):
     process = started(python(tmp_path, IGNORE_INTERRUPT))
-    assert stop([process], [(signal.SIGINT, 0.05), (signal.SIGTERM, LIMIT)]) == []
+    assert stop([process], [(signal.SIGINT, 0.05), (signal.SIGTERM, PATIENCE)]) == []
     assert process.how_it_ended() == 'was killed by SIGTERM'
 
 
 def test_what_listens_to_nothing_is_killed(tmp_path):
     process = started(python(tmp_path, IGNORE_ALL))
-    ending = [(signal.SIGINT, 0.05), (signal.SIGTERM, 0.05), (signal.SIGKILL, LIMIT)]
+    ending = [(signal.SIGINT, 0.05), (signal.SIGTERM, 0.05), (signal.SIGKILL, PATIENCE)]
     assert stop([process], ending) == ['/node']
     assert process.how_it_ended() == 'was killed by SIGKILL'
 
@@ -173,7 +165,7 @@ def test_what_listens_to_nothing_is_killed(tmp_path):
 def test_stopping_what_has_ended_or_never_started_does_nothing(tmp_path):
     ended = python(tmp_path, '')
     ended.start()
-    until(lambda: not ended.running)
+    wait_until(lambda: not ended.running)
     assert stop([ended, python(tmp_path, '', '/other')]) == []
 
 
@@ -196,12 +188,12 @@ def test_nodes_do_not_outlive_a_killed_run(tmp_path, number):
         [sys.executable, '-u', '-c', code, str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
     pid = int(run.stdout.readline())
-    until(lambda: 'ready' in (tmp_path / 'log').read_text())
+    wait_until(lambda: 'ready' in (tmp_path / 'log').read_text())
     assert alive(pid)
     run.send_signal(number)
-    run.wait(LIMIT)
+    run.wait(PATIENCE)
     run.stdout.close()
-    until(lambda: not alive(pid))
+    wait_until(lambda: not alive(pid))
 
 
 def test_unknown_packages_and_executables_are_named(tmp_path, monkeypatch):

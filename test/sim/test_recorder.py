@@ -1,7 +1,5 @@
 """The recorder: what it writes down, and with which time."""
 
-import time
-
 import pytest
 import rclpy
 import yaml
@@ -9,6 +7,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from waiting import PATIENCE, wait_until
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs.msg import AgentState, LockstepStep
@@ -17,7 +16,6 @@ from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.run_record import RunEnd
 
-PATIENCE = 120.0
 RELIABLE = QoSProfile(
     history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE
 )
@@ -51,13 +49,13 @@ class Session:
         self.clock = self.node.create_publisher(Clock, '/clock', RELIABLE)
         self.odometry = self.node.create_publisher(Odometry, '/rover/odom', RELIABLE)
 
+    def turn(self):
+        self.recorder.discover()
+        self.recorder.wait(0.02)
+        self.recorder.drain()
+
     def until(self, condition):
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < end
-            self.recorder.discover()
-            self.recorder.wait(0.02)
-            self.recorder.drain()
+        wait_until(condition, self.turn)
 
     def connect(self):
         self.until(

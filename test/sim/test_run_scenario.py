@@ -1,11 +1,9 @@
 """Runs with nodes that play by a script: how they end, what they leave, who is blamed."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,6 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
+from waiting import wait_until
 
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.run_folder import make_folder
@@ -204,10 +203,7 @@ def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(
     with Bag(run.folder) as bag:
         assert bag.counts['/mambo/state'] > 0
     node.times.clear()
-    end = time.monotonic() + LIMIT
-    while len(node.times) < 20 and time.monotonic() < end:
-        executor.spin_once(timeout_sec=0.1)
-    assert len(node.times) >= 20
+    wait_until(lambda: len(node.times) >= 20, lambda: executor.spin_once(timeout_sec=0.1))
     assert len(run.nodes()) == 1
     node.destroy_node()
     code, output = run.wait()
@@ -350,10 +346,7 @@ def test_no_node_outlives_a_run_that_is_killed(tmp_path, scenario):
     assert len(run.nodes()) == 5
     run.process.kill()
     run.wait()
-    deadline = time.monotonic() + LIMIT
-    while run.nodes():
-        assert time.monotonic() < deadline
-        os.sched_yield()
+    wait_until(lambda: not run.nodes())
 
 
 def test_wrong_input_is_told_before_anything_starts(tmp_path, scenario):

@@ -20,6 +20,7 @@ from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from visualization_msgs.msg import Marker, MarkerArray
+from waiting import wait_until
 
 from maasi_drivers.links.mavlink.link import VehicleLink
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
@@ -191,11 +192,8 @@ class Team:
         for member in self.members:
             member.say_ready()
 
-    def spin_until(self, condition, limit=120.0):
-        end = time.monotonic() + limit
-        while not condition():
-            assert time.monotonic() < end, self.sim.status()
-            self.executor.spin_once(timeout_sec=0.1)
+    def spin_until(self, condition):
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.1), self.sim.status)
 
     def settle(self, seconds_=0.2):
         """Let all that is under way arrive."""
@@ -270,12 +268,12 @@ def test_its_diagnostics_are_stamped_with_the_time_that_it_publishes(make_team):
     team = make_team()
     team.filter.listen('/diagnostics', DiagnosticArray, 10)
     shown = team.filter.seen['/diagnostics']
-    team.spin_until(lambda: shown, 60.0)
+    team.spin_until(lambda: shown)
     assert seconds(shown[0].header.stamp) == 0.0
     team.say_ready()
     team.run(2)
     count = len(shown)
-    team.spin_until(lambda: len(shown) > count + 1, 60.0)
+    team.spin_until(lambda: len(shown) > count + 1)
     begun = seconds(team.filter.steps[-1].stamp)
     # The filter may not have been told of the last step.
     assert 0.0 < seconds(shown[-1].header.stamp) < begun + 1.5 * STEP
@@ -553,7 +551,7 @@ def test_a_linked_robot_is_where_its_autopilot_is(make_team, vehicle_link):
             return vehicle.flying
 
     # It lives before the time starts.
-    team.spin_until(flies, limit=60.0)
+    team.spin_until(flies)
     team.say_ready()
     drone = team.drivers['drone']
     team.spin_until(lambda: drone.of('ranges'))

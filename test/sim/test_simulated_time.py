@@ -10,6 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from test_life_cycle import in_graph, made_by
+from waiting import PATIENCE, wait_until
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.executor import executor_of
@@ -17,7 +18,6 @@ from maasi_filter.ros.qos import RELIABLE, UPDATES
 from maasi_msgs.msg import AgentState, BatchMember, FilterUpdate, MeasurementBatch, PlanDecision
 from maasi_sim.run.processes import Domain
 
-PATIENCE = 120.0
 SECOND = 1_000_000_000
 TIMEOUT = 0.3
 
@@ -56,10 +56,7 @@ class World(Node):
         self.until(lambda: self.tested.get_clock().now().nanoseconds == nanoseconds)
 
     def until(self, condition):
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < end
-            self.turn()
+        wait_until(condition, self.turn)
 
     def turn(self):
         self.own.spin_once(0.005)

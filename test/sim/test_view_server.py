@@ -6,6 +6,7 @@ import socket
 import time
 
 import pytest
+from waiting import wait_until
 
 from maasi_sim.view.event_log import STATE_PERIOD
 from maasi_sim.view.hub import Hub
@@ -138,11 +139,7 @@ def test_a_browser_that_reads_nothing_holds_up_nobody(hub, server):
     reader.until(50_000)
     for browser in (reader, stuck):
         browser.close()
-    deadline = time.monotonic() + PATIENCE
-    while server.browsers and time.monotonic() < deadline:
-        hub.put(state(1))
-        time.sleep(0.05)
-    assert server.browsers == 0
+    wait_until(lambda: hub.put(state(1)) or server.browsers == 0)
 
 
 def test_a_long_run_is_thinned_and_browsers_begin_anew():

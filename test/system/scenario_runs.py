@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 from report_check import check_report
+from waiting import wait_until
 
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.recording import plain
@@ -60,10 +61,7 @@ def run_scenario(scenario, folder, *options, environment=None):
 
 
 def wait_for(condition, what):
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, f'{what} within {PATIENCE:g} s'
-        time.sleep(0.05)
+    wait_until(condition, lambda: time.sleep(0.05), f'{what} within {PATIENCE:g} s', PATIENCE)
 
 
 def processes_with(text):

@@ -9,7 +9,6 @@ import os
 import resource
 import signal
 import subprocess
-import time
 
 import pytest
 import rclpy
@@ -20,6 +19,7 @@ from rclpy.node import Node
 from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
 from scenario_runs import PATIENCE, command, processes_with, wait_for
+from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_sim.run.bag import Bag
@@ -156,10 +156,8 @@ class Witness:
         self.time = max(self.time, stamp_from_ros(message.clock))
 
     def until(self, seconds):
-        deadline = time.monotonic() + PATIENCE
-        while self.time < seconds * 1e9:
-            assert time.monotonic() < deadline
-            self.executor.spin_once(timeout_sec=0.05)
+        executor, end = self.executor, seconds * 1e9
+        wait_until(lambda: self.time >= end, lambda: executor.spin_once(0.05), limit=PATIENCE)
 
     def close(self):
         self.executor.shutdown()

@@ -22,6 +22,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
+from waiting import wait_until
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'sim'))
 
@@ -41,7 +42,6 @@ from maasi_msgs.msg import (
 )
 from maasi_sim.run.processes import Domain
 
-PATIENCE = 120.0
 ROUNDS = 24
 # Of bad stamps per topic, at the end: the counters have to be exact.
 BAD_STAMPS = 3
@@ -100,14 +100,14 @@ class World:
         return (self.folder / f'{kind}.log').read_text()[-4000:]
 
     def until(self, condition, what):
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, what() if callable(what) else what
-            assert self.process.poll() is None, 'the nodes are gone'
-            ended = (self.folder / 'ended.txt').read_text().split('\n')[1:]
-            for line in filter(None, ended):
-                pytest.fail(f'{line}:\n{self.log(line.split()[0])}')
-            self.executor.spin_once(timeout_sec=0.05)
+        wait_until(condition, self.turn, what)
+
+    def turn(self):
+        assert self.process.poll() is None, 'the nodes are gone'
+        ended = (self.folder / 'ended.txt').read_text().split('\n')[1:]
+        for line in filter(None, ended):
+            pytest.fail(f'{line}:\n{self.log(line.split()[0])}')
+        self.executor.spin_once(timeout_sec=0.05)
 
     def namespace(self, kind):
         return self.names[kind].rpartition('/')[0]

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -13,11 +12,11 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from reserved_domain import reserved_domain
+from waiting import wait_until
 
 from maasi_filter.ros.qos import sensor_reader
 
 pytestmark = pytest.mark.system
-PATIENCE = 120.0
 ROBOTS = ('turtlebot', 'mambo')
 # A robot that has not moved further between odometry of this time stands [s, m].
 SPAN, STILL = 1.5, 0.04
@@ -46,10 +45,7 @@ class Watcher:
         self.path[name].append((stamp.sec + stamp.nanosec * 1e-9, point.x, point.y, point.z))
 
     def until(self, condition, what):
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < end, what
-            self.executor.spin_once(timeout_sec=0.05)
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.05), what)
 
     def moved(self, name, span):
         """Return how far a robot went in the last `span` seconds; None where not known."""

@@ -2,7 +2,6 @@
 
 import itertools
 import subprocess
-import time
 
 import pytest
 import rclpy
@@ -13,6 +12,7 @@ from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
 from scenario_runs import PATIENCE, Run, command, replay
 from std_srvs.srv import Trigger
+from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_sim.run.bag import Bag
@@ -72,10 +72,7 @@ class Operator:
                 return
 
     def until(self, condition, what):
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < end, what
-            self.executor.spin_once(timeout_sec=0.02)
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.02), what, PATIENCE)
 
     def close(self):
         self.executor.shutdown()

@@ -2,7 +2,6 @@
 
 import importlib
 import subprocess
-import time
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ import rclpy
 from browsers import CHROMIUM, chromium, needs_chromium
 from rclpy.executors import SingleThreadedExecutor
 from scenario_runs import PATIENCE, Run, command, of_topic
+from waiting import wait_until
 
 from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.bag import Bag, BagWriter, load_types
@@ -289,10 +289,7 @@ def test_the_view_node_shows_a_bag_that_is_played_and_begins_again_with_it(run, 
         executor.add_node(node)
 
         def spin_until(condition):
-            deadline = time.monotonic() + PATIENCE
-            while not condition():
-                assert time.monotonic() < deadline
-                executor.spin_once(0.05)
+            wait_until(condition, lambda: executor.spin_once(0.05), limit=PATIENCE)
 
         spin_until(lambda: all(item.get_subscription_count() for item in publishers.values()))
         whole = read_events(run.folder)
