@@ -20,7 +20,7 @@ from maasi_filter.ros.qos import SENSOR
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 
-DONE, FAILED, ABSENT = 0, 1, 2
+DONE, FAILED, ABSENT, INTERRUPTED = 0, 1, 2, 130
 _STATUS = {
     AgentState.IDLE: 'no goal',
     AgentState.MOVING: 'on the way',
@@ -39,7 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog='robot_command',
         description='Shows the state of a robot, or sends it to a waypoint in the map.',
         epilog='Ctrl-C cancels the goal. Exit codes: 0 done, 1 refused, given up or cancelled, '
-        '2 wrong arguments or no such driver.',
+        '2 wrong arguments or no such driver, 130 interrupted before.',
     )
     parser.add_argument('robot', help='its name, with the namespace of its team if it has one')
     parser.add_argument(
@@ -82,14 +82,29 @@ class _User:
         self._top = '/' + options.robot.strip('/')
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
+        self._interrupted = False
+        signal.signal(signal.SIGINT, self._interrupt)
 
-    def _wait(self, condition: Callable[[], object], timeout: float = math.inf) -> bool:
+    def _interrupt(self, *_: object) -> None:
+        self._interrupted = True
+
+    def _wait(
+        self, condition: Callable[[], object], timeout: float = math.inf, *, patient: bool = False
+    ) -> bool:
+        """Return whether a condition came true before the timeout, and, if not patient, Ctrl-C."""
         end = time.monotonic() + timeout
         while not condition():
-            if time.monotonic() > end:
+            if time.monotonic() > end or (self._interrupted and not patient):
                 return False
             self._executor.spin_once(timeout_sec=0.05)
         return True
+
+    def _missed(self, what: str) -> int:
+        """Return the exit code where something did not come, and say so after the timeout."""
+        if self._interrupted:
+            return INTERRUPTED
+        print(f'{what} for {self._options.timeout:g} s: is its driver there?')
+        return ABSENT
 
     def show(self) -> int:
         """Print the next state."""
@@ -97,8 +112,7 @@ class _User:
         topic = f'{self._top}/state'
         self._node.create_subscription(AgentState, topic, heard.append, SENSOR)
         if not self._wait(lambda: heard, self._options.timeout):
-            print(f'nothing on {topic} for {self._options.timeout:g} s: is its driver there?')
-            return ABSENT
+            return self._missed(f'nothing on {topic}')
         print(describe(heard[-1]))
         return DONE
 
@@ -107,37 +121,28 @@ class _User:
         topic = f'{self._top}/go_to'
         client = ActionClient(self._node, GoToWaypoint, topic)
         if not self._wait(client.server_is_ready, self._options.timeout):
-            print(f'no {topic} for {self._options.timeout:g} s: is its driver there?')
-            return ABSENT
+            return self._missed(f'no {topic}')
         goal = GoToWaypoint.Goal(goal_id=1)
         goal.waypoint.header.frame_id = 'map'
         position = goal.waypoint.pose.position
         position.x, position.y, position.z = self._options.x, self._options.y, self._options.z
         goal.waypoint.pose.orientation.w = 1.0
         answer = client.send_goal_async(goal)
-        handle = result = None
-        try:
-            self._wait(answer.done)
-            handle = answer.result()
-            if handle is None or not handle.accepted:
-                print('refused: the log of its driver says why')
-                return FAILED
-            result = handle.get_result_async()
-            self._wait(result.done)
-        except KeyboardInterrupt:
-            self._cancel(answer, handle)
-            if result is None or not self._wait(result.done, _CANCEL_TIME):
+        # After an interrupt too: only a goal whose answer is known can be cancelled.
+        if not (self._wait(answer.done) or self._wait(answer.done, _CANCEL_TIME, patient=True)):
+            print('interrupted; nothing was heard of the goal')
+            return FAILED
+        handle = answer.result()
+        if handle is None or not handle.accepted:
+            print('refused: the log of its driver says why')
+            return FAILED
+        result = handle.get_result_async()
+        if not self._wait(result.done):
+            handle.cancel_goal_async()
+            if not self._wait(result.done, _CANCEL_TIME, patient=True):
                 print('cancelled; nothing was heard of its end')
                 return FAILED
-        assert result is not None
         return self._conclude(result.result())
-
-    def _cancel(self, answer: Any, handle: Any) -> None:
-        """Cancel a goal, also one whose answer has not come yet."""
-        if handle is None and self._wait(answer.done, _CANCEL_TIME):
-            handle = answer.result()
-        if handle is not None and handle.accepted:
-            handle.cancel_goal_async()
 
     @staticmethod
     def _conclude(answer: Any) -> int:
@@ -154,7 +159,6 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line."""
     options = build_parser().parse_args(arguments)
     # Ctrl-C cancels the goal before the context ends.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node('robot_command', use_global_arguments=False)
     try:

@@ -7,7 +7,7 @@ import sys
 import pytest
 from driven_team import driven
 
-from maasi_drivers.robot_command import DONE, FAILED, build_parser
+from maasi_drivers.robot_command import DONE, FAILED, INTERRUPTED, build_parser
 
 
 @pytest.fixture
@@ -56,6 +56,15 @@ def test_a_robot_is_shown_sent_and_stopped_again(world):
     code, said = ended(world, process)
     assert code == FAILED and 'not reached: cancelled' in said, said
     world.until(lambda: not a.moves, 'it goes on')
+
+
+@pytest.mark.parametrize('words', [['state'], ['go', '1', '2']])
+def test_interrupted_before_there_is_a_driver_it_ends_at_once(world, words):
+    process = started(world, '--timeout', '1000', 'nobody', *words)
+    # A node of it is in the graph: it waits.
+    world.until(lambda: 'robot_command' in world.node.get_node_names(), 'it does not start')
+    process.send_signal(signal.SIGINT)
+    assert ended(world, process) == (INTERRUPTED, '')
 
 
 @pytest.mark.parametrize('words', [[], ['a'], ['a', 'go'], ['a', 'go', '1', 'nan'], ['a', 'fly']])
