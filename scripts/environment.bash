@@ -5,10 +5,13 @@
 
 maasi_root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 maasi_workspace="${MAASI_WORKSPACE:-$maasi_root/.workspace}"
+case "$maasi_workspace" in /*) ;; *) maasi_workspace="$PWD/$maasi_workspace" ;; esac
 maasi_venv="$maasi_workspace/venv"
 
 maasi_fail() {
-  printf 'error: %s\n' "$@" >&2
+  printf 'error: %s\n' "$1" >&2
+  shift
+  [ $# = 0 ] || printf '  %s\n' "$@" >&2
   exit 2
 }
 
@@ -144,7 +147,9 @@ maasi_compile() {
 maasi_set_up() (
   set +e
   local python="$1" mode="$2" key compiling='' kernels
-  mkdir -p "$maasi_workspace"
+  if ! mkdir -p "$maasi_workspace" 2> /dev/null || ! [ -w "$maasi_workspace" ]; then
+    maasi_fail "cannot write to $maasi_workspace" 'name a folder for it: MAASI_WORKSPACE=FOLDER'
+  fi
   exec {maasi_lock}> "$maasi_workspace/lock"
   flock "$maasi_lock"
   key="$( (cat "$maasi_root"/requirements.txt "$maasi_root"/requirements-build.txt \

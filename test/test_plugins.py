@@ -117,7 +117,7 @@ def test_planner_beside_the_scenario(folder):
     own = search(scenario, 1, most_measurements=5, planner='second:Second')
     assert 'next' in own.decisions[0].robots['rover'].reason
     assert search(scenario, 1, most_measurements=5, planner=sys.modules['second'].Second).decisions
-    with pytest.raises(ValueError, match="unknown planner 'third'"):
+    with pytest.raises(ValueError, match=r"^planner: unknown planner 'third'"):
         search(scenario, 1, planner='third')
 
 

@@ -53,6 +53,21 @@ def test_shell_finds_executables_by_their_names(tmp_path: Path) -> None:
     assert 'measurement_batch' in result.stdout
 
 
+def test_a_node_whose_parameter_file_is_missing_ends_with_wrong_input(tmp_path: Path) -> None:
+    node = [ROOT / 'scripts' / 'shell', 'filter_node', '--ros-args', '--params-file', 'none.yaml']
+    result = call(*node, folder=tmp_path)
+    assert result.returncode == 2
+    line = result.stderr.splitlines()[-1]
+    assert line.startswith('error: ') and 'none.yaml' in line
+    assert 'Traceback' not in result.stderr
+
+
+def test_the_help_of_a_node_may_be_cut(tmp_path: Path) -> None:
+    help_of_node = f'{ROOT}/scripts/shell filter_node --help | true; echo ${{PIPESTATUS[0]}}'
+    result = call('bash', '-c', help_of_node, folder=tmp_path)
+    assert (result.stdout, result.stderr) == ('0\n', '')
+
+
 def test_an_interactive_shell_survives_an_environment_that_cannot_be_set_up() -> None:
     commands = f'source {ENVIRONMENT}; echo "status $?"'
     result = call('bash', '--norc', '-ic', commands, PYTHON='no_such_python')
@@ -66,6 +81,15 @@ def test_a_script_ends_where_the_environment_cannot_be_set_up() -> None:
     assert 'PYTHON=no_such_python' in result.stderr
 
 
+def test_a_workspace_that_cannot_be_written_is_named_in_one_line() -> None:
+    result = call(ROOT / 'scripts' / 'demo', MAASI_WORKSPACE='/proc/workspace')
+    assert (result.returncode, result.stdout) == (2, '')
+    assert result.stderr.splitlines() == [
+        'error: cannot write to /proc/workspace',
+        '  name a folder for it: MAASI_WORKSPACE=FOLDER',
+    ]
+
+
 def test_no_compiled_module_is_left_in_the_repository() -> None:
     before = set(ROOT.glob('maasi_*/**/*.pyc'))
     result = call(ROOT / 'scripts' / 'python', '-c', 'import maasi_sim.search')
@@ -73,8 +97,8 @@ def test_no_compiled_module_is_left_in_the_repository() -> None:
     assert set(ROOT.glob('maasi_*/**/*.pyc')) <= before
 
 
-@pytest.mark.parametrize('name', ['demo', 'test'])
+@pytest.mark.parametrize('name', ['colcon_test', 'demo', 'docs', 'shell', 'test'])
 def test_help_says_what_a_command_is_before_anything_is_set_up(name: str) -> None:
     result = call(ROOT / 'scripts' / name, '--help', PYTHON='no_such_python')
     assert result.returncode == 0
-    assert result.stdout.startswith(f'usage: {name} [')
+    assert result.stdout.startswith(f'usage: {name}')

@@ -11,6 +11,9 @@ import signal
 import sys
 from typing import Any
 
+# What the commands import at once, and only extras require.
+_OF_EXTRAS = ('distributed', 'matplotlib', 'rich', 'setproctitle')
+
 
 class _Script:
     """Runs `main` of a module; each attribute is the script of a module inside it."""
@@ -28,14 +31,16 @@ class _Script:
         try:
             return importlib.import_module(self._module).main()
         except ModuleNotFoundError as error:
-            if not _is_of_ros(error.name or ''):
+            missing = error.name or ''
+            if _is_of_ros(missing):
+                needed = 'it needs ROS 2 Jazzy and maasi_msgs, built and sourced'
+            elif missing.partition('.')[0] in _OF_EXTRAS:
+                needed = 'it comes with an extra of the package'
+            else:
                 raise
             name = self._module.rpartition('.')[2]
-            print(
-                f'error: {name}: no module {error.name}: it needs ROS 2 Jazzy and maasi_msgs, '
-                'built and sourced (docs/install.md)',
-                file=sys.stderr,
-            )
+            text = f'error: {name}: no module {missing}: {needed} (docs/install.md)'
+            print(text, file=sys.stderr)
             return 2
 
 

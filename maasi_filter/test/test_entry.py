@@ -18,3 +18,18 @@ def test_a_script_runs_main_of_its_module(monkeypatch):
 @pytest.mark.parametrize('name', ['generate_test_description', 'pytestmark', '__path__of'])
 def test_what_is_no_package_of_ours_is_no_script(name):
     assert not hasattr(maasi_entry, name)
+
+
+def test_what_an_extra_brings_is_named_where_it_is_missing(monkeypatch, capsys):
+    from maasi_filter import filter_node
+
+    def main():
+        raise ModuleNotFoundError("No module named 'rich'", name='rich')
+
+    monkeypatch.setattr(signal, 'signal', lambda *_: None)
+    monkeypatch.setattr(filter_node, 'main', main)
+    assert maasi_entry.maasi_filter.filter_node() == 2
+    assert capsys.readouterr().err == (
+        'error: filter_node: no module rich: it comes with an extra of the package '
+        '(docs/install.md)\n'
+    )

@@ -21,6 +21,12 @@ def load_mission(
     path = find_scenario(path)
     layer = read_scenario(path)
     if is_cuboid_scenario(layer):
+        for origin, (key, value) in (overrides or {}).items():
+            if key == ('planner', 'name') and value != NAME:
+                raise ScenarioError(
+                    f"{origin}: read '{value}'; {path} is a search of buildings, for which only "
+                    f"'{NAME}' is allowed"
+                )
         return BuildingMission(path.stem, check_cuboid_scenario(layer, overrides))
     for origin, given in (overrides or {}).items():
         if given == (('planner', 'name'), NAME):

@@ -9,6 +9,7 @@ from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.agent.sensor_reading import SensorReading
@@ -235,7 +236,13 @@ def search(
     if isinstance(planner, type):
         planner = f'{planner.__module__}:{planner.__qualname__}'
     if isinstance(planner, str):
-        scenario = scenario.model_copy(update={'planner': scenario.planner.renamed(planner)})
+        try:
+            renamed = scenario.planner.renamed(planner)
+        except ValidationError as error:
+            # One line, without the type of error and the address that pydantic adds.
+            reasons = [item.get('ctx', {}).get('error', item['msg']) for item in error.errors()]
+            raise ValueError('planner: ' + '; '.join(map(str, reasons))) from None
+        scenario = scenario.model_copy(update={'planner': renamed})
         planner = None
     running = _Search(scenario, seed, planner)
     feed = open_view(running.trace) if view else None

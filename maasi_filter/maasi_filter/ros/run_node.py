@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -31,6 +32,13 @@ def _configure(node: LockstepLifecycleNode[Any]) -> bool:
     return done
 
 
+def _print_help(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:  # `--help | head`; Python writes the rest when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def run(
     make_node: Callable[[], LockstepLifecycleNode[Any]],
     arguments: list[str] | None = None,
@@ -51,7 +59,7 @@ def run(
     """
     if {'-h', '--help'} & set(sys.argv[1:] if arguments is None else arguments):
         explained = kind or (make_node if isinstance(make_node, type) else LockstepLifecycleNode)
-        print(node_help(explained, Path(sys.argv[0]).name, LockstepLifecycleNode))
+        _print_help(node_help(explained, Path(sys.argv[0]).name, LockstepLifecycleNode))
         return 0
     # The handler only sets a flag: an exception raised inside a call into rclpy's C++ surfaces as
     # a different one. A second signal raises at once.
@@ -67,7 +75,11 @@ def run(
     try:
         signal.signal(signal.SIGINT, interrupt)
         signal.signal(signal.SIGTERM, interrupt)
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        except RuntimeError as error:  # a parameter file or an argument that rcl cannot read
+            print(f'error: {str(error).partition(", at ")[0]}', file=sys.stderr)
+            return 2
         node = make_node()
         executor = executor_of(node)
         if node.get_parameter('autostart').value and not asked:

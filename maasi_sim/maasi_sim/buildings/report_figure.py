@@ -14,6 +14,7 @@ from maasi_sim.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours
 from maasi_sim.buildings.report import build_cuboid_report
 from maasi_sim.run.report_files import END_REASONS
 from maasi_sim.run.report_panels import (
+    MARGIN,
     View,
     add_legend,
     draw_start_and_end,
@@ -96,7 +97,7 @@ def _draw_visited(axes: Axes, record: CuboidRecord) -> None:
 
 def _draw_active(axes: Axes, record: CuboidRecord) -> None:
     axes.step(record.active[:, 0], record.active[:, 1], where='post', color='#009E73', lw=2.0)
-    axes.set_xlim(0.0, max(record.end_time, 1e-9))
+    axes.set_xlim(0.0, MARGIN * max(record.end_time, 1e-9))
     axes.set_ylim(0.0, len(record.scenario.robots) + 0.5)
     axes.set_ylabel('robots that search')
 

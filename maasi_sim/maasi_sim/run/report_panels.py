@@ -24,6 +24,8 @@ FloatArray = NDArray[np.float64]
 # Palette for colour-blind readers (Okabe and Ito).
 COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')
 PALE, GRID, UNSEEN = '#9A9A9A', '#E6E6E6', '#CFCFCF'
+# Of axes to the right of the last value, or a step at the end cannot be seen.
+MARGIN = 1.015
 _NAMES = 'xyz'
 # A side view is at least this share of the size of the view from above.
 _THINNEST = 0.22
@@ -141,9 +143,9 @@ def finish_figure(
     over, times = panels.plots[:2]
     over.sharex(times)
     over.tick_params(labelbottom=False)
-    over.set_title(heading, fontsize=11)
+    over.set_title(heading, fontsize=11, loc='left')
     _draw_times(times, colours, record.end_time)
-    times.set_xlim(0.0, max(record.end_time, 1e-9))
+    times.set_xlim(0.0, MARGIN * max(record.end_time, 1e-9))
     _write_rows(panels.plots[-1], rows)
     panels.figure.suptitle(title(record), fontsize=13, fontweight='bold')
     return panels.figure

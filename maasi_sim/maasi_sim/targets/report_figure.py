@@ -16,6 +16,7 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import END_REASONS
 from maasi_sim.run.report_panels import (
     COLOURS,
+    MARGIN,
     PALE,
     UNSEEN,
     View,
@@ -199,11 +200,21 @@ def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
         axes.step(places, every, where='post', color=_FALSE, lw=1.0, label='with false ones')
     axes.step(places, right, where='post', color=_FOUND, lw=2.0, label='found')
     axes.axhline(len(record.truth), color=_TRUE, lw=1.0, ls='--', label='true targets')
-    axes.set_xlim(0.0, max(places[-1], 1.0))
+    axes.set_xlim(0.0, MARGIN * max(places[-1], 1.0))
     axes.set_ylim(0.0, max(len(record.truth), max(every), 1) * 1.08)
     axes.set_ylabel('targets')
     if by_time:
-        axes.legend(loc='lower right', fontsize=8.5, frameon=False)
+        # Beside the title: inside, it would hide one curve or the other.
+        axes.legend(
+            loc='lower right',
+            bbox_to_anchor=(1.0, 1.0),
+            ncol=3,
+            columnspacing=1.2,
+            handlelength=1.6,
+            fontsize=8.5,
+            borderaxespad=0.1,
+            frameon=False,
+        )
 
 
 def _rows(record: TargetRecord) -> list[tuple[str, str]]:
