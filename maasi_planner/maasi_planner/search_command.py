@@ -9,11 +9,12 @@ from typing import Any
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from maasi_planner.search_control.search_modes import COMMANDS
 
-DONE, REFUSED, ABSENT = 0, 1, 2
+DONE, REFUSED, ABSENT, INTERRUPTED = 0, 1, 2, 130
 # Commands that only drivers have.
 _OF_DRIVERS = ('release', 'arm')
 _TRIGGER = 'std_srvs/srv/Trigger'
@@ -28,7 +29,7 @@ def build_parser() -> argparse.ArgumentParser:
         description='Calls the planner; stop, release and arm reach the drivers themselves, so '
         'that they work without a planner.',
         epilog='Exit codes: 0 all followed, 1 one refused or did not answer, 2 wrong arguments '
-        'or no such service.',
+        'or no such service, 130 interrupted.',
     )
     parser.add_argument('command', choices=[*COMMANDS, *_OF_DRIVERS])
     parser.add_argument('--robot', metavar='NAME', help='one robot instead of the team')
@@ -106,10 +107,12 @@ def call_all(node: Node, options: argparse.Namespace) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line."""
     options = build_parser().parse_args(arguments)
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node('search_command', use_global_arguments=False)
     try:
         answers = call_all(node, options)
+    except KeyboardInterrupt:
+        return INTERRUPTED
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
 from maasi_filter.metrics import match_targets, normalised_error, restricted_mean
+from maasi_sim.experiments.execution import run_command
 from maasi_sim.experiments.statistics import paired_difference
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
@@ -247,7 +249,9 @@ def main(arguments: list[str] | None = None) -> int:
     kept = runs_in(options.json)
     print(HEAD, flush=True)
     begin = time.perf_counter()
-    with ProcessPoolExecutor(max(options.jobs, 1)) as pool:
+    # An interrupt is for the parent: it ends the pool.
+    ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    with ProcessPoolExecutor(max(options.jobs, 1), initializer=ignore) as pool:
         for condition in wanted:
             done: dict[str, list[Run]] = {}
             for method in options.method:
@@ -269,4 +273,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == '__main__':
-    raise SystemExit(main())
+    raise SystemExit(run_command(main))

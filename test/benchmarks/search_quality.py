@@ -20,7 +20,7 @@ from maasi_sim.experiments.campaign import plan
 from maasi_sim.experiments.cases import Case
 from maasi_sim.experiments.comparison import SearchComparison, search_settings
 from maasi_sim.experiments.comparison_tables import markdown
-from maasi_sim.experiments.execution import carry_out_all
+from maasi_sim.experiments.execution import carry_out_all, run_command
 from maasi_sim.experiments.experiment import Results
 
 # What differences are to.
@@ -97,4 +97,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_command(main))

@@ -21,7 +21,7 @@ from maasi_sim.chaos.cases import Case, all_cases
 from maasi_sim.chaos.execution import execute
 from maasi_sim.chaos.verdict import judge
 
-PASSED, FAILED, WRONG_INPUT = 0, 1, 2
+PASSED, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 _SEED = 1
 _GOLDEN = 0.6180339887498949
 
@@ -48,7 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog='chaos',
         description='Run scenarios in which nodes are killed or hang, and check the results: '
         'exit code, robots at rest, found targets, recording, report, processes.',
-        epilog='Exit codes: 0 all cases passed, 1 some did not, 2 wrong input.',
+        epilog='Exit codes: 0 all cases passed, 1 some did not, 2 wrong input, 130 interrupted.',
     )
     parser.add_argument('--list', action='store_true', help='list all cases and exit')
     parser.add_argument('--case', nargs='+', metavar='NAME', help='only these; * is a wildcard')
@@ -176,7 +176,13 @@ def main(arguments: list[str] | None = None) -> int:
         return PASSED
     with tempfile.TemporaryDirectory(prefix='maasi_chaos_') as temporary:
         folder = Path(temporary) if options.out is None else options.out.resolve()
-        results = run_all(cases, folder, options.seed, options.jobs, options.budget, options.json)
+        try:
+            results = run_all(
+                cases, folder, options.seed, options.jobs, options.budget, options.json
+            )
+        except KeyboardInterrupt:
+            print('error: interrupted', file=sys.stderr)
+            return INTERRUPTED
     passed = sum(item.passed for item in results)
     left_out = len(cases) - len(results)
     print(
