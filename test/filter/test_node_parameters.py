@@ -61,8 +61,8 @@ def make(context):
 def process(domain, tmp_path):
     running = []
 
-    def start(content=None):
-        command = [sys.executable, '-m', 'maasi_filter.filter_node', '--ros-args']
+    def start(content=None, before=()):
+        command = [*before, sys.executable, '-m', 'maasi_filter.filter_node', '--ros-args']
         if content is not None:
             file = tmp_path / f'parameters{len(running)}.yaml'
             file.write_text(yaml.safe_dump(content))
@@ -208,3 +208,13 @@ def test_wrong_parameters_are_named_with_what_was_read(process):
     assert 'parameter step: Input should be greater than 0, read -0.5' in said
     assert 'parameter filter.particles: ' in said and "read 'many'" in said
     assert 'Traceback' not in said
+
+
+def test_a_node_started_alone_says_that_the_loopback_interface_is_down(process):
+    # A network namespace of its own has a loopback interface that is down.
+    alone = ['unshare', '--map-root-user', '--net']
+    if subprocess.run([*alone, 'true'], capture_output=True).returncode:
+        pytest.skip('no network namespaces here')
+    node = process({'/**': {'ros__parameters': flatten(SETTINGS)}}, alone)
+    said = iter(node.stderr.readline, '')
+    assert any('the loopback interface cannot be used' in line for line in said)

@@ -20,6 +20,7 @@ from rclpy.subscription import Subscription
 from maasi_filter.ros.bad_requests import survive_bad_requests
 from maasi_filter.ros.clock_watch import ClockWatch
 from maasi_filter.ros.diagnostics import key_values, level_of
+from maasi_filter.ros.loopback import loopback_fault
 from maasi_filter.ros.node_entities import NodeEntities
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.ros.qos import LATCHED, RELIABLE
@@ -289,8 +290,11 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         """Name, once after activation, the topics that nobody publishes."""
         self._end_notice_timer()
         missing = unpublished_topics(self)
-        if self.active and missing:
-            self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
+        if not self.active or not missing:
+            return
+        self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
+        if fault := loopback_fault():
+            self.get_logger().warning(fault)
 
     def on_ready(self) -> None:
         """Handle that all peers are present."""

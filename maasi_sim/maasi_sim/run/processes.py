@@ -7,7 +7,6 @@ import ctypes
 import fcntl
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from typing import Any, BinaryIO, NoReturn
 
 from setproctitle import setproctitle
 
+from maasi_filter.ros.loopback import loopback_fault
 from maasi_sim.run.shared_memory import LONGEST_CREATION, remove_dead_ports
 
 # Domains whose ports lie below the ephemeral ports of Linux (from 32768).
@@ -64,7 +64,8 @@ class Domain:
         team: str = '',
         shared: bool = False,
     ) -> None:
-        _check_loopback()
+        if fault := loopback_fault():
+            raise ProcessError(fault)
         # A run that was killed while starting leaves recent ports.
         remove_dead_ports(patience=LONGEST_CREATION + 1.0)
         self._folder = folder or Path('/tmp/maasi_domains')
@@ -140,17 +141,6 @@ class Domain:
     def __exit__(self, *_: object) -> None:
         """Release it."""
         self.release()
-
-
-def _check_loopback() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(('127.0.0.1', _FIRST_PORT))
-        except OSError as error:
-            raise ProcessError(
-                f'the loopback interface cannot be used ({error.strerror}), and nodes talk '
-                'through it: sudo ip link set lo up'
-            ) from None
 
 
 def _port_used(port: int) -> bool:
