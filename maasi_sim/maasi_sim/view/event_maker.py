@@ -108,7 +108,8 @@ class EventMaker:
             self._listener(event)
 
     def _place(self, position: ArrayLike) -> list[float]:
-        return [round(float(value), self._digits) for value in padded(position)]
+        place = [round(float(value), self._digits) for value in np.ravel(position)]
+        return [*place, 0.0, 0.0][:3]
 
     def robot(
         self,

@@ -6,6 +6,7 @@ so that recordings of `ros2 bag record -a` and teams in a namespace are read as 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -132,17 +133,17 @@ class MessageEvents:
     def _take_state(self, topic: str, message: Any) -> None:
         pose = message.pose.pose
         turn = pose.orientation
-        yaw = np.arctan2(
+        yaw = math.atan2(
             2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
         )
-        place = (pose.position.x, pose.position.y, pose.position.z, float(yaw))
-        if np.isfinite(place).all():
+        place = (*_point(pose.position), yaw)
+        if all(map(math.isfinite, place)):
             time = self._now(topic, message)
             self.maker.robot(
                 time,
                 message.robot,
                 place,
-                message.battery if np.isfinite(message.battery) else -1.0,
+                message.battery if math.isfinite(message.battery) else -1.0,
                 message.goal_status,
                 message.reason,
             )
