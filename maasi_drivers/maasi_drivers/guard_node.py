@@ -17,7 +17,8 @@ from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1
-# Between two checks of the subscriptions: zeros must not wait for the discovery of a publisher [s].
+# Between two checks of the subscriptions, as zeros must not wait for the discovery of a publisher,
+# and between two requests to cancel the goals of Nav2 [s].
 _REFRESH_PERIOD = 0.5
 
 
@@ -35,7 +36,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
     Publishes
     ---------
     `cmd_vel` (geometry_msgs/TwistStamped or Twist), 10 times a second from the loss of liveliness
-    until it is back
+    until it is back; nothing before it has heard a driver
 
     Calls
     -----
@@ -45,6 +46,8 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
     def __init__(self, **options: Any) -> None:
         super().__init__('guard', GuardSettings, in_robot=True, lockstep_member=False, **options)
         self._last = b''
+        # Whether there was a driver, and is none any more.
+        self._lost = False
         self._stop_timer: Any = None
 
     def set_up(self) -> None:
@@ -53,7 +56,7 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             self, 'cmd_vel', self.settings.command_type, self.settings.lockstep
         )
         self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
-        self.create_wall_timer(_REFRESH_PERIOD, self._publisher.refresh)
+        self.create_wall_timer(_REFRESH_PERIOD, self._refresh)
         lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
         quality = liveliness_reader(lease)
         # Of the messages only the last one is used, and only once no other comes.
@@ -66,34 +69,48 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
             event_callbacks=SubscriptionEventCallbacks(liveliness=self._on_liveliness),
         )
 
+    def start(self) -> None:
+        """Stop the robot of a driver that was lost before."""
+        if self._lost:
+            self._begin_stop()
+
     def tear_down(self) -> None:
         """Disconnect."""
         self._end_stop()
-        self._last = b''
+        self._last, self._lost = b'', False
 
     def halt(self) -> None:
         """Stop publishing."""
         self._end_stop()
 
     def status(self) -> dict[str, Any]:
-        """Return whether the robot is being stopped."""
-        return {'stopping': self._stop_timer is not None}
+        """Return whether the driver was lost, and whether the robot is being stopped."""
+        return {'driver lost': self._lost, 'stopping': self._stop_timer is not None}
 
     def _on_state(self, message: bytes) -> None:
         self._last = message
 
     def _on_liveliness(self, event: Any) -> None:
-        if event.alive_count > 0:
+        self._lost = event.alive_count == 0
+        if not self._lost:
             if self._stop_timer is not None:
                 self.get_logger().info('the driver is back')
             self._end_stop()
         elif self.active and self._stop_timer is None:
-            self.get_logger().warning('the driver is dead or hangs: zeros on cmd_vel')
-            self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._command_zeros)
-            if self._nav2.service_is_ready():
-                # Without an id: all its goals.
-                self._nav2.call_async(CancelGoal.Request())
-            self._command_zeros()
+            self._begin_stop()
+
+    def _begin_stop(self) -> None:
+        self.get_logger().warning('the driver is dead or hangs: zeros on cmd_vel')
+        self._stop_timer = self.create_wall_timer(_STOP_PERIOD, self._command_zeros)
+        self._refresh()
+        self._command_zeros()
+
+    def _refresh(self) -> None:
+        self._publisher.refresh()
+        # Repeated: Nav2 may have been about to accept the driver's last goal.
+        if self._stop_timer is not None and self._nav2.service_is_ready():
+            # Without an id: all its goals.
+            self._nav2.call_async(CancelGoal.Request())
 
     def _end_stop(self) -> None:
         if self._stop_timer is not None:

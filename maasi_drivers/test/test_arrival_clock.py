@@ -36,3 +36,11 @@ def test_a_time_that_slows_down_is_followed():
     assert 0 < clock.stamp(7.98) - (1_000_000_000 + 3_990_000_000) <= 1_020_000_000
     clock.observe(8.1, 0)
     assert clock.stamp(8.1) is None
+
+
+def test_a_jump_back_is_followed_at_once():
+    clock = ArrivalClock()
+    for tick in range(100):
+        clock.observe(0.02 * tick, 50_000_000_000 + 20_000_000 * tick)
+    clock.observe(2.0, 1_000_000_000)
+    assert clock.stamp(2.0) == 1_000_000_000

@@ -218,7 +218,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         try:
             self.filter.save(self.settings.save_file)
         except OSError as error:
-            # The search is worth more than its copy.
+            # A search must not fail because its copy cannot be written.
             self.get_logger().error(f'{self.settings.save_file}: state not saved: {error.strerror}')
 
     def reset(self) -> None:
@@ -352,7 +352,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         try:
             memory.save(self.filter, progress)
         except OSError as error:
-            # The search is worth more than its copy.
+            # A search must not fail because its copy cannot be written.
             self.warn_throttled('state', f'{memory.path}: state not saved: {error.strerror}')
 
     def _on_kept(self, message: FoundTargetArray) -> None:

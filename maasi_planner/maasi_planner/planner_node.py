@@ -38,8 +38,9 @@ from maasi_planner.search_control.team_goals import HeardState
 FloatArray = NDArray[np.float64]
 
 _CHECK_PERIOD = 0.1
-# At shutdown: executor rounds for sending results.
-_LAST_TASKS = 5
+# At shutdown: longest wait for answers to goals, which are then cancelled [s], and executor rounds
+# for sending results.
+_ANSWERS, _LAST_TASKS = 0.5, 5
 # Period of republishing a batch without an update [s].
 _ANSWER_PATIENCE = 1.0
 
@@ -158,6 +159,9 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         """Send the result of the search to its client, and shut down."""
         self.active = False
         if self.configured and self.executor is not None:
+            deadline = time.monotonic() + _ANSWERS
+            while self._goals.waiting and time.monotonic() < deadline:
+                self.executor.spin_once(0.01)
             for _ in range(_LAST_TASKS):
                 self.executor.spin_once(timeout_sec=0.0)
         super().destroy_node()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,6 @@ from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion.base import MotionModel, RobotState, Trajectories
 from maasi_planner.obstacles import Obstacles
-
-if TYPE_CHECKING:
-    from maasi_filter.records import FoundTarget
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -83,8 +79,6 @@ class TeamView:
         Potential targets now.
     exploration : UnexploredMap
         e after the last measurements.
-    found_targets : sequence
-        Not used by the objective; for planners that avoid them.
     obstacles : Obstacles, optional
         In true size, not inflated.
     particles, weights : (n, d), (n,) arrays, optional
@@ -98,7 +92,6 @@ class TeamView:
     robots: dict[str, RobotView]
     clusters: list[Cluster]
     exploration: UnexploredMap
-    found_targets: Sequence[FoundTarget] = ()
     obstacles: Obstacles | None = None
     particles: FloatArray | None = None
     weights: FloatArray | None = None

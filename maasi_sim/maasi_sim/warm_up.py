@@ -72,7 +72,7 @@ def prepare_copies() -> None:
     # and for its first log message.
     PLANNERS.names()
     inspect.getmodule(inspect.currentframe())
-    # What is there now stays: copies of this process share it.
+    # Exclude what exists now from garbage collection: forked processes share its memory.
     gc.collect()
     gc.freeze()
 

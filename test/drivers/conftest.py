@@ -7,11 +7,13 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 from marker_view import sees_whole
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import KINDS, TURTLEBOT, Team, parameters_of
 
@@ -166,6 +168,18 @@ def hard_score() -> Callable[[str, int, int], Score]:
         return score(MarkerDetector(settings), sequence(settings, hard_floor(seed), seed, frames))
 
     return run
+
+
+@pytest.fixture
+def set_back(monkeypatch):
+    """Return a function that sets the clock of a node back by a time [s]."""
+
+    def change(node, seconds):
+        clock, behind = node.get_clock(), Duration(seconds=seconds)
+        late = SimpleNamespace(now=lambda: clock.now() - behind)
+        monkeypatch.setattr(node, 'get_clock', lambda: late)
+
+    return change
 
 
 @pytest.fixture

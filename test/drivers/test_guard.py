@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from action_msgs.srv import CancelGoal
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import KINDS, Team, numbers, start_guard
 
@@ -64,6 +65,12 @@ def test_a_driver_that_hangs_leaves_zeros(guarded):
     team.until(lambda: len(team.commands) >= known + 3)
     assert not np.any([numbers(item) for item in team.commands[known:]])
     assert driver.poll() is None
+    # Nav2 is told as well, also one that is found only now.
+    asked = []
+    name = 'navigate_to_pose/_action/cancel_goal'
+    team.create_service(CancelGoal, name, lambda request, answer: asked.append(request) or answer)
+    team.until(lambda: asked, 'the goals of Nav2 are not cancelled')
+    assert asked[0] == CancelGoal.Request()
     # The last command stays; one that is not active publishes nothing.
     assert guard.trigger_deactivate().name == 'SUCCESS'
     assert not guard.active and not guard.status()['stopping']

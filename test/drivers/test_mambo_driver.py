@@ -314,6 +314,18 @@ def test_what_is_lost_has_it_hover_then_land(fly, fault, reason):
     assert flight.fake.firmware.take_offs == 1
 
 
+def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
+    flight = fly()
+    _, result = flight.on_its_way()
+    set_back(flight.driver, 1000.0)
+    flight.until(result.done)
+    assert result.result().result.reason == 'the time jumped back'
+    flight.until(lambda: flight.speed < 0.05)
+    _, result = flight.team.send_accepted(GOAL)
+    flight.until(result.done)
+    assert result.result().result.reached
+
+
 def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
     flight = fly(mambo={'land_after': 1.0})
     firmware = flight.fake.firmware

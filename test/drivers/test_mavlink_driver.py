@@ -433,6 +433,19 @@ def test_a_position_that_hangs(fly):
     flight.gives_up(result, 'no LOCAL_POSITION_NED for')
 
 
+def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
+    flight = fly(odometry_timeout=0.5).fly()
+    result = flight.under_way()
+    set_back(flight.driver, 1000.0)
+    flight.until(result.done)
+    assert result.result().result.reason == 'the time jumped back'
+    flight.until(lambda: flight.speed < STOPPED)
+    flight.wait_for_flight()
+    _, result = flight.team.send_accepted([1.0, 1.5, 0.8])
+    flight.until(result.done)
+    assert result.result().result.reached
+
+
 def test_a_sensor_that_falls_silent(fly):
     flight = fly(sensor_timeout=1.0)
 

@@ -235,6 +235,18 @@ def test_the_odometry_of_another_robot_is_refused(play, capfd, frame):
     assert 'header.frame_id: read' in capfd.readouterr().err
 
 
+@pytest.mark.parametrize('height', [-0.1, 50.0])
+def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play, height):
+    _, team = play('mambo')
+    team.move()
+    reason = team.refused([1.2, 1.2, height])
+    assert 'waypoint.pose.position.z' in reason
+    team.move(20)
+    assert team.body.robot_state().pose.position[2] == pytest.approx(1.0, abs=0.01)
+    # Its own height is that of the waypoints, and it may change it a little.
+    assert team.takes([1.2, 1.2, 1.3], live=team.move)
+
+
 def test_the_type_of_the_commands_is_found_out(play):
     """Humble's TurtleBot3 listens to Twist, Jazzy's to TwistStamped."""
     _, team = play(wants=Twist)
@@ -282,6 +294,8 @@ def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, t
     assert np.any(team.command != 0.0)
     driver.send_signal(signal.SIGKILL)
     driver.wait()
+    # Commands of the driver may still be on their way until then.
+    team.until(lambda: guard.status()['stopping'])
     known = len(team.commands)
     team.until(lambda: len(team.commands) >= known + 3)
     assert not np.any([numbers(item) for item in team.commands[known:]])
@@ -292,6 +306,25 @@ def test_the_guard_stops_the_robot_when_its_driver_is_killed(context, process, t
     team.states.clear()
     team.awaken()
     drive_without_the_guard(team)
+    guard.destroy_node()
+
+
+def test_a_guard_that_is_activated_after_the_death_of_its_driver_stops_the_robot(
+    context, process, team
+):
+    guard = start_guard(context, team)
+    driver = process()
+    team.connect()
+    team.awaken()
+    drive_without_the_guard(team)
+    assert guard.trigger_deactivate().name == 'SUCCESS'
+    driver.kill()
+    driver.wait()
+    team.until(lambda: guard.status()['driver lost'])
+    known = len(team.commands)
+    assert guard.trigger_activate().name == 'SUCCESS'
+    team.until(lambda: len(team.commands) >= known + 3, 'no zeros')
+    assert not np.any([numbers(item) for item in team.commands[known:]])
     guard.destroy_node()
 
 

@@ -358,6 +358,24 @@ def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, contex
     guard.destroy_node()
 
 
+def test_nav2_does_not_drive_a_robot_whose_pose_is_not_known(nav2, with_nav2, process, context):
+    said, _ = nav2
+    process(environment=with_nav2, navigation='nav2')
+    executor = SingleThreadedExecutor(context=context)
+    team = Team(context, TURTLEBOT | {'navigation': 'nav2'}, executor)
+    team.connect()
+    reasons = []
+    team.until(
+        lambda: (
+            reasons.append(team.refused([0.7, 0.8, 0.0])) or 'Nav2 is not there' not in reasons[-1]
+        )
+    )
+    assert reasons[-1] == 'no pose on tf yet'
+    assert said.empty()
+    executor.shutdown()
+    team.destroy_node()
+
+
 def test_nav2_that_is_not_installed_is_said(context, monkeypatch):
     # None stands for a module that cannot be imported, also where Nav2 is installed.
     monkeypatch.setitem(sys.modules, 'nav2_msgs', None)

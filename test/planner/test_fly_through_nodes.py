@@ -1,8 +1,11 @@
 """Free running: goals that preempt one another, and robots whose planner dies meanwhile."""
 
+import threading
+
 import numpy as np
 from driven_team import driven
 from test_planner_node import SETTINGS
+from waiting import wait_until
 
 from maasi_msgs.msg import AgentState
 
@@ -33,6 +36,35 @@ def test_robots_whose_planner_dies_while_they_pass_a_waypoint_stop_at_the_last_o
         assert a.state.goal_status == AgentState.REACHED
         point = last.waypoint
         assert np.hypot(a.place[0] - point.x, a.place[1] - point.y) < 0.06
+
+
+def test_a_planner_that_is_told_to_end_stops_robots_whose_next_goal_is_on_its_way():
+    with driven(robots=ROBOTS) as world:
+        world.until(lambda: all(robot.moves for robot in world.robots.values()))
+
+        planner, waiting = world.planner, world.planner._goals.waiting
+
+        def turn():
+            """Do a step of the robots, up to a goal that no driver has answered yet."""
+            world.step += 1
+            for robot in world.robots.values():
+                robot.move(world.step)
+            for _ in range(10):
+                if not waiting:
+                    world.executor.spin_once(timeout_sec=0.001)
+                    world.own.spin_once(0.001)
+
+        wait_until(lambda: waiting, turn)
+        # As its process does it; the drivers answer meanwhile.
+        end = threading.Thread(target=lambda: (planner.halt(), world.end_planner()))
+        end.start()
+        while end.is_alive():
+            world.executor.spin_once(timeout_sec=0.01)
+        places = [robot.place for robot in world.robots.values()]
+        world.until(world.standing)
+        for robot, place in zip(world.robots.values(), places, strict=True):
+            assert robot.state.goal_status == AgentState.CANCELED
+            assert np.hypot(robot.place[0] - place[0], robot.place[1] - place[1]) < 0.3
 
 
 def test_a_robot_that_refuses_the_next_waypoint_is_stopped_and_planned_anew():

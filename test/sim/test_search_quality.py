@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-
-from maasi_sim.experiments.comparison import find_times
-
-sys.path.insert(0, str(Path(__file__).parents[1] / 'benchmarks'))
-
 import search_quality
 import search_regimes
+
+from maasi_sim.experiments.comparison import find_times
 
 
 def test_find_times():

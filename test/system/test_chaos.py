@@ -79,6 +79,11 @@ def test_wrong_arguments_are_refused(tmp_path, capsys):
     assert main(['--out', str(tmp_path)]) == WRONG_INPUT
     assert main(['--list', '--case', 'buildings-*']) == PASSED
     assert 'buildings-lockstep-end-kill-middle-sim_node' in capsys.readouterr().out
+    assert main(['--list', '--case', 'buildings-*', '--case', 'mavlink-*']) == PASSED
+    assert {line.split('-')[0] for line in capsys.readouterr().out.split()} == {
+        'buildings',
+        'mavlink',
+    }
     assert len(chosen_cases(['search-free-end-pause-middle-*'])) > 5
 
 

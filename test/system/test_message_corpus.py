@@ -15,6 +15,7 @@ from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from message_corpus import Corpus, kind_of
 from nav_msgs.msg import Odometry
+from node_kinds import KINDS
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -23,10 +24,6 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from waiting import wait_until
-
-sys.path.insert(0, str(Path(__file__).parents[1] / 'sim'))
-
-from node_kinds import KINDS
 
 from maasi_filter.ros.qos import RELIABLE, SENSOR_READER, UPDATES
 from maasi_filter.ros.stamps import stamp_problem

@@ -6,6 +6,8 @@ from collections import deque
 
 # Length of the window of observations [s].
 _WINDOW = 2.0
+# A lead that falls by more at once is a jump back of the node's time [ns].
+_JUMP = 1_000_000_000
 
 
 class ArrivalClock:
@@ -26,6 +28,8 @@ class ArrivalClock:
             leads.clear()
             return
         lead = time - round(now * 1e9)
+        if leads and lead < leads[-1][1] - _JUMP:
+            leads.clear()
         while leads and leads[-1][1] <= lead:
             leads.pop()
         leads.append((now, lead))

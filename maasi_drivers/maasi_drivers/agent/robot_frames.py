@@ -141,7 +141,7 @@ class RobotFrames:
         settings = self._settings
         if settings.poses == 'tf' or not settings.tf_rate:
             return
-        # Of the stamp alone, so that runs in lockstep are equal.
+        # Depends on the stamp only, so that runs in lockstep are equal.
         slot = math.floor(placed.stamp * settings.tf_rate * 1e-9 + 1e-6)
         if slot == self._slot:
             return

@@ -96,12 +96,19 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         latest = self.history.latest
         if latest is None or stamp > latest.stamp:
             return True
-        if latest.stamp - stamp <= JUMP:
-            if stamp < latest.stamp or not self.settings.lockstep:
-                self.drop(
-                    'odometry stamp',
-                    f'{what}: read {stamp} ns, allowed are stamps after {latest.stamp} ns',
-                )
+        if self.restart_if_back(what, stamp):
+            return True
+        if stamp < latest.stamp or not self.settings.lockstep:
+            self.drop(
+                'odometry stamp',
+                f'{what}: read {stamp} ns, allowed are stamps after {latest.stamp} ns',
+            )
+        return False
+
+    def restart_if_back(self, what: str, stamp: int) -> bool:
+        """Restart the driver if a stamp [ns] is far before the latest pose's; return whether."""
+        latest = self.history.latest
+        if latest is None or latest.stamp - stamp <= JUMP:
             return False
         self.get_logger().warning(
             f'{what} jumped back by {1e-9 * (latest.stamp - stamp):.3f} s: starting anew'

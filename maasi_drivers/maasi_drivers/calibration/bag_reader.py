@@ -176,7 +176,7 @@ class BagReader:
         chosen = [
             item for item in self._reader.connections if topics is None or item.topic in topics
         ]
-        # Without a connection it would read all.
+        # An empty selection would read all topics.
         messages = self._reader.messages(chosen) if chosen else iter(())
         while True:
             try:

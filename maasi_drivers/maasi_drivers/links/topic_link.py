@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from geometry_msgs.msg import TwistStamped
 
+from maasi_drivers.agent import geofence
 from maasi_drivers.agent.battery_topic import BatteryTopic
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.odometry_topic import OdometryTopic
@@ -35,6 +36,11 @@ class TopicLink(RobotLink):
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
+        settings = driver.settings
+        # In the plane the bounds of the environment have no heights.
+        self._fence = geofence.make_vehicle_fence(
+            None, driver.bounds, settings.radius, 0.0, settings.start[2]
+        )
         self._publisher: CommandPublisher | None = None
         self._command = TwistStamped()
         self._command.header.frame_id = f'{driver.robot}/base_link'
@@ -79,6 +85,12 @@ class TopicLink(RobotLink):
         self._publisher.refresh()
         if problem := self._publisher.problem():
             self.driver.warn_throttled('cmd_vel', problem)
+
+    def goal_problem(self, position: Sequence[float]) -> str | None:
+        """Refuse heights far from that of the start; a ground robot has none."""
+        if self.driver.follower.on_ground:
+            return None
+        return geofence.goal_problem(self._fence, position)
 
     def begin_step(self, stamp: int) -> None:
         """Take the readings of the battery before this step."""

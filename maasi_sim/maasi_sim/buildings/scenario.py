@@ -99,7 +99,7 @@ def check_cuboid_scenario(
 ) -> CuboidScenario:
     """Return the scenario of a tree of values with all layers merged."""
     if overrides:
-        # What wins over the file hides none of its errors.
+        # Overrides must not hide errors of the file.
         validate(CuboidScenario, layer)
         layer = with_overrides(layer, overrides)
     scenario = validate(CuboidScenario, layer)

@@ -51,7 +51,9 @@ def build_parser() -> argparse.ArgumentParser:
         epilog='Exit codes: 0 all cases passed, 1 some did not, 2 wrong input, 130 interrupted.',
     )
     parser.add_argument('--list', action='store_true', help='list all cases and exit')
-    parser.add_argument('--case', nargs='+', metavar='NAME', help='only these; * is a wildcard')
+    parser.add_argument(
+        '--case', nargs='+', action='extend', metavar='NAME', help='only these; * is a wildcard'
+    )
     parser.add_argument('--seed', type=whole, default=_SEED, metavar='N', help='of all runs')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the results')
     parser.add_argument(

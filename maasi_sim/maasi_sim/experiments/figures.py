@@ -107,7 +107,7 @@ def draw_curves(
         mean = np.array([span.mean for span in spans])
         half = np.nan_to_num(np.array([span.half_width for span in spans]))
         axes.plot(grid, mean, line, color=colour, lw=1.8, label=name)
-        # The band of two or three runs would fill the figure.
+        # With two or three runs the confidence band would fill the figure.
         if len(runs) >= _FEWEST_SHADED:
             axes.fill_between(grid, mean - half, mean + half, color=colour, alpha=0.15, lw=0)
         targets = max(targets, *(run.value('targets') or 0.0 for run in runs))

@@ -191,7 +191,7 @@ class Session:
             ending = self._check()
             if ending is not None:
                 return ending
-            # Before the look for topics: those of a node that has reported are known.
+            # Before the check of topics: all topics of a node that has reported are discovered.
             ready = set(recorder.take_ready())
             recorder.discover()
             # Messages of starting nodes are recorded as they arrive.

@@ -279,7 +279,7 @@ def describe(error: ValidationError, model: type[BaseModel], layer: Layer) -> st
     lines = []
     for key, items in problems.items():
         if len(items) > 1:
-            # Of a union: what went deepest is what the writer meant.
+            # Of a union, report the alternative that matched deepest: probably the intended one.
             depth = max(len(item['loc']) for item in items)
             items = [item for item in items if len(item['loc']) == depth] or items
         texts = list(dict.fromkeys(_explain(item, key, model, layer.data) for item in items))

@@ -27,7 +27,7 @@ def robot_candidates(robot: RobotSettings, environment: EnvironmentSettings) -> 
 def never_seen(scenario: Scenario) -> str:
     """Return a warning about parts that can never be seen from the candidates, or ''."""
     if any(robot.candidates.ring is not None for robot in scenario.robots.values()):
-        # Waypoints that move with the robot lead anywhere.
+        # Candidates that move with the robot can reach every place.
         return ''
     bounds = scenario.environment.array()
     margin = scenario.targets.margin if scenario.targets.positions is None else 0.0
@@ -71,7 +71,7 @@ def covering_grid(
     while True:
         numbers = np.ceil(sides / width - 1e-9).astype(int)
         if first and numbers.prod() > _MOST_CANDIDATES:
-            # Nothing helps; `never_seen` names what is not seen.
+            # A finer grid would be too large; `never_seen` reports what stays unseen.
             return first
         spacing = sides / numbers
         grid = {

@@ -204,7 +204,7 @@ def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
     axes.set_ylim(0.0, max(len(record.truth), max(every), 1) * 1.08)
     axes.set_ylabel('targets')
     if by_time:
-        # Beside the title: inside, it would hide one curve or the other.
+        # Beside the title: inside the axes it would cover curves.
         axes.legend(
             loc='lower right',
             bbox_to_anchor=(1.0, 1.0),

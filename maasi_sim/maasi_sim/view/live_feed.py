@@ -53,7 +53,7 @@ class LiveFeed:
                 try:
                     self._take(self._waiting.popleft())
                 except (ValueError, ArithmeticError, LookupError, AttributeError, TypeError):
-                    # Whatever a message holds, the view goes on with the next one.
+                    # A message that cannot be shown must not end the view.
                     self.refused += 1
             if ended:
                 return

@@ -222,7 +222,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._send_portions(view)
         except OSError:
-            # It went away, or reads nothing.
+            # The client has disconnected, or does not read.
             pass
         finally:
             view.leave()

@@ -91,7 +91,7 @@ def write_video(log: EventLog, path: Path, speed: float = 5.0) -> None:
     """
     pictures = _pictures(log, speed)
     write = _write_gif if path.suffix == '.gif' else _write_mp4
-    # The kind of a file is known by the end of its name, which stays.
+    # Keep the suffix: it tells the type of the file.
     write_whole(path, lambda part: write(part, pictures))
 
 

@@ -88,7 +88,7 @@ class CameraRenderer:
             row[5], row[6] = np.cos(shape.angle), np.sin(shape.angle)
             row[7:10] = shape.colour
         self._rims = self._shape_rims()
-        # Light belongs to the room, the drift of exposure and white balance to each camera.
+        # Uneven light is common to all cameras; exposure and white balance drift in each one.
         room = noise_stream(seed, purpose='light')
         direction, phase = room.uniform(0.0, 2.0 * np.pi), room.uniform(0.0, 1.0)
         wave = np.array([np.cos(direction), np.sin(direction)]) / settings.light_wavelength

@@ -423,7 +423,7 @@ def _check_port(port: int, drone: str) -> None:
         DroneSocket(drone, port).close()
     except OSError as error:
         if error.errno != errno.EADDRINUSE:
-            # No way to the drone yet: its network may come.
+            # No route to the drone yet: its network may come up later.
             return
         raise MamboLinkError(
             f'UDP port {port}: {error.strerror}; allowed is one that is free: one Mambo per '

@@ -197,14 +197,12 @@ class MamboRobotLink(RobotLink):
         if stamp is None:
             # A simulated time has not begun: nothing is late.
             driver.silence.end()
+            return
+        if self._mambo.pose != 'events' or not pilot.has_pose or state is None:
+            return
+        driver.restart_if_back('the clock', stamp)
         latest = driver.history.latest
-        if (
-            self._mambo.pose == 'events'
-            and pilot.has_pose
-            and state is not None
-            and stamp is not None
-            and (latest is None or stamp > latest.stamp)
-        ):
+        if latest is None or stamp > latest.stamp:
             driver.take_pose(
                 StampedPose(
                     stamp,

@@ -146,6 +146,10 @@ class MavlinkRobotLink(RobotLink):
             )
         self._log_reports()
 
+    def reset(self) -> None:
+        """Discard the autopilot's poses of another time."""
+        self._local_poses.clear()
+
     def latch_stop(self) -> None:
         """End the permission to take off."""
         if self._link is not None:
@@ -242,8 +246,11 @@ class MavlinkRobotLink(RobotLink):
         if stamp is None:
             # A simulated time has not begun: nothing is late.
             driver.silence.end()
+            return
+        if not self._localised:
+            driver.restart_if_back('the clock', stamp)
         latest = (self._local_poses if self._localised else driver.history).latest
-        if stamp is None or (latest is not None and stamp <= latest.stamp):
+        if latest is not None and stamp <= latest.stamp:
             return
         local = Pose(telemetry.position - self._local_origin, telemetry.orientation)
         placed = StampedPose(

@@ -218,7 +218,7 @@ class FakeMambo:
     def _transmit(self, frame: Frame) -> None:
         if self._controller is None or self.cut_down:
             return
-        # A lost controller is not an error for the drone.
+        # Losing the controller is no error of the simulated drone.
         with contextlib.suppress(OSError):
             self._air.sendto(frame.encode(), self._controller)
 
