@@ -190,7 +190,8 @@ def _hand_over_choice(maker: EventMaker, time: float, space: str, record: _Choic
     )
     for name, robot in sorted(decision.robots.items()):
         maker.way(time, name, robot.positions)
-    maker.map(time, space, record.corner, record.spacing, record.ninths / 9.0)
+    values = record.ninths / 9.0
+    maker.map(time, space, record.corner, record.spacing, values, record.explored)
 
 
 def _choices(decision: Decision, indices: Mapping[str, int]) -> Iterator[RobotChoice]:
