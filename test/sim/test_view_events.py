@@ -245,6 +245,9 @@ def test_a_search_in_one_process_leaves_the_same_events(result, tmp_path):
     assert chosen[2] == decision.chosen and chosen[5] == decision.reason
     updates = [event for event in log.events if event[1] == 'filter']
     assert updates[-1][5] == result.total_measurements
+    # As from the nodes, once a second, and not only at decisions.
+    times = [event[0] for event in log.events if event[1] == 'map']
+    assert np.diff(times).max() <= 2.0 and len(times) > 2 * len(plans)
     result.save_replay(tmp_path / REPLAY)
     assert (tmp_path / REPLAY).stat().st_size < 1_000_000
 
