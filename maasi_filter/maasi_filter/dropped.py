@@ -9,6 +9,9 @@ from maasi_filter.measurement_check import CheckedMeasurement
 
 FloatArray = NDArray[np.float64]
 
+# Reason of detections that a found target took: every search has them.
+FOUND = 'found'
+
 
 def count_dropped(dropped: dict[str, int], reason: str, number: int) -> None:
     """Add a number of detections to those dropped for a reason."""

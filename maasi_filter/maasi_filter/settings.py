@@ -369,9 +369,7 @@ class FilterSettings(Settings):
         default=None,
         description='pmb: whether covariances of detections replace that of the sensor',
     )
-    pmb: PmbSettings = Field(
-        default_factory=PmbSettings, description='Of the Poisson multi-Bernoulli filter'
-    )
+    pmb: PmbSettings = Field(default_factory=PmbSettings, description='pmb: what only it has')
 
     def resolved(self) -> FilterSettings:
         """Return a copy with None replaced by the value of the method or preset."""
@@ -401,6 +399,22 @@ def unsuitable_lengths(settings: FilterSettings, bounds: FloatArray) -> str:
         f'will be missed, as the lengths of {settings.preset} are those of a larger one; give '
         'found_radius, removal_distance and jitter_deviation, or method: pmb'
     )
+
+
+def unused_settings(settings: FilterSettings) -> str:
+    """Return a warning if settings are given that only the other method has, else ''."""
+    other = 'pmb' if settings.method == 'ic_phd' else 'ic_phd'
+    # T_z is also the length by which found targets are scored.
+    names = [
+        name
+        for name, field in FilterSettings.model_fields.items()
+        if str(field.description).startswith(f'{other}:')
+        and getattr(settings, name) != field.get_default(call_default_factory=True)
+        and name != 'removal_distance'
+    ]
+    if not names:
+        return ''
+    return f'filter: {", ".join(names)}: of method {other}; {settings.method} does not use them'
 
 
 @dataclass(frozen=True)

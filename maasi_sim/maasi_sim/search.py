@@ -189,6 +189,7 @@ class _Group:
         found = self.filter.own_found_targets() if known else None
         self.trace.update(time, self.space, measurements, result, found)
         self.coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
+        self.trace.explored(time, self.space, self.coordinator.exploration)
         return [item.robot for item in members]
 
 

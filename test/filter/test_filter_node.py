@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -146,18 +147,40 @@ def test_a_target_seen_again_and_again_is_found(world):
     assert not node.dropped
 
 
-def test_the_node_runs_the_multi_bernoulli_filter():
-    changed = SETTINGS.filter.model_copy(update={'method': 'pmb'})
-    with running(filter=changed) as (node, team, until):
-        for number in range(1, 9):
+def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_no_fault():
+    settings = FilterSettings(
+        preset='paper_000', found_radius=0.05, removal_distance=0.1, jitter_deviation=0.003
+    )
+    with running(filter=settings) as (node, team, until):
+        reports = []
+        team.node.create_subscription(DiagnosticArray, '/diagnostics', reports.append, 10)
+        for number in range(1, 20):
             team.measure(number, ['a', 'b'], {'a': [(0.3, 0.5)], 'b': [(0.3, 0.5)]})
             until(lambda number=number: len(team.updates) == number)
         until(lambda: team.found and len(team.found[-1].targets) == 1)
         target = team.found[-1].targets[0]
         assert target.position.x == pytest.approx(1.0 + 0.3 * math.cos(0.5), abs=0.02)
         assert target.position.y == pytest.approx(1.0 + 0.3 * math.sin(0.5), abs=0.02)
-        assert not node.dropped
         assert node.status()['found'] == 1
+        assert node.status()['detections of found targets'] > 0
+        assert not node.dropped
+        reports.clear()
+        until(lambda: reports)
+        status = reports[-1].status[0]
+        assert status.level == DiagnosticStatus.OK and status.message == 'active'
+
+
+def test_the_diagnostics_say_what_was_dropped(world):
+    node, team, until = world
+    reports = []
+    team.node.create_subscription(DiagnosticArray, '/diagnostics', reports.append, 10)
+    team.measure(1, ['a'], {'a': [(0.3, 0.5)]}, robot='nobody')
+    until(lambda: node.dropped)
+    reports.clear()
+    until(lambda: reports)
+    status = reports[-1].status[0]
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message == 'active; dropped: bad detections 1'
 
 
 def test_found_targets_carry_class_and_identity():

@@ -12,7 +12,7 @@ from maasi_filter import (
     NoiseSettings,
     SensorSettings,
 )
-from maasi_filter.settings import PRESETS, unsuitable_lengths
+from maasi_filter.settings import PRESETS, unsuitable_lengths, unused_settings
 
 
 @pytest.mark.parametrize(
@@ -87,6 +87,15 @@ def test_three_dimensional_noise_needs_an_elevation():
     assert noise.covariance(2).shape == (2, 2)
     with pytest.raises(ValueError, match='elevation'):
         noise.covariance(3)
+
+
+def test_settings_that_only_the_other_method_has_are_warned_of():
+    assert unused_settings(FilterSettings(particles=500, removal_distance=1.0)) == ''
+    assert unused_settings(FilterSettings(method='pmb', pmb={'walk': 0.1}, pose_error=0.1)) == ''
+    told = unused_settings(FilterSettings(pmb={'walk': 0.1}, pose_error=0.1))
+    assert told == 'filter: pose_error, pmb: of method pmb; ic_phd does not use them'
+    told = unused_settings(FilterSettings(method='pmb', preset='paper_001', jitter_deviation=0.1))
+    assert told == 'filter: preset, jitter_deviation: of method ic_phd; pmb does not use them'
 
 
 def test_lengths_that_do_not_suit_an_environment_are_warned_of():

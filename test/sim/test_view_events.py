@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import OccupancyGrid
+from sensor_msgs.msg import BatteryState
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray, LockstepStep, PlanDecision
@@ -75,6 +76,18 @@ def test_candidates_that_are_not_allowed_have_no_objective():
     assert plan[3:5] == ['maasi', 0.25]
 
 
+def test_a_state_without_a_battery_has_what_the_battery_says():
+    taken = Taken()
+    unknown = state(0.0, battery=-1.0)
+    taken.take('/team/rover/state', unknown)
+    taken.take('/team/rover/battery_state', BatteryState(percentage=0.75))
+    taken.take('/team/rover/state', state(0.1, battery=-1.0))
+    taken.take('/team/rover/state', state(0.2, battery=0.5))
+    taken.take('/team/rover/battery_state', BatteryState(percentage=math.nan))
+    taken.take('/team/rover/state', state(0.3, battery=-1.0))
+    assert [event[4] for event in taken.of('robot')] == [-1.0, 0.75, 0.5, -1.0]
+
+
 def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario():
     taken = Taken()
     grid = OccupancyGrid(data=[0, 100, 50, 50, 0, 0])
@@ -83,7 +96,8 @@ def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario():
     taken.take('/exploration', grid)
     assert taken.maker.scene['bounds'] == [[0.0, 1.0], [0.0, 0.5]]
     # By x, then by y: e of (1, 0) is 1.
-    assert taken.of('map')[0][5:] == [[3, 2, 1], '049040']
+    # Of the explored share nodes at the ends of an axis count half.
+    assert taken.of('map')[0][5:] == [[3, 2, 1], '049040', 0.625]
 
 
 def test_found_targets_are_scored_where_the_truth_is_known():
@@ -231,8 +245,31 @@ def test_a_search_in_one_process_leaves_the_same_events(result, tmp_path):
     assert chosen[2] == decision.chosen and chosen[5] == decision.reason
     updates = [event for event in log.events if event[1] == 'filter']
     assert updates[-1][5] == result.total_measurements
+    # As from the nodes, once a second, and not only at decisions.
+    times = [event[0] for event in log.events if event[1] == 'map']
+    assert np.diff(times).max() <= 2.0 and len(times) > 2 * len(plans)
     result.save_replay(tmp_path / REPLAY)
     assert (tmp_path / REPLAY).stat().st_size < 1_000_000
+
+
+def test_the_objective_is_made_of_its_terms_with_the_weights_of_the_scene(result):
+    log = result.trace.log()
+    weights = log.scene['weights']
+    checked = 0
+    for event in log.events:
+        for robot in event[7] if event[1] == 'plan' else []:
+            for _, _, _, control, refinement, exploration, objective, length, _ in robot[4]:
+                if objective is not None:
+                    gain = weights['alpha'] * refinement + weights['beta'] * exploration
+                    expected = (gain - weights['control'] * control) / length
+                    assert objective == pytest.approx(expected, rel=1e-3, abs=1e-6)
+                    checked += 1
+    assert checked > 100
+
+
+def test_planners_with_another_objective_have_no_weights_in_the_scene():
+    changes = {'planner': (('planner', 'name'), 'maas')}
+    assert 'weights' not in scene_of('maas', load_mission('mambo_turtlebot', changes).scenario)
 
 
 def test_the_page_is_one_file_without_addresses(result):

@@ -11,7 +11,9 @@ from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import load_types
 from maasi_sim.scenario.loading import config_folder
 from maasi_sim.search import search
+from maasi_sim.view import video
 from maasi_sim.view.event_log import EventLog
+from maasi_sim.view.page_file import FOLDER
 from maasi_sim.view.scene import scene_of
 from maasi_sim.view.video import write_video
 from maasi_sim.view.view_run import main
@@ -27,7 +29,7 @@ def planar():
     scene = scene_of('plane', load_mission('mambo_turtlebot_obstacles').scenario)
     unit = [0.01, 0.0, 0.0, 0.02, 0.0, 0.0]
     events = [
-        [0.0, 'map', '', [0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2, 2, 1], '0949'],
+        [0.0, 'map', '', [0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2, 2, 1], '0949', 0.4],
         [0.0, 'truth', '', [[1.0, 1.0, 0.0]]],
         [0.0, 'robot', 'mambo', [0.0, 0.0, 1.0, 0.0], 1.0, 1, ''],
         [0.0, 'way', 'mambo', [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]],
@@ -73,6 +75,42 @@ def test_a_video_shows_geofences(tmp_path):
     write_video(log, tmp_path / 'with.mp4', speed=1e3)
     without, fenced = (frames(tmp_path / f'{name}.mp4')[0] for name in ('without', 'with'))
     assert np.abs(without.astype(int) - fenced).max() > 50
+
+
+def still(scene, yaw, folder):
+    """Return a picture of a robot at a yaw that is sent to a waypoint."""
+    row = ['mambo', 0, 0, [2.0, 0.5, 1.0], [], '']
+    events = [
+        [0.0, 'robot', 'mambo', [0.5, 0.5, 1.0, yaw], 1.0, 1, ''],
+        [0.0, 'plan', '', 'maasi', 0.0, 0.0, '', [row]],
+    ]
+    write_video(EventLog(scene, events), folder / 'still.mp4', speed=1e3)
+    return frames(folder / 'still.mp4')[0].astype(int)
+
+
+def test_a_video_shows_where_a_robot_points_what_it_sees_and_where_it_goes(tmp_path):
+    scene = scene_of('plane', load_mission('mambo').scenario)
+    whole = still(scene, 0.0, tmp_path)
+    view = scene['robots']['mambo'].pop('view')
+    assert view['kind'] == 'box'
+    unseeing = still(scene, 0.0, tmp_path)
+    assert np.abs(whole - unseeing).max() > 20
+    # Not the same after a third of a turn.
+    assert np.abs(unseeing - still(scene, 2.0 * np.pi / 3.0, tmp_path)).max() > 50
+    # A robot and its waypoint in the robot's colour, which is blue; pictures are BGR.
+    blue = np.abs(unseeing - (178, 114, 0)).max(axis=2) < 40
+    columns = np.flatnonzero(blue.any(axis=0))
+    assert np.diff(columns).max() > 100
+
+
+def test_robots_have_the_colours_of_the_page():
+    text = (FOLDER / 'colours.js').read_text()
+    robots = re.search(r'const ROBOTS = (\[.*\]);', text).group(1)
+    assert tuple(re.findall(r'#\w+', robots.upper())) == video._ROBOTS
+    named = re.search(r'const NAMED = (\{.*\});', text).group(1)
+    assert {name: colour.upper() for name, colour in re.findall(r"(\w+): '(#\w+)'", named)} == (
+        video._NAMED
+    )
 
 
 def test_a_video_of_another_kind_is_refused(tmp_path, capsys):

@@ -222,6 +222,14 @@ def test_a_command_needs_the_token(commanded):
     assert server.token in server.address
 
 
+@pytest.mark.parametrize('command', ['pause', 'resume', 'home', 'stop', 'release'])
+def test_these_commands_are_carried_out(commanded, command):
+    server, calls = commanded
+    body = json.dumps({'command': command, 'robot': None})
+    assert ask(server, 'POST', '/control', body, {'X-Maasi-Token': server.token})[0] == 200
+    assert calls == [(command, None)]
+
+
 @pytest.mark.parametrize(
     ('body', 'status'),
     [

@@ -14,9 +14,10 @@ from waiting import wait_until
 from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.view.bag_events import read_events
+from maasi_sim.view.event_log import EventLog
 from maasi_sim.view.live_view import LiveView, MessageFeed
 from maasi_sim.view.messages import is_shown
-from maasi_sim.view.page_file import REPLAY
+from maasi_sim.view.page_file import REPLAY, write_replay
 from maasi_sim.view.scene import empty_scene
 from maasi_sim.view.view_node import ViewNode
 from maasi_sim.view.view_run import main
@@ -61,6 +62,7 @@ class Watched:
             shown.settle()
             self.found = shown.number()
             self.decisions = shown.page.evaluate('maasi.log.decisions.times.length')
+            self.controls = shown.page.is_visible('#controls')
             shown.check()
 
 
@@ -102,6 +104,8 @@ def test_a_browser_saw_the_run_while_it_went_on(watched):
         len(item['robots']) for item in of_topic(watched.run, '/decisions')
     )
     assert watched.answer == 'pause turtlebot: pause: turtlebot'
+    # Nobody follows after the end.
+    assert not watched.controls
 
 
 def test_the_events_are_those_of_the_bag(run):
@@ -149,6 +153,41 @@ def test_the_page_shows_the_bag(run, address):
 
 
 @needs_chromium
+def test_the_page_says_how_many_targets_are_expected_to_be_left(run, address):
+    log = read_events(run.folder)
+    before = [event for event in log.events if event[0] <= 10.0]
+    explored = [event for event in before if event[1] in ('map', 'plan')][-1]
+    share = explored[7] if explored[1] == 'map' else explored[4]
+    potential = [event for event in before if event[1] == 'filter'][-1][3]
+    expected = potential + log.scene['expected_targets'] * (1.0 - share)
+    assert expected > 1.0
+    with chromium() as shown:
+        shown.open(address)
+        shown.seek(10.0)
+        shown_number = shown.page.inner_text('dt:text-is("expected left") + dd')
+        assert float(shown_number) == pytest.approx(expected, rel=0.01)
+        shown.check()
+
+
+@needs_chromium
+def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
+    scene = {'name': 'space', 'robots': {}, 'bounds': [[0, 1], [0, 1], [0, 2]]}
+    # Explored at the ground, and above it of one column only.
+    grid = [0.0, 'map', '', [0, 0, 0], [1, 1, 1], [2, 2, 3], '099099099000', 0.5]
+    write_replay(EventLog(scene, [grid]), tmp_path / 'page.html')
+    with chromium() as shown:
+        shown.open((tmp_path / 'page.html').as_uri())
+        shown.page.click('#space')
+        shown.settle()
+        shades = shown.page.evaluate(
+            'Array.from(maasi.map.shading.canvas.getContext("2d").getImageData(0, 0, 2, 2).data)'
+        )[3::4]
+        # From the upper left corner, by rows: y falls, x rises.
+        assert shades == [90, 0, 90, 90]
+        shown.check()
+
+
+@needs_chromium
 def test_a_click_on_a_decision_shows_its_candidates(run, address):
     decisions = of_topic(run, '/decisions')
     first = decisions[0]['robots'][0]
@@ -161,6 +200,7 @@ def test_a_click_on_a_decision_shows_its_candidates(run, address):
         chosen = shown.page.inner_text('#why tr.chosen td').strip()
         assert int(chosen) == first['chosen']
         assert 'admissible' in shown.page.inner_text('#why .reason')
+        assert shown.page.inner_text('#why .formula') == 'J = (-1.0e-6 C + 0.5 T + 1 E) / K'
         # Sorted by the objective, and by another column where that is clicked.
         best = max(range(len(first['candidates'])), key=lambda i: objective(first, i))
         assert int(rows.first.locator('td').first.inner_text()) == best

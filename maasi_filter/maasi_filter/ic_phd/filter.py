@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.clutter import least_clutter
-from maasi_filter.dropped import count_dropped, count_unexplained, within_range
+from maasi_filter.dropped import FOUND, count_dropped, count_unexplained, within_range
 from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
     MeasurementBirths,
@@ -279,7 +279,7 @@ class IcPhdFilter:
             self._numbers.removal_distance,
             self._numbers.removal == 'every',
         )
-        count_dropped(dropped, 'found', int((~keep).sum()))
+        count_dropped(dropped, FOUND, int((~keep).sum()))
         return member.only(keep)
 
     def _threads(self) -> ThreadPoolExecutor | None:

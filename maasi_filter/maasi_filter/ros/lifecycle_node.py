@@ -412,8 +412,11 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._clock_watch.look()
         fault = self.fault() if self.active else ''
         warnings = self.warnings() if self.active else []
+        if sum(self.dropped.values()):
+            counts = (f'{reason} {number}' for reason, number in sorted(self.dropped.items()))
+            warnings = [*warnings, f'dropped: {", ".join(counts)}']
         status = DiagnosticStatus(
-            level=level_of(fault, bool(warnings or sum(self.dropped.values()))),
+            level=level_of(fault, bool(warnings)),
             name=self.get_fully_qualified_name(),
             message='; '.join([fault or ('active' if self.active else 'not active'), *warnings]),
             hardware_id='',

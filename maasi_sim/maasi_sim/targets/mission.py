@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
 
-from maasi_filter.settings import unsuitable_lengths
+from maasi_filter.settings import unsuitable_lengths, unused_settings
 from maasi_sim.emulators.linked_robots import with_addresses
 from maasi_sim.run.node_plan import NodePlan, RunSettings
 from maasi_sim.scenario.schema import Scenario
@@ -70,8 +70,10 @@ class TargetMission:
 
     def warning(self) -> str:
         """See `Mission.warning`."""
-        lengths = unsuitable_lengths(self.scenario.filter, self.scenario.environment.array())
-        return '\n'.join(filter(None, (never_seen(self.scenario), lengths)))
+        settings = self.scenario.filter
+        lengths = unsuitable_lengths(settings, self.scenario.environment.array())
+        warnings = never_seen(self.scenario), lengths, unused_settings(settings)
+        return '\n'.join(filter(None, warnings))
 
     def observer(self, types: Typestore) -> TargetObserver:
         """See `Mission.observer`."""

@@ -13,7 +13,8 @@ found       targets [id, x, y, z, covariance, robot, time]
 plan        planner, explored share, objective, reason, robots [name, index, chosen, waypoint,
             candidates [x, y, z, C, T, E, J, K, M], reason]
 way         planned positions [x, y, z]
-map         corner [x, y, z], spacing, number of nodes by axis, e of each node as a digit 0 to 9
+map         corner [x, y, z], spacing, number of nodes by axis, e of each node as a digit 0 to 9,
+            explored share
 truth       true targets [x, y, z]
 score       true targets found, missed, false, RMSE or null [m], GOSPA [m]
 cuboid      activity, how, target, robots heard, cuboids planned, snapshots [cuboid, x, y, z, p_d],

@@ -69,6 +69,15 @@ def significant(value: float) -> float:
     return float(f'{value:.5g}') if math.isfinite(value) else 0.0
 
 
+def _explored(values: FloatArray) -> float:
+    """Return 1 - mean of e; nodes at the ends of an axis stand for half a step."""
+    for count in values.shape:
+        weights = np.ones(count)
+        weights[[0, -1]] = 0.5
+        values = np.average(values, axis=0, weights=weights)
+    return 1.0 - float(values)
+
+
 class EventMaker:
     """Make events, and hand each to a listener.
 
@@ -248,14 +257,21 @@ class EventMaker:
         self._put(time, 'way', robot, [self._place(points[item]) for item in chosen])
 
     def map(
-        self, time: float, space: str, corner: ArrayLike, spacing: ArrayLike, values: FloatArray
+        self,
+        time: float,
+        space: str,
+        corner: ArrayLike,
+        spacing: ArrayLike,
+        values: FloatArray,
+        explored: float | None = None,
     ) -> None:
-        """Add e on a grid: values (nx, ny) or (nx, ny, nz), 1 is unseen."""
+        """Add e on a grid: values (nx, ny) or (nx, ny, nz), 1 is unseen; the explored share."""
         shape = [*values.shape, 1][:3]
         digits = np.clip(np.rint(9.0 * values), 0, 9).astype(np.uint8) + ord('0')
         text = digits.tobytes().decode('ascii')
         steps = [significant(value) for value in padded(spacing)]
-        self._put(time, 'map', space, self._place(corner), steps, shape, text)
+        share = round(_explored(values) if explored is None else explored, 4)
+        self._put(time, 'map', space, self._place(corner), steps, shape, text, share)
 
     def truth(self, time: float, targets: ArrayLike) -> None:
         """Add the true targets, (n, 2 or 3) [m]."""

@@ -12,12 +12,17 @@ from maasi_drivers.agent.geofence import make_fence, make_vehicle_fence
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_filter.settings import DETECTIONS
+from maasi_planner.objective.weights import resolve
+from maasi_planner.settings import PlannerSettings
 from maasi_sim.buildings.scenario import NAME as BUILDINGS
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.targets.scoring import scoring_radius
 from maasi_sim.view.event_log import Scene
+
+# Planners that choose by (17).
+_WEIGHING = ('asi', 'maasi')
 
 
 def empty_scene(name: str = '') -> Scene:
@@ -58,8 +63,7 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
         'robots': {name: _robot(scenario.robots[name], scenario) for name in scenario.names()},
         'targets': len(truth),
         'expected_targets': scenario.planner.expected_targets,
-        'weights': {'alpha': scenario.planner.alpha, 'beta': scenario.planner.beta},
-        'objective': scenario.planner.objective,
+        **_objective(scenario.planner),
         'scoring_radius': scoring_radius(scenario, truth) if len(truth) else None,
         'scoring_order': scenario.scoring.order,
     }
@@ -82,6 +86,22 @@ def scene_of_facts(facts: Mapping[str, Any]) -> Scene:
 def rounded(values: ArrayLike) -> list[Any]:
     """Return an array as nested lists, to a tenth of a millimetre."""
     return list(np.round(np.asarray(values, dtype=float), 4).tolist())
+
+
+def _objective(settings: PlannerSettings) -> Scene:
+    """Return what J is made of, for planners whose J is that of `PlannerSettings`."""
+    if settings.name not in _WEIGHING:
+        return {}
+    weights = resolve(settings)
+    return {
+        'objective': settings.objective,
+        'weights': {
+            'control': weights.control,
+            'alpha': weights.alpha,
+            'beta': weights.beta,
+            'per_distance': weights.per_distance,
+        },
+    }
 
 
 def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:

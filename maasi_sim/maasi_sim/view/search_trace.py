@@ -22,14 +22,24 @@ from maasi_sim.view.scene import scene_of
 
 FloatArray = NDArray[np.float64]
 
+# Between exploration functions [s].
+_MAP_PERIOD = 1.0
+
 
 @dataclass(frozen=True)
 class _Choice:
-    """A joint decision, and the exploration function that it was made with, e in ninths."""
+    """A joint decision, and the explored share that it was made with."""
 
     decision: Decision
     indices: Mapping[str, int]
     planner: str
+    explored: float
+
+
+@dataclass(frozen=True)
+class _Map:
+    """The exploration function, e in ninths."""
+
     corner: FloatArray
     spacing: FloatArray
     ninths: NDArray[np.uint8]
@@ -64,6 +74,7 @@ class SearchTrace:
     live: Callable[[float, str, Any], None] | None = None
     records: list[tuple[float, str, Any]] = field(default_factory=list)
     _last_states: float = -np.inf
+    _last_maps: dict[str, float] = field(default_factory=dict)
     _indices: dict[str, int] = field(default_factory=dict)
 
     def _add(self, time: float, space: str, record: Any) -> None:
@@ -91,6 +102,21 @@ class SearchTrace:
                 decision,
                 {name: self._indices[name] for name in decision.robots},
                 self.scenario.planner.name,
+                exploration.explored_fraction(),
+            ),
+        )
+        self._last_maps.pop(space, None)
+        self.explored(time, space, exploration)
+
+    def explored(self, time: float, space: str, exploration: UnexploredMap) -> None:
+        """Add the exploration function; as the planner node, once a second and at decisions."""
+        if time - self._last_maps.get(space, -np.inf) < _MAP_PERIOD - 1e-9:
+            return
+        self._last_maps[space] = time
+        self._add(
+            time,
+            space,
+            _Map(
                 exploration.bounds[:, 0],
                 exploration.step,
                 np.rint(9.0 * exploration.values).astype(np.uint8),
@@ -142,6 +168,9 @@ def hand_over(maker: EventMaker, time: float, space: str, record: Any) -> None:
         _hand_over_update(maker, time, space, record)
     elif isinstance(record, _Choice):
         _hand_over_choice(maker, time, space, record)
+    elif isinstance(record, _Map):
+        values = record.ninths / 9.0
+        maker.map(time, space, record.corner, record.spacing, values, record.explored)
     elif isinstance(record, np.ndarray):
         maker.truth(time, record)
     elif isinstance(record, str):
@@ -190,7 +219,6 @@ def _hand_over_choice(maker: EventMaker, time: float, space: str, record: _Choic
     )
     for name, robot in sorted(decision.robots.items()):
         maker.way(time, name, robot.positions)
-    maker.map(time, space, record.corner, record.spacing, record.ninths / 9.0)
 
 
 def _choices(decision: Decision, indices: Mapping[str, int]) -> Iterator[RobotChoice]:

@@ -25,7 +25,7 @@ from maasi_sim.view.page_file import empty_page
 PORT = 8420
 # Takes a command and a robot (None: all); returns whether it was followed, and an answer.
 Commander = Callable[[str, 'str | None'], 'tuple[bool, str]']
-COMMANDS = ('pause', 'resume', 'home', 'stop')
+COMMANDS = ('pause', 'resume', 'home', 'stop', 'release')
 # Browsers at once; further ones are refused.
 MOST_BROWSERS = 32
 # Longest body of a request [bytes], and longest wait for a browser that reads or writes [s].

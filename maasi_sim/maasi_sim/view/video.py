@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Ellipse
+from matplotlib.patches import Circle, Ellipse, Polygon
+from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from maasi_sim.buildings.picture import colours_of, draw_box
+from maasi_sim.buildings.picture import draw_box
 from maasi_sim.run.run_folder import write_whole
 from maasi_sim.view.event_log import Event, EventLog
 
@@ -24,6 +26,9 @@ FloatArray = NDArray[np.float64]
 RATE = 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80
 _FOUND, _POTENTIAL, _SEEN, _OPEN, _VISITED = '#009E73', '#E69F00', '#CC79A7', '#D55E00', '#56B4E9'
+# Of robots, as on the page.
+_ROBOTS = ('#0072B2', '#D55E00', '#8C564B', '#56B4E9', '#7F7F7F', '#CC79A7')
+_NAMED = {'purple': '#7B3294', 'red': '#D62728', 'green': '#2CA02C', 'blue': '#0072B2'}
 # The last picture is shown for so long [s].
 _HOLD = 2.0
 # Detections are shown for so long [s].
@@ -37,10 +42,15 @@ class Moments:
         self.log = log
         self._times: dict[tuple[str, str], list[float]] = {}
         self._events: dict[tuple[str, str], list[Event]] = {}
+        self._waypoints: dict[str, tuple[list[float], list[list[float] | None]]] = {}
         for event in sorted(log.events, key=lambda item: float(item[0])):
             key = event[1], event[2]
             self._times.setdefault(key, []).append(event[0])
             self._events.setdefault(key, []).append(event)
+            for row in event[7] if event[1] == 'plan' else []:
+                times, waypoints = self._waypoints.setdefault(row[0], ([], []))
+                times.append(event[0])
+                waypoints.append(row[3] if row[2] >= 0 else None)
 
     def until(self, kind: str, owner: str, time: float) -> list[Event]:
         """Return the events of a kind and owner at or before a time."""
@@ -54,6 +64,18 @@ class Moments:
                 events = self.until(kind, owner, time)
                 if events:
                     yield events[-1]
+
+    @property
+    def robots(self) -> list[str]:
+        """Names of all robots."""
+        moving = {owner for kind, owner in self._times if kind == 'robot'}
+        return sorted(moving | set(self.log.scene.get('robots', {})))
+
+    def waypoint(self, robot: str, time: float) -> list[float] | None:
+        """Return where a robot is sent at a time; None: it stays, or has not decided."""
+        times, waypoints = self._waypoints.get(robot, ([], []))
+        index = bisect.bisect_right(times, time)
+        return waypoints[index - 1] if index else None
 
     def found(self, time: float) -> int:
         """Return how many targets or cuboids were found by a time."""
@@ -150,8 +172,10 @@ def _draw(figure: Figure, moments: Moments, time: float) -> None:
     if spatial:
         axes.set_zlim(*bounds[2])
         axes.set_zlabel('z [m]')
-        axes.set_box_aspect(bounds[:, 1] - bounds[:, 0])
+        # Labels of the axes need room.
+        axes.set_box_aspect(bounds[:, 1] - bounds[:, 0], zoom=0.9)
         _draw_boxes(axes, moments, time)
+        _draw_links(axes, moments, time)
     else:
         axes.set_aspect('equal')
         _draw_floor(axes, moments, time)
@@ -176,8 +200,12 @@ def _draw_floor(axes: Any, moments: Moments, time: float) -> None:
         extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
         axes.imshow(values, origin='lower', extent=extent, cmap='Greys', vmin=0, vmax=24)
         break
-    for obstacle in moments.log.scene.get('obstacles', []):
-        axes.add_patch(Circle(obstacle[:2], obstacle[-1], color='#59636e'))
+    scene = moments.log.scene
+    kept = max((robot.get('clearance', 0.0) for robot in scene['robots'].values()), default=0.0)
+    for *centre, radius in scene.get('obstacles', []):
+        axes.add_patch(Circle(centre[:2], radius, color='#59636e'))
+        if kept:
+            axes.add_patch(Circle(centre[:2], radius + kept, fill=False, ls='--', ec='#59636e'))
 
 
 def _draw_boxes(axes: Any, moments: Moments, time: float) -> None:
@@ -253,21 +281,66 @@ def _mark(
 def _draw_robots(axes: Any, moments: Moments, time: float, spatial: bool) -> None:
     size = 3 if spatial else 2
     now = {event[2]: event for event in moments.now('robot', time)}
-    for name, colour in colours_of(now).items():
+    for index, name in enumerate(moments.robots):
+        if name not in now:
+            continue
+        colour = _NAMED.get(name, _ROBOTS[index % len(_ROBOTS)])
         path = np.array([event[3][:size] for event in moments.until('robot', name, time)])
         axes.plot(*path.T, '-', color=colour, lw=1.3)
         ways = moments.until('way', name, time)
         if ways and ways[-1][3]:
             axes.plot(*np.array(ways[-1][3])[:, :size].T, '--', color=colour, lw=1.3)
+        waypoint = moments.waypoint(name, time)
+        if waypoint is not None:
+            axes.plot(*np.array(waypoint)[:size, None], 's', color=colour, ms=8, mfc='none')
         *place, yaw = now[name][3]
-        marker: Any = 'D' if spatial else (3, 0, math.degrees(yaw) - 90.0)
+        _draw_view(axes, moments.log.scene, name, now[name][3], colour)
+        marker: Any = 'D' if spatial else _arrow(yaw)
         axes.plot(
-            *np.array(place)[:size, None], marker=marker, color=colour, ms=8 if spatial else 13
+            *np.array(place)[:size, None], marker=marker, color=colour, ms=8 if spatial else 16
         )
         axes.text(*place[:size], f'   {name}', fontsize=9, weight='bold')
         fence = moments.log.scene.get('robots', {}).get(name, {}).get('fence')
         if fence:
             _draw_fence(axes, fence, colour, spatial)
+
+
+def _arrow(yaw: float) -> Outline:
+    """Return a marker that points along a yaw [rad]."""
+    ahead, left = np.array([1.4, -0.9, -0.5, -0.9, 1.4]), np.array([0.0, 0.8, 0.0, -0.8, 0.0])
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return Outline(np.column_stack([ahead * cos - left * sin, ahead * sin + left * cos]))
+
+
+def _draw_view(axes: Any, scene: dict[str, Any], name: str, pose: list[float], colour: str) -> None:
+    """Draw the field of view; in space only how high the robot is."""
+    x, y, z, yaw = pose
+    if len(scene.get('bounds') or [0, 0]) == 3:
+        axes.plot([x, x], [y, y], [scene['bounds'][2][0], z], ':', color=colour, lw=0.8)
+        return
+    view = scene['robots'].get(name, {}).get('view')
+    if view is None:
+        return
+    style: Any = {'ec': colour, 'fc': (*to_rgb(colour), 0.12), 'ls': ':'}
+    if view['kind'] == 'box':
+        (left, low), (right, high) = view['lower'][:2], view['upper'][:2]
+        corners = np.array([[left, low], [right, low], [right, high], [left, high]])
+        turn = yaw if view['turns'] else 0.0
+        turned = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+        axes.add_patch(Polygon(corners @ turned + (x, y), **style))
+    else:
+        wide, high = view['size'][:2]
+        axes.add_patch(Ellipse((x, y), 2.0 * wide, 2.0 * high, **style))
+
+
+def _draw_links(axes: Any, moments: Moments, time: float) -> None:
+    """Draw lines between robots of which one hears the other."""
+    places = {event[2]: event[3][:3] for event in moments.now('robot', time)}
+    for event in moments.now('cuboid', time):
+        for other in event[6]:
+            if event[2] in places and other in places:
+                ends = np.array([places[event[2]], places[other]])
+                axes.plot(*ends.T, ':', color='0.3', lw=1.0)
 
 
 def _draw_fence(axes: Any, fence: list[list[float]], colour: str, spatial: bool) -> None:

@@ -57,7 +57,8 @@ function drawLinks(view, log, time) {
     if (!event || !here) continue;
     for (const other of event[6]) {
       const there = log.at('robot', other, time);
-      if (!there || other < name) continue;
+      const answers = other < name && (log.at('cuboid', other, time) || [])[6];
+      if (!there || (answers && answers.includes(name))) continue;
       path(context, camera, [here[3], there[3]]);
       context.stroke();
     }

@@ -5,7 +5,8 @@ export const POTENTIAL = '#e69f00';
 export const SEEN = '#cc79a7';
 export const VISITED = '#56b4e9';
 export const OPEN = '#d55e00';
-const ROBOTS = ['#0072b2', '#d55e00', '#cc79a7', '#56b4e9', '#8c564b', '#7f7f7f'];
+// The last is also that of detections.
+const ROBOTS = ['#0072b2', '#d55e00', '#8c564b', '#56b4e9', '#7f7f7f', '#cc79a7'];
 const NAMED = { purple: '#7b3294', red: '#d62728', green: '#2ca02c', blue: '#0072b2' };
 const CIVIDIS = [
   [0, 34, 78], [18, 53, 112], [59, 73, 108], [87, 93, 109], [112, 113, 115],

@@ -42,7 +42,9 @@ export class Curve {
     const found = log.isOfBuildings
       ? { times: log.visits.times, events: log.visits.times.map((_, index) => index + 1) }
       : log.totals;
-    const most = Math.max(1, log.total || 0, ...found.events.slice(-1), ...sampled(log.left, 500).map((item) => item[1]));
+    // Without the number expected before the search only potential targets are known.
+    const [other, title] = log.knowsExpected ? [log.left, 'expected left'] : [log.potential, 'potential'];
+    const most = Math.max(1, log.total || 0, ...found.events.slice(-1), ...sampled(other, 500).map((item) => item[1]));
     const [left, wide] = this.axis;
     const top = 6;
     const high = height - 26;
@@ -61,9 +63,9 @@ export class Curve {
     context.textAlign = 'left';
     context.fillStyle = FOUND;
     context.fillText(log.isOfBuildings ? 'visited' : 'found', left, height - 6);
-    if (log.left.times.length) {
+    if (other.times.length) {
       context.fillStyle = POTENTIAL;
-      context.fillText('expected left', left + 50, height - 6);
+      context.fillText(title, left + 50, height - 6);
     }
     const steps = (points, colour, dash) => {
       context.strokeStyle = colour;
@@ -82,7 +84,7 @@ export class Curve {
       context.setLineDash([]);
       context.lineWidth = 1;
     };
-    if (log.left.times.length) steps(sampled(log.left, 800), POTENTIAL, [4, 3]);
+    if (other.times.length) steps(sampled(other, 800), POTENTIAL, [4, 3]);
     steps(sampled(found, 2000), FOUND, []);
   }
 }

@@ -17,7 +17,11 @@ export function follow(onLog, onEvents, onState) {
   source.onerror = () => onState('connection lost');
 }
 
-const COMMANDS = [['pause', 'Pause'], ['resume', 'Resume'], ['home', 'Send home'], ['stop', 'Stop']];
+const COMMANDS = [['pause', 'Pause'], ['resume', 'Resume'], ['home', 'Send home'], ['stop', 'Stop'], ['release', 'Release']];
+const HINTS = {
+  stop: 'The selected robot, or all where none is selected, until they are released',
+  release: 'The selected robot, or all where none is selected, take goals again after a stop',
+};
 
 // Show the controls; the token is in the address.
 export function showControls(parent, selectedRobot) {
@@ -27,7 +31,7 @@ export function showControls(parent, selectedRobot) {
   for (const [command, title] of COMMANDS) {
     const button = element('button', '', title);
     button.dataset.command = command;
-    button.title = 'The selected robot, or the whole search where none is selected';
+    button.title = HINTS[command] || 'The selected robot, or the whole search where none is selected';
     button.onclick = async () => {
       const robot = selectedRobot();
       answer.textContent = `${command} ${robot || 'all'} ...`;
@@ -39,6 +43,7 @@ export function showControls(parent, selectedRobot) {
         });
         const result = await reply.json();
         answer.textContent = `${command} ${robot || 'all'}: ${result.message}`;
+        answer.title = answer.textContent;
       } catch (error) {
         answer.textContent = `${command}: no answer`;
       }

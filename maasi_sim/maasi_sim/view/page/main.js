@@ -61,6 +61,8 @@ class Page {
       (state) => {
         $('source').textContent = state;
         document.body.dataset.connection = state;
+        // Nobody is left who would follow.
+        if (state === 'ended') $('controls').hidden = true;
       },
     );
   }
@@ -76,7 +78,10 @@ class Page {
       $('source').textContent = facts.filter(Boolean).join(', ');
     }
     if (log.scene.control && !$('controls').childElementCount) showControls($('controls'), () => this.selected);
-    $('curve_title').textContent = log.isOfBuildings ? 'Cuboids visited' : 'Found and expected';
+    for (const button of $('layers').querySelectorAll('[data-layer]')) {
+      button.hidden = log.isOfBuildings && button.dataset.layer !== 'ways';
+    }
+    $('curve_title').textContent = log.isOfBuildings ? 'Cuboids visited' : `Found and ${log.knowsExpected ? 'expected' : 'potential'}`;
     this.fitted = false;
     this.changed = true;
     this.request();

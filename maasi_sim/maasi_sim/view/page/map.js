@@ -87,9 +87,8 @@ export class MapView {
     }
     context.fillStyle = themed('--quiet');
     context.font = '11px system-ui, sans-serif';
-    const [x, y] = camera.project([right, low, this.floor]);
     context.textAlign = 'right';
-    context.fillText(`grid ${Number(step.toPrecision(2))} m`, x, y + 14);
+    context.fillText(`grid ${Number(step.toPrecision(2))} m`, camera.width - 10, camera.height - 12);
     context.textAlign = 'left';
   }
 
@@ -97,13 +96,14 @@ export class MapView {
     for (const space of log.owners('map')) {
       const event = log.at('map', space, time);
       if (!event) continue;
-      if (event[5][2] > 1) this.drawUnseenSpace(event);
+      if (event[5][2] > 1 && this.camera.spatial) this.drawUnseenSpace(event);
       else this.drawUnseenFloor(event);
       return;
     }
   }
 
-  drawUnseenFloor([, , , corner, step, [nx, ny], digits]) {
+  // From above a search in space has the mean of each column.
+  drawUnseenFloor([, , , corner, step, [nx, ny, nz], digits]) {
     const { context, camera } = this;
     const half = [step[0] / 2, step[1] / 2];
     const colour = themed('--unseen');
@@ -135,7 +135,8 @@ export class MapView {
       const [red, green, blue] = colour.split(',').map(Number);
       for (let i = 0; i < nx; i += 1) {
         for (let j = 0; j < ny; j += 1) {
-          const value = digits.charCodeAt(i * ny + j) - 48;
+          let value = 0;
+          for (let k = 0; k < nz; k += 1) value += (digits.charCodeAt((i * ny + j) * nz + k) - 48) / nz;
           pixels.data.set([red, green, blue, 15 * value], 4 * ((ny - 1 - j) * nx + i));
         }
       }
@@ -154,7 +155,7 @@ export class MapView {
     const skip = Math.max(1, Math.round(Math.cbrt((nx * ny * nz) / 3000)));
     for (let i = 0; i < nx; i += skip) {
       for (let j = 0; j < ny; j += skip) {
-        for (let k = 0; k < nz; k += camera.spatial ? skip : nz) {
+        for (let k = 0; k < nz; k += skip) {
           const value = digits.charCodeAt((i * ny + j) * nz + k) - 48;
           if (value < 1) continue;
           const [x, y] = camera.project([corner[0] + i * step[0], corner[1] + j * step[1], corner[2] + k * step[2]]);
@@ -407,7 +408,10 @@ export class MapView {
     const [px, py] = camera.project([x, y, z]);
     context.fillStyle = themed('--text');
     context.font = '600 12px system-ui, sans-serif';
-    context.fillText(name, px + 12, py - 10);
+    const isFarRight = px + 14 + context.measureText(name).width > camera.width;
+    context.textAlign = isFarRight ? 'right' : 'left';
+    context.fillText(name, isFarRight ? px - 12 : px + 12, py - 10);
+    context.textAlign = 'left';
     this.targets.push({ x: px, y: py, robot: name });
   }
 

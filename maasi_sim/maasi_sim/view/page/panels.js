@@ -10,17 +10,17 @@ const MOST_LINES = 60;
 
 export function showNumbers(parent, log, time) {
   const score = log.at('score', '', time);
-  const plans = log.owners('plan').map((space) => log.at('plan', space, time)).filter(Boolean);
-  const explored = plans.length ? Math.max(...plans.map((plan) => plan[4])) : null;
+  const explored = log.explored.at(time);
   const total = log.total;
   const rows = [
     [log.isOfBuildings ? 'visited' : 'found', `${log.found(time)}${total ? ` of ${total}` : ''}`, 'found_count'],
   ];
   if (log.isOfBuildings) rows.push(['snapshots', shots(log, time)]);
   else {
-    rows.push(['expected left', number(log.left.at(time))]);
+    if (log.knowsExpected) rows.push(['expected left', number(log.left.at(time))]);
+    rows.push(['potential', number(log.potential.at(time))]);
     rows.push(['measurements', log.measurements(time)]);
-    rows.push(['explored', explored === null ? '-' : `${Math.round(100 * explored)} %`]);
+    rows.push(['explored', explored === undefined ? '-' : `${Math.round(100 * explored)} %`]);
     rows.push(['decisions', log.decisions.count(time)]);
   }
   if (score) {
@@ -102,7 +102,7 @@ export function showLog(list, log, time, onChoose) {
 
 export function showLegend(parent, log) {
   const entries = log.isOfBuildings
-    ? [['cuboid visited', VISITED], ['to visit', OPEN]]
+    ? [['cuboid visited', VISITED], ['to visit (planned: as its robot)', OPEN]]
     : [['found (3 sigma)', FOUND], ['potential (mass)', POTENTIAL], ['detection', SEEN]];
   parent.replaceChildren(
     ...entries.map(([text, colour]) => {
@@ -113,7 +113,8 @@ export function showLegend(parent, log) {
       return entry;
     }),
   );
-  if (!log.isOfBuildings) parent.append(element('span', '', '✕ true target'), element('span', '', '□ waypoint'));
+  if (log.isOfBuildings) parent.append(element('span', '', '┈ radio link'));
+  else parent.append(element('span', '', '✕ true target'), element('span', '', '□ waypoint'));
   if (Object.values(log.scene.robots).some((robot) => robot.fence)) parent.append(element('span', '', '-·- geofence'));
   if (log.scene.thinned) parent.append(element('span', '', `thinned: one state per ${log.scene.thinned} s`));
 }

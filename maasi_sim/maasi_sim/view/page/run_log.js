@@ -48,10 +48,13 @@ export class RunLog {
     this.decisions = new Slot();
     this.lines = new Slot();
     this.totals = new Slot();
+    this.potential = new Slot();
+    this.explored = new Slot();
     this.left = new Slot();
     this.visits = new Slot();
     this.foundBy = new Map();
-    this.leftBy = new Map();
+    this.potentialBy = new Map();
+    this.exploredBy = new Map();
     this.visited = new Set();
   }
 
@@ -99,9 +102,13 @@ export class RunLog {
       this.foundBy.set(owner, event[3].length);
       this.totals.add(time, [...this.foundBy.values()].reduce((sum, item) => sum + item, 0));
     } else if (kind === 'filter') {
-      this.leftBy.set(owner, event[3]);
-      this.left.add(time, Math.max(...this.leftBy.values()));
+      this.potentialBy.set(owner, event[3]);
+      this.potential.add(time, Math.max(...this.potentialBy.values()));
+      this.expect(time);
+    } else if (kind === 'map') {
+      this.explore(time, owner, event[7]);
     } else if (kind === 'plan') {
+      this.explore(time, owner, event[4]);
       for (const robot of event[7]) {
         const decision = { time, event, robot, name: robot[0] };
         this.decisions.add(time, decision);
@@ -116,6 +123,22 @@ export class RunLog {
         this.visits.add(time, { cuboid: shot[0], robot: owner, place: shot.slice(1, 4) });
       }
     }
+  }
+
+  explore(time, owner, share) {
+    this.exploredBy.set(owner, share);
+    this.explored.add(time, Math.max(...this.exploredBy.values()));
+    this.expect(time);
+  }
+
+  // Expected number left: potential targets, and N0 times the unexplored share.
+  expect(time) {
+    const unseen = 1 - (this.explored.at(time) || 0);
+    if (this.knowsExpected) this.left.add(time, (this.potential.at(time) || 0) + this.scene.expected_targets * unseen);
+  }
+
+  get knowsExpected() {
+    return this.scene.expected_targets !== undefined;
   }
 
   // What was found by a time: targets, or cuboids in a search of buildings.

@@ -4,17 +4,18 @@ import { scaleColour } from './colours.js';
 import { element, number } from './text.js';
 
 const COLUMNS = [
-  ['x', 0, 'm'], ['y', 1, 'm'], ['z', 2, 'm'], ['J', 6, '1/step'], ['C', 3, ''], ['T', 4, ''], ['E', 5, ''], ['K', 7, 'steps'], ['M', 8, ''],
+  ['x', 0, 'm'], ['y', 1, 'm'], ['z', 2, 'm'], ['J', 6, ''], ['C', 3, ''], ['T', 4, ''], ['E', 5, ''], ['K', 7, 'steps'], ['M', 8, ''],
 ];
 const TITLES = {
-  J: 'objective: (-C + alpha T + beta E) / K', C: 'control cost', T: 'target refinement', E: 'exploration', K: 'steps to reach it', M: 'measurements on the way',
+  J: 'objective', C: 'control cost', T: 'target refinement', E: 'exploration', K: 'steps to reach it', M: 'measurements on the way',
 };
 let order = 6;
 
 // Units of the terms: docs/planners.md.
 function units(log) {
-  if (log.scene.objective === 'information') return { C: '', T: 'nat', E: 'targets', J: 'per step' };
-  return { C: '', T: '', E: '', J: 'per step' };
+  const { objective, weights } = log.scene;
+  const terms = objective === 'information' ? { T: 'nat', E: 'targets' } : { T: '', E: '' };
+  return { C: '', ...terms, J: weights ? `per ${weights.per_distance ? 'metre' : 'step'}` : '' };
 }
 
 // Return the sentence on the choice that the node gives, or what follows from the numbers.
@@ -83,8 +84,12 @@ function showCandidates(parent, log, decision, marked, onMark) {
     const steps = `K ${gain.K >= 0 ? '+' : ''}${gain.K} steps`;
     parent.append(element('p', 'gain', `Over the next best (candidate ${gain.next}): ${['J', 'C', 'T', 'E'].map(part).join(', ')}, ${steps}`));
   }
-  const { alpha, beta } = log.scene.weights || {};
-  if (alpha !== undefined) parent.append(element('p', 'quiet', `J = (-C + alpha T + beta E) / K; alpha ${alpha}, beta ${beta === null ? 'of the preset' : beta}`));
+  const { weights } = log.scene;
+  if (weights) {
+    const { control, alpha, beta } = weights;
+    const terms = `-${number(control)} C + ${number(alpha)} T + ${number(beta)} E`;
+    parent.append(element('p', 'formula quiet', `J = (${terms}) / ${weights.per_distance ? 'metres of the way' : 'K'}`));
+  }
   const table = element('table', '');
   const head = table.createTHead().insertRow();
   head.append(element('th', '', '#'));
