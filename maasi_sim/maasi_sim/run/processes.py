@@ -18,7 +18,6 @@ from typing import Any, BinaryIO, NoReturn
 
 from setproctitle import setproctitle
 
-from maasi_filter.ros.loopback import loopback_fault
 from maasi_sim.run.shared_memory import LONGEST_CREATION, remove_dead_ports
 
 # Domains whose ports lie below the ephemeral ports of Linux (from 32768).
@@ -64,6 +63,9 @@ class Domain:
         team: str = '',
         shared: bool = False,
     ) -> None:
+        # Deferred: it imports NumPy, whose threads keep a process from being forked.
+        from maasi_filter.ros.loopback import loopback_fault
+
         if fault := loopback_fault():
             raise ProcessError(fault)
         # A run that was killed while starting leaves recent ports.
