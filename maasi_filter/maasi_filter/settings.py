@@ -403,6 +403,7 @@ def unsuitable_lengths(settings: FilterSettings, bounds: FloatArray) -> str:
 
 def unused_settings(settings: FilterSettings) -> str:
     """Return a warning if settings are given that only the other method has, else ''."""
+    # The description of a setting begins with the only method that has it.
     other = 'pmb' if settings.method == 'ic_phd' else 'ic_phd'
     # T_z is also the length by which found targets are scored.
     names = [

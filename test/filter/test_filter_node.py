@@ -1,4 +1,4 @@
-"""The filter node over real topics: batches, trouble, and what it says of it."""
+"""The filter node over real topics: batches, faults, and what it says of it."""
 
 import math
 import time

@@ -1,4 +1,4 @@
-"""The planner node over real topics: decisions, trouble, and what it says of it."""
+"""The planner node over real topics: decisions, faults, and what it says of it."""
 
 import math
 from contextlib import contextmanager

@@ -1,7 +1,7 @@
 """Nodes that play a run by a script: what they find, when they die. Started as processes by tests.
 
-Usage: fake_nodes.py ROLE --ros-args ... with parameters `robots`, `lockstep`, `step`, `trouble`
-(none, die, hang, loop, raise, deaf, silent), `trouble_step`, `targets` (flat), `finished_step`,
+Usage: fake_nodes.py ROLE --ros-args ... with parameters `robots`, `lockstep`, `step`, `fault`
+(none, die, hang, loop, raise, deaf, silent), `fault_step`, `targets` (flat), `finished_step`,
 `marker`.
 """
 
@@ -49,8 +49,8 @@ class Fake(Node):
         self.robots = list(self.value('robots', ['mambo']))
         self.lockstep = self.value('lockstep', True)
         self.length = self.value('step', 0.05)
-        self.trouble = self.value('trouble', 'none')
-        self.trouble_step = self.value('trouble_step', 0)
+        self.fault = self.value('fault', 'none')
+        self.fault_step = self.value('fault_step', 0)
         self.full_name = self.get_fully_qualified_name()
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self.beat)
@@ -69,7 +69,7 @@ class Fake(Node):
     def say_ready(self, *peers):
         """Say so once each publisher has as many subscriptions as named, the recorder's apart."""
         self.peers = peers
-        if self.trouble != 'silent':
+        if self.fault != 'silent':
             self.ready_timer = self.create_timer(0.01, self.look_for_peers)
 
     def look_for_peers(self):
@@ -93,21 +93,21 @@ class Fake(Node):
             if not self.has_parameter('marker')
             else (self.get_parameter('marker').value)
         )
-        if self.trouble == 'none' or step != self.trouble_step:
+        if self.fault == 'none' or step != self.fault_step:
             return False
         if marker and os.path.exists(marker):
             return False
         if marker:
             with open(marker, 'w'):
                 pass
-        if self.trouble == 'die':
+        if self.fault == 'die':
             os.kill(os.getpid(), signal.SIGKILL)
-        if self.trouble == 'raise':
-            raise RuntimeError('a scripted trouble')
-        while self.trouble == 'loop':
+        if self.fault == 'raise':
+            raise RuntimeError('a scripted fault')
+        while self.fault == 'loop':
             # The executor's thread is busy for ever; the process lives.
             pass
-        return self.trouble == 'hang'
+        return self.fault == 'hang'
 
     def stamp(self, message, step):
         nanoseconds = round(step * self.length * 1e9)
@@ -319,7 +319,7 @@ def main():
     role = sys.argv[1]
     rclpy.init()
     node = {'sim': Sim, 'driver': Driver, 'filter': Filter, 'planner': Planner}[role]()
-    if node.trouble == 'deaf':
+    if node.fault == 'deaf':
         # Ends by nothing but SIGKILL.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         signal.signal(signal.SIGINT, signal.SIG_IGN)

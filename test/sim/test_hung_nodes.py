@@ -9,7 +9,7 @@ pytestmark = pytest.mark.system
 
 
 def test_a_node_in_an_endless_loop_ends_a_free_run_and_is_named(tmp_path, scenario):
-    script = {'found': 0, 'filter_node': {'trouble': 'loop', 'trouble_step': 20}}
+    script = {'found': 0, 'filter_node': {'fault': 'loop', 'fault_step': 20}}
     path = scenario(limits={'time': 120.0, 'start': 60.0, 'silence': 90.0})
     run = Run(tmp_path / 'run', path, '--no-record', script=script)
     code, output = run.wait()
@@ -21,10 +21,10 @@ def test_a_node_in_an_endless_loop_ends_a_free_run_and_is_named(tmp_path, scenar
 
 def test_a_node_in_an_endless_loop_is_killed_and_started_again(tmp_path, scenario):
     marker = tmp_path / 'looped'
-    trouble = {'trouble': 'loop', 'trouble_step': 5, 'marker': str(marker)}
+    fault = {'fault': 'loop', 'fault_step': 5, 'marker': str(marker)}
     limits = {'time': 120.0, 'start': 60.0, 'silence': 90.0}
     path = scenario(on_exit='respawn', limits=limits)
-    run = Run(tmp_path / 'run', path, script={'filter_node': trouble})
+    run = Run(tmp_path / 'run', path, script={'filter_node': fault})
     code, output = run.wait()
     assert code == 0, output
     assert 'it is killed' in output and 'it is restarted' in output

@@ -237,7 +237,7 @@ def test_the_planner_may_end_a_run(tmp_path, scenario, stop, code):
 
 @pytest.mark.parametrize('node', ['filter_node', 'mambo/driver', 'sim_node'])
 def test_a_node_that_dies_ends_the_run_and_is_named(tmp_path, scenario, node):
-    script = {node: {'trouble': 'die', 'trouble_step': 15}}
+    script = {node: {'fault': 'die', 'fault_step': 15}}
     run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
     code, output = run.wait()
     assert code == 3, output
@@ -254,18 +254,18 @@ def test_a_node_that_dies_ends_the_run_and_is_named(tmp_path, scenario, node):
 
 
 def test_an_error_is_shown_with_the_end_of_the_log(tmp_path, scenario):
-    script = {'filter_node': {'trouble': 'raise', 'trouble_step': 5}}
+    script = {'filter_node': {'fault': 'raise', 'fault_step': 5}}
     run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
     code, output = run.wait()
     assert code == 3, output
     assert '/filter_node exited with 1' in output
-    assert 'RuntimeError: a scripted trouble' in output
+    assert 'RuntimeError: a scripted fault' in output
 
 
 def test_a_node_that_dies_is_started_again_where_the_scenario_says_so(tmp_path, scenario):
     marker = tmp_path / 'died'
     script = {
-        'second/driver': {'trouble': 'die', 'trouble_step': 5, 'marker': str(marker)},
+        'second/driver': {'fault': 'die', 'fault_step': 5, 'marker': str(marker)},
     }
     # To start again takes longer than a node may be silent otherwise.
     path = scenario(on_exit='respawn', limits={'time': 20.0, 'start': 30.0, 'silence': 30.0})
@@ -279,7 +279,7 @@ def test_a_node_that_dies_is_started_again_where_the_scenario_says_so(tmp_path, 
 
 def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, scenario):
     limits = {'time': 20.0, 'start': 30.0, 'silence': 20.0, 'restarts': 1}
-    script = {'second/driver': {'trouble': 'die', 'trouble_step': 5}}
+    script = {'second/driver': {'fault': 'die', 'fault_step': 5}}
     path = scenario(on_exit='respawn', limits=limits)
     run = Run(tmp_path / 'run', path, '--lockstep', script=script)
     code, output = run.wait()
@@ -289,7 +289,7 @@ def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, scenario):
 
 def test_a_node_that_hangs_ends_the_run_and_is_named(tmp_path, scenario):
     node = 'second/driver'
-    script = {node: {'trouble': 'hang', 'trouble_step': 7}}
+    script = {node: {'fault': 'hang', 'fault_step': 7}}
     run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
     code, output = run.wait()
     assert code == 3, output
@@ -299,7 +299,7 @@ def test_a_node_that_hangs_ends_the_run_and_is_named(tmp_path, scenario):
 
 def test_a_node_that_never_gets_ready_is_named(tmp_path, scenario):
     limits = {'time': 20.0, 'start': 5.0, 'silence': 5.0}
-    script = {'filter_node': {'trouble': 'silent'}}
+    script = {'filter_node': {'fault': 'silent'}}
     run = Run(tmp_path / 'run', scenario(limits=limits), script=script)
     code, output = run.wait()
     assert code == 3, output
@@ -308,7 +308,7 @@ def test_a_node_that_never_gets_ready_is_named(tmp_path, scenario):
 
 
 def test_deaf_nodes_are_killed_and_no_robot_goes_on(tmp_path, scenario):
-    script = {name: {'trouble': 'deaf'} for name in ('filter_node', 'mambo/driver')}
+    script = {name: {'fault': 'deaf'} for name in ('filter_node', 'mambo/driver')}
     run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
     code, output = run.wait()
     assert code == 0, output
