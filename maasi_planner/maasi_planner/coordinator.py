@@ -333,8 +333,8 @@ class Coordinator:
                 view.phase = (plan.measured_from - step) % plan.period
                 if len(plan.positions):
                     first = min(gone, len(plan.positions) - 1)
-                    view.tail = plan.positions[first:]
-                    view.tail_yaws = plan.yaws[first:]
+                    view.remaining_path = plan.positions[first:]
+                    view.remaining_yaws = plan.yaws[first:]
             views[name] = view
         return TeamView(
             step=step,

@@ -36,11 +36,11 @@ class RobotView:
         Steps between possible measurements, Delta.
     planning : bool
         Whether the robot is in P_k: it chooses a waypoint now.
-    tail : (n, 3) array, optional
+    remaining_path : (n, 3) array, optional
         Remaining trajectory of a robot that is not planning: positions at steps now, now + 1 and
         so on. None: it stands at its present position.
-    tail_yaws : (n,) array, optional
-        Headings along the tail, radians. None: the present one.
+    remaining_yaws : (n,) array, optional
+        Headings along the remaining path, radians. None: the present one.
     phase : int
         Steps from now to the next possible measurement of a robot that is not planning. (One
         that plans measures now.)
@@ -56,8 +56,8 @@ class RobotView:
     sensor: Sensor
     period_steps: int
     planning: bool = True
-    tail: FloatArray | None = None
-    tail_yaws: FloatArray | None = None
+    remaining_path: FloatArray | None = None
+    remaining_yaws: FloatArray | None = None
     phase: int = 0
     radius: float = 0.0
     exploration: UnexploredMap | None = None
@@ -81,8 +81,6 @@ class TeamView:
         e after the last measurements.
     obstacles : Obstacles, optional
         In true size, not inflated.
-    particles, weights : (n, d), (n,) arrays, optional
-        Intensity function, for mutual information; approximated by the clusters if None.
     taken : sequence of (3,) array and float
         Present or final positions of robots of other planners, metres, and their radii.
     """
@@ -93,8 +91,6 @@ class TeamView:
     clusters: list[Cluster]
     exploration: UnexploredMap
     obstacles: Obstacles | None = None
-    particles: FloatArray | None = None
-    weights: FloatArray | None = None
     taken: Sequence[tuple[FloatArray, float]] = ()
 
     @property

@@ -32,7 +32,7 @@ def _decide(team: TeamView) -> None:
     last = team.robots[team.names()[-1]]
     last.planning = False
     start = np.array(last.state.pose.position)
-    last.tail = np.stack([start, start + 0.1])
+    last.remaining_path = np.stack([start, start + 0.1])
     for settings in (PlannerSettings(objective='paper'), PlannerSettings()):
         make_planner('maasi', settings).decide(team)
     name = team.names()[0]

@@ -27,19 +27,21 @@ def measurement_steps(team, name, trajectories, choice, weights, horizon):
             if counts or (regular and weights.extend):
                 out.append((step, *pose, counts and (step > 0 or weights.present)))
         return out
-    tail = view.tail if view.tail is not None else view.state.pose.position[None, :]
+    path = view.remaining_path
+    if path is None:
+        path = view.state.pose.position[None, :]
     yaws = (
-        view.tail_yaws
-        if view.tail is not None and view.tail_yaws is not None
-        else np.full(len(tail), view.state.pose.yaw)
+        view.remaining_yaws
+        if view.remaining_path is not None and view.remaining_yaws is not None
+        else np.full(len(path), view.state.pose.yaw)
     )
-    last = len(tail) - 1
+    last = len(path) - 1
     for step in range(horizon + 1):
         k = min(step, last)
         regular = step >= view.phase and (step - view.phase) % view.period_steps == 0
         arrives = last > 0 and step == last
         if (regular and (step < last or weights.extend)) or arrives:
-            out.append((step, tail[k], yaws[k], False))
+            out.append((step, path[k], yaws[k], False))
     return out
 
 
@@ -93,7 +95,7 @@ def information(team, name, trajectories, w, weights, present_only=False):
     horizon = (
         int(trajectories[name].lengths[w])
         if view.planning
-        else (len(view.tail) - 1 if view.tail is not None else 0)
+        else (len(view.remaining_path) - 1 if view.remaining_path is not None else 0)
     )
     if view.planning:
         steps = measurement_steps(
@@ -105,13 +107,13 @@ def information(team, name, trajectories, w, weights, present_only=False):
         elif not weights.present:
             steps = steps[1:]
     else:
-        tail = view.tail if view.tail is not None else np.zeros((0, 3))
-        last = len(tail) - 1
-        yaws = view.tail_yaws if view.tail_yaws is not None else np.zeros(len(tail))
+        path = view.remaining_path if view.remaining_path is not None else np.zeros((0, 3))
+        last = len(path) - 1
+        yaws = view.remaining_yaws if view.remaining_yaws is not None else np.zeros(len(path))
         steps = [
-            (k, tail[k], yaws[k], True)
+            (k, path[k], yaws[k], True)
             for k in range(max(last, 0) + 1)
-            if len(tail)
+            if len(path)
             and (
                 (k >= view.phase and (k - view.phase) % view.period_steps == 0 and k < last)
                 or (k == last and last > 0)

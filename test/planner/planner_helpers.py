@@ -36,8 +36,8 @@ class Member:
     period: int
     radius: float = 0.0
     waypoint: np.ndarray | None = None
-    tail: np.ndarray | None = None
-    tail_yaws: np.ndarray | None = None
+    remaining_path: np.ndarray | None = None
+    remaining_yaws: np.ndarray | None = None
     since: int = 0
     idle: bool = False
     path: list = field(default_factory=list)
@@ -52,8 +52,8 @@ class Member:
             sensor=self.sensor,
             period_steps=self.period,
             planning=planning,
-            tail=None if planning or self.idle else self.tail[self.since :],
-            tail_yaws=None if planning or self.idle else self.tail_yaws[self.since :],
+            remaining_path=None if planning or self.idle else self.remaining_path[self.since :],
+            remaining_yaws=None if planning or self.idle else self.remaining_yaws[self.since :],
             phase=(-self.since) % self.period,
             radius=self.radius,
         )
@@ -96,7 +96,7 @@ class SmallSearch:
                     or member.motion.arrived(
                         member.body.robot_state().pose.position, member.waypoint
                     )
-                    or member.since > 3 * len(member.tail) + 100
+                    or member.since > 3 * len(member.remaining_path) + 100
                 )
             ]
             if planning:
@@ -105,7 +105,7 @@ class SmallSearch:
                 for name, robot in decision.robots.items():
                     member = self.members[name]
                     member.waypoint = robot.waypoint
-                    member.tail, member.tail_yaws = robot.positions, robot.yaws
+                    member.remaining_path, member.remaining_yaws = robot.positions, robot.yaws
                     member.since = 0
                     member.idle = robot.stays
                 reason = self.planner.finished(self.team([]))
@@ -263,8 +263,8 @@ def random_team(
                 way = motion.predict(state, places(1), 0.1)
                 end = int(way.lengths[0]) + 1
                 skip = int(rng.integers(0, max(1, end // 2)))
-                view.tail = way.positions[0, skip:end].copy()
-                view.tail_yaws = way.yaws[0, skip:end].copy()
+                view.remaining_path = way.positions[0, skip:end].copy()
+                view.remaining_yaws = way.yaws[0, skip:end].copy()
                 view.phase = int(rng.integers(0, view.period_steps))
         robots[f'robot{rng.integers(1000):03d}_{index}'] = view
     return TeamView(7, 0.1, robots, clusters, exploration)

@@ -27,7 +27,7 @@ SENSOR = Sensor.ranging('s', BoxDetection([-0.3, -0.3], [0.3, 0.3], 0.5), np.dia
 PAPER = PlannerSettings(objective='paper', alpha=0.0, beta=1.0, control_weight=0.0)
 
 
-def robot(x, planning, period, goals=(), tail=None, phase=0):
+def robot(x, planning, period, goals=(), remaining_path=None, phase=0):
     """Return a robot on the line y = 2 that moves 0.5 m a step."""
     motion = make_motion(
         MotionSettings(model='constant_speed', speed=0.5, tolerance=0.01, approach_rate=1.0)
@@ -39,7 +39,9 @@ def robot(x, planning, period, goals=(), tail=None, phase=0):
         sensor=SENSOR,
         period_steps=period,
         planning=planning,
-        tail=None if tail is None else np.array([[place, 2.0, 0.0] for place in tail]),
+        remaining_path=None
+        if remaining_path is None
+        else np.array([[place, 2.0, 0.0] for place in remaining_path]),
         phase=phase,
     )
 
@@ -68,8 +70,8 @@ def test_alone_with_a_longer_period():
 
 def test_tail_longer_than_the_horizon():
     """The other robot passes 1 at step 1 (in time) and 0.5 only after step 4 (too late)."""
-    tail = [1.5, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5]
-    other = robot(1.5, False, 1, tail=tail, phase=1)
+    path = [1.5, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5]
+    other = robot(1.5, False, 1, remaining_path=path, phase=1)
     result = explore({'a': robot(0.0, True, 1, [2.0]), 'b': other})
     # a measures 0 at step 0, 0.5 at 1, 1 at 2, 1.5 at 3. b halves node 1 at steps 1 and 2.
     assert result['a'] == pytest.approx([0.5 + 0.5 + 0.5 * 0.25 + 0.5])
@@ -77,7 +79,7 @@ def test_tail_longer_than_the_horizon():
 
 def test_tail_shorter_than_the_horizon_is_extended():
     """The other robot arrives at 1.5 at step 1 and stays there, measuring on."""
-    other = robot(2.0, False, 1, tail=[2.0, 1.5], phase=0)
+    other = robot(2.0, False, 1, remaining_path=[2.0, 1.5], phase=0)
     result = explore({'a': robot(0.0, True, 1, [2.0]), 'b': other})
     # Node 1.5 is halved at steps 1, 2 and 3 by b, and at 3 by a itself.
     assert result['a'] == pytest.approx([0.5 + 0.5 + 0.5 + 0.5 * 0.125])
@@ -89,10 +91,10 @@ def test_tail_shorter_than_the_horizon_is_extended():
 
 def test_other_measurement_period_and_phase():
     """The other robot waits at 1.5 and measures at steps 1 and 3 only."""
-    other = robot(1.5, False, 2, tail=[1.5] * 8, phase=1)
+    other = robot(1.5, False, 2, remaining_path=[1.5] * 8, phase=1)
     result = explore({'a': robot(0.0, True, 1, [2.0]), 'b': other})
     assert result['a'] == pytest.approx([0.5 + 0.5 + 0.5 + 0.5 * 0.25])
-    later = robot(1.5, False, 2, tail=[1.5] * 8, phase=0)
+    later = robot(1.5, False, 2, remaining_path=[1.5] * 8, phase=0)
     result = explore({'a': robot(0.0, True, 1, [2.0]), 'b': later})
     # Now at steps 0 and 2.
     assert result['a'] == pytest.approx([0.5 + 0.5 + 0.5 + 0.5 * 0.25])
@@ -133,7 +135,7 @@ def test_one_of_two_plans_and_keeps_away_from_the_other_ones_way():
     exploration = UnexploredMap([[0.0, 10.0], [0.0, 4.0]], 0.5)
     robots = {
         'a': robot(5.0, True, 1, [3.0, 7.0]),
-        'b': robot(5.0, False, 1, tail=[5.0, 4.5, 4.0, 3.5, 3.0]),
+        'b': robot(5.0, False, 1, remaining_path=[5.0, 4.5, 4.0, 3.5, 3.0]),
     }
     decision = make_planner('maasi', PAPER).decide(TeamView(0, 1.0, robots, [], exploration))
     assert list(decision.robots) == ['a']

@@ -22,7 +22,7 @@ from maasi_planner import (
     make_planner,
 )
 from maasi_planner.planners.lawnmower import lanes
-from maasi_planner.planners.mutual_information import mutual_information
+from maasi_planner.planners.mutual_information import intensity, mutual_information
 
 NAMES = ('maasi', 'asi', 'maas', 'as', 'mutual_information', 'nearest_widest', 'lawnmower')
 
@@ -238,15 +238,15 @@ def test_active_search_by_mutual_information_is_brute_force(planning, horizon):
     for seed in range(3):
         rng = np.random.default_rng(seed)
         team = ring_team(rng, planning)
-        team.particles = rng.uniform(0.0, 2.0, (60, 2))
-        team.weights = rng.uniform(0.0, 0.05, 60)
+        points, weights = intensity(team)
+        assert len(points)
 
-        def seen(name, past, team=team):
+        def seen(name, past, team=team, points=points, weights=weights):
             detection = team.robots[name].sensor.detection
-            missed = np.ones(60)
+            missed = np.ones(len(points))
             for place in past:
-                missed *= 1.0 - detection.probability(team.particles, Pose.from_yaw(place, 0.0))
-            return mutual_information(missed, team.weights)
+                missed *= 1.0 - detection.probability(points, Pose.from_yaw(place, 0.0))
+            return mutual_information(missed, weights)
 
         decision = make_planner('maas', settings).decide(team)
         expected = brute_active_search(team, settings, seen)
@@ -315,8 +315,8 @@ def test_mutual_information_extremes():
 def test_mutual_information_chooses_the_most_informative_pair():
     rng = np.random.default_rng(4)
     team = random_team(rng, dimension=2, planning=2, waiting=0, candidates=4)
-    team.particles = rng.uniform(0.0, 2.0, (200, 2))
-    team.weights = rng.uniform(0.0, 0.03, 200)
+    points, weights = intensity(team)
+    assert len(points)
     decision = make_planner('mutual_information').decide(team)
     names = team.planning()
     missed = {}
@@ -332,10 +332,10 @@ def test_mutual_information_chooses_the_most_informative_pair():
             if turns:
                 yaw = math.atan2(place[1] - here[1], place[0] - here[0])
             pose = Pose.from_yaw(place, yaw)
-            rows.append(1.0 - view.sensor.detection.probability(team.particles, pose))
+            rows.append(1.0 - view.sensor.detection.probability(points, pose))
         missed[name] = rows
     best = max(
-        mutual_information(one * two, team.weights)
+        mutual_information(one * two, weights)
         for one in missed[names[0]]
         for two in missed[names[1]]
     )
@@ -466,11 +466,11 @@ def test_idle_robots_and_goals_of_others_count(name):
     team = random_team(rng, dimension=2, planning=1, waiting=2, candidates=3, radius=0.1)
     planning = team.planning()[0]
     first, second = (n for n in team.names() if n != planning)
-    team.robots[first].tail = None
-    team.robots[first].tail_yaws = None
+    team.robots[first].remaining_path = None
+    team.robots[first].remaining_yaws = None
     team.robots[first].state = RobotState.at_rest([0.5, 0.5, 0.0])
-    team.robots[second].tail = np.array([[1.9, 1.9, 0.0], [1.5, 1.5, 0.0]])
-    team.robots[second].tail_yaws = None
+    team.robots[second].remaining_path = np.array([[1.9, 1.9, 0.0], [1.5, 1.5, 0.0]])
+    team.robots[second].remaining_yaws = None
     team.clusters = []
     team.robots[planning].state = RobotState.at_rest([0.1, 1.9, 0.0])
     team.robots[planning].candidates = np.array(
@@ -581,7 +581,7 @@ def test_wrong_team_is_refused():
     for change, word in (
         ({'period_steps': 0}, 'period_steps'),
         ({'radius': math.nan}, 'radius'),
-        ({'tail': np.array([[np.nan, 0.0, 0.0]])}, 'tail'),
+        ({'remaining_path': np.array([[np.nan, 0.0, 0.0]])}, 'remaining_path'),
         ({'candidates': np.zeros((3, 2))}, 'candidates'),
     ):
         team, robot = one_robot()

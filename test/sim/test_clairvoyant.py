@@ -16,7 +16,7 @@ def one_robot(probability):
     """Return a robot at the origin that moves 1 m each tick and sees 0.5 m far."""
     kind, parameters = BoxDetection([-0.5, -0.5], [0.5, 0.5], probability).kernel()
     return _Robots(
-        tail=np.zeros((1, 1, 3)),
+        remaining_path=np.zeros((1, 1, 3)),
         free=np.zeros(1, np.int64),
         speed=np.ones(1),
         pause=np.zeros(1),

@@ -159,19 +159,20 @@ def reach_of(kind: int, parameters: FloatArray) -> float:
     return max([reach, *extra.tolist()]) + 2.0 * float(parameters[7])
 
 
-def tail_events(view: RobotView, horizon: int, extend: bool) -> Events:
+def path_events(view: RobotView, horizon: int, extend: bool) -> Events:
     """Return the predicted measurements of a robot that is not planning."""
-    if view.tail is None or len(view.tail) == 0:
+    path = view.remaining_path
+    if path is None or len(path) == 0:
         positions = np.array(view.state.pose.position)[None, None, :]
     else:
-        positions = np.ascontiguousarray(view.tail, dtype=float)[None, :, :]
-    if view.tail is not None and view.tail_yaws is not None and len(view.tail):
-        yaws = np.ascontiguousarray(view.tail_yaws, dtype=float)[None, :]
+        positions = np.ascontiguousarray(path, dtype=float)[None, :, :]
+    if path is not None and view.remaining_yaws is not None and len(path):
+        yaws = np.ascontiguousarray(view.remaining_yaws, dtype=float)[None, :]
     else:
         yaws = np.full(positions.shape[:2], view.state.pose.yaw)
     lengths = np.array([positions.shape[1] - 1], np.int64)
-    # Where the tail ends the robot measures in any case: it plans there.
-    arrival = view.tail is not None and len(view.tail) > 1
+    # Where its path ends the robot measures in any case: it plans there.
+    arrival = path is not None and len(path) > 1
     timing = Timing(max(0, view.phase), view.period_steps, horizon, arrival, extend)
     return events(positions, yaws, lengths, timing)
 

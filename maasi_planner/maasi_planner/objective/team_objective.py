@@ -32,11 +32,11 @@ from maasi_planner.objective.predicted_measurements import (
     Timing,
     events,
     joined,
+    path_events,
     reach_of,
     rows_of,
     stacked,
     starts_of,
-    tail_events,
 )
 from maasi_planner.objective.unexplored_nodes import (
     Entries,
@@ -173,7 +173,7 @@ class TeamObjective:
                 item = events(way.positions, way.yaws, way.lengths, timing)
                 planned.append(_Measuring(view, kernel, item))
             else:
-                item = tail_events(view, horizon, weights.extend)
+                item = path_events(view, horizon, weights.extend)
                 settled.append(_Measuring(view, kernel, item))
         return planned, settled
 

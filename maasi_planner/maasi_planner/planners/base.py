@@ -117,22 +117,23 @@ def check_team(team: TeamView) -> None:
             raise ValueError(
                 f'{name}: radius: got {view.radius}, allowed are finite numbers from 0 [m]'
             )
-        for field, value, width in (('candidates', view.candidates, 3), ('tail', view.tail, 3)):
+        for field in ('candidates', 'remaining_path'):
+            value = getattr(view, field)
             if value is None:
                 continue
             array = np.asarray(value, dtype=float)
-            if array.ndim != 2 or array.shape[1] != width:
-                raise ValueError(
-                    f'{name}: {field}: got shape {array.shape}, allowed is (n, {width})'
-                )
-        if view.tail is not None and not np.isfinite(view.tail).all():
-            raise ValueError(f'{name}: tail: got a number that is not finite')
-        if view.tail_yaws is not None and (
-            view.tail is None
-            or np.shape(view.tail_yaws) != (len(view.tail),)
-            or not np.isfinite(view.tail_yaws).all()
+            if array.ndim != 2 or array.shape[1] != 3:
+                raise ValueError(f'{name}: {field}: got shape {array.shape}, allowed is (n, 3)')
+        if view.remaining_path is not None and not np.isfinite(view.remaining_path).all():
+            raise ValueError(f'{name}: remaining_path: got a number that is not finite')
+        if view.remaining_yaws is not None and (
+            view.remaining_path is None
+            or np.shape(view.remaining_yaws) != (len(view.remaining_path),)
+            or not np.isfinite(view.remaining_yaws).all()
         ):
-            raise ValueError(f'{name}: tail_yaws: allowed is one finite heading per tail position')
+            raise ValueError(
+                f'{name}: remaining_yaws: allowed is one finite heading per position of its path'
+            )
     for place, radius in team.taken:
         if not (np.isfinite(place).all() and math.isfinite(radius) and radius >= 0.0):
             raise ValueError(
@@ -238,8 +239,8 @@ def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
         view = team.robots[name]
         if view.planning:
             continue
-        if view.tail is not None and len(view.tail):
-            place = np.asarray(view.tail[-1], dtype=float)
+        if view.remaining_path is not None and len(view.remaining_path):
+            place = np.asarray(view.remaining_path[-1], dtype=float)
         else:
             place = np.array(view.state.pose.position)
         places.append((place, view.radius))

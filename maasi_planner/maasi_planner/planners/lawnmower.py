@@ -201,7 +201,8 @@ class Lawnmower(Planner):
         """See `Planner.finished`; also when every lane is done."""
         if self._started and not any(self._blocks) and not any(self._pending.values()):
             standing = all(
-                view.tail is None or len(view.tail) <= 1 for view in team.robots.values()
+                view.remaining_path is None or len(view.remaining_path) <= 1
+                for view in team.robots.values()
             )
             if standing:
                 return 'all lanes of the lawnmower are done'

@@ -105,14 +105,9 @@ def mutual_information(missed: FloatArray, weights: FloatArray) -> float:
 def intensity(team: TeamView) -> tuple[FloatArray, FloatArray]:
     """Return the points (n, d) and weights (n,) that stand for the intensity.
 
-    Without particles each cluster is 2 d + 1 points with its mean and covariance.
+    Each cluster is 2 d + 1 points of equal weight with its mean and covariance.
     """
     d = team.dimension
-    if team.particles is not None and team.weights is not None:
-        return (
-            np.ascontiguousarray(team.particles[:, :d], dtype=float),
-            np.ascontiguousarray(team.weights, dtype=float),
-        )
     points, weights = [np.zeros((0, d))], [np.zeros(0)]
     for cluster in team.clusters:
         root = np.zeros((d, d))
@@ -129,8 +124,7 @@ def intensity(team: TeamView) -> tuple[FloatArray, FloatArray]:
         scale = math.sqrt(d + 0.5)
         offsets = np.vstack([np.zeros((1, d)), scale * root.T, -scale * root.T])
         points.append(np.asarray(cluster.position, dtype=float)[:d] + offsets)
-        share = 0.5 / (d + 0.5)
-        weights.append(cluster.mass * np.array([share] + [0.5 / (d + 0.5)] * (2 * d)))
+        weights.append(np.full(2 * d + 1, cluster.mass * (0.5 / (d + 0.5))))
     return np.vstack(points), np.concatenate(weights)
 
 

@@ -42,7 +42,7 @@ ROUNDS = 80
 class _Robots(NamedTuple):
     """The R robots in units of ticks, the shortest measurement period."""
 
-    tail: FloatArray  # (R, n, 3) path until each is free [m], padded by its last position
+    remaining_path: FloatArray  # (R, n, 3) path until each is free [m], padded by its last position
     free: IntArray  # (R,) when each is free
     speed: FloatArray  # (R,) [m]
     pause: FloatArray  # (R,) additional time of a turn
@@ -69,7 +69,7 @@ def _expected_end(
     # Probabilities of no detection and of exactly one.
     none = np.where(detected, 0.0, 1.0)
     one = np.where(detected, 1.0, 0.0)
-    place = robots.tail[:, 0].copy()
+    place = robots.remaining_path[:, 0].copy()
     cosine = np.ones(number)
     sine = np.zeros(number)
     wait = np.zeros(number)
@@ -78,13 +78,13 @@ def _expected_end(
         if not np.isnan(robots.yaw[r]):
             cosine[r] = np.cos(robots.yaw[r])
             sine[r] = np.sin(robots.yaw[r])
-        stops[r] = robots.tail[r, -1]
+        stops[r] = robots.remaining_path[r, -1]
     cost = 0.0
     for tick in range(TICKS):
         for r in range(number):
             goal = place[r].copy()
             if tick < robots.free[r]:
-                goal = robots.tail[r, tick].copy()
+                goal = robots.remaining_path[r, tick].copy()
             else:
                 while current[r] < size and routes[r, current[r]] >= 0:
                     j = routes[r, current[r]]
@@ -215,7 +215,7 @@ def _best_routes(team: TeamView, targets: FloatArray) -> tuple[Routes, FloatArra
         return float(_expected_end(robots, array, targets, detected, team.dimension, stops))
 
     routes: Routes = [[] for _ in range(number)]
-    ends = robots.tail[:, -1].copy()
+    ends = robots.remaining_path[:, -1].copy()
     times = robots.free.astype(float)
     left = list(range(len(targets)))
     while left:
@@ -270,13 +270,15 @@ def _robots(team: TeamView, targets: FloatArray) -> _Robots:
     """Return all robots of a team for the simulation."""
     views = [team.robots[name] for name in team.names()]
     tick = min(view.period_steps for view in views)
-    tails, pauses, speeds, yaws = [], [], [], []
+    ahead, pauses, speeds, yaws = [], [], [], []
     parameters = np.zeros((len(views), PARAMETERS))
     kinds = []
     for row, view in zip(parameters, views):
         here = np.array(view.state.pose.position)
-        tail = here[None] if view.tail is None or not len(view.tail) else view.tail
-        tails.append(np.vstack([tail[::tick], tail[-1]]))
+        path = view.remaining_path
+        if path is None or not len(path):
+            path = here[None]
+        ahead.append(np.vstack([path[::tick], path[-1]]))
         settings = view.motion.settings
         speed = settings.speed * team.step_time
         goals = targets.copy()
@@ -290,10 +292,12 @@ def _robots(team: TeamView, targets: FloatArray) -> _Robots:
         yaws.append(np.nan if travels else view.state.pose.yaw)
         kind, row[:] = view.sensor.detection.kernel()
         kinds.append(kind)
-    longest = max(map(len, tails))
+    longest = max(map(len, ahead))
     return _Robots(
-        tail=np.stack([np.pad(t, ((0, longest - len(t)), (0, 0)), mode='edge') for t in tails]),
-        free=np.array([len(t) - 1 if len(t) > 2 else 0 for t in tails], np.int64),
+        remaining_path=np.stack(
+            [np.pad(path, ((0, longest - len(path)), (0, 0)), mode='edge') for path in ahead]
+        ),
+        free=np.array([len(path) - 1 if len(path) > 2 else 0 for path in ahead], np.int64),
         speed=np.array(speeds),
         pause=np.array(pauses),
         period=np.array([max(1, round(view.period_steps / tick)) for view in views], np.int64),
