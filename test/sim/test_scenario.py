@@ -181,6 +181,7 @@ WRONG = [
     ([('targets.count', 500)], 'targets.separation', ['not 500']),
     ([('targets', {'positions': [[0.5, 3.0]]})], 'targets.positions[0]', ['within the bounds']),
     ([('targets', {})], 'targets', ['count or positions']),
+    ([('targets', {'count': 2, 'classes': ['a', '']})], 'targets.classes[1]', ['at least 1 char']),
     ([('targets.count', 0)], 'stop', ['planner_done']),
     ([('robots.mambo.sensor.period', 0.12)], 'robots.mambo.sensor.period', ['multiples of step']),
     ([('robots.mambo.camera.rate', 30.0)], 'robots.mambo.camera.rate', ['multiples of step']),

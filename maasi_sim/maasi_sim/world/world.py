@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,7 +54,7 @@ class TargetSettings(Settings):
         description='Whether sensors read the identity of each target, as from a transponder; '
         'ranging sensors only',
     )
-    classes: list[str] = Field(
+    classes: list[Annotated[str, Field(min_length=1)]] = Field(
         default_factory=list,
         description='Classes that sensors tell, of the targets in turn; ranging sensors only',
     )

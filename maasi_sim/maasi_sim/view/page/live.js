@@ -42,7 +42,9 @@ export function showControls(parent, selectedRobot) {
           body: JSON.stringify({ command, robot }),
         });
         const result = await reply.json();
-        answer.textContent = `${command} ${robot || 'all'}: ${result.message}`;
+        const { message } = result;
+        const complete = message.startsWith(`${command}: `);
+        answer.textContent = complete ? message : `${command} ${robot || 'all'}: ${message}`;
         answer.title = answer.textContent;
       } catch (error) {
         answer.textContent = `${command}: no answer`;
