@@ -40,5 +40,5 @@ def test_a_run_waits_until_young_ports_are_ready_or_known_to_be_dead(tmp_path):
 def test_a_run_gets_a_domain_beside_a_port_that_was_just_left(tmp_path, monkeypatch):
     port = write(tmp_path, 'fastrtps_port7411', 1, 0.0)
     monkeypatch.setattr(remove_dead_ports, '__defaults__', (tmp_path, 0.0))
-    with Domain(folder=tmp_path / 'domains'):
+    with Domain():
         assert not port.exists()
