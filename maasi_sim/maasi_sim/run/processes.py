@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, NoReturn
 
 from setproctitle import setproctitle
 
-from maasi_sim.run.shared_memory import LONGEST_CREATION, remove_dead_ports
+from maasi_sim.run.shared_memory import remove_dead
 
 # Domains whose ports lie below the ephemeral ports of Linux (from 32768).
 DOMAINS = range(0, 102)
@@ -72,8 +72,7 @@ class Domain:
 
         if fault := loopback_fault():
             raise ProcessError(fault)
-        # A run that was killed while starting leaves recent ports.
-        remove_dead_ports(patience=LONGEST_CREATION + 1.0)
+        remove_dead()
         self._purpose = purpose
         if number is not None and number not in DOMAINS:
             raise ProcessError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
@@ -127,7 +126,8 @@ class Domain:
         return variables
 
     def release(self) -> None:
-        """Release the domain."""
+        """Release the domain; what killed nodes left in shared memory goes before."""
+        remove_dead()
         while self._locks:
             self._locks.pop().close()
 
@@ -342,7 +342,7 @@ class NodeProcess:
     def restart(self) -> None:
         """Restart it after it died."""
         self.restarts += 1
-        remove_dead_ports()
+        remove_dead()
         with contextlib.suppress(OSError), self.log.open('ab') as output:
             output.write(f'--- start number {self.restarts + 1} ---\n'.encode())
         self.start()
