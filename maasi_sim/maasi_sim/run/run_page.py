@@ -51,6 +51,7 @@ class RunPage:
     def close(self) -> None:
         """Show the queued messages, and stop serving."""
         self._feed.close()
+        self.view.maker.end()
         self.view.end('the run has ended')
         if self._control is not None:
             self._control.close()
