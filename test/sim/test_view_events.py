@@ -14,7 +14,7 @@ from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray, LockstepSt
 from maasi_sim.missions import load_mission
 from maasi_sim.search import search
 from maasi_sim.view.event_log import EventLog, line, thin
-from maasi_sim.view.event_maker import EventMaker
+from maasi_sim.view.event_maker import ENDED, LEFT, SILENT, EventMaker
 from maasi_sim.view.messages import MessageEvents, is_shown
 from maasi_sim.view.page_file import REPLAY, empty_page, replay_page
 from maasi_sim.view.scene import empty_scene, scene_of, scene_of_facts
@@ -52,6 +52,36 @@ def test_states_are_one_per_period_except_where_the_robot_says_something_else():
     taken.take('/rover/state', lost)
     assert taken.of('robot')[-1][5:] == [AgentState.UNAVAILABLE, 'its link is lost']
     assert [event[5] for event in taken.of('log')] == ['cannot go on: its link is lost']
+
+
+def step(seconds, *robots):
+    return LockstepStep(robots=list(robots), stamp=stamp_to_ros(round(seconds * 1e9)))
+
+
+def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_end():
+    taken = Taken()
+    for seconds in range(7):
+        present = ['crawler', 'rover', 'walker'] if seconds < 2 else ['crawler', 'rover']
+        taken.take('/lockstep/step', step(float(seconds), *present))
+        taken.take('/rover/state', state(float(seconds), goal_status=AgentState.MOVING))
+        for name in ('crawler', 'walker'):
+            # One falls silent; the other's driver goes on after it has left.
+            if name == 'walker' or seconds < 2:
+                other = state(float(seconds), goal_status=AgentState.MOVING)
+                other.robot = name
+                taken.take(f'/{name}/state', other)
+    taken.maker.end()
+    statuses = {
+        name: [(event[0], *event[5:]) for event in taken.of('robot') if event[2] == name]
+        for name in ('crawler', 'rover', 'walker')
+    }
+    assert statuses['walker'] == [(0.0, 1, ''), (1.0, 1, ''), (2.0, LEFT, '')]
+    assert statuses['crawler'][1:] == [(1.0, 1, ''), (6.0, SILENT, 'not heard for 3 s')]
+    assert statuses['rover'][-1] == (6.0, ENDED, '')
+    assert [event[4:] for event in taken.of('log')] == [
+        ['walker', 'left'],
+        ['crawler', 'not heard for 3 s'],
+    ]
 
 
 def test_a_state_that_is_not_finite_is_left_out():

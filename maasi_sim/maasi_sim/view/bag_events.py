@@ -36,6 +36,7 @@ def read_events(path: Path) -> EventLog:
         topics = [topic for topic, kind in shown.items() if not (known and kind == _MARKERS)]
         for item in bag.messages(topics):
             takes.take(item.topic, item.type, item.message)
+        maker.end()
     # Parts that became known later belong to the scene of a replay.
     return EventLog(maker.scene, [event for event in events if event[1] != 'scene'])
 

@@ -138,6 +138,7 @@ class TraceFeed:
     def close(self, text: str) -> None:
         """Take what waits, say how the search ended, and stop serving."""
         self._feed.close()
+        self._view.maker.end()
         self._view.end(text)
 
 

@@ -131,7 +131,7 @@ class MessageEvents:
         before, self._team = self._team, set(message.robots)
         if before is not None:
             for name in sorted(before - self._team):
-                self.maker.message(time, name, 'team', 'left')
+                self.maker.leave(time, name)
             for name in sorted(self._team - before):
                 self.maker.message(time, name, 'team', 'joined')
 
@@ -144,6 +144,9 @@ class MessageEvents:
         place = (*_point(pose.position), yaw)
         if all(map(math.isfinite, place)):
             time = self._now(topic, message)
+            # The driver of a robot that left may go on for a while.
+            if self._team is not None and message.robot not in self._team:
+                return
             self.maker.robot(
                 time,
                 message.robot,
