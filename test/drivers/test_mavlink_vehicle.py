@@ -17,6 +17,7 @@ from maasi_drivers.links.mavlink.frames import (
     swap_orientation,
     swap_yaw,
 )
+from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.phase import Phase
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_filter.models.pose import Pose
@@ -158,26 +159,49 @@ def test_nothing_is_armed_where_another_ground_station_would_do_for_the_driver(p
     assert not play.commands(ARM)
 
 
-def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver():
+@pytest.mark.parametrize('component', [1, 190, 191])
+def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver(component):
     play = Play()
-    play.station = play.vehicle.settings.own_system
+    play.station = (240, component)
     play.run(10.0)
     assert not play.commands(ARM)
-    assert 'another program sends heartbeats with system id 240' in play.vehicle.fault
+    assert 'another program sends with system id 240' in play.vehicle.fault
     play.station = None
     play.run(6.0)
     assert play.permit() == ''
     play.fly()
     # In the air it is reported: the failsafe would not act now.
     play.reports.clear()
-    play.station = play.vehicle.settings.own_system
+    play.station = (240, component)
     play.run(2.0)
-    assert 'another program sends heartbeats with system id 240' in play.said
+    assert 'another program sends with system id 240' in play.said
+
+
+def test_two_drivers_of_one_vehicle_on_two_links_hear_each_other():
+    senders = {make_sender(240).srcComponent for _ in range(200)}
+    assert len(senders) > 20
+    # No ground station, companion computer, camera or radio has one of them.
+    assert senders <= set(range(25, 68))
+
+
+@pytest.mark.parametrize(
+    ('kind', 'values'),
+    [('command_ack', (0, 0, 0, 0, 240, 190)), ('system_time', (0, 0))],
+)
+def test_the_id_of_the_driver_shows_in_other_messages_than_heartbeats(kind, values):
+    """Behind a router that keeps programs apart, and on a link where heartbeats do not come."""
+    play = Play()
+    play.run(1.0)
+    source = (1, 1) if kind == 'command_ack' else (240, 190)
+    getattr(mavlink.MAVLink(play.to_driver, *source), f'{kind}_send')(*values)
+    play.run(3.0)
+    assert 'another program sends with system id 240' in play.vehicle.fault
+    assert not play.commands(ARM)
 
 
 def test_a_ground_station_of_its_own_id_does_not_keep_the_failsafe_from_acting():
     play = Play().fly()
-    play.station = 255
+    play.station = (255, 190)
     play.go(SPEED)
     play.driver_lives = False
     play.run(AT_MOST + 8.0)
@@ -265,7 +289,11 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
     play = Play(permitted=False, origin='here')
     play.run(10.0)
     play.autopilot.restart()
+    play.driver_lives = False
+    play.run(3.0)
+    # It is carried once its EKF has an origin.
     play.autopilot.body.position[:2] = [3.0, 4.0]
+    play.driver_lives = True
     play.autopilot.parameters['FS_GCS_ENABLE'] = 0.0
     play.run(12.0)
     assert 'the autopilot has restarted' in play.said
@@ -580,8 +608,11 @@ def test_a_copter_that_the_pilot_has_in_the_air_is_taken_over_without_arming():
 
 
 def test_a_vehicle_that_stands_elsewhere_counts_heights_from_there():
-    play = Play(origin='here', autopilot={'estimator_time': 0.5})
+    play = Play(origin='here')
+    play.driver_lives = False
+    play.run(3.0)
     play.autopilot.body.position[:2] = [3.0, 4.0]
+    play.driver_lives = True
     play.fly()
     assert_allclose(play.vehicle.estimate.origin, [3.0, 4.0, 0.0], atol=0.05)
 

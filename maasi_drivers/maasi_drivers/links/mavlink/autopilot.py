@@ -107,12 +107,11 @@ class Autopilot:
     def handle(self, message: Any, now: float) -> ModeChange | None:
         """Take a message; return what a heartbeat says.
 
-        Of other systems only heartbeats with the driver's own id count.
+        Of other systems only messages with the driver's own id count.
         """
         kind = message.get_type()
-        if message.get_srcSystem() == self._settings.own_system:
-            # The driver does not receive its own messages.
-            if kind == 'HEARTBEAT' and self.failsafes is not None:
+        if self._shows_own_id(message):
+            if self.failsafes is not None:
                 self.failsafes.hear_own_id(now)
             return None
         if (
@@ -132,6 +131,21 @@ class Autopilot:
         elif self.firmware is not None:
             self.estimate.take(message, now, self.armed)
         return None
+
+    def _shows_own_id(self, message: Any) -> bool:
+        """Return whether another program has the driver's system id.
+
+        The driver does not receive its own messages. Behind a router that keeps programs apart,
+        the answers to the other one's commands are all that comes.
+        """
+        own = self._settings.own_system
+        if message.get_srcSystem() == own:
+            return True
+        return (
+            message.get_type() == 'COMMAND_ACK'
+            and message.target_system == own
+            and message.target_component not in (0, self._sender.srcComponent)
+        )
 
     def _take_heartbeat(self, message: Any) -> ModeChange | None:
         if self.refusal or (self.firmware is None and not self._recognise(message)):

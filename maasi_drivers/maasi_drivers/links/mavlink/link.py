@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from collections.abc import Iterator
@@ -16,10 +17,22 @@ from maasi_drivers.links.mavlink.vehicle import Vehicle
 _PERIOD = 0.02
 # Between two tries to open a device that is not there [s].
 _RETRY = 1.0
+# Component ids that MAVLink leaves to private networks: no ground station has one of them.
+_COMPONENTS = range(mavlink.MAV_COMP_ID_USER1, mavlink.MAV_COMP_ID_USER43 + 1)
 
 
 class LinkError(RuntimeError):
     """A connection that cannot be opened."""
+
+
+def make_sender(system: int) -> Any:
+    """Return what packs the messages of a driver, without a wire.
+
+    Its component id is another one at each start: ArduPilot does not pass a heartbeat on to a link
+    on which it knows the same system and component (`MAVLink_routing::handle_heartbeat`), so a
+    program with both ids of the driver could not be heard.
+    """
+    return mavlink.MAVLink(None, system, random.choice(_COMPONENTS))
 
 
 def open_connection(url: str, system: int, component: int, baud: int = 57600) -> Any:
@@ -71,9 +84,7 @@ class VehicleLink:
         self.failure = ''
         self._connection: Any = None
         # It writes to the wire, once that is there.
-        self._sender = mavlink.MAVLink(
-            None, settings.own_system, mavlink.MAV_COMP_ID_MISSIONPLANNER
-        )
+        self._sender = make_sender(settings.own_system)
         self._vehicle = Vehicle(settings, height, self._sender)
         self._lock = threading.Lock()
         self._end = threading.Event()
@@ -115,7 +126,7 @@ class VehicleLink:
             self._connection = open_connection(
                 self.settings.url,
                 self.settings.own_system,
-                mavlink.MAV_COMP_ID_MISSIONPLANNER,
+                self._sender.srcComponent,
                 self.settings.baud,
             )
         except LinkError as error:
