@@ -38,12 +38,15 @@ class Wire:
 class Play:
     """Both sides, and what went over the wire."""
 
-    def __init__(self, firmware='arducopter', autopilot=None, permitted=True, **changes):
+    def __init__(
+        self, firmware='arducopter', autopilot=None, permitted=True, memory=None, **changes
+    ):
         kind = 'submarine' if firmware == 'ardusub' else 'copter'
         settings = {'vehicle': kind, 'arm': True} | changes
         self.to_driver, self.to_autopilot = Wire(), Wire()
         link = MavlinkSettings.model_validate(settings)
-        self.vehicle = self._driver(link, HEIGHTS[firmware])
+        self._start, self.memory = [2.0, 3.0, HEIGHTS[firmware]], memory
+        self.vehicle = self._driver(link)
         # System and component of a ground station on another link; None: there is none.
         self.station = None
         self._beat_at = 0.0
@@ -57,13 +60,12 @@ class Play:
         self.now = 100.0
         self.driver_lives = True
         self.reports = []
-        if permitted:
-            self.permit()
+        self._permitted = permitted
 
-    def _driver(self, settings, height):
+    def _driver(self, settings):
         sender = make_sender(settings.own_system)
         sender.file = self.to_autopilot
-        return Vehicle(settings, height, sender)
+        return Vehicle(settings, self._start, sender, self.memory)
 
     def permit(self):
         """Call the service `arm`."""
@@ -72,7 +74,7 @@ class Play:
     def restart_driver(self):
         """Start another driver in the place of the one before, which was killed."""
         old = self.vehicle
-        self.vehicle = self._driver(old.settings, old.height)
+        self.vehicle = self._driver(old.settings)
         self.vehicle.active = self.driver_lives = True
         self.reports = []
 
@@ -88,6 +90,9 @@ class Play:
             sender.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4)
             for message in wire.take():
                 self.autopilot.handle(message, link=1)
+        if self._permitted and self.vehicle.phase is not Phase.CONNECTING:
+            self._permitted = False
+            self.permit()
         self.autopilot.advance(PERIOD)
         heard = self.to_driver.take()
         if self.driver_lives:

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -102,8 +103,8 @@ class Flight:
         return f'{self.mode}, {self.team.states[-1:]}'
 
     def fly(self):
-        answer = self.team.call('arm')
-        assert answer.success, answer.message
+        # Refused until the vehicle is heard.
+        self.until(lambda: self.team.call('arm').success)
         return self.wait_for_flight()
 
     def wait_for_flight(self):
@@ -132,8 +133,9 @@ class Flight:
 
 
 @pytest.fixture
-def fly(context):
+def fly(context, monkeypatch, tmp_path):
     """Return a function that brings a driver and its vehicle together."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
     ended = []
     executor = SingleThreadedExecutor(context=context)
 
@@ -310,11 +312,15 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
     flight = fly()
     flight.until(lambda: flight.team.states and UNTIL_ARM in flight.state.reason)
     assert flight.state.goal_status == AgentState.UNAVAILABLE
+    # The origin is kept for a driver that is started again.
+    kept = Path(os.environ['ROS_HOME']) / 'maasi' / 'rover_flight_origin.json'
+    assert not kept.exists()
     assert flight.team.call('stop').success
     answer = flight.team.call('arm')
     assert (answer.success, answer.message) == (False, STOPPED_BY_SERVICE)
     assert flight.team.call('release').success
     flight.fly()
+    assert kept.exists()
     answer = flight.team.call('arm')
     assert (answer.success, answer.message) == (False, 'it is in the air already')
     with flight.vehicle._lock:

@@ -10,7 +10,9 @@ from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
+from maasi_drivers.links.mavlink import flight_origin
 from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, identify
+from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
 from maasi_drivers.links.mavlink.frames import (
     swap_enu_ned,
     swap_flu_frd,
@@ -19,6 +21,7 @@ from maasi_drivers.links.mavlink.frames import (
 )
 from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.phase import Phase
+from maasi_drivers.links.mavlink.report_log import ReportLog
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_filter.models.pose import Pose
 
@@ -364,6 +367,72 @@ def test_a_driver_restarted_in_the_air_sends_it_nowhere_before_it_may():
     assert play.autopilot.mode_name == 'GUIDED'
     assert play.permit() == ''
     play.fly()
+
+
+def far_away(memory, origin):
+    """Return a vehicle in the air, away from its start and from the origin of its local frame."""
+    play = Play(memory=memory, origin=origin, autopilot={'barometer_drift': -0.1})
+    play.driver_lives = False
+    play.run(3.0)
+    play.autopilot.body.position[:2] = [3.0, 4.0]
+    play.driver_lives = True
+    play.fly().go(SPEED)
+    play.run(3.0)
+    return play
+
+
+@pytest.mark.parametrize('origin', ['here', 'local'])
+@pytest.mark.parametrize('landed', [False, True])
+def test_a_restarted_driver_has_the_map_and_the_heights_of_before(tmp_path, origin, landed):
+    play = far_away(tmp_path / 'new' / 'origin.json', origin)
+    before = play.vehicle.estimate.origin
+    assert before[2] < -0.2
+    if landed:
+        play.vehicle.finish('land')
+        play.until(lambda: play.vehicle.phase is Phase.STOPPED)
+    play.restart_driver()
+    play.run(6.0)
+    assert_allclose(play.vehicle.estimate.origin, before, atol=1e-6)
+    assert 'the origin of the flight before is kept' in play.said
+    assert play.permit() == ''
+    play.fly()
+    assert_allclose(play.vehicle.estimate.origin[:2], before[:2], atol=1e-6)
+
+
+def test_a_driver_that_finds_its_vehicle_in_the_air_does_not_guess_where_it_is():
+    play = far_away(None, 'here')
+    play.restart_driver()
+    play.run(6.0)
+    assert 'its place in the map is not known' in play.vehicle.fault
+    assert 'its place in the map is not known' in play.permit()
+    assert play.vehicle.estimate.telemetry is None
+    # After a landing it is not at its start either.
+    play.autopilot.take_mode('LAND')
+    play.until(lambda: not play.autopilot.armed)
+    play.run(3.0)
+    assert 'its place in the map is not known' in play.permit()
+
+
+@pytest.mark.parametrize('change', ['autopilot', 'start', 'ground', 'broken', 'host'])
+def test_an_origin_of_another_time_or_map_is_not_used(tmp_path, change, monkeypatch):
+    path, start, booted = tmp_path / 'origin.json', [1.0, 2.0, 3.0], 50.0
+    settings, log = MavlinkSettings(origin='here'), ReportLog()
+    FlightOrigin(settings, start, path, log).keep(np.array([4.0, 5.0, 6.0]), booted)
+    here = np.array([7.0, 8.0, 9.0])
+    found = FlightOrigin(settings, start, path, log).find(here, booted + 1.0, True)
+    assert_allclose(found, [4.0, 5.0, 6.0])
+    if change == 'autopilot':
+        booted += 60.0
+    elif change == 'start':
+        start = [1.0, 2.5, 3.0]
+    elif change == 'ground':
+        settings = MavlinkSettings(origin='here', ground=0.5)
+    elif change == 'host':
+        monkeypatch.setattr(flight_origin, '_host_boot', lambda: 'another')
+    else:
+        path.write_text(path.read_text()[:-9])
+    assert FlightOrigin(settings, start, path, log).find(here, booted, True) is None
+    assert_allclose(FlightOrigin(settings, start, path, log).find(here, booted, False), here)
 
 
 def test_a_correction_after_a_refusal_does_not_take_it_off():

@@ -12,6 +12,7 @@ from maasi_drivers.links.mavlink.commands import CommandQueue, command_name, res
 from maasi_drivers.links.mavlink.estimate import Estimate
 from maasi_drivers.links.mavlink.failsafes import FailsafeCheck
 from maasi_drivers.links.mavlink.firmware import Firmware, identify
+from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.report_log import DEBUG, ERROR, INFO, WARNING, ReportLog
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
@@ -52,6 +53,8 @@ class Autopilot:
         Packs messages and writes them to the wire.
     log : ReportLog
         Takes reports.
+    place : FlightOrigin
+        Says where the map lies in its local frame.
     on_restart : callable
         Called when the autopilot was restarted.
 
@@ -76,7 +79,12 @@ class Autopilot:
     """
 
     def __init__(
-        self, settings: MavlinkSettings, sender: Any, log: ReportLog, on_restart: Callable[[], None]
+        self,
+        settings: MavlinkSettings,
+        sender: Any,
+        log: ReportLog,
+        place: FlightOrigin,
+        on_restart: Callable[[], None],
     ) -> None:
         self.firmware: Firmware | None = None
         self.failsafes: FailsafeCheck | None = None
@@ -84,7 +92,7 @@ class Autopilot:
         self.armed = False
         self.mode = -1
         self.lost = False
-        self.estimate = Estimate(settings, on_restart)
+        self.estimate = Estimate(settings, place, on_restart)
         self.commands = CommandQueue(settings.system, sender)
         self._settings = settings
         self._sender = sender

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from maasi_drivers.links.mavlink.protocol import mavlink, mavutil
@@ -70,8 +71,10 @@ class VehicleLink:
     ----------
     settings : MavlinkSettings
         Of the link.
-    height : float
-        To which the vehicle rises, over its origin [m].
+    start : list of float
+        Where the take-off of the vehicle ends, in the map [m].
+    memory : Path
+        File that keeps the origin of a flight.
 
     Attributes
     ----------
@@ -79,13 +82,13 @@ class VehicleLink:
         What is wrong with the wire; empty where it works.
     """
 
-    def __init__(self, settings: MavlinkSettings, height: float) -> None:
+    def __init__(self, settings: MavlinkSettings, start: list[float], memory: Path) -> None:
         self.settings = settings
         self.failure = ''
         self._connection: Any = None
         # It writes to the wire, once that is there.
         self._sender = make_sender(settings.own_system)
-        self._vehicle = Vehicle(settings, height, self._sender)
+        self._vehicle = Vehicle(settings, start, self._sender, memory)
         self._lock = threading.Lock()
         self._end = threading.Event()
         self._open()

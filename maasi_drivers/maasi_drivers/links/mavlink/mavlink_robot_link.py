@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,10 +48,12 @@ class MavlinkRobotLink(RobotLink):
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
         settings = driver.settings
-        self._mavlink = settings.mavlink or MavlinkSettings()
-        self._link: VehicleLink | None = None
         # Whether poses of a localiser define where the autopilot's frame is in the map.
         self._localised = settings.poses != 'odometry'
+        self._mavlink = settings.mavlink or MavlinkSettings()
+        if self._localised:
+            self._mavlink = self._mavlink.model_copy(update={'origin': 'local'})
+        self._link: VehicleLink | None = None
         if not self._localised:
             driver.pose_name = 'LOCAL_POSITION_NED'
         self._local_poses = PoseHistory()
@@ -77,7 +81,9 @@ class MavlinkRobotLink(RobotLink):
     def connect(self) -> None:
         """Open the connection; the vehicle is armed only once the driver is active."""
         driver = self.driver
-        link = VehicleLink(self._mavlink, driver.settings.start[2] - self._mavlink.ground)
+        folder = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
+        name = f'{driver.namespace.replace("/", "_")}_flight_origin.json'
+        link = VehicleLink(self._mavlink, driver.settings.start, folder / 'maasi' / name)
         self._link = link
         driver.create_wall_timer(_POLL_PERIOD, self._update)
         offer_arm(driver, self._arm)
