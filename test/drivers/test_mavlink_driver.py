@@ -497,6 +497,32 @@ def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     flight.until(lambda: flight.mode == 'LAND')
 
 
+def test_with_a_low_battery_it_lands_once_the_pilot_gives_it_back(fly):
+    flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
+    autopilot, lock = flight.vehicle.autopilot, flight.vehicle._lock
+    with lock:
+        autopilot.take_mode('LOITER')
+    flight.until(lambda: 'the pilot has taken over' in flight.state.reason)
+    with lock:
+        autopilot.charge = 0.15
+    flight.until(lambda: 'battery at 0.15' in flight.state.reason)
+    assert flight.mode == 'LOITER'
+    with lock:
+        autopilot.take_mode('GUIDED')
+    flight.until(lambda: flight.mode == 'LAND')
+    flight.until(lambda: not autopilot.armed)
+
+
+def test_the_service_stop_ends_a_take_off(fly):
+    flight = fly(start=[1.0, 2.0, 4.0])
+    flight.until(lambda: flight.team.call('arm').success)
+    flight.until(lambda: flight.position[2] > 0.3)
+    assert flight.team.call('stop').success
+    flight.until(lambda: not flight.vehicle.autopilot.armed)
+    assert flight.mode == 'LAND'
+    assert 'its take-off was stopped' in flight.state.reason
+
+
 def test_a_port_that_is_taken_is_tried_again(context, fly):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(('127.0.0.1', 0))

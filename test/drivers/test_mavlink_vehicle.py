@@ -470,6 +470,57 @@ def test_a_stop_before_it_is_armed_ends_the_permission():
     assert not play.autopilot.armed
 
 
+@pytest.mark.parametrize('share', [0.2, 0.7])
+@firmwares
+def test_a_stop_ends_a_take_off(firmware, share):
+    play = Play(firmware)
+    height = HEIGHTS[firmware]
+    play.until(lambda: abs(play.autopilot.body.position[2]) > share * abs(height))
+    assert play.vehicle.phase is Phase.RISING
+    play.vehicle.stop()
+    farthest = 0.0
+    for _ in range(1000):
+        play.turn()
+        farthest = max(farthest, abs(play.autopilot.body.position[2]))
+    assert farthest < (share + 0.3) * abs(height)
+    assert play.autopilot.mode_name in ('LAND', 'AUTO.LAND', 'SURFACE')
+    assert 'its take-off was stopped' in play.vehicle.fault
+    assert play.autopilot.body.position[2] == pytest.approx(0.0, abs=0.1)
+    assert play.autopilot.armed == (firmware == 'ardusub')
+
+
+def test_a_stop_in_flight_does_not_land_it():
+    play = Play().fly().go(SPEED)
+    play.vehicle.stop()
+    play.run(3.0)
+    assert play.vehicle.flying
+    assert play.autopilot.mode_name == 'GUIDED'
+
+
+def test_a_permission_needs_a_vehicle_that_is_heard():
+    play = Play(permitted=False)
+    play.to_driver.cut = True
+    play.run(5.0)
+    assert play.permit() == 'vehicle: nothing heard yet'
+    play.to_driver.cut = False
+    play.run(10.0)
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
+    assert not play.commands(ARM)
+
+
+def test_a_permission_ends_with_the_link():
+    play = Play(permitted=False, autopilot={'estimator_time': 20.0})
+    play.run(3.0)
+    assert play.permit() == ''
+    play.to_driver.cut = True
+    play.run(2.0)
+    assert 'nothing heard' in play.permit()
+    play.to_driver.cut = False
+    play.run(25.0)
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
+    assert not play.commands(ARM)
+
+
 def test_two_batteries_are_two():
     play = Play(autopilot={'charge': 0.8, 'more_batteries': [0.05]})
     seen = set()

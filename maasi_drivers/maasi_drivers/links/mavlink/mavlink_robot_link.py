@@ -157,10 +157,10 @@ class MavlinkRobotLink(RobotLink):
         self._local_poses.clear()
 
     def latch_stop(self) -> None:
-        """End the permission to take off."""
+        """End the permission to take off, and a take-off."""
         if self._link is not None:
             with self._link.vehicle() as vehicle:
-                vehicle.forbid()
+                vehicle.stop()
 
     def poll(self) -> None:
         """Report why the vehicle does not start."""
@@ -213,9 +213,10 @@ class MavlinkRobotLink(RobotLink):
         if reports != self._charge_reports:
             self._charge_reports = reports
             driver.take_charge(charge)
-            if BATTERY in driver.health and not self._ending:
-                self._ending = True
-                link.finish(self._mavlink.on_low_battery, 0.0)
+        if BATTERY in driver.health:
+            # Again and again: a vehicle that the pilot has meanwhile may be given back.
+            self._ending = True
+            link.finish(self._mavlink.on_low_battery, 0.0)
         if telemetry is not None and telemetry.number != self._taken:
             self._taken = telemetry.number
             self._take_telemetry(telemetry)

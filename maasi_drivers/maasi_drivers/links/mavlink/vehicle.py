@@ -191,6 +191,12 @@ class Vehicle:
             self._autopilot.commands.clear()
             self._enter(Phase.WAITING)
 
+    def stop(self) -> None:
+        """End the permission; a take-off is given up, and it lands; a flight continues."""
+        if self.phase is Phase.RISING:
+            self.finish('land', 'its take-off was stopped')
+        self.forbid()
+
     def _objection(self, now: float) -> str:
         """Return why it must not be armed, or taken over."""
         autopilot = self._autopilot
@@ -198,11 +204,7 @@ class Vehicle:
             return 'it is in the air already'
         if self._displaced:
             return 'the autopilot has restarted: start the driver again'
-        if (
-            autopilot.lost
-            or self._place.problem
-            or self.phase in (Phase.RELEASED, Phase.ENDING, Phase.REFUSED)
-        ):
+        if autopilot.lost or self._place.problem or self.phase in _UNABLE:
             return self.fault
         if autopilot.armed and autopilot.firmware is not None and not autopilot.in_external_mode:
             return f'it is flown in {autopilot.mode_name}'
