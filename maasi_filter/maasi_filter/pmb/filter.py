@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.clutter import measurement_space
-from maasi_filter.dropped import count_unexplained, within_range
+from maasi_filter.dropped import count_unexplained, within_range, without_repeats
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
@@ -184,7 +184,7 @@ class PmbFilter:
         time: float,
     ) -> bool:
         """Correct with one robot's scan; return whether what is found changed."""
-        member = within_range(member, dropped)
+        member = without_repeats(within_range(member, dropped), dropped)
         space = measurement_space(member.sensor, self.bounds)
         # kappa: clutter per unit of measurement space.
         kappa = self._clutter.per_scan(member.robot, member.sensor.clutter * space) / space
