@@ -9,7 +9,7 @@ from maasi_filter.measurement_check import CheckedMeasurement
 
 FloatArray = NDArray[np.float64]
 
-# Reasons that are no faults: a found target took the detection; another one of the scan is the same.
+# Reasons that are no faults: a found target took it, or another one of the scan is the same.
 FOUND = 'found'
 REPEATED = 'repeated'
 

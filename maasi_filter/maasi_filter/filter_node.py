@@ -115,6 +115,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._views.reset()
         self._latency = 0.0
         self._no_faults = {FOUND: 0, REPEATED: 0}
+        self._misfits: dict[str, str] = {}
 
     def _restore(self, memory: FilterMemory) -> None:
         """Resume after the last batch of a process that died."""
@@ -243,6 +244,10 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             'last step [ms]': f'{1e3 * self._latency:.2f}',
         }
 
+    def warnings(self) -> list[str]:
+        """Return which robots' detections do not fit their settings."""
+        return list(self._misfits.values())
+
     # ---- what comes in -----------------------------------------------------------------------
 
     def _on_batch(self, batch: MeasurementBatch) -> None:
@@ -299,6 +304,9 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 self._no_faults[reason] += number
             else:
                 self.dropped[reason] += number
+        for robot in sorted(result.misfits.keys() - self._misfits.keys()):
+            self.warn_throttled(f'misfit of {robot}', result.misfits[robot])
+        self._misfits = result.misfits
         header = Header(stamp=stamp_to_ros(batch.stamp), frame_id=self.settings.frame)
         for target in result.newly_found:
             self._settled_by[target.id] = batch.id

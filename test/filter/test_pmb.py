@@ -150,7 +150,7 @@ def test_close_to_the_exact_mixture(targets, tolerance):
                 false = [generator.uniform(5.0, 40.0), generator.uniform(-3.0, 3.0)]
                 values = np.concatenate([values, [false]])
             space = measurement_space(sensor, PLANE)
-            kappa = search._clutter.per_scan('robot', sensor.clutter * space) / space
+            kappa = search._learnt.clutter.per_scan('robot', sensor.clutter * space) / space
             search.step([measured(sensor, place, values, step)], 1, step)
             exact.update(*densities(sensor, place, values), kappa)
         density = exact.density()
