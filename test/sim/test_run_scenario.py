@@ -190,6 +190,14 @@ def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, scenario, f
     check_report(run.report)
 
 
+def test_a_run_without_a_home_folder(tmp_path, scenario, monkeypatch):
+    for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR'):
+        monkeypatch.delenv(name, raising=False)
+    run = Run(tmp_path / 'run', scenario(), '--lockstep')
+    code, output = run.wait()
+    assert code == 0, output
+
+
 @pytest.fixture
 def follower():
     """Return a domain, and the simulation of another run in it that follows its clock."""
@@ -384,6 +392,7 @@ def test_wrong_input_is_told_before_anything_starts(tmp_path, scenario):
         (['--time-limit', 'nan'], '--time-limit'),
         (['--time-limit', 'inf'], '--time-limit'),
         (['--lockstepp'], '--lockstepp'),
+        (['--lokstep'], 'unknown: --lokstep (did you mean --lockstep?)'),
     ],
 )
 def test_wrong_options_are_named(options, words, capsys):
