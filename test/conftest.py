@@ -8,6 +8,13 @@ import pytest
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_sessionfinish():
+    """Remove what killed nodes left in shared memory."""
+    from maasi_sim.run.shared_memory import remove_dead
+
+    remove_dead()
+
+
 @pytest.fixture
 def domain(monkeypatch):
     """Reserve a ROS domain for this test and the processes that it starts."""

@@ -102,3 +102,21 @@ def test_help_says_what_a_command_is_before_anything_is_set_up(name: str) -> Non
     result = call(ROOT / 'scripts' / name, '--help', PYTHON='no_such_python')
     assert result.returncode == 0
     assert result.stdout.startswith(f'usage: {name}')
+
+
+def test_property_tests_draw_the_same_examples_each_time(tmp_path: Path) -> None:
+    file = tmp_path / 'test_draws.py'
+    file.write_text(
+        'from hypothesis import given, strategies\n'
+        '@given(strategies.integers())\n'
+        "def test_draws(number): print('drew', number)\n"
+    )
+    # The tests alone.
+    script = 'ruff() { :; }; codespell() { :; }; mypy() { :; }; source scripts/test "$@"'
+    command = ['bash', '-c', script, 'test', file, '-n', '0', '-s', '-p', 'no:cacheprovider']
+    results = [call(*command) for _ in range(2)]
+    assert [result.returncode for result in results] == [0, 0], results[0].stdout
+    first, second = (
+        [line for line in result.stdout.splitlines() if 'drew' in line] for result in results
+    )
+    assert len(first) > 50 and first == second

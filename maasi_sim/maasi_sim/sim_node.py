@@ -193,7 +193,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
                 )
             )
         self._entities += self.connect()
-        # After all other publishers, which the recorder then knows: it waits for these.
+        # After all other publishers, which the recorder then knows: it waits for clock and step.
         self._clock_publisher: Publisher | None = None
         if self._follows:
             self.create_subscription(Clock, '/clock', self._on_clock, sensor_reader(False))

@@ -87,7 +87,9 @@ def test_components_agree_with_scipy(seed, share):
     assert_array_equal(blobs.border_cut, cut)
 
 
-@pytest.mark.parametrize(('rule', 'tolerance'), [(PAPER, 0.25), (ROBUST, 0.03)])
+# The paper's rule marks in each row the pixels whose centre is at most some distance from x: the
+# middle of each row, and so the centroid, is within half a pixel of x. Columns likewise.
+@pytest.mark.parametrize(('rule', 'tolerance'), [(PAPER, 0.5), (ROBUST, 0.03)])
 @settings(max_examples=25, deadline=None)
 @given(x=st.floats(20, 140), y=st.floats(20, 100), radius=st.floats(2.5, 8.0))
 def test_a_disc_is_one_blob_at_its_centre(rule, tolerance, x, y, radius):

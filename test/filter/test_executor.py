@@ -104,6 +104,15 @@ def test_an_error_in_a_callback_ends_the_spin(pair):
         pair.until(lambda: False)
 
 
+def test_an_error_in_a_task_ends_the_spin(pair):
+    def fail():
+        raise RuntimeError('a task failed')
+
+    pair.executor.create_task(fail)
+    with pytest.raises(RuntimeError, match='a task failed'):
+        pair.until(lambda: False)
+
+
 def test_the_end_of_the_context_ends_the_spin(pair):
     pair.listener.context.try_shutdown()
     with pytest.raises(ExternalShutdownException):

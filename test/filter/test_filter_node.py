@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import Log
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -181,6 +182,25 @@ def test_the_diagnostics_say_what_was_dropped(world):
     status = reports[-1].status[0]
     assert status.level == DiagnosticStatus.WARN
     assert status.message == 'active; dropped: bad detections 1'
+
+
+def test_detections_that_do_not_fit_are_said_in_log_and_diagnostics(world):
+    _, team, until = world
+    reports, lines = [], []
+    team.node.create_subscription(DiagnosticArray, '/diagnostics', reports.append, 10)
+    team.node.create_subscription(Log, '/rosout', lines.append, 100)
+    until(lambda: team.node.count_publishers('/rosout') >= 2)
+    generator = np.random.default_rng(1)
+    for number in range(1, 41):
+        # Many times the believed noise, once the target is found.
+        error = (0.01 if number < 5 else 0.15) * generator.standard_normal()
+        team.measure(number, ['a'], {'a': [(0.3 + error, 0.5)]})
+        until(lambda number=number: len(team.updates) == number)
+    reports.clear()
+    until(lambda: reports and any('a: detections of found' in item.msg for item in lines))
+    status = reports[-1].status[0]
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message.startswith('active; a: detections of found targets are')
 
 
 def test_found_targets_carry_class_and_identity():

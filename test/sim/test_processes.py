@@ -43,10 +43,10 @@ def started(process):
     return process
 
 
-def test_domains_are_not_shared(tmp_path, monkeypatch):
+def test_domains_are_not_shared(monkeypatch):
     profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
     monkeypatch.delenv(profiles, raising=False)
-    with Domain(folder=tmp_path) as first, Domain(folder=tmp_path) as second:
+    with Domain() as first, Domain() as second:
         assert first.number != second.number
         assert 1 <= first.number <= 101
         variables = first.environment()
@@ -60,51 +60,72 @@ def test_domains_are_not_shared(tmp_path, monkeypatch):
 
 
 def test_a_domain_that_was_asked_for_is_given_once(tmp_path):
-    with Domain(57, tmp_path) as domain:
+    with Domain(57, str(tmp_path)) as domain:
         assert domain.number == 57
         with pytest.raises(ProcessError, match='57 is used by another run'):
-            Domain(57, tmp_path)
-    Domain(57, tmp_path).release()
+            Domain(57, str(tmp_path))
+    Domain(57, str(tmp_path)).release()
 
 
 def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_path):
-    with Domain(57, tmp_path, team='team_a'):
-        with Domain(57, tmp_path, team='team/b', shared=True) as second:
+    with Domain(57, str(tmp_path), team='team_a'):
+        with Domain(57, str(tmp_path), team='team/b', shared=True) as second:
             assert second.number == 57
             with pytest.raises(ProcessError, match='namespace /team/b in 57 is used by another'):
-                Domain(57, tmp_path, team='team/b', shared=True)
+                Domain(57, str(tmp_path), team='team/b', shared=True)
             with pytest.raises(ProcessError, match='namespace /team_a in 57 is used by another'):
-                Domain(57, tmp_path, team='team_a', shared=True)
+                Domain(57, str(tmp_path), team='team_a', shared=True)
             with pytest.raises(ProcessError, match='domain id: 57 is used by another run'):
-                Domain(57, tmp_path, team='team_c')
-        Domain(57, tmp_path, team='team/b', shared=True).release()
+                Domain(57, str(tmp_path), team='team_c')
+        Domain(57, str(tmp_path), team='team/b', shared=True).release()
 
 
 @pytest.mark.parametrize('number', [-1, 102])
-def test_domains_that_do_not_exist_are_refused(tmp_path, number):
+def test_domains_that_do_not_exist_are_refused(number):
     with pytest.raises(ProcessError, match='0 to 101'):
-        Domain(number, tmp_path)
+        Domain(number)
 
 
-def test_a_domain_with_other_nodes_is_left_to_them(tmp_path):
-    with Domain(folder=tmp_path) as domain:
+def test_a_domain_with_other_nodes_is_left_to_them():
+    with Domain() as domain:
         number = domain.number
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(('', 7400 + 250 * number))
-        with Domain(folder=tmp_path) as domain:
+        with Domain() as domain:
             assert domain.number != number
 
 
 def test_the_lock_ends_with_the_process(tmp_path):
     code = (
-        'import os, sys\nfrom pathlib import Path\nfrom maasi_sim.run.processes import Domain\n'
-        'Domain(33, Path(sys.argv[1]))\nos.kill(os.getpid(), 9)\n'
+        'import os, sys\nfrom maasi_sim.run.processes import Domain\n'
+        'Domain(33, sys.argv[1])\nos.kill(os.getpid(), 9)\n'
     )
     done = subprocess.run(
         [sys.executable, '-c', code, str(tmp_path)], check=False, timeout=PATIENCE
     )
     assert done.returncode == -signal.SIGKILL
-    Domain(33, tmp_path).release()
+    Domain(33, str(tmp_path)).release()
+
+
+def test_a_domain_is_locked_without_a_file():
+    """In a shared folder another user could have put a link in the place of one."""
+    code = (
+        'import os, sys\n'
+        'import maasi_filter.ros.loopback\nfrom maasi_sim.run.processes import Domain\n'
+        'def note(event, words):\n'
+        "    made = event == 'open' and isinstance(words[2], int) and words[2] & os.O_CREAT\n"
+        "    if made or event in ('os.mkdir', 'os.chmod', 'os.link', 'os.symlink'):\n"
+        '        print(event, *words)\n'
+        'sys.addaudithook(note)\nDomain().release()\n'
+    )
+    done = subprocess.run(
+        [sys.executable, '-B', '-c', code],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert done.stdout == ''
 
 
 def test_a_process_writes_its_log_and_says_how_it_ended(tmp_path):

@@ -1,44 +1,114 @@
-"""A process that is killed while it creates a DDS port must not block all later ones."""
+"""What killed processes leave in shared memory goes; what a live one uses, or owns, stays."""
 
+import mmap
 import os
-import threading
-import time
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
 
+import pytest
+from waiting import PATIENCE
+
+from maasi_sim.run import shared_memory
 from maasi_sim.run.processes import Domain
-from maasi_sim.run.shared_memory import LONGEST_CREATION, remove_dead_ports
+from maasi_sim.run.shared_memory import remove_dead
+
+SHARED = Path('/dev/shm')
+NODE = """
+import rclpy
+from std_msgs.msg import Empty
+rclpy.init()
+node = rclpy.create_node('node')
+publisher = node.create_publisher(Empty, 'beat', 10)
+subscription = node.create_subscription(Empty, 'beat', lambda _: print('heard', flush=True), 10)
+node.create_timer(0.05, lambda: publisher.publish(Empty()))
+rclpy.spin(node)
+"""
 
 
-def write(folder, name, word, age):
-    path = folder / name
-    path.write_bytes(word.to_bytes(4, 'little') + bytes(60))
-    os.utime(path, (time.time() - age, time.time() - age))
-    return path
+@pytest.fixture
+def folder():
+    with tempfile.TemporaryDirectory(dir=SHARED) as name:
+        yield Path(name)
 
 
-def test_only_ports_of_dead_creators_are_removed(tmp_path):
-    ready = write(tmp_path, 'fastrtps_port7411', 2, 60.0)
-    young = write(tmp_path, 'fastrtps_port7412', 0, 0.0)
-    lock = write(tmp_path, 'fastrtps_port7413_el', 0, 60.0)
-    segment = write(tmp_path, 'fastrtps_0017a085580e8ff0', 0, 60.0)
-    dead = write(tmp_path, 'fastrtps_port7414', 0, 60.0)
-    half = write(tmp_path, 'fastrtps_port7415', 1, 60.0)
-    assert remove_dead_ports(tmp_path) == [dead.name, half.name]
-    assert all(path.exists() for path in (ready, young, lock, segment))
-    assert not dead.exists() and not half.exists()
+def write(folder, *names):
+    for name in names:
+        (folder / name).write_bytes(bytes(64))
+    return set(names)
 
 
-def test_a_run_waits_until_young_ports_are_ready_or_known_to_be_dead(tmp_path):
-    dies = write(tmp_path, 'fastrtps_port7411', 1, LONGEST_CREATION - 0.5)
-    lives = write(tmp_path, 'fastrtps_port7412', 1, 0.0)
-    creator = threading.Timer(0.2, write, (tmp_path, lives.name, 2, 0.0))
-    creator.start()
-    assert remove_dead_ports(tmp_path, patience=60.0) == [dies.name]
-    assert lives.exists()
-    creator.join()
+def started():
+    """Start a node; return its process and its files, once it hears itself."""
+    process = subprocess.Popen(
+        [sys.executable, '-c', NODE], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stdout.readline() == 'heard\n'
+    maps = Path(f'/proc/{process.pid}/maps').read_text().splitlines()
+    files = {line.split()[-1] for line in maps if '/dev/shm/fastrtps' in line}
+    files |= {
+        target
+        for link in Path(f'/proc/{process.pid}/fd').iterdir()
+        if '/dev/shm/fastrtps' in (target := os.readlink(link))
+    }
+    return process, {Path(file) for file in files}
 
 
-def test_a_run_gets_a_domain_beside_a_port_that_was_just_left(tmp_path, monkeypatch):
-    port = write(tmp_path, 'fastrtps_port7411', 1, 0.0)
-    monkeypatch.setattr(remove_dead_ports, '__defaults__', (tmp_path, 0.0))
-    with Domain(folder=tmp_path / 'domains'):
-        assert not port.exists()
+def test_files_of_a_killed_node_go_and_those_of_a_live_one_stay(domain):
+    killed, left = started()
+    killed.kill()
+    killed.wait(PATIENCE)
+    assert left and all(path.exists() for path in left)
+    remove_dead()
+    assert not any(path.exists() for path in left)
+    live, used = started()
+    try:
+        remove_dead()
+        assert used and all(path.exists() for path in used)
+        assert live.stdout.readline() == 'heard\n'
+    finally:
+        live.kill()
+        live.wait(PATIENCE)
+
+
+def test_a_run_removes_them_at_its_start_and_at_its_end():
+    def dead():
+        name = f'fastrtps_port{os.getpid() + 10**6}'
+        return SHARED / write(SHARED, name).pop()
+
+    before = dead()
+    with Domain():
+        assert not before.exists()
+        within = dead()
+    assert not within.exists()
+
+
+def test_a_port_goes_as_a_whole_where_nobody_uses_a_part_of_it(folder):
+    dead = write(folder, 'fastrtps_port7411', 'fastrtps_port7411_el', 'sem.fastrtps_port7411_mutex')
+    dead |= write(folder, 'fastrtps_0017a085580e8ff0', 'fastrtps_0017a085580e8ff0_el')
+    mapped = write(folder, 'fastrtps_port7413', 'fastrtps_port7413_el')
+    opened = write(folder, 'fastrtps_0017a085580e8ff1', 'fastrtps_0017a085580e8ff1_el')
+    others = write(folder, 'fastrtps_notes', 'sem.others', 'fastrtps_port7411_copy')
+    with (folder / 'fastrtps_port7413').open('r+b') as file:
+        memory = mmap.mmap(file.fileno(), 64)
+    with (folder / 'fastrtps_0017a085580e8ff1_el').open('rb'):
+        assert set(remove_dead(folder)) == dead
+        assert {path.name for path in folder.iterdir()} == mapped | opened | others
+    memory.close()
+    assert set(remove_dead(folder)) == mapped | opened
+
+
+def test_what_another_user_put_there_is_left(folder, monkeypatch):
+    write(folder, 'precious')
+    (folder / 'fastrtps_port7411').symlink_to(folder / 'precious')
+    os.mkfifo(folder / 'fastrtps_port7413')
+    assert remove_dead(folder) == []
+    write(folder, 'fastrtps_port7415')
+    monkeypatch.setattr(shared_memory.os, 'getuid', lambda: -1)
+    assert remove_dead(folder) == []
+    assert len(list(folder.iterdir())) == 4
+
+
+def test_there_may_be_no_shared_memory(folder):
+    assert remove_dead(folder / 'missing') == []

@@ -528,12 +528,13 @@ def test_wrong_parameters_are_refused_with_what_is_wrong(make_team, parameters, 
 
 
 @pytest.fixture
-def vehicle_link():
+def vehicle_link(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(('127.0.0.1', 0))
         port = probe.getsockname()[1]
     settings = {'arm': True, 'url': f'udpin:127.0.0.1:{port}'}
-    link = VehicleLink(MavlinkSettings.model_validate(settings), 1.0)
+    memory = tmp_path / 'origin.json'
+    link = VehicleLink(MavlinkSettings.model_validate(settings), [0.0, 0.0, 1.0], memory)
     yield link
     link.close()
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable
 from functools import partial
-from typing import Any, Generic
+from typing import Any, Generic, TypeVar
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -16,6 +16,7 @@ from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
 from maasi_filter.ros.bad_requests import survive_bad_requests
 from maasi_filter.ros.clock_watch import ClockWatch
@@ -37,6 +38,7 @@ _WARNING_PERIOD = 2.0
 # From activation until a node says what it waits for [s].
 _NOTICE_DELAY = 1.0
 
+T = TypeVar('T')
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -249,6 +251,23 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.step_subscription = None
         self._parameters_read.release()
 
+    def permanent(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return an entity that *cleanup* must not destroy, as others wait for its answer.
+
+        That is an action client, an action server or a subscription with event callbacks. It is
+        made at the first call with this key, and lives as long as the node (`NodeEntities`).
+        """
+        return self._entities_made.permanent(key, make)
+
+    def offer_service(
+        self, name: str, answer: Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
+    ) -> None:
+        """Offer a service (std_srvs/Trigger) that lives as long as the node."""
+        service = self.permanent(
+            self.resolve_service_name(name), lambda: self.create_service(Trigger, name, answer)
+        )
+        service.callback = answer
+
     # ---- readiness and lockstep --------------------------------------------------------------
 
     def expect(self, condition: Callable[[], bool]) -> None:
@@ -359,10 +378,18 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription that drops messages with an invalid stamp."""
-        if not options.get('raw'):
-            callback = partial(self.check_stamp, topic, callback)
-        return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
+        """Return a subscription that drops messages with an invalid stamp.
+
+        It is never called after its destruction; the executor may already have queued a message.
+        """
+        take = callback if options.get('raw') else partial(self.check_stamp, topic, callback)
+
+        def call(message: Any) -> None:
+            if any(item is made for item in self.subscriptions):
+                take(message)
+
+        made = super().create_subscription(msg_type, topic, call, qos_profile, **options)
+        return made
 
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
         """Call back unless the stamp of a message is invalid."""

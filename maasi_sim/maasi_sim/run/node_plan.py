@@ -185,7 +185,8 @@ def sim_plan(executable: str, scenario: BaseScenario, run: RunSettings) -> NodeP
         executable,
         'sim_node',
         parameters=parameters,
-        topics=(CLOCK, STEP) if run.lockstep else (CLOCK,),
+        # The last publishers that it makes: with these the recorder knows all of its others.
+        topics=(CLOCK, STEP),
         says_ready=False,
         says_done=False,
         is_clock=True,

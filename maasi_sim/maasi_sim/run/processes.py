@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import fcntl
+import hashlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -18,7 +19,7 @@ from typing import Any, BinaryIO, NoReturn
 
 from setproctitle import setproctitle
 
-from maasi_sim.run.shared_memory import LONGEST_CREATION, remove_dead_ports
+from maasi_sim.run.shared_memory import remove_dead
 
 # Domains whose ports lie below the ephemeral ports of Linux (from 32768).
 DOMAINS = range(0, 102)
@@ -37,12 +38,15 @@ class ProcessError(RuntimeError):
 class Domain:
     """A ROS domain that no other run on this host uses, until `release`.
 
+    A domain, and a namespace in it, is locked by the name of an abstract Unix socket: it is valid
+    for all users, makes no file, and ends with the process.
+
     Parameters
     ----------
     number : int, optional
         The domain to use; the first free one from 1 if not given (0 is the ROS default).
-    folder : Path, optional
-        Of the lock files: one for each domain, and one for each namespace in it.
+    purpose : str
+        Locks of different purposes are independent.
     team : str
         Namespace of the run.
     shared : bool
@@ -58,7 +62,7 @@ class Domain:
     def __init__(
         self,
         number: int | None = None,
-        folder: Path | None = None,
+        purpose: str = 'run',
         *,
         team: str = '',
         shared: bool = False,
@@ -68,12 +72,8 @@ class Domain:
 
         if fault := loopback_fault():
             raise ProcessError(fault)
-        # A run that was killed while starting leaves recent ports.
-        remove_dead_ports(patience=LONGEST_CREATION + 1.0)
-        self._folder = folder or Path('/tmp/maasi_domains')
-        self._folder.mkdir(mode=0o777, parents=True, exist_ok=True)
-        if self._folder.stat().st_uid == os.getuid():
-            self._folder.chmod(0o777)
+        remove_dead()
+        self._purpose = purpose
         if number is not None and number not in DOMAINS:
             raise ProcessError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
         for candidate in DOMAINS[1:] if number is None else [number]:
@@ -91,32 +91,26 @@ class Domain:
     def _take(self, number: int, team: str, shared: bool) -> str:
         """Lock a domain and a namespace in it; return the name of a taken one, else empty."""
         wanted = {} if shared else {f'{number}': f'{number}'}
-        wanted[f'{number}_{team.replace("/", ".")}'] = f'namespace /{team} in {number}'
-        self._files: list[int] = []
+        wanted[f'{number} {team}'] = f'namespace /{team} in {number}'
+        self._locks: list[socket.socket] = []
         for name, words in wanted.items():
-            file = self._lock(name)
-            if file is None:
+            lock = self._lock(name)
+            if lock is None:
                 self.release()
                 return words
-            self._files.append(file)
+            self._locks.append(lock)
         return ''
 
-    def _lock(self, name: str) -> int | None:
-        path = self._folder / f'{name}.lock'
+    def _lock(self, name: str) -> socket.socket | None:
+        # A digest, as the names of sockets are short.
+        digest = hashlib.sha256(f'{self._purpose} {name}'.encode()).hexdigest()
+        lock = socket.socket(socket.AF_UNIX)
         try:
-            try:
-                file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-            except FileNotFoundError:
-                file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-                os.fchmod(file, 0o666)
+            lock.bind(f'\0maasi {digest}')
         except OSError:
+            lock.close()
             return None
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(file)
-            return None
-        return file
+        return lock
 
     def environment(self) -> dict[str, str]:
         """Return the variables that keep nodes in this domain, and on this host.
@@ -132,9 +126,10 @@ class Domain:
         return variables
 
     def release(self) -> None:
-        """Release the domain."""
-        while self._files:
-            os.close(self._files.pop())
+        """Release the domain; what killed nodes left in shared memory goes before."""
+        remove_dead()
+        while self._locks:
+            self._locks.pop().close()
 
     def __enter__(self) -> Domain:
         """Return itself."""
@@ -347,7 +342,7 @@ class NodeProcess:
     def restart(self) -> None:
         """Restart it after it died."""
         self.restarts += 1
-        remove_dead_ports()
+        remove_dead()
         with contextlib.suppress(OSError), self.log.open('ab') as output:
             output.write(f'--- start number {self.restarts + 1} ---\n'.encode())
         self.start()

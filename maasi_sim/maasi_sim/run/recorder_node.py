@@ -139,6 +139,9 @@ class Recorder:
         self._begun: int | None = None
         self.step: int | None = None
         self.last_seen: dict[str, float] = {}
+        #: Robots at the first step, and time of the first message of each recorded topic [ns].
+        self.robots: list[str] = []
+        self.first: dict[str, int] = {}
         #: Share of the environment explored, published by planners each second.
         self.explored = 0.0
         #: Time of the last diagnostics of each node [s of wall time].
@@ -218,6 +221,15 @@ class Recorder:
             if self._connected(self._relative(full)) < number
         ]
 
+    def unmatched(self) -> list[str]:
+        """Return the topics with a publisher that is known, but not connected yet."""
+        return [
+            full
+            for topic, subscription in self._subscriptions.items()
+            if subscription.handle.get_publisher_count()
+            < self.node.count_publishers(full := self._full(topic))
+        ]
+
     def _connected(self, topic: str | None) -> float:
         """Return the number of connected publishers; infinite if the topic is not recorded."""
         if topic is None or not self._wants(topic):
@@ -280,6 +292,7 @@ class Recorder:
             self._set_time(data, 12)
             if self._begun is None:
                 self._begun = time_at(data, 12)
+                self.robots = deserialize_message(data, LockstepStep).robots
         taken = [(CLOCK, data) for data in self._take_from(CLOCK)]
         for _, data in taken:
             self._set_time(data, 4)
@@ -349,6 +362,7 @@ class Recorder:
         try:
             for topic, data in self._due(taken):
                 self.bag.write(self._full(topic), self.time, data)
+                self.first.setdefault(topic, self.time)
         except BagError:
             if not self.bag.failed:
                 raise

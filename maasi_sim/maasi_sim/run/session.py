@@ -25,6 +25,7 @@ from maasi_sim.run.progress import ProgressDisplay, Status
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.supervisor import Supervisor
+from maasi_sim.run.topics import STEP
 from maasi_sim.scenario.layering import to_yaml
 
 # Bytes that may wait for the disk when the recorder reports a step done.
@@ -33,6 +34,8 @@ _BACKLOG = 8 * 2**20
 _POLL = 0.02
 # Between two checks for runs that follow the clock [s].
 _FOLLOWERS_PERIOD = 0.5
+# Longest wait for a publisher that the run does not need: it may not fit the recorder [s].
+_CONNECTION_PATIENCE = 5.0
 # Wall time between two messages about missing nodes [s].
 _START_PATIENCE = 10.0
 
@@ -127,8 +130,29 @@ class Session:
         self.ending = ending or self._follow()
         self._arming.close()
         self._ended = time.monotonic()
+        self._check_recording()
         self.recorder.finish()
         self._supervisor.stop(self.recorder, self.is_followed, _POLL)
+
+    def _check_recording(self) -> None:
+        """Note which topics with a message at each step lack a recording of their beginning."""
+        recorder, options = self.recorder, self._options
+        if not options.record or self.ending.code not in (DONE, NOT_ALL_FOUND):
+            return
+        topics = [STEP, *(f'/{name}/state' for name in recorder.robots)]
+        times = [recorder.first.get(topic, recorder.time) for topic in topics]
+        begin = min(times) if options.follow_clock or self._scenario.external_clock else 0
+        for topic, time_ in zip(topics, times):
+            missed = (time_ - begin) * 1e-9
+            if missed <= _CONNECTION_PATIENCE * (options.rate or 1.0):
+                continue
+            gap = f'the recording lacks the first {missed:.1f} s of {topic}'
+            if topic not in recorder.first:
+                gap = f'the recording lacks {topic}'
+            self.unwritten.append(gap)
+            self._supervisor.events.append(
+                {'time': recorder.elapsed, 'node': 'recorder', 'event': 'gap', 'reason': gap}
+            )
 
     @property
     def wall_time(self) -> float:
@@ -187,6 +211,7 @@ class Session:
         self._name_external_robots()
         expected = [plan.full_name for plan in supervisor.plans if plan.says_ready]
         needed = [topic for plan in supervisor.plans for topic in plan.topics]
+        complete: float | None = None
         while True:
             ending = self._check()
             if ending is not None:
@@ -200,11 +225,15 @@ class Session:
             late = [name for name in expected if name not in ready]
             missing = recorder.missing(needed)
             if not late and not missing:
-                break
+                complete = complete or time.monotonic()
+                unmatched = recorder.unmatched()
+                if not unmatched or time.monotonic() - complete > _CONNECTION_PATIENCE:
+                    break
             waited = time.monotonic() - begin
             what = ', '.join(
                 [f'{name} is not ready' for name in late]
                 or [f'nobody publishes {topic}' for topic in missing]
+                or [f'{topic} has a publisher that is not connected' for topic in unmatched]
             )
             if waited > self._limits.start:
                 supervisor.failed.update(late)
@@ -215,6 +244,8 @@ class Session:
             recorder.wait(_POLL)
         for complaint in recorder.complaints:
             self._display.say(f'warning: {complaint}')
+        for topic in unmatched:
+            self._display.say(f'warning: {topic} has a publisher that is not recorded')
         # Their executors run, even if no heartbeat has arrived so far.
         for name in expected:
             supervisor.watch.beat(name, time.monotonic())

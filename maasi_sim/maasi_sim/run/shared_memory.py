@@ -1,61 +1,58 @@
-"""Shared memory that Fast DDS processes leave when they are killed while they create it."""
+"""Shared memory that processes with Fast DDS leave when they are killed."""
 
 from __future__ import annotations
 
 import contextlib
-import time
+import fcntl
+import os
+import re
+import signal
+from collections import defaultdict
 from pathlib import Path
 
-# First word of a segment that is ready (Boost.Interprocess).
-_READY = 2
-# The creator writes it within microseconds; after this time it is dead [s].
-LONGEST_CREATION = 5.0
+# A port or a segment, its locks, and the semaphore under which a port is opened (Fast DDS 2.14).
+_NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
 
 
-# Period of checks of a port that is being created [s].
-_PERIOD = 0.02
+def remove_dead(folder: Path = Path('/dev/shm')) -> list[str]:
+    """Remove ports and segments of this user that no process has open; return the removed files.
 
-
-def remove_dead_ports(folder: Path = Path('/dev/shm'), patience: float = 0.0) -> list[str]:
-    """Remove ports whose creator died before they were ready; return their names.
-
-    A process that opens such a port waits for its creator for ever, on this host in all domains.
-
-    Parameters
-    ----------
-    folder : Path
-        Where shared memory is.
-    patience : float
-        How long to wait for ports that may be in creation: until they are ready, or their creator
-        is known to be dead [s].
+    They fill the memory, and a process that opens a port whose creator died before it was ready
+    waits for ever, on this host in all domains.
     """
+    parts: dict[str, list[Path]] = defaultdict(list)
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if match := _NAME.fullmatch(path.name):
+            parts[match[1]].append(path)
     removed = []
-    deadline = time.monotonic() + patience
-    while True:
-        dead, young = _unready_ports(folder)
-        for path in dead:
-            with contextlib.suppress(OSError):
-                path.unlink()
-                removed.append(path.name)
-        if not young or time.monotonic() >= deadline:
-            return removed
-        time.sleep(_PERIOD)
+    for paths in parts.values():
+        # Not the lock alone: without it Fast DDS takes the port of a dead reader for a live one.
+        if all(map(_is_unused, paths)):
+            for path in paths:
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                    removed.append(path.name)
+    return removed
 
 
-def _unready_ports(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the ports whose creator is dead, and those that may be in creation."""
-    dead: list[Path] = []
-    young: list[Path] = []
-    for path in sorted(folder.glob('fastrtps_port*')):
-        if path.name.endswith(('_el', '_sl')):
-            continue
-        try:
-            with path.open('rb') as file:
-                if int.from_bytes(file.read(4), 'little') == _READY:
-                    continue
-            old = time.time() - path.stat().st_mtime > LONGEST_CREATION
-        except OSError:
-            # Removed meanwhile, or owned by another user.
-            continue
-        (dead if old else young).append(path)
-    return dead, young
+def _is_unused(path: Path) -> bool:
+    """Return whether no process, of any container, has this user's file open or mapped.
+
+    Owners keep their locks open and their memory mapped while they live, also in creation. Linux
+    grants a lease for writing on a file only that is not open elsewhere.
+    """
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        if os.fstat(file).st_uid != os.getuid():
+            return False
+        # Who opens it meanwhile causes this signal, which is ignored by default, not SIGIO.
+        fcntl.fcntl(file, fcntl.F_SETSIG, signal.SIGURG)
+        fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_WRLCK)
+    except OSError:
+        return False
+    finally:
+        os.close(file)
+    return True
