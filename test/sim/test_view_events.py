@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import OccupancyGrid
-from sensor_msgs.msg import BatteryState
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray, LockstepStep, PlanDecision
@@ -104,18 +103,6 @@ def test_candidates_that_are_not_allowed_have_no_objective():
     (plan,) = taken.of('plan')
     assert [item[6:] for item in plan[7][0][4]] == [[None, 0, 0], [0.5, 7, 2]]
     assert plan[3:5] == ['maasi', 0.25]
-
-
-def test_a_state_without_a_battery_has_what_the_battery_says():
-    taken = Taken()
-    unknown = state(0.0, battery=-1.0)
-    taken.take('/team/rover/state', unknown)
-    taken.take('/team/rover/battery_state', BatteryState(percentage=0.75))
-    taken.take('/team/rover/state', state(0.1, battery=-1.0))
-    taken.take('/team/rover/state', state(0.2, battery=0.5))
-    taken.take('/team/rover/battery_state', BatteryState(percentage=math.nan))
-    taken.take('/team/rover/state', state(0.3, battery=-1.0))
-    assert [event[4] for event in taken.of('robot')] == [-1.0, 0.75, 0.5, -1.0]
 
 
 def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario():

@@ -16,6 +16,7 @@ from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
@@ -42,6 +43,12 @@ _NOTICE_DELAY = 1.0
 T = TypeVar('T')
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+
+def _has_lists(msg_type: Any) -> bool:
+    """Return whether messages of a type have lists of messages, which are slow to read."""
+    fields = msg_type.get_fields_and_field_types().values()
+    return any(field.startswith('sequence<') and '/' in field for field in fields)
 
 
 class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
@@ -387,7 +394,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription that drops messages with an invalid stamp.
+        """Return a subscription that drops messages with an invalid stamp, and far too large ones.
 
         It is never called after its destruction; the executor may already have queued a message.
         It has no event callbacks of rclpy; see `Unconnected`.
@@ -395,7 +402,12 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         options.setdefault(
             'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
         )
-        take = callback if options.get('raw') else partial(self.check_stamp, topic, callback)
+        take = callback
+        if not options.get('raw'):
+            take = partial(self.check_stamp, topic, callback)
+            if _has_lists(msg_type):
+                # Reading 100,000 items of a list alone takes a second.
+                take, options['raw'] = partial(self._check_size, topic, msg_type, take), True
 
         def call(message: Any) -> None:
             if any(item is made for item in self.subscriptions):
@@ -403,6 +415,19 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
 
         made = super().create_subscription(msg_type, topic, call, qos_profile, **options)
         return made
+
+    def _check_size(
+        self, topic: str, msg_type: Any, callback: Callable[[Any], None], data: bytes
+    ) -> None:
+        """Call back with a serialised message unless it is too large."""
+        limit = self.settings.largest_message
+        if len(data) <= limit:
+            callback(deserialize_message(data, msg_type))
+        else:
+            self.drop(
+                'too large message',
+                f'{topic}: read {len(data)} bytes, allowed are {limit} (parameter largest_message)',
+            )
 
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
         """Call back unless the stamp of a message is invalid."""

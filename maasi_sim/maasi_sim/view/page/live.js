@@ -4,7 +4,7 @@ import { RunLog } from './run_log.js';
 import { element } from './text.js';
 
 export function follow(onLog, onEvents, onState) {
-  const source = new EventSource('events');
+  const source = new EventSource(`events${window.location.search}`);
   source.addEventListener('scene', (message) => {
     onLog(new RunLog(JSON.parse(message.data)));
     onState('live');
