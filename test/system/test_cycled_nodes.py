@@ -35,6 +35,7 @@ DEMO = {
 }
 OTHERS = {
     'ranging_drone_3d': {'/drone/driver': 10},
+    'drone_rov': {'/drone/driver': 5, '/rov/driver': 5},
     'buildings_one': {'/red/cuboid_planner': 10, '/sim_node': 5},
 }
 
