@@ -318,7 +318,21 @@ def test_detector_of_ones_own(folder):
         ),
         (
             'def reach(self): return 1.0\n    def evaluate(self, x, y, z): return 0.5',
-            'got shape',
+            r'evaluate: got shape \(\), allowed is \(263169,\)',
+        ),
+        ("def reach(self): return 'far'", "mine:Mine: reach: got 'far', allowed are numbers"),
+        (
+            "def reach(self): return 1.0\n    def evaluate(self, x, y, z): return 'never'",
+            "mine:Mine: evaluate: got 'never', allowed are numbers",
+        ),
+        (
+            "def reach(self): return 1.0\n    def compiled(x, y, z, values): return 'often'",
+            r"mine:Mine: compiled: got \['often', .*, allowed are numbers",
+        ),
+        (
+            'def reach(self): return 1.0\n    def values(self): return [[1.0], []]\n'
+            '    def compiled(x, y, z, values): return 0.5',
+            r'mine:Mine: values: got \[\[1.0\], \[\]\], allowed are numbers',
         ),
         (
             'def reach(self): return 1.0\n    def compiled(x, y, z, values): return 1.0 + x * x',
@@ -334,6 +348,34 @@ def test_wrong_detection_models_are_refused_before_anything_starts(folder, body,
     changes = {'kind': (('robots', 'rover', 'sensor', 'detection', 'kind'), 'mine:Mine')}
     with pytest.raises(ScenarioError, match=message):
         load_scenario(folder / 'search.yaml', changes)
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'message'),
+    [
+        ('return None', 'decide returned None, allowed is a Decision'),
+        ('return {}', 'decide returned {}, allowed is a Decision'),
+        ('decision.robots.clear()', r"decided for \[\], .* the robots that plan, \['rover'\]"),
+        ("decision.robots['rover'] = None", 'rover: got None, allowed is a RobotDecision'),
+        (
+            'rover.waypoint = np.array([81.0, 0.0, 0.0])',
+            r'rover: waypoint: got \[81.0, 0.0, 0.0\], allowed is inside \[\[0.0, 2.0\]',
+        ),
+        ('rover.waypoint[0] = np.nan', 'rover: waypoint: got a number that is not finite'),
+        ('rover.waypoint = [1.0, 1.0, 0.0]', r'rover: waypoint: got \[1.0, 1.0, 0.0\], allowed is'),
+        ('rover.yaws = rover.yaws[1:]', r'rover: yaws: got shape \('),
+        ('rover.chosen = 4', 'rover: chosen: got 4, allowed are integers below 4'),
+    ],
+)
+def test_wrong_decisions_are_refused(folder, spoil, message):
+    spoilt = ONE_BY_ONE.replace(
+        'return decision',
+        f"rover = decision.robots['rover']\n        {spoil}\n        return decision",
+    )
+    (folder / 'one_by_one.py').write_text(f'import numpy as np\n{spoilt}')
+    scenario = load_scenario(folder / 'search.yaml')
+    with pytest.raises(PluginError, match=f'^planner one_by_one:OneByOne: {message}'):
+        search(scenario, 1)
 
 
 def test_driver_of_ones_own_is_tried_before_anything_starts(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from action_msgs.srv import CancelGoal
@@ -57,27 +58,27 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         )
         self._nav2 = self.create_client(CancelGoal, 'navigate_to_pose/_action/cancel_goal')
         self.create_wall_timer(_REFRESH_PERIOD, self._refresh)
-        lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
+        self._lease = lease = LOCKSTEP_LEASE if self.settings.lockstep else self.settings.lease
         quality = liveliness_reader(lease)
         # Of the messages only the last one is used, and only once no other comes.
-        self.create_subscription(
-            AgentState,
-            'state',
-            self._on_state,
-            quality,
-            raw=True,
-            event_callbacks=SubscriptionEventCallbacks(liveliness=self._on_liveliness),
+        self.permanent(
+            lease,
+            lambda: self.create_subscription(
+                AgentState,
+                'state',
+                self._on_state,
+                quality,
+                raw=True,
+                event_callbacks=SubscriptionEventCallbacks(
+                    liveliness=partial(self._on_liveliness, lease)
+                ),
+            ),
         )
 
     def start(self) -> None:
         """Stop the robot of a driver that was lost before."""
         if self._lost:
             self._begin_stop()
-
-    def tear_down(self) -> None:
-        """Disconnect."""
-        self._end_stop()
-        self._last, self._lost = b'', False
 
     def halt(self) -> None:
         """Stop publishing."""
@@ -90,7 +91,10 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
     def _on_state(self, message: bytes) -> None:
         self._last = message
 
-    def _on_liveliness(self, event: Any) -> None:
+    def _on_liveliness(self, lease: float, event: Any) -> None:
+        if lease != self._lease:
+            # Of an earlier configuration.
+            return
         self._lost = event.alive_count == 0
         if not self._lost:
             if self._stop_timer is not None:

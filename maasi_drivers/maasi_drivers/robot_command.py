@@ -50,7 +50,7 @@ def build_parser() -> argparse.ArgumentParser:
     go = words.add_parser('go', help='send it to a waypoint, and wait until it is there')
     for axis in 'xy':
         go.add_argument(axis, type=_metres, help='[m, map]')
-    go.add_argument('z', type=_metres, nargs='?', default=0.0, help='[m, map]; default 0')
+    go.add_argument('z', type=_metres, nargs='?', help='[m, map]; default: the height it is at')
     return parser
 
 
@@ -108,16 +108,30 @@ class _User:
 
     def show(self) -> int:
         """Print the next state."""
+        state = self._next_state()
+        if isinstance(state, int):
+            return state
+        print(describe(state))
+        return DONE
+
+    def _next_state(self) -> AgentState | int:
+        """Return the next state, or the exit code where none comes."""
         heard: list[AgentState] = []
         topic = f'{self._top}/state'
         self._node.create_subscription(AgentState, topic, heard.append, SENSOR)
         if not self._wait(lambda: heard, self._options.timeout):
             return self._missed(f'nothing on {topic}')
-        print(describe(heard[-1]))
-        return DONE
+        return heard[-1]
 
     def go(self) -> int:
         """Send it to the waypoint, and wait; an interrupt cancels the goal."""
+        height = self._options.z
+        if height is None:
+            # One that flies is not sent into the ground.
+            state = self._next_state()
+            if isinstance(state, int):
+                return state
+            height = state.pose.pose.position.z
         topic = f'{self._top}/go_to'
         client = ActionClient(self._node, GoToWaypoint, topic)
         if not self._wait(client.server_is_ready, self._options.timeout):
@@ -125,7 +139,7 @@ class _User:
         goal = GoToWaypoint.Goal(goal_id=1)
         goal.waypoint.header.frame_id = 'map'
         position = goal.waypoint.pose.position
-        position.x, position.y, position.z = self._options.x, self._options.y, self._options.z
+        position.x, position.y, position.z = self._options.x, self._options.y, height
         goal.waypoint.pose.orientation.w = 1.0
         answer = client.send_goal_async(goal)
         # After an interrupt too: only a goal whose answer is known can be cancelled.

@@ -1,35 +1,34 @@
-"""The charge of a battery, whatever unit the robot reports it in."""
+"""The charge of a battery, in the unit that its robot reports it in."""
 
 import math
 
 import pytest
 
-from maasi_drivers.agent.battery_gauge import BatteryGauge, BatteryReadings
+from maasi_drivers.agent.battery_gauge import BatteryReadings, charge_of
 
 
-def charges(readings):
-    gauge = BatteryGauge()
-    return [gauge.charge(reading) for reading in readings]
+@pytest.mark.parametrize(
+    ('voltage', 'charge'), [(12.6, 1.0), (12.3, 1.0), (11.4, 0.5), (10.527, 0.015), (10.5, 0.0)]
+)
+def test_a_turtlebot3_reports_per_cent_between_two_voltages(voltage, charge):
+    """As `update_battery_status` of OpenCR's turtlebot3.cpp; turtlebot3_node passes it on."""
+    percent = (voltage - 3.5 * 3) / (4.1 * 3 - 3.5 * 3) * 100.0
+    assert charge_of(0.01 * int(100.0 * percent + 1e-6), 'percent') == pytest.approx(charge)
 
 
-@pytest.mark.parametrize('more', [1.0001, 1.1, 1.3])
-def test_a_reading_above_one_is_a_full_battery_and_changes_no_later_one(more):
-    assert charges([0.9, more, 0.8, 0.5]) == [0.9, 1.0, 0.8, 0.5]
+@pytest.mark.parametrize(('reading', 'charge'), [(0.0, 0.0), (0.9, 0.9), (1.0, 1.0), (1.1, 1.0)])
+def test_a_fraction_is_a_fraction(reading, charge):
+    assert charge_of(reading, 'fraction') == charge
 
 
-def test_per_cent_stays_per_cent_down_to_the_end():
-    readings = [80.0, 40.0, 9.0, 2.5, 1.5, 0.9, 0.2]
-    assert charges(readings) == pytest.approx([0.01 * value for value in readings])
+@pytest.mark.parametrize('reading', [math.nan, math.inf, -math.inf, -0.1, 1e308])
+@pytest.mark.parametrize('unit', ['fraction', 'percent'])
+def test_what_is_no_charge_is_unknown(reading, unit):
+    assert charge_of(reading, unit) == -1.0
 
 
-@pytest.mark.parametrize('wrong', [3.0, 15.0, 55.0])
-def test_one_reading_in_per_cent_does_not_stay(wrong):
-    assert charges([0.9, wrong, 0.8]) == pytest.approx([0.9, 0.01 * wrong, 0.8])
-
-
-@pytest.mark.parametrize('reading', [math.nan, math.inf, -math.inf, -0.1, 100.5, 1e308])
-def test_what_is_no_charge_is_unknown_and_forgotten(reading):
-    assert charges([0.8, reading, 0.7]) == [0.8, -1.0, 0.7]
+def test_per_cent_are_no_fraction():
+    assert charge_of(55.0, 'fraction') == -1.0
 
 
 @pytest.mark.parametrize('order', [(0, 1, 2), (2, 0, 1), (1, 2, 0)])

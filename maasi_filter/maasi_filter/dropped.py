@@ -9,8 +9,9 @@ from maasi_filter.measurement_check import CheckedMeasurement
 
 FloatArray = NDArray[np.float64]
 
-# Reason of detections that a found target took: every search has them.
+# Reasons that are no faults: a found target took it, or another one of the scan is the same.
 FOUND = 'found'
+REPEATED = 'repeated'
 
 
 def count_dropped(dropped: dict[str, int], reason: str, number: int) -> None:
@@ -26,6 +27,28 @@ def within_range(member: CheckedMeasurement, dropped: dict[str, int]) -> Checked
         return member
     count_dropped(dropped, 'range', int((~reach).sum()))
     return member.only(reach)
+
+
+def without_repeats(member: CheckedMeasurement, dropped: dict[str, int]) -> CheckedMeasurement:
+    """Return a measurement with one detection where several are one by the sensor's resolution.
+
+    Detections with different identities are of different targets.
+    """
+    values, gate = member.values, member.sensor.resolution
+    # Detections are sorted by range, which is within the gate first of all.
+    reach = values[:, 0] - gate * np.sqrt(member.covariances[:, 0, 0])
+    first = np.searchsorted(values[:, 0], reach, side='right')
+    keep = np.ones(len(values), np.bool_)
+    for j in np.flatnonzero(first < np.arange(len(values))).tolist():
+        others = first[j] + np.flatnonzero(keep[first[j] : j])
+        errors = member.sensor.measurement.residual(values[others], values[j])
+        solved = np.linalg.solve(member.covariances[j], errors.T).T
+        same = (errors * solved).sum(axis=1) < gate**2
+        if member.labels:
+            same &= [member.labels[i].identity == member.labels[j].identity for i in others]
+        keep[j] = not same.any()
+    count_dropped(dropped, REPEATED, int((~keep).sum()))
+    return member if keep.all() else member.only(keep)
 
 
 def count_unexplained(centres: FloatArray, bounds: FloatArray, dropped: dict[str, int]) -> None:

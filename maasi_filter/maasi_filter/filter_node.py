@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 from maasi_filter import warm_up
-from maasi_filter.dropped import FOUND
+from maasi_filter.dropped import FOUND, REPEATED
 from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch
 from maasi_filter.node.filter_memory import FilterMemory, Progress
@@ -114,7 +114,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._shared.reset()
         self._views.reset()
         self._latency = 0.0
-        self._of_found = 0
+        self._no_faults = {FOUND: 0, REPEATED: 0}
+        self._misfits: dict[str, str] = {}
 
     def _restore(self, memory: FilterMemory) -> None:
         """Resume after the last batch of a process that died."""
@@ -237,10 +238,15 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             'particles': len(self.filter.weights),
             'expected number': f'{self.filter.expected_number:.3f}',
             'found': len(self.filter.found_targets),
-            # Robots see found targets again: that is no fault, as what is dropped is.
-            'detections of found targets': self._of_found,
+            # That is no fault, as what is dropped is.
+            'detections of found targets': self._no_faults[FOUND],
+            'repeated detections': self._no_faults[REPEATED],
             'last step [ms]': f'{1e3 * self._latency:.2f}',
         }
+
+    def warnings(self) -> list[str]:
+        """Return which robots' detections do not fit their settings."""
+        return list(self._misfits.values())
 
     # ---- what comes in -----------------------------------------------------------------------
 
@@ -294,10 +300,13 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             members = []
             result = self.filter.step([], steps, now)
         for reason, number in sorted(result.dropped.items()):
-            if reason == FOUND:
-                self._of_found += number
+            if reason in self._no_faults:
+                self._no_faults[reason] += number
             else:
                 self.dropped[reason] += number
+        for robot in sorted(result.misfits.keys() - self._misfits.keys()):
+            self.warn_throttled(f'misfit of {robot}', result.misfits[robot])
+        self._misfits = result.misfits
         header = Header(stamp=stamp_to_ros(batch.stamp), frame_id=self.settings.frame)
         for target in result.newly_found:
             self._settled_by[target.id] = batch.id

@@ -122,6 +122,8 @@ class FilterResult:
         Expected number of targets that are not found.
     dropped : dict
         Detections that were not used: reason to count.
+    misfits : dict
+        Warnings that the detections of a robot do not fit its settings, by robot.
     """
 
     clusters: list[Cluster]
@@ -129,3 +131,4 @@ class FilterResult:
     found_changed: bool
     expected_number: float
     dropped: dict[str, int] = field(default_factory=dict)
+    misfits: dict[str, str] = field(default_factory=dict)

@@ -178,6 +178,12 @@ class SensorSettings(Settings):
         description='Intensity of false detections [1/(m rad) in 2D, 1/(m rad^2) in 3D]',
     )
     period: float = Field(default=0.0, ge=0.0, description='Time between possible measurements [s]')
+    resolution: float = Field(
+        default=1.0,
+        ge=0.0,
+        description='pmb: detections of one scan that are closer are of one target; 0: none are '
+        '[deviations of the noise]',
+    )
 
     def build(self, name: str, dimension: int) -> Sensor:
         """Return the sensor of robot `name` for a problem of `dimension` 2 or 3.
@@ -196,6 +202,7 @@ class SensorSettings(Settings):
             covariance=self.noise.covariance(dimension),
             clutter=self.clutter,
             period=self.period,
+            resolution=self.resolution,
         )
 
 

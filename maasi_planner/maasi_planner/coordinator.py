@@ -22,6 +22,7 @@ from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import make_planner
+from maasi_planner.planners.base import check_decision
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
 
 FloatArray = NDArray[np.float64]
@@ -270,6 +271,7 @@ class Coordinator:
                 plan.staying = True
             return Decision(step=step, reason=finished)
         decision = self.planner.decide(team)
+        check_decision(self.planner, team, decision)
         for name in planning:
             if name not in arrived and decision.robots[name].stays:
                 self._plans[name].turning_distance = 0.0

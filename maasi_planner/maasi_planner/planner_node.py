@@ -137,7 +137,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._stand,
             self.drop,
         )
-        offer_services(self, names, self.team_topic, self._command)
+        offer_services(self, names, self._command)
         self.create_wall_timer(_CHECK_PERIOD, self._check_team)
 
     def start(self) -> None:

@@ -19,9 +19,10 @@ from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
-from quality_conditions import CONDITIONS, SCENARIOS, SEEDS
+from quality_conditions import CONDITIONS, RETURNS, SCENARIOS, SEEDS
 from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
@@ -32,6 +33,7 @@ from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
 from maasi_sim.targets.scoring import scoring_radius
+from maasi_sim.world.ranging_sensor import RangingSensor
 
 METHODS = ('ic_phd', 'pmb')
 CUBE = 'ranging_drone_3d'
@@ -110,7 +112,10 @@ def prepared(
 def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | None = None) -> Run:
     """Run one search up to its number of measurements."""
     scenario = prepared(condition, method, seed, settings)
-    result = search(scenario, seed, _cap(condition))
+    measure = RangingSensor.measure
+    returned = RETURNS[condition](measure) if condition in RETURNS else measure
+    with patch.object(RangingSensor, 'measure', returned):
+        result = search(scenario, seed, _cap(condition))
     d = scenario.dimension
     found = np.array([target.position for target in result.found_targets]).reshape(-1, d)
     match = match_targets(found, result.truth, scoring_radius(scenario, result.truth))

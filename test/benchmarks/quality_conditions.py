@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from maasi_filter import NoiseSettings
+from maasi_sim.world.noise_streams import noise_stream
 
 # What is tuned is tuned on the first block and looked at again on the second; the third is for
 # the numbers in the documents, and never used for anything else.
@@ -31,6 +32,8 @@ SPACE = SIDE * math.sqrt(3.0) * 2.0 * math.pi * math.pi
 
 Content = dict[str, Any]
 Change = Callable[[Content, int], None]
+# In place of `RangingSensor.measure`, from it.
+Measure = Callable[..., tuple[Any, Any]]
 
 
 def noise(name: str) -> Change:
@@ -71,6 +74,17 @@ def odometry(**values: Any) -> Change:
     def change(content: Content, seed: int) -> None:
         for robot in content['robots'].values():
             robot['odometry'] = {**robot.get('odometry', {}), **values}
+
+    return change
+
+
+def untold(**values: Any) -> Change:
+    """Errors of the robots' positions that are not in the covariances they report."""
+
+    def change(content: Content, seed: int) -> None:
+        for robot in content['robots'].values():
+            simulated = robot.setdefault('simulated', {})
+            simulated['odometry'] = {**robot.get('odometry', {}), **values}
 
     return change
 
@@ -140,14 +154,52 @@ def filter_settings(**values: Any) -> Change:
     return change
 
 
-def walk(deviation: float) -> Change:
-    """Targets that walk; the filter is told."""
+def walk(deviation: float, told: bool = True) -> Change:
+    """Targets that walk, of which the filter is told or not."""
 
     def change(content: Content, seed: int) -> None:
         content['targets']['walk'] = deviation
-        content['filter'].setdefault('pmb', {})['walk'] = deviation
+        if told:
+            content['filter'].setdefault('pmb', {})['walk'] = deviation
 
     return change
+
+
+def duplicates(share: float, apart: float) -> Callable[[Measure], Measure]:
+    """Some detections come twice, `apart` of the noise's deviations from each other."""
+
+    def changed(measure: Measure) -> Measure:
+        def twice(sensor: Any, pose: Any, step: int, targets: Any = None) -> tuple[Any, Any]:
+            values, causes = measure(sensor, pose, step, targets)
+            generator = noise_stream(sensor.seed, sensor.robot, step, 'duplicates')
+            again = generator.random(len(values)) < share
+            errors = generator.standard_normal(values[again].shape) @ sensor._spread.T
+            return (
+                np.concatenate([values, values[again] + apart * errors]),
+                np.concatenate([causes, causes[again]]),
+            )
+
+        return twice
+
+    return changed
+
+
+def reflections(places: int, share: float) -> Callable[[Measure], Measure]:
+    """Fixed places without a target that return with a share of pi."""
+
+    def changed(measure: Measure) -> Measure:
+        def reflected(sensor: Any, pose: Any, step: int, targets: Any = None) -> tuple[Any, Any]:
+            values, causes = measure(sensor, pose, step, targets)
+            at = np.random.default_rng([sensor.seed, 78]).uniform(10.0, SIDE - 10.0, (places, 3))
+            generator = noise_stream(sensor.seed, sensor.robot, step, 'reflections')
+            seen = generator.random(places) < share * sensor.sensor.detection.probability(at, pose)
+            errors = generator.standard_normal((places, 3)) @ sensor._spread.T
+            returns = (sensor.sensor.measurement.measure(at, pose) + errors)[seen]
+            return np.concatenate([values, returns]), np.append(causes, np.full(len(returns), -1))
+
+        return reflected
+
+    return changed
 
 
 DEGREES, RADIANS = noise('degrees'), noise('radians')
@@ -201,10 +253,21 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
     'pairs at 3 m, identified': (DEGREES, pairs(3.0), targets(identified=True)),
     'walk 0.1 m/sqrt(s), told': (DEGREES, walk(0.1)),
     'walk 0.3 m/sqrt(s), told': (DEGREES, walk(0.3)),
+    'pi 0.5 of believed': (DEGREES, simulated(probability_factor=0.5)),
+    'one in five detections twice': (DEGREES,),
+    'five reflections': (DEGREES,),
+    'positions off by 3 m, not told': (DEGREES, untold(position_noise=3.0)),
+    'drift 0.08 m/sqrt(m), not told': (DEGREES, untold(position_drift=0.08)),
+    'walk 0.2 m/sqrt(s), not told': (DEGREES, walk(0.2, told=False)),
     'demo': (),
     'mambo': (),
     'drone_rov': (),
     'two TurtleBots': (two_turtlebots(),),
+}
+# What the sensor returns besides, by condition.
+RETURNS: dict[str, Callable[[Measure], Measure]] = {
+    'one in five detections twice': duplicates(0.2, 0.3),
+    'five reflections': reflections(5, 0.3),
 }
 # Conditions that are no changes of the cube, by the scenario that they change.
 SCENARIOS = {

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.phase import Phase
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
@@ -37,15 +38,16 @@ class Wire:
 class Play:
     """Both sides, and what went over the wire."""
 
-    def __init__(self, firmware='arducopter', autopilot=None, permitted=True, **changes):
+    def __init__(
+        self, firmware='arducopter', autopilot=None, permitted=True, memory=None, **changes
+    ):
         kind = 'submarine' if firmware == 'ardusub' else 'copter'
         settings = {'vehicle': kind, 'arm': True} | changes
         self.to_driver, self.to_autopilot = Wire(), Wire()
         link = MavlinkSettings.model_validate(settings)
-        self.vehicle = Vehicle(
-            link, HEIGHTS[firmware], mavlink.MAVLink(self.to_autopilot, link.own_system, 190)
-        )
-        # A ground station on the same network, which the autopilot passes on; None: there is none.
+        self._start, self.memory = [2.0, 3.0, HEIGHTS[firmware]], memory
+        self.vehicle = self._driver(link)
+        # System and component of a ground station on another link; None: there is none.
         self.station = None
         self._beat_at = 0.0
         self.vehicle.active = True
@@ -58,8 +60,12 @@ class Play:
         self.now = 100.0
         self.driver_lives = True
         self.reports = []
-        if permitted:
-            self.permit()
+        self._permitted = permitted
+
+    def _driver(self, settings):
+        sender = make_sender(settings.own_system)
+        sender.file = self.to_autopilot
+        return Vehicle(settings, self._start, sender, self.memory)
 
     def permit(self):
         """Call the service `arm`."""
@@ -68,9 +74,7 @@ class Play:
     def restart_driver(self):
         """Start another driver in the place of the one before, which was killed."""
         old = self.vehicle
-        self.vehicle = Vehicle(
-            old.settings, old.height, mavlink.MAVLink(self.to_autopilot, 240, 190)
-        )
+        self.vehicle = self._driver(old.settings)
         self.vehicle.active = self.driver_lives = True
         self.reports = []
 
@@ -82,11 +86,13 @@ class Play:
         if self.station is not None and self.now - self._beat_at >= 1.0:
             self._beat_at = self.now
             wire = Wire()
-            sender = mavlink.MAVLink(wire, self.station, 190)
+            sender = mavlink.MAVLink(wire, *self.station)
             sender.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4)
-            self.to_driver.write(bytes(wire.data))
             for message in wire.take():
-                self.autopilot.handle(message)
+                self.autopilot.handle(message, link=1)
+        if self._permitted and self.vehicle.phase is not Phase.CONNECTING:
+            self._permitted = False
+            self.permit()
         self.autopilot.advance(PERIOD)
         heard = self.to_driver.take()
         if self.driver_lives:

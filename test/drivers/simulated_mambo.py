@@ -76,6 +76,7 @@ class Flight:
         self.motion = make_motion(MOTION)
         settings = {'full_speed': full_speed(drag), 'arm': arm} | settings
         self.pilot = MamboPilot(self, self.motion, MamboSettings(**settings), HOME, fence)
+        self.pilot.update(self.time)
         self.pilot.permit(self.time)
         self.goal = None
         self.problems = []

@@ -33,12 +33,13 @@ class Flight:
         settings = MamboSettings(**settings, link_timeout=1.5, land_after=1.0)
         self.motion = make_motion(MOTION)
         self.pilot = MamboPilot(self.link, self.motion, settings, HOME, FENCE)
-        self.pilot.permit(time.monotonic())
+        self.permitted = False
 
     def step(self):
         now = time.monotonic()
         self.link.keep_alive()
         self.pilot.update(now)
+        self.permitted = self.permitted or self.pilot.permit(now) == ''
         self.pilot.take_pose(now, self.firmware.state)
         if self.goal is not None and self.pilot.phase is Phase.FLYING:
             self.pilot.fly(self.motion.command(self.pilot.ahead(), self.goal))

@@ -149,6 +149,26 @@ def test_a_drone_that_is_not_heard_is_told_to_hover_then_to_land(fly):
     assert flight.drone.take_offs == 1
 
 
+def test_the_service_stop_ends_a_take_off(fly):
+    flight = fly()
+    flight.until(lambda: UNTIL_ARM in flight.reason)
+    assert flight.team.call('arm', flight.until).success
+    flight.until(lambda: flight.where[2] > GROUND_HEIGHT + 0.1)
+    assert flight.team.call('stop', flight.until).success
+    flight.until(lambda: flight.drone.state == GROUND and 'landed: ' in flight.reason)
+    assert f'landed: its take-off was stopped, {UNTIL_ARM}' in flight.reason
+    assert flight.drone.take_offs == 1
+
+
+def test_a_permission_needs_a_drone_that_is_heard(fly):
+    flight = fly()
+    flight.until(lambda: UNTIL_ARM in flight.reason)
+    flight.drone.silent = True
+    flight.until(lambda: 'no ' in flight.reason)
+    answer = flight.team.call('arm', flight.until)
+    assert (answer.success, answer.message) == (False, 'it is in the air, or not heard')
+
+
 def test_a_low_battery_lands_it_and_it_stays_down(fly):
     flight = fly()
     flight.on_its_way()

@@ -9,7 +9,7 @@ from simulated_mambo import FENCE, HOME, STEP, TILT, Flight, full_speed, measure
 
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
 from maasi_drivers.links.mambo.link import PositionEvent
-from maasi_drivers.links.mambo.pilot import Phase
+from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
 from maasi_drivers.links.mambo.reckoning import DeadReckoning
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.mambo.tilt_model import Course, TiltModel
@@ -330,3 +330,48 @@ def test_it_flies_by_the_pose_of_another_system():
     began = flight.time
     flight.until(lambda: flight.pilot.problem.startswith('no position'))
     assert flight.time - began <= AT_MOST
+
+
+@pytest.mark.parametrize('phase', [Phase.TAKING_OFF, Phase.CLIMBING])
+def test_a_stop_ends_a_take_off(phase):
+    flight = Flight()
+    flight.until(lambda: flight.pilot.phase is phase)
+    flight.pilot.stop(flight.time)
+    height = flight.where[2]
+    flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
+    flight.step(5)
+    assert flight.pilot.problem == f'landed: its take-off was stopped, {UNTIL_ARM}'
+    assert height < HOME.position[2] - 0.1
+    flight.step(200)
+    assert flight.firmware.take_offs == 1
+
+
+def test_a_permission_needs_a_drone_that_is_heard():
+    flight = Flight(arm_timeout=1e3)
+    flight.pilot.permit(flight.time)
+    flight.cut_down = True
+    flight.step(60)
+    assert 'link lost' in flight.pilot.permit(flight.time)
+    flight.cut_down = False
+    flight.step(200)
+    flight.connected = False
+    other = MamboPilot(flight, flight.motion, flight.pilot.settings, HOME, FENCE)
+    assert other.permit(flight.time) == 'connecting to the Mambo'
+
+
+def test_a_permission_ends_with_the_link():
+    flight = Flight(pose='pose')
+    # No pose yet: it stands.
+    flight.step(20)
+    assert flight.pilot.phase is Phase.GROUND
+    flight.cut_down = True
+    flight.step(60)
+    flight.cut_down = False
+    flight.step(20)
+    state = flight.firmware.state
+    for _ in range(100):
+        flight.pilot.take_pose(flight.time, state)
+        flight.step()
+    assert flight.pilot.phase is Phase.GROUND
+    assert UNTIL_ARM in flight.pilot.problem
+    assert flight.firmware.take_offs == 0

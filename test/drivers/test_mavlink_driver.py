@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -102,8 +103,8 @@ class Flight:
         return f'{self.mode}, {self.team.states[-1:]}'
 
     def fly(self):
-        answer = self.team.call('arm')
-        assert answer.success, answer.message
+        # Refused until the vehicle is heard.
+        self.until(lambda: self.team.call('arm').success)
         return self.wait_for_flight()
 
     def wait_for_flight(self):
@@ -132,8 +133,9 @@ class Flight:
 
 
 @pytest.fixture
-def fly(context):
+def fly(context, monkeypatch, tmp_path):
     """Return a function that brings a driver and its vehicle together."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
     ended = []
     executor = SingleThreadedExecutor(context=context)
 
@@ -310,11 +312,15 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
     flight = fly()
     flight.until(lambda: flight.team.states and UNTIL_ARM in flight.state.reason)
     assert flight.state.goal_status == AgentState.UNAVAILABLE
+    # The origin is kept for a driver that is started again.
+    kept = Path(os.environ['ROS_HOME']) / 'maasi' / 'rover_flight_origin.json'
+    assert not kept.exists()
     assert flight.team.call('stop').success
     answer = flight.team.call('arm')
     assert (answer.success, answer.message) == (False, STOPPED_BY_SERVICE)
     assert flight.team.call('release').success
     flight.fly()
+    assert kept.exists()
     answer = flight.team.call('arm')
     assert (answer.success, answer.message) == (False, 'it is in the air already')
     with flight.vehicle._lock:
@@ -489,6 +495,32 @@ def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
         flight.vehicle.autopilot.charge = 0.15
     flight.gives_up(result, 'battery at 0.15, below 0.20')
     flight.until(lambda: flight.mode == 'LAND')
+
+
+def test_with_a_low_battery_it_lands_once_the_pilot_gives_it_back(fly):
+    flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
+    autopilot, lock = flight.vehicle.autopilot, flight.vehicle._lock
+    with lock:
+        autopilot.take_mode('LOITER')
+    flight.until(lambda: 'the pilot has taken over' in flight.state.reason)
+    with lock:
+        autopilot.charge = 0.15
+    flight.until(lambda: 'battery at 0.15' in flight.state.reason)
+    assert flight.mode == 'LOITER'
+    with lock:
+        autopilot.take_mode('GUIDED')
+    flight.until(lambda: flight.mode == 'LAND')
+    flight.until(lambda: not autopilot.armed)
+
+
+def test_the_service_stop_ends_a_take_off(fly):
+    flight = fly(start=[1.0, 2.0, 4.0])
+    flight.until(lambda: flight.team.call('arm').success)
+    flight.until(lambda: flight.position[2] > 0.3)
+    assert flight.team.call('stop').success
+    flight.until(lambda: not flight.vehicle.autopilot.armed)
+    assert flight.mode == 'LAND'
+    assert 'its take-off was stopped' in flight.state.reason
 
 
 def test_a_port_that_is_taken_is_tried_again(context, fly):

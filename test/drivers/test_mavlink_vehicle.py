@@ -10,14 +10,18 @@ from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
 from maasi_drivers.agent.arm_permission import UNTIL_ARM
+from maasi_drivers.links.mavlink import flight_origin
 from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, identify
+from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
 from maasi_drivers.links.mavlink.frames import (
     swap_enu_ned,
     swap_flu_frd,
     swap_orientation,
     swap_yaw,
 )
+from maasi_drivers.links.mavlink.link import make_sender
 from maasi_drivers.links.mavlink.phase import Phase
+from maasi_drivers.links.mavlink.report_log import ReportLog
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_filter.models.pose import Pose
 
@@ -158,26 +162,49 @@ def test_nothing_is_armed_where_another_ground_station_would_do_for_the_driver(p
     assert not play.commands(ARM)
 
 
-def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver():
+@pytest.mark.parametrize('component', [1, 190, 191])
+def test_nothing_is_armed_while_another_program_has_the_id_of_the_driver(component):
     play = Play()
-    play.station = play.vehicle.settings.own_system
+    play.station = (240, component)
     play.run(10.0)
     assert not play.commands(ARM)
-    assert 'another program sends heartbeats with system id 240' in play.vehicle.fault
+    assert 'another program sends with system id 240' in play.vehicle.fault
     play.station = None
     play.run(6.0)
     assert play.permit() == ''
     play.fly()
     # In the air it is reported: the failsafe would not act now.
     play.reports.clear()
-    play.station = play.vehicle.settings.own_system
+    play.station = (240, component)
     play.run(2.0)
-    assert 'another program sends heartbeats with system id 240' in play.said
+    assert 'another program sends with system id 240' in play.said
+
+
+def test_two_drivers_of_one_vehicle_on_two_links_hear_each_other():
+    senders = {make_sender(240).srcComponent for _ in range(200)}
+    assert len(senders) > 20
+    # No ground station, companion computer, camera or radio has one of them.
+    assert senders <= set(range(25, 68))
+
+
+@pytest.mark.parametrize(
+    ('kind', 'values'),
+    [('command_ack', (0, 0, 0, 0, 240, 190)), ('system_time', (0, 0))],
+)
+def test_the_id_of_the_driver_shows_in_other_messages_than_heartbeats(kind, values):
+    """Behind a router that keeps programs apart, and on a link where heartbeats do not come."""
+    play = Play()
+    play.run(1.0)
+    source = (1, 1) if kind == 'command_ack' else (240, 190)
+    getattr(mavlink.MAVLink(play.to_driver, *source), f'{kind}_send')(*values)
+    play.run(3.0)
+    assert 'another program sends with system id 240' in play.vehicle.fault
+    assert not play.commands(ARM)
 
 
 def test_a_ground_station_of_its_own_id_does_not_keep_the_failsafe_from_acting():
     play = Play().fly()
-    play.station = 255
+    play.station = (255, 190)
     play.go(SPEED)
     play.driver_lives = False
     play.run(AT_MOST + 8.0)
@@ -265,7 +292,11 @@ def test_an_autopilot_that_restarts_before_it_is_armed_is_asked_anew():
     play = Play(permitted=False, origin='here')
     play.run(10.0)
     play.autopilot.restart()
+    play.driver_lives = False
+    play.run(3.0)
+    # It is carried once its EKF has an origin.
     play.autopilot.body.position[:2] = [3.0, 4.0]
+    play.driver_lives = True
     play.autopilot.parameters['FS_GCS_ENABLE'] = 0.0
     play.run(12.0)
     assert 'the autopilot has restarted' in play.said
@@ -338,6 +369,72 @@ def test_a_driver_restarted_in_the_air_sends_it_nowhere_before_it_may():
     play.fly()
 
 
+def far_away(memory, origin):
+    """Return a vehicle in the air, away from its start and from the origin of its local frame."""
+    play = Play(memory=memory, origin=origin, autopilot={'barometer_drift': -0.1})
+    play.driver_lives = False
+    play.run(3.0)
+    play.autopilot.body.position[:2] = [3.0, 4.0]
+    play.driver_lives = True
+    play.fly().go(SPEED)
+    play.run(3.0)
+    return play
+
+
+@pytest.mark.parametrize('origin', ['here', 'local'])
+@pytest.mark.parametrize('landed', [False, True])
+def test_a_restarted_driver_has_the_map_and_the_heights_of_before(tmp_path, origin, landed):
+    play = far_away(tmp_path / 'new' / 'origin.json', origin)
+    before = play.vehicle.estimate.origin
+    assert before[2] < -0.2
+    if landed:
+        play.vehicle.finish('land')
+        play.until(lambda: play.vehicle.phase is Phase.STOPPED)
+    play.restart_driver()
+    play.run(6.0)
+    assert_allclose(play.vehicle.estimate.origin, before, atol=1e-6)
+    assert 'the origin of the flight before is kept' in play.said
+    assert play.permit() == ''
+    play.fly()
+    assert_allclose(play.vehicle.estimate.origin[:2], before[:2], atol=1e-6)
+
+
+def test_a_driver_that_finds_its_vehicle_in_the_air_does_not_guess_where_it_is():
+    play = far_away(None, 'here')
+    play.restart_driver()
+    play.run(6.0)
+    assert 'its place in the map is not known' in play.vehicle.fault
+    assert 'its place in the map is not known' in play.permit()
+    assert play.vehicle.estimate.telemetry is None
+    # After a landing it is not at its start either.
+    play.autopilot.take_mode('LAND')
+    play.until(lambda: not play.autopilot.armed)
+    play.run(3.0)
+    assert 'its place in the map is not known' in play.permit()
+
+
+@pytest.mark.parametrize('change', ['autopilot', 'start', 'ground', 'broken', 'host'])
+def test_an_origin_of_another_time_or_map_is_not_used(tmp_path, change, monkeypatch):
+    path, start, booted = tmp_path / 'origin.json', [1.0, 2.0, 3.0], 50.0
+    settings, log = MavlinkSettings(origin='here'), ReportLog()
+    FlightOrigin(settings, start, path, log).keep(np.array([4.0, 5.0, 6.0]), booted)
+    here = np.array([7.0, 8.0, 9.0])
+    found = FlightOrigin(settings, start, path, log).find(here, booted + 1.0, True)
+    assert_allclose(found, [4.0, 5.0, 6.0])
+    if change == 'autopilot':
+        booted += 60.0
+    elif change == 'start':
+        start = [1.0, 2.5, 3.0]
+    elif change == 'ground':
+        settings = MavlinkSettings(origin='here', ground=0.5)
+    elif change == 'host':
+        monkeypatch.setattr(flight_origin, '_host_boot', lambda: 'another')
+    else:
+        path.write_text(path.read_text()[:-9])
+    assert FlightOrigin(settings, start, path, log).find(here, booted, True) is None
+    assert_allclose(FlightOrigin(settings, start, path, log).find(here, booted, False), here)
+
+
 def test_a_correction_after_a_refusal_does_not_take_it_off():
     play = Play(autopilot={'parameters': {'FS_GCS_ENABLE': 0}})
     play.run(10.0)
@@ -371,6 +468,57 @@ def test_a_stop_before_it_is_armed_ends_the_permission():
     play.autopilot.charge = 1.0
     play.run(10.0)
     assert not play.autopilot.armed
+
+
+@pytest.mark.parametrize('share', [0.2, 0.7])
+@firmwares
+def test_a_stop_ends_a_take_off(firmware, share):
+    play = Play(firmware)
+    height = HEIGHTS[firmware]
+    play.until(lambda: abs(play.autopilot.body.position[2]) > share * abs(height))
+    assert play.vehicle.phase is Phase.RISING
+    play.vehicle.stop()
+    farthest = 0.0
+    for _ in range(1000):
+        play.turn()
+        farthest = max(farthest, abs(play.autopilot.body.position[2]))
+    assert farthest < (share + 0.3) * abs(height)
+    assert play.autopilot.mode_name in ('LAND', 'AUTO.LAND', 'SURFACE')
+    assert 'its take-off was stopped' in play.vehicle.fault
+    assert play.autopilot.body.position[2] == pytest.approx(0.0, abs=0.1)
+    assert play.autopilot.armed == (firmware == 'ardusub')
+
+
+def test_a_stop_in_flight_does_not_land_it():
+    play = Play().fly().go(SPEED)
+    play.vehicle.stop()
+    play.run(3.0)
+    assert play.vehicle.flying
+    assert play.autopilot.mode_name == 'GUIDED'
+
+
+def test_a_permission_needs_a_vehicle_that_is_heard():
+    play = Play(permitted=False)
+    play.to_driver.cut = True
+    play.run(5.0)
+    assert play.permit() == 'vehicle: nothing heard yet'
+    play.to_driver.cut = False
+    play.run(10.0)
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
+    assert not play.commands(ARM)
+
+
+def test_a_permission_ends_with_the_link():
+    play = Play(permitted=False, autopilot={'estimator_time': 20.0})
+    play.run(3.0)
+    assert play.permit() == ''
+    play.to_driver.cut = True
+    play.run(2.0)
+    assert 'nothing heard' in play.permit()
+    play.to_driver.cut = False
+    play.run(25.0)
+    assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
+    assert not play.commands(ARM)
 
 
 def test_two_batteries_are_two():
@@ -580,8 +728,11 @@ def test_a_copter_that_the_pilot_has_in_the_air_is_taken_over_without_arming():
 
 
 def test_a_vehicle_that_stands_elsewhere_counts_heights_from_there():
-    play = Play(origin='here', autopilot={'estimator_time': 0.5})
+    play = Play(origin='here')
+    play.driver_lives = False
+    play.run(3.0)
     play.autopilot.body.position[:2] = [3.0, 4.0]
+    play.driver_lives = True
     play.fly()
     assert_allclose(play.vehicle.estimate.origin, [3.0, 4.0, 0.0], atol=0.05)
 

@@ -210,16 +210,27 @@ def test_a_minimum_without_a_charge_is_warned_of(play, monkeypatch):
     assert 'battery at 0.10' in team.state.reason
 
 
-def test_a_battery_that_speaks_per_cent_is_not_full_at_one_per_cent(play):
-    _, team = play(battery_minimum=0.2)
+def test_a_battery_in_per_cent_is_read_as_such_from_full_to_empty(play):
+    _, team = play(battery_minimum=0.2, battery_unit='percent')
     team.move()
-    for percentage in (80.0, 15.0, 0.9):
+    for percentage, expected in ((1.5, 0.015), (116.7, 1.0), (80.0, 0.8), (15.0, 0.15)):
         team.battery.publish(BatteryState(percentage=percentage))
-        charge = pytest.approx(0.01 * percentage)
+        charge = pytest.approx(expected)
         team.until(lambda charge=charge: team.move() or team.state.battery == charge)
     assert team.state.goal_status == AgentState.UNAVAILABLE
     team.battery.publish(BatteryState(percentage=90.0))
     team.until(lambda: team.move() or team.state.goal_status == AgentState.IDLE)
+
+
+def test_a_battery_in_the_wrong_unit_is_said(play, capfd):
+    _, team = play(battery_minimum=0.2)
+    team.battery.publish(BatteryState(percentage=0.9))
+    team.until(lambda: team.move() or team.state.battery > 0.0)
+    team.battery.publish(BatteryState(percentage=55.0))
+    team.until(lambda: team.move() or team.state.battery == -1.0)
+    said = capfd.readouterr().err
+    assert 'battery_state.percentage: read 55, allowed is 0 to 1' in said
+    assert 'battery_unit is fraction' in said
 
 
 @pytest.mark.parametrize('frame', ['other/odom', '/other/odom'])

@@ -1,13 +1,16 @@
 """The Poisson multi-Bernoulli filter against closed forms and exact posteriors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from exact_pmbm import ExactPmbm
 from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, plane_sensor
 
-from maasi_filter import FilterSettings, Pose, UnexploredMap
+from maasi_filter import FilterSettings, Pose, UnexploredMap, wrap_angle
 from maasi_filter.clutter import LEAST_PER_SCAN, measurement_space
 from maasi_filter.measurement_check import check_measurements
+from maasi_filter.models.label import Label
 from maasi_filter.pmb.births import draw_births
 from maasi_filter.pmb.clutter import PRIOR_SCANS, ClutterEstimate
 from maasi_filter.pmb.filter import PmbFilter
@@ -136,7 +139,8 @@ def test_close_to_the_exact_mixture(targets, tolerance):
     worst = []
     for seed in range(4):
         generator = np.random.default_rng([seed, 8])
-        sensor = plane_sensor(clutter=2e-4)
+        # The exact filter knows of no resolution.
+        sensor = replace(plane_sensor(clutter=2e-4), resolution=0.0)
         search = plane_filter(seed=seed, particles=2000)
         exact = ExactPmbm(np.full(SIDE**2, 3.0 / SIDE**2))
         for step, place in enumerate(PLACES[:3]):
@@ -146,7 +150,7 @@ def test_close_to_the_exact_mixture(targets, tolerance):
                 false = [generator.uniform(5.0, 40.0), generator.uniform(-3.0, 3.0)]
                 values = np.concatenate([values, [false]])
             space = measurement_space(sensor, PLANE)
-            kappa = search._clutter.per_scan('robot', sensor.clutter * space) / space
+            kappa = search._learnt.clutter.per_scan('robot', sensor.clutter * space) / space
             search.step([measured(sensor, place, values, step)], 1, step)
             exact.update(*densities(sensor, place, values), kappa)
         density = exact.density()
@@ -211,6 +215,22 @@ def test_two_targets_three_metres_apart_stay_two():
     positions = np.array([target.position for target in search.found_targets])
     assert len(positions) == 2
     assert np.abs(positions[positions[:, 0].argsort()] - targets).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    ('resolution', 'identities', 'repeated'), [(1.0, 'aa', 1), (0.0, 'aa', 0), (1.0, 'ab', 0)]
+)
+def test_a_detection_that_comes_twice_is_one_by_the_resolution_of_the_sensor(
+    resolution, identities, repeated
+):
+    sensor = replace(plane_sensor(), resolution=resolution)
+    deviations = np.sqrt(np.diagonal(sensor.covariance))
+    values = np.array([40.0, -np.pi]) + np.array([[0.0, 0.0], [0.3, -0.3], [2.0, 2.0]]) * deviations
+    # Bearings on both sides of the same direction.
+    values[:, 1] = wrap_angle(values[:, 1])
+    member = measured(sensor, (60.0, 50.0), values)
+    member.labels = [Label(identity=name) for name in (*identities, 'c')]
+    assert plane_filter().step([member], 1, 0.0).dropped.get('repeated', 0) == repeated
 
 
 def test_found_target_that_is_missed_again_and_again_is_withdrawn():

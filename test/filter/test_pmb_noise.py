@@ -1,11 +1,13 @@
-"""The factor of a robot's noise is learnt from the innovations of found targets."""
+"""What is learnt of noise and errors of positions, and the warning that they do not fit."""
 
 import numpy as np
 import pytest
-from searches import CUBE, cube_sensor
+from scipy.stats import chi2, norm
+from searches import CUBE, DEGREES, RADIANS, cube_sensor, observe
 
 from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose
 from maasi_filter.measurement_check import check_measurements
+from maasi_filter.pmb.consistency import BOUND, Consistency, _excess
 from maasi_filter.pmb.noise_scale import MOST_FACTOR, NoiseScale, innovations
 
 TARGET = np.array([[130.0, 130.0, 130.0]])
@@ -64,6 +66,60 @@ def test_a_filter_learns_the_noise_of_its_robot(factor):
         values = drawn(generator, factor, 1)
         search.step([AgentMeasurement('drone', POSE, cube_sensor(), values)], 1, float(step))
     assert len(search.found_targets) == 1
-    learnt = search._noise.factor('drone')
+    learnt = search._learnt.noise.factor('drone')
     assert min(1.0, factor) - 0.15 < learnt < max(1.0, factor) + 0.3
     assert abs(learnt - factor) < 0.5 * abs(1.0 - factor) + 0.2
+
+
+def searched(seed, scans=100, error=0.0, walk=0.0, noise=DEGREES):
+    """Return a filter that saw one target from around it, and its last result; m, m/scan^0.5."""
+    generator = np.random.default_rng(seed)
+    sensor = cube_sensor(noise)
+    search = PmbFilter(FilterSettings(method='pmb'), CUBE, np.random.default_rng(seed + 1))
+    target = TARGET.copy()
+    for step in range(scans):
+        target += walk * generator.standard_normal(3)
+        pose = Pose(TARGET[0] + generator.uniform(-15.0, 15.0, 3))
+        values = observe(generator, sensor, target, pose)
+        reported = Pose(pose.position + error * generator.standard_normal(3))
+        result = search.step([AgentMeasurement('drone', reported, sensor, values)], 1, float(step))
+    return search, result
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_errors_of_positions_that_nobody_tells_of_are_learnt(seed):
+    search, result = searched(seed, error=3.0)
+    assert len(search.found_targets) == 1
+    target = search.found_targets[0]
+    offset = target.position - TARGET[0]
+    # Within the 0.999 quantile of chi-squared; without the learnt error it is above 100.
+    assert offset @ np.linalg.solve(target.covariance, offset) < 16.3
+    assert 'drone: detections of found targets are' in result.misfits['drone']
+
+
+@pytest.mark.parametrize('noise', [DEGREES, RADIANS])
+def test_what_is_as_believed_is_no_misfit_and_no_error(noise):
+    for seed in range(5):
+        search, result = searched(seed, noise=noise)
+        assert len(search.found_targets) == 1
+        assert not result.misfits
+        assert search._learnt.errors.probabilities['drone'].argmax() == 0
+
+
+def test_a_target_that_walks_untold_does_not_fit():
+    assert 'drone' in searched(0, walk=0.5)[1].misfits
+
+
+@pytest.mark.parametrize('freedom', [12.0, 150.0])
+def test_the_excess_of_a_sum_is_that_of_chi_squared(freedom):
+    """Its tail beyond four deviations is that of a normal number, within a factor of two."""
+    ratio = chi2.isf(norm.sf(BOUND), freedom) / freedom
+    assert norm.sf(_excess(ratio, freedom)) == pytest.approx(norm.sf(BOUND), rel=0.5)
+
+
+def test_one_detection_of_something_else_is_no_misfit():
+    consistency = Consistency()
+    for _ in range(30):
+        consistency.count('drone', 3.0, 3)
+    consistency.count('drone', 1e6, 3)
+    assert not consistency.misfits()

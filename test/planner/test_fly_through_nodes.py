@@ -3,6 +3,7 @@
 import threading
 
 import numpy as np
+import pytest
 from driven_team import driven
 from test_planner_node import SETTINGS
 from waiting import wait_until
@@ -38,7 +39,8 @@ def test_robots_whose_planner_dies_while_they_pass_a_waypoint_stop_at_the_last_o
         assert np.hypot(a.place[0] - point.x, a.place[1] - point.y) < 0.06
 
 
-def test_a_planner_that_is_told_to_end_stops_robots_whose_next_goal_is_on_its_way():
+@pytest.mark.parametrize('cleaned', [False, True])
+def test_a_planner_that_ends_stops_robots_whose_next_goal_is_on_its_way(cleaned):
     with driven(robots=ROBOTS) as world:
         world.until(lambda: all(robot.moves for robot in world.robots.values()))
 
@@ -55,11 +57,16 @@ def test_a_planner_that_is_told_to_end_stops_robots_whose_next_goal_is_on_its_wa
                     world.own.spin_once(0.001)
 
         wait_until(lambda: waiting, turn)
-        # As its process does it; the drivers answer meanwhile.
-        end = threading.Thread(target=lambda: (planner.halt(), world.end_planner()))
-        end.start()
-        while end.is_alive():
-            world.executor.spin_once(timeout_sec=0.01)
+        if cleaned:
+            # The drivers answer after that.
+            assert planner.trigger_deactivate().name == 'SUCCESS'
+            assert planner.trigger_cleanup().name == 'SUCCESS'
+        else:
+            # As its process does it; the drivers answer meanwhile.
+            end = threading.Thread(target=lambda: (planner.halt(), world.end_planner()))
+            end.start()
+            while end.is_alive():
+                world.executor.spin_once(timeout_sec=0.01)
         places = [robot.place for robot in world.robots.values()]
         world.until(world.standing)
         for robot, place in zip(world.robots.values(), places, strict=True):

@@ -268,6 +268,8 @@ def test_wrong_updates_change_nothing(world):
     ):
         team.update(batch, members, **changes)
         until(lambda number=number: node.dropped['bad update'] == number)
+    team.update(batch, members, clusters=[Cluster(mass=0.5)] * 2000)
+    until(lambda: node.dropped['too large message'] == 1)
     assert node.coordinator.exploration.explored_fraction() == before
     right = Cluster(mass=0.5)
     right.position.x = right.position.y = 1.0

@@ -6,8 +6,12 @@ import sys
 
 import pytest
 from driven_team import driven
+from rclpy.action import ActionServer
 
 from maasi_drivers.robot_command import DONE, FAILED, INTERRUPTED, build_parser
+from maasi_filter.ros.qos import SENSOR
+from maasi_msgs.action import GoToWaypoint
+from maasi_msgs.msg import AgentState
 
 
 @pytest.fixture
@@ -56,6 +60,27 @@ def test_a_robot_is_shown_sent_and_stopped_again(world):
     code, said = ended(world, process)
     assert code == FAILED and 'not reached: cancelled' in said, said
     world.until(lambda: not a.moves, 'it goes on')
+
+
+@pytest.mark.parametrize(('words', 'height'), [(['1', '2'], 5.0), (['1', '2', '3'], 3.0)])
+def test_a_robot_that_flies_keeps_its_height_unless_it_is_told_another(world, words, height):
+    goals = []
+
+    def take(handle):
+        goals.append(handle.request.waypoint.pose.position)
+        handle.succeed()
+        return GoToWaypoint.Result(reached=True)
+
+    server = ActionServer(world.node, GoToWaypoint, '/drone/go_to', take)
+    publisher = world.node.create_publisher(AgentState, '/drone/state', SENSOR)
+    state = AgentState(robot='drone')
+    state.pose.pose.position.z = 5.0
+    timer = world.node.create_timer(0.05, lambda: publisher.publish(state))
+    code, said = ended(world, started(world, 'drone', 'go', *words))
+    assert code == DONE, said
+    assert [(goal.x, goal.y, goal.z) for goal in goals] == [(1.0, 2.0, height)]
+    for entity in (timer, publisher, server):
+        entity.destroy()
 
 
 @pytest.mark.parametrize('words', [['state'], ['go', '1', '2']])

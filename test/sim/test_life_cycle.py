@@ -74,11 +74,21 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
         executor.spin_once(0.01)
 
     wait_until(lambda: is_known(node))
-    unconfigured = made_by(node), in_graph(node)
+    unconfigured = made_by(node)
+    assert node.trigger_configure().name == 'SUCCESS', node.problem
+    wait_until(lambda: is_known(node))
+    waitables = set(node.waitables)
+    assert node.trigger_cleanup().name == 'SUCCESS', node.problem
+    wait_until(lambda: is_known(node), spin)
+    # Services and actions live as long as the node: the executor crashes without its waitables.
+    assert set(node.waitables) == waitables
+    cleaned = made_by(node), in_graph(node)
+    for entities in ('publishers', 'timers', 'clients'):
+        assert cleaned[0][entities] == unconfigured[entities]
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     wait_until(lambda: is_known(node))
     configured = made_by(node), in_graph(node)
-    assert configured[0]['publishers'] > unconfigured[0]['publishers']
+    assert configured[0]['publishers'] > unconfigured['publishers']
     # The recorder looks for topics after it has heard the last publisher of each node.
     *_, step, ready = [item.topic_name for item in node.publishers]
     assert ready.endswith('lockstep/ready')
@@ -93,7 +103,7 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
         lambda: f'{made_by(node)}, {in_graph(node)}, configured: {configured}',
     )
     assert node.trigger_cleanup().name == 'SUCCESS'
-    wait_until(lambda: (made_by(node), in_graph(node)) == unconfigured, spin)
+    wait_until(lambda: (made_by(node), in_graph(node)) == cleaned, spin)
     executor.shutdown()
     node.destroy_node()
 

@@ -303,6 +303,8 @@ def test_what_the_messages_say(make_team):
     assert len(scan.ranges) == 360
     assert scan.ranges[0] == pytest.approx(2.7, abs=0.1)
     assert mambo.of('battery_state')[1].percentage < mambo.of('battery_state')[0].percentage <= 1.0
+    # In the unit of its type.
+    assert 99.0 < turtlebot.of('battery_state')[0].percentage <= 100.0
     truth = team.filter.seen['/ground_truth/targets'][0]
     assert truth.header.frame_id == 'map'
     np.testing.assert_allclose(
@@ -528,12 +530,13 @@ def test_wrong_parameters_are_refused_with_what_is_wrong(make_team, parameters, 
 
 
 @pytest.fixture
-def vehicle_link():
+def vehicle_link(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(('127.0.0.1', 0))
         port = probe.getsockname()[1]
     settings = {'arm': True, 'url': f'udpin:127.0.0.1:{port}'}
-    link = VehicleLink(MavlinkSettings.model_validate(settings), 1.0)
+    memory = tmp_path / 'origin.json'
+    link = VehicleLink(MavlinkSettings.model_validate(settings), [0.0, 0.0, 1.0], memory)
     yield link
     link.close()
 
@@ -542,9 +545,13 @@ def test_a_linked_robot_is_where_its_autopilot_is(make_team, vehicle_link):
     content = deepcopy(LINKED)
     content['robots']['drone']['mavlink']['url'] = vehicle_link.settings.url
     team = make_team(content, robots=('drone',), lockstep=False, rate=1.0)
-    with vehicle_link.vehicle() as vehicle:
-        vehicle.active = True
-        assert vehicle.permit(time.monotonic()) == ''
+
+    def permitted():
+        with vehicle_link.vehicle() as vehicle:
+            vehicle.active = True
+            return vehicle.permit(time.monotonic()) == ''
+
+    team.spin_until(permitted)
 
     def flies():
         with vehicle_link.vehicle() as vehicle:

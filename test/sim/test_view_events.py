@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import OccupancyGrid
-from sensor_msgs.msg import BatteryState
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray, LockstepStep, PlanDecision
 from maasi_sim.missions import load_mission
 from maasi_sim.search import search
 from maasi_sim.view.event_log import EventLog, line, thin
-from maasi_sim.view.event_maker import EventMaker
+from maasi_sim.view.event_maker import ENDED, LEFT, SILENT, EventMaker
 from maasi_sim.view.messages import MessageEvents, is_shown
 from maasi_sim.view.page_file import REPLAY, empty_page, replay_page
 from maasi_sim.view.scene import empty_scene, scene_of, scene_of_facts
@@ -54,6 +53,36 @@ def test_states_are_one_per_period_except_where_the_robot_says_something_else():
     assert [event[5] for event in taken.of('log')] == ['cannot go on: its link is lost']
 
 
+def step(seconds, *robots):
+    return LockstepStep(robots=list(robots), stamp=stamp_to_ros(round(seconds * 1e9)))
+
+
+def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_end():
+    taken = Taken()
+    for seconds in range(7):
+        present = ['crawler', 'rover', 'walker'] if seconds < 2 else ['crawler', 'rover']
+        taken.take('/lockstep/step', step(float(seconds), *present))
+        taken.take('/rover/state', state(float(seconds), goal_status=AgentState.MOVING))
+        for name in ('crawler', 'walker'):
+            # One falls silent; the other's driver goes on after it has left.
+            if name == 'walker' or seconds < 2:
+                other = state(float(seconds), goal_status=AgentState.MOVING)
+                other.robot = name
+                taken.take(f'/{name}/state', other)
+    taken.maker.end()
+    statuses = {
+        name: [(event[0], *event[5:]) for event in taken.of('robot') if event[2] == name]
+        for name in ('crawler', 'rover', 'walker')
+    }
+    assert statuses['walker'] == [(0.0, 1, ''), (1.0, 1, ''), (2.0, LEFT, '')]
+    assert statuses['crawler'][1:] == [(1.0, 1, ''), (6.0, SILENT, 'not heard for 3 s')]
+    assert statuses['rover'][-1] == (6.0, ENDED, '')
+    assert [event[4:] for event in taken.of('log')] == [
+        ['walker', 'left'],
+        ['crawler', 'not heard for 3 s'],
+    ]
+
+
 def test_a_state_that_is_not_finite_is_left_out():
     taken = Taken()
     broken = state(0.0)
@@ -74,18 +103,6 @@ def test_candidates_that_are_not_allowed_have_no_objective():
     (plan,) = taken.of('plan')
     assert [item[6:] for item in plan[7][0][4]] == [[None, 0, 0], [0.5, 7, 2]]
     assert plan[3:5] == ['maasi', 0.25]
-
-
-def test_a_state_without_a_battery_has_what_the_battery_says():
-    taken = Taken()
-    unknown = state(0.0, battery=-1.0)
-    taken.take('/team/rover/state', unknown)
-    taken.take('/team/rover/battery_state', BatteryState(percentage=0.75))
-    taken.take('/team/rover/state', state(0.1, battery=-1.0))
-    taken.take('/team/rover/state', state(0.2, battery=0.5))
-    taken.take('/team/rover/battery_state', BatteryState(percentage=math.nan))
-    taken.take('/team/rover/state', state(0.3, battery=-1.0))
-    assert [event[4] for event in taken.of('robot')] == [-1.0, 0.75, 0.5, -1.0]
 
 
 def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario():

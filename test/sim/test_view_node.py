@@ -43,12 +43,10 @@ def test_a_node_that_comes_late_shows_what_is_there(ros):
         view.end()
 
 
-def test_a_port_that_is_taken_is_refused(ros, capsys):
-    view = LiveView(empty_scene(), 0)
+def test_an_address_of_another_machine_is_refused(ros, capsys):
     rclpy.shutdown()
-    assert main(['--port', str(view.server.port)]) == 2
-    assert 'in use' in capsys.readouterr().err
-    view.end()
+    assert main(['--host', '192.0.2.1']) == 2
+    assert '192.0.2.1: Cannot assign' in capsys.readouterr().err
 
 
 def test_a_scenario_that_is_none_is_refused(capsys):

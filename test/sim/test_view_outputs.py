@@ -1,11 +1,13 @@
 """What is made of a run beside the page: videos, and a layout for Foxglove."""
 
+import base64
 import json
 import re
 
 import cv2
 import numpy as np
 import pytest
+from browsers import chromium, needs_chromium
 
 from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import load_types
@@ -13,7 +15,8 @@ from maasi_sim.scenario.loading import config_folder
 from maasi_sim.search import search
 from maasi_sim.view import video
 from maasi_sim.view.event_log import EventLog
-from maasi_sim.view.page_file import FOLDER
+from maasi_sim.view.event_maker import EventMaker
+from maasi_sim.view.page_file import FOLDER, write_replay
 from maasi_sim.view.scene import scene_of
 from maasi_sim.view.video import write_video
 from maasi_sim.view.view_run import main
@@ -101,6 +104,45 @@ def test_a_video_shows_where_a_robot_points_what_it_sees_and_where_it_goes(tmp_p
     blue = np.abs(unseeing - (178, 114, 0)).max(axis=2) < 40
     columns = np.flatnonzero(blue.any(axis=0))
     assert np.diff(columns).max() > 100
+
+
+def departing():
+    """Return a run whose robot is on its way at 1 s, and leaves at 2 s."""
+    events = []
+    maker = EventMaker(scene_of('plane', load_mission('mambo').scenario), events.append)
+    maker.robot(0.0, 'mambo', (0.5, 0.5, 1.0, 0.0))
+    maker.way(0.0, 'mambo', [(0.5, 0.5, 1.0), (2.0, 2.0, 1.0)])
+    maker.robot(1.0, 'mambo', (0.6, 0.6, 1.0, 0.0))
+    maker.leave(2.0, 'mambo')
+    maker.message(3.0, 'team', 'team', 'goes on')
+    return EventLog(maker.scene, events)
+
+
+def bluish(picture):
+    """Return how many pixels have the robot's colour; pictures are BGR."""
+    return int((np.abs(picture.astype(int) - (178, 114, 0)).max(axis=2) < 40).sum())
+
+
+def test_a_robot_that_left_goes_nowhere_in_a_video(tmp_path):
+    write_video(departing(), tmp_path / 'run.mp4', speed=1.0)
+    pictures = frames(tmp_path / 'run.mp4')
+    assert bluish(pictures[25]) < 0.5 * bluish(pictures[15])
+
+
+@needs_chromium
+def test_a_robot_that_left_goes_nowhere_on_the_page(tmp_path):
+    write_replay(departing(), tmp_path / 'page.html')
+    with chromium() as shown:
+        shown.open((tmp_path / 'page.html').as_uri())
+        pixels = []
+        for seconds, text in ((1.5, 'on the way'), (2.5, 'left')):
+            shown.seek(seconds)
+            assert shown.page.inner_text('#robots tr[data-robot=mambo] td.text') == text
+            address = shown.page.evaluate("document.getElementById('map').toDataURL()")
+            data = np.frombuffer(base64.b64decode(address.partition(',')[2]), np.uint8)
+            pixels.append(bluish(cv2.imdecode(data, cv2.IMREAD_COLOR)))
+        assert pixels[1] < 0.5 * pixels[0]
+        shown.check()
 
 
 def test_robots_have_the_colours_of_the_page():

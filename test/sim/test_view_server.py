@@ -3,15 +3,19 @@
 import http.client
 import json
 import socket
+import threading
 import time
+from urllib.parse import urlsplit
 
 import pytest
+from browsers import chromium, needs_chromium
 from waiting import wait_until
 
 from maasi_sim.view.event_log import STATE_PERIOD
 from maasi_sim.view.hub import Hub
 from maasi_sim.view.live_feed import LiveFeed
-from maasi_sim.view.server import LARGEST_BODY, MOST_BROWSERS, ViewServer
+from maasi_sim.view.live_view import LiveView
+from maasi_sim.view.server import LARGEST_BODY, MOST_BROWSERS, MOST_IDLE, ViewServer
 
 PATIENCE = 20.0
 
@@ -162,6 +166,61 @@ def test_there_are_only_so_many_browsers(server):
     assert status == 503
     for browser in browsers:
         browser.close()
+
+
+def test_half_open_connections_make_room(hub, server):
+    reader = Browser(server)
+    threads = threading.active_count()
+    held = [
+        socket.create_connection(('127.0.0.1', server.port), timeout=PATIENCE)
+        for _ in range(3 * MOST_IDLE)
+    ]
+    # The oldest were closed, without a thread that goes on.
+    assert held[0].recv(1) == b'' and held[MOST_IDLE].recv(1) == b''
+    wait_until(lambda: threading.active_count() <= threads + MOST_IDLE)
+    assert ask(server, 'GET', '/')[0] == 200
+    hub.put(state(0))
+    reader.until(1)
+    for connection in (reader, *held):
+        connection.close()
+
+
+def test_other_machines_need_the_whole_link(hub, capsys):
+    view = LiveView({'name': 'test', 'robots': {}}, 0, '0.0.0.0')
+    server = view.server
+    link = urlsplit(server.address)
+    assert link.hostname not in ('0.0.0.0', '127.0.0.1') and link.query == f'token={server.token}'
+    view.announce(print)
+    said = capsys.readouterr().out
+    assert f'view: {server.address}\n' in said and 'other machines see it' in said
+    for path in ('/', '/events', '/?token=', '/?token=wrong'):
+        status, text = ask(server, 'GET', path)
+        assert status == 403 and 'whole link' in text
+    assert ask(server, 'GET', f'/?{link.query}')[0] == 200
+    # By a number or by its own name, but by no name that somebody made point here.
+    for host, status in (('192.0.2.7', 200), (socket.gethostname(), 200), ('evil.example', 403)):
+        assert ask(server, 'GET', f'/?{link.query}', headers={'Host': host})[0] == status
+    assert ask(server, 'POST', '/control', '{}', {'X-Maasi-Token': server.token})[0] == 403
+    view.end()
+
+
+@needs_chromium
+def test_a_browser_on_another_machine_gets_the_events_by_the_whole_link(hub):
+    view = LiveView({'name': 'far', 'robots': {}, 'bounds': [[0, 1], [0, 1]]}, 0, '0.0.0.0')
+    view.hub.put(state(3))
+    with chromium() as shown:
+        shown.open(view.server.address)
+        shown.until("maasi.log.robots().includes('rover')")
+    view.end()
+
+
+def test_where_a_port_is_in_use_the_next_one_is_taken_and_said(server, capsys):
+    view = LiveView({'name': 'test', 'robots': {}}, server.port)
+    assert server.port < view.server.port <= server.port + 20
+    view.announce(print)
+    said = capsys.readouterr().out
+    assert f'port {server.port} is in use: the page is at {view.server.port}' in said
+    view.end()
 
 
 def test_the_page_is_served_and_nothing_else(server):

@@ -155,9 +155,6 @@ class AgentDriver(RobotNode):
 
     def tear_down(self) -> None:
         """Disconnect."""
-        # Results were sent from *deactivate* on; what is left goes with the server.
-        if self._goals is not None:
-            self._goals.clear()
         self._close()
 
     def destroy_node(self) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
-from rclpy.node import Node
 from std_srvs.srv import Trigger
+
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 
 # Reason in `state` while a vehicle waits for it.
 UNTIL_ARM = 'until the service arm is called'
@@ -43,19 +45,19 @@ class ArmPermission:
         return now >= self._end and self.end()
 
 
-def offer_arm(node: Node, arm: Callable[[], str]) -> None:
-    """Create the service `arm` (std_srvs/Trigger) of a node.
+def offer_arm(node: LockstepLifecycleNode[Any], arm: Callable[[], str]) -> None:
+    """Offer the service `arm` (std_srvs/Trigger) of a node.
 
     Parameters
     ----------
-    node : Node
+    node : LockstepLifecycleNode
         Of a robot that takes off.
     arm : callable
         Gives the permission, or returns the reason of a refusal; empty where it is given.
     """
 
     def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        problem = arm()
+        problem = arm() if node.active else 'the driver is not active'
         response.success = not problem
         response.message = problem or 'it takes off as soon as it is ready'
         if problem:
@@ -64,4 +66,4 @@ def offer_arm(node: Node, arm: Callable[[], str]) -> None:
             node.get_logger().info('arm: it may take off')
         return response
 
-    node.create_service(Trigger, 'arm', answer)
+    node.offer_service('arm', answer)

@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-import math
+from typing import Literal
 
-# `percentage` is 0 to 1. Robots report somewhat more when full (TurtleBot3), and some report
-# per cent: above this it can be nothing else.
-_FULL = 2.0
-# A battery in per cent gets below `_FULL` only from near there [%].
-_NEARLY_EMPTY = 20.0
-# Consecutive readings above `_FULL` after which the unit is per cent.
-_SETTLED = 2
+BatteryUnit = Literal['fraction', 'percent']
+
+# A full battery may read more than 1: a TurtleBot3 with 12.6 V says 116.7 per cent, as OpenCR maps
+# 10.5 V to 12.3 V on 0 to 100 (`update_battery_status` in turtlebot3.cpp).
+_MOST = 1.5
 
 
-class BatteryGauge:
-    """Converts readings to a charge of 0 to 1.
-
-    A reading above 2 is per cent. One of at most 2 is a fraction, unless several in per cent led
-    down to it.
-    """
-
-    def __init__(self) -> None:
-        # Readings in per cent in a row, and the last of them.
-        self._in_a_row = 0
-        self._per_cent = 0.0
-
-    def charge(self, reading: float) -> float:
-        """Return the charge, 0 to 1, or -1 for an invalid reading."""
-        if not (math.isfinite(reading) and 0.0 <= reading <= 100.0):
-            return -1.0
-        settled = self._in_a_row >= _SETTLED and self._per_cent <= _NEARLY_EMPTY
-        if reading > _FULL or settled:
-            self._in_a_row += 1
-            self._per_cent = reading
-            return 0.01 * reading
-        self._in_a_row = 0
-        return min(reading, 1.0)
+def charge_of(percentage: float, unit: BatteryUnit) -> float:
+    """Return the charge, 0 to 1, or -1 for what is none in this unit."""
+    charge = percentage if unit == 'fraction' else 0.01 * percentage
+    return min(charge, 1.0) if 0.0 <= charge <= _MOST else -1.0
 
 
 class BatteryReadings:

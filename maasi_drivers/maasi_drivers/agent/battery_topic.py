@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 from sensor_msgs.msg import BatteryState
 
-from maasi_drivers.agent.battery_gauge import BatteryGauge, BatteryReadings
+from maasi_drivers.agent.battery_gauge import BatteryReadings, charge_of
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.qos import sensor_reader
@@ -25,7 +27,6 @@ class BatteryTopic:
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
-        self._gauge = BatteryGauge()
         self._readings = BatteryReadings()
         self._subscription = driver.create_subscription(
             BatteryState, 'battery_state', self._on_battery, sensor_reader(driver.settings.lockstep)
@@ -35,7 +36,18 @@ class BatteryTopic:
         if self._driver.settings.lockstep:
             self._readings.add(stamp_from_ros(message.header.stamp), message.percentage)
         else:
-            self._driver.take_charge(self._gauge.charge(message.percentage))
+            self._take(message.percentage)
+
+    def _take(self, percentage: float) -> None:
+        unit = self._driver.settings.battery_unit
+        charge = charge_of(percentage, unit)
+        if charge < 0.0 and not math.isnan(percentage):
+            self._driver.drop(
+                'battery',
+                f'battery_state.percentage: read {percentage:g}, allowed is '
+                f'{"0 to 1" if unit == "fraction" else "0 to 100"}, or nan: battery_unit is {unit}',
+            )
+        self._driver.take_charge(charge)
 
     def take_before(self, stamp: int) -> None:
         """In lockstep: take the readings of the steps before the one at `stamp` [ns]."""
@@ -43,4 +55,4 @@ class BatteryTopic:
         while (taken := handle.take_message(BatteryState, False)) is not None:
             self._on_battery(taken[0])
         for reading in self._readings.before(stamp):
-            self._driver.take_charge(self._gauge.charge(reading))
+            self._take(reading)

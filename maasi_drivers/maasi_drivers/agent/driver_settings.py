@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from maasi_drivers.agent.battery_gauge import BatteryUnit
 from maasi_drivers.agent.ranging_mount import RangingSettings
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
@@ -209,6 +210,11 @@ class DriverSettings(NodeSettings):
         default='auto',
         description='Type of cmd_vel: TwistStamped, Twist, or the type that it subscribes to; auto '
         'is stamped in lockstep',
+    )
+    battery_unit: BatteryUnit = Field(
+        default='fraction',
+        description='Unit of battery_state.percentage: fraction, 0 to 1 as its definition says, or '
+        'percent, 0 to 100 as a TurtleBot3 has it',
     )
     battery_minimum: float = Field(
         default=0.0,

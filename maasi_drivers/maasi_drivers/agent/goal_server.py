@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_frames import RobotFrames
@@ -52,19 +52,17 @@ class GoalServer:
         self._feedback_at = 0
 
     def offer(self) -> None:
-        """Create the action server."""
-        ActionServer(
-            self._driver,
-            GoToWaypoint,
-            'go_to',
-            self._conclude,
-            handle_accepted_callback=self._answer,
-            cancel_callback=self._cancel,
+        """Offer the action; without configuration goals are refused."""
+        driver = self._driver
+        server = driver.permanent(
+            'go_to', lambda: ActionServer(driver, GoToWaypoint, 'go_to', self._conclude)
         )
-
-    def clear(self) -> None:
-        """Discard results that were not sent; they go with the action server."""
-        self._ended.clear()
+        server.register_goal_callback(
+            lambda _: GoalResponse.ACCEPT if driver.configured else GoalResponse.REJECT
+        )
+        server.register_handle_accepted_callback(self._answer)
+        server.register_cancel_callback(self._cancel)
+        server.register_execute_callback(self._conclude)
 
     def end(self, status: GoalStatus, reason: str) -> None:
         """End the present goal, if there is one."""
@@ -160,9 +158,7 @@ class GoalServer:
         return CancelResponse.ACCEPT
 
     def _conclude(self, handle: ServerGoalHandle) -> GoToWaypoint.Result:
-        goal = self._ended.pop(bytes(handle.goal_id.uuid), None)
-        if goal is None:
-            return GoToWaypoint.Result(reason='the driver was cleaned up')
+        goal = self._ended.pop(bytes(handle.goal_id.uuid))
         if goal.status == GoalStatus.REACHED:
             handle.succeed()
         elif goal.status == GoalStatus.CANCELED and handle.is_cancel_requested:

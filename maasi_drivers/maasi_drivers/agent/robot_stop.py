@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
-from rclpy.node import Node
 from std_srvs.srv import Trigger
+
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 
 # Reason in `state` while it is latched.
 STOPPED = 'stopped by the service stop, until the service release is called'
@@ -32,10 +34,10 @@ class RobotStop:
         self._on_stop = on_stop
         self._on_release = on_release
 
-    def offer(self, node: Node) -> None:
-        """Create the services `stop` and `release` (std_srvs/Trigger) of a node."""
-        node.create_service(Trigger, 'stop', self._stop)
-        node.create_service(Trigger, 'release', self._release)
+    def offer(self, node: LockstepLifecycleNode[Any]) -> None:
+        """Offer the services `stop` and `release` (std_srvs/Trigger) of a node."""
+        node.offer_service('stop', self._stop)
+        node.offer_service('release', self._release)
 
     def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.latched = True

@@ -9,11 +9,10 @@ import numpy as np
 from action_msgs.msg import GoalStatus as ActionStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.action.client import ActionClient
-from rclpy.node import Node
 
 from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_filter.ros.conversions import point_to_ros
-from maasi_filter.ros.lifecycle_node import SettingsError
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.silence import Silence
 
 
@@ -22,7 +21,7 @@ class Nav2Navigation:
 
     Parameters
     ----------
-    node : Node
+    node : LockstepLifecycleNode
         In the robot's namespace.
     frame : str
         Of the waypoints: Nav2's global frame.
@@ -39,7 +38,11 @@ class Nav2Navigation:
     """
 
     def __init__(
-        self, node: Node, frame: str, timeout: float, on_end: Callable[[Goal, bool, str], None]
+        self,
+        node: LockstepLifecycleNode[Any],
+        frame: str,
+        timeout: float,
+        on_end: Callable[[Goal, bool, str], None],
     ) -> None:
         try:
             from nav2_msgs.action import NavigateToPose
@@ -53,7 +56,9 @@ class Nav2Navigation:
         self._timeout = timeout
         self._on_end = on_end
         self._silence = Silence(node)
-        self._client = ActionClient(node, NavigateToPose, 'navigate_to_pose')
+        self._client = node.permanent(
+            'navigate_to_pose', lambda: ActionClient(node, NavigateToPose, 'navigate_to_pose')
+        )
         self._goal: Goal | None = None
         self._handle: Any = None
         # Handle of the replaced goal, until Nav2 has accepted the present one.

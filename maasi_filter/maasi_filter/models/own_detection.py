@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 from maasi_filter.models.custom_kernel import ADDRESS, CUSTOM, NUMBER, REACH, register
 from maasi_filter.models.detection import PARAMETERS, DetectionModel
+from maasi_filter.plugins import PluginError
 
 FloatArray = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ class OwnDetection(DetectionModel):
 
     Raises
     ------
-    ValueError
+    PluginError
         If the function returns something else than finite numbers in [0, 1].
     """
 
@@ -69,16 +70,16 @@ class OwnDetection(DetectionModel):
         self.own = settings
         self.gain = float(probability)
         self.dimension = dimension
-        reach = float(self.reach())
+        reach = float(self._numbers(self.reach(), 'reach', ()))
         if not (math.isfinite(reach) and reach > 0.0):
-            raise ValueError(
+            raise PluginError(
                 f'{self._name}: reach: got {reach}, allowed are finite numbers above 0'
             )
         function = type(self).compiled
         if function is None:
             function, values = _interpolated, self._table(reach)
         else:
-            values = np.array([float(value) for value in self.values()])
+            values = self._numbers(self.values(), 'values', None)
             self._try(function, values, reach)
         self._parameters = np.zeros(PARAMETERS)
         self._parameters[0] = self.gain
@@ -107,14 +108,28 @@ class OwnDetection(DetectionModel):
     def _name(self) -> str:
         return f'{type(self).__module__}:{type(self).__qualname__}'
 
-    def _checked(self, result: Any, shape: tuple[int, ...]) -> FloatArray:
-        found = np.asarray(result, dtype=float)
-        if found.shape != shape:
-            raise ValueError(f'{self._name}: got shape {found.shape}, allowed is {shape}')
+    def _numbers(self, value: Any, what: str, shape: tuple[int, ...] | None) -> FloatArray:
+        """Return what a method gave as numbers of a shape; None: of any number of them."""
+        try:
+            found = np.asarray(value)
+        except ValueError:  # rows of unequal lengths
+            found = np.asarray(None)
+        if found.dtype.kind not in 'biuf':
+            raise PluginError(f'{self._name}: {what}: got {value!r:.80}, allowed are numbers')
+        if found.shape != shape and not (shape is None and found.ndim == 1):
+            allowed = '(n,)' if shape is None else shape
+            raise PluginError(
+                f'{self._name}: {what}: got shape {found.shape}, allowed is {allowed}'
+            )
+        return found.astype(float)
+
+    def _checked(self, result: Any, shape: tuple[int, ...], what: str) -> FloatArray:
+        found = self._numbers(result, what, shape)
         wrong = found[~((found >= 0.0) & (found <= 1.0))]
         if wrong.size:
-            raise ValueError(
-                f'{self._name}: got a probability of {wrong[0]}, allowed are numbers in [0, 1]'
+            raise PluginError(
+                f'{self._name}: {what}: got a probability of {wrong[0]}, allowed are numbers '
+                'in [0, 1]'
             )
         return found
 
@@ -124,7 +139,7 @@ class OwnDetection(DetectionModel):
         axis = np.linspace(-reach, reach, 2 * cells + 1)
         height = axis if self.dimension == 3 else np.zeros(1)
         grids = [grid.ravel() for grid in np.meshgrid(axis, axis, height, indexing='ij')]
-        table = self._checked(self.evaluate(*grids), grids[0].shape)
+        table = self._checked(self.evaluate(*grids), grids[0].shape, 'evaluate')
         return np.concatenate([[cells, cells / reach, self.dimension], table])
 
     def _try(self, function: Callable[..., float], values: FloatArray, reach: float) -> None:
@@ -134,7 +149,7 @@ class OwnDetection(DetectionModel):
         places[:, self.dimension :] = 0.0
         places[0] = 0.0
         results = [function(*place, values) for place in places.tolist()]
-        self._checked(results, (_TRIALS,))
+        self._checked(results, (_TRIALS,), 'compiled')
 
 
 @njit(cache=True, error_model='numpy')

@@ -67,6 +67,8 @@ class Sensor:
         Seconds between possible measurements; 0 means no limit.
     maximum_range : float
         Detections from farther away are dropped and counted, metres.
+    resolution : float
+        Detections of one scan that are closer are of one target, in deviations of the noise.
 
     Raises
     ------
@@ -81,6 +83,7 @@ class Sensor:
     clutter: float = 0.0
     period: float = 0.0
     maximum_range: float = field(default=math.inf)
+    resolution: float = 1.0
 
     def __post_init__(self) -> None:
         self.covariance = np.array(self.covariance, dtype=float)
@@ -92,6 +95,10 @@ class Sensor:
         if not (math.isfinite(self.period) and self.period >= 0.0):
             raise ValueError(
                 f'{self.name}: period: got {self.period}, allowed are finite numbers from 0'
+            )
+        if not (math.isfinite(self.resolution) and self.resolution >= 0.0):
+            raise ValueError(
+                f'{self.name}: resolution: got {self.resolution}, allowed are finite numbers from 0'
             )
         if not self.maximum_range > 0.0:
             raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,8 +35,11 @@ class Marginals:
 
 
 @njit(cache=True, error_model='numpy')
-def _propagate(psi, missed, caused, new):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Pass messages until they stand still, and fill the marginals."""
+def propagate(psi, missed, caused, new):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Pass messages until they stand still, and fill the marginals; `psi` is odds over `other`.
+
+    Returns the log of the sum of the weights of all associations, by the Bethe free energy.
+    """
     n, m = psi.shape
     mu = np.zeros((n, m))
     nu = np.ones((n, m))
@@ -59,18 +63,23 @@ def _propagate(psi, missed, caused, new):  # type: ignore[no-untyped-def]  # pra
                 nu[i, j] = message
         if change < TOLERANCE:
             break
+    log_sum = 0.0
     for i in range(n):
         total = 1.0
         for j in range(m):
             total += psi[i, j] * nu[i, j]
         missed[i] = 1.0 / total
+        log_sum += math.log(total)
         for j in range(m):
             caused[i, j] = psi[i, j] * nu[i, j] / total
+            log_sum -= math.log(1.0 + mu[i, j] * nu[i, j])
     for j in range(m):
         total = 1.0
         for i in range(n):
             total += mu[i, j]
         new[j] = 1.0 / total
+        log_sum += math.log(total)
+    return log_sum
 
 
 def associate(odds: FloatArray, other: FloatArray) -> Marginals:
@@ -88,5 +97,5 @@ def associate(odds: FloatArray, other: FloatArray) -> Marginals:
     n, m = odds.shape
     marginals = Marginals(np.ones(n), np.zeros((n, m)), np.ones(m))
     if n and m:
-        _propagate(odds / other, marginals.missed, marginals.caused, marginals.new)
+        propagate(odds / other, marginals.missed, marginals.caused, marginals.new)
     return marginals

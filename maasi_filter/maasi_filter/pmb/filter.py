@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.clutter import measurement_space
-from maasi_filter.dropped import count_unexplained, within_range
+from maasi_filter.dropped import count_unexplained, within_range, without_repeats
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
@@ -29,12 +30,11 @@ from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb import state as pmb_state
 from maasi_filter.pmb.association import Marginals, associate
 from maasi_filter.pmb.births import Births, born, draw_births
-from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import Component, View, merge, views
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest
 from maasi_filter.pmb.identity import associate_by_identity, learn_labels, new_label
-from maasi_filter.pmb.noise_scale import NoiseScale, innovations
+from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offset_state import offset_arrays, restore_offsets
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.scan import Scan, make_scan
@@ -101,8 +101,7 @@ class PmbFilter:
         self.generator = generator
         self.components: list[Component] = []
         self.clusters: list[Cluster] = []
-        self._clutter = ClutterEstimate()
-        self._noise = NoiseScale()
+        self._learnt = Learnt()
         self._offsets = Offsets(self._numbers.pmb.offset, self.dimension)
         self._scans = 0
         self._last_id = 0
@@ -174,6 +173,7 @@ class PmbFilter:
             found_changed=changed,
             expected_number=self.expected_number,
             dropped=dropped,
+            misfits=self._learnt.consistency.misfits(),
         )
 
     def _correct(
@@ -184,11 +184,12 @@ class PmbFilter:
         time: float,
     ) -> bool:
         """Correct with one robot's scan; return whether what is found changed."""
-        member = within_range(member, dropped)
+        member = without_repeats(within_range(member, dropped), dropped)
         space = measurement_space(member.sensor, self.bounds)
         # kappa: clutter per unit of measurement space.
-        kappa = self._clutter.per_scan(member.robot, member.sensor.clutter * space) / space
-        member = self._localised(member, kappa)
+        kappa = self._learnt.clutter.per_scan(member.robot, member.sensor.clutter * space) / space
+        believed = self._localised(member, kappa)
+        member = self._blurred(believed, kappa)
         scan = self._scan(member)
         self._scans += 1
         # lambda_j = (N0 / V) int e pi g_j dx, by importance sampling from the detections.
@@ -209,7 +210,8 @@ class PmbFilter:
         named = associate_by_identity(member.labels, self.components, odds, other)
         marginals = associate(odds, other)
         learn_labels(member.labels, self.components, marginals.caused)
-        self._learn_noise(member, marginals.caused)
+        blurred = member.pose_error > believed.pose_error
+        self._learnt.count_found(believed, self.components, marginals.caused, blurred)
         alone = (births.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
         count_unexplained(scan.centres[alone], self.bounds, dropped)
         changed = self._offsets.active and bool(self.own_found_targets())
@@ -225,7 +227,7 @@ class PmbFilter:
             )
             item.labels = new_label(member.labels, j, self.components)
             self.components.append(item)
-        self._clutter.count(member.robot, float((marginals.new * (1.0 - real)).sum()))
+        self._learnt.clutter.count(member.robot, float((marginals.new * (1.0 - real)).sum()))
         # e <- e (1 - pi).
         self.exploration.update(scan.detection, member.pose)
         return changed
@@ -272,18 +274,11 @@ class PmbFilter:
             item.stale = True
         return member
 
-    def _learn_noise(self, member: CheckedMeasurement, caused: FloatArray) -> None:
-        """Count the innovations of the detections that found targets caused."""
-        own = [i for i, item in enumerate(self.components) if item.target and not item.foreign]
-        rows = [i for i in own if caused[i].max(initial=0.0) > 0.5]
-        if not rows:
-            return
-        densities = [self.components[i].density for i in rows]
-        means = np.array([density.mean for density in densities])
-        covariances = np.array([density.covariance for density in densities])
-        squares = innovations(member, means, covariances).squares / self.dimension
-        for row, j in np.argwhere(caused[rows] > 0.5).tolist():
-            self._noise.count(member.robot, float(caused[rows[row], j]), float(squares[row, j]))
+    def _blurred(self, member: CheckedMeasurement, kappa: float) -> CheckedMeasurement:
+        """Return a scan with the error of the robot's position that its fit tells of."""
+        density = self._expected_targets / self.exploration.volume
+        error = self._learnt.errors.learn(member, self.components, kappa, density)
+        return replace(member, pose_error=math.hypot(member.pose_error, error))
 
     def _scan(self, member: CheckedMeasurement) -> Scan:
         """Return a member's detections for the kernels, with the noise that was learnt."""
@@ -291,7 +286,7 @@ class PmbFilter:
         if isinstance(detection, BoxDetection):
             # The position error of the robot blurs the edge of a box-shaped field of view.
             detection = detection.softened(2.0 * member.pose_error)
-        return make_scan(member, self._noise.factor(member.robot), detection)
+        return make_scan(member, self._learnt.noise.factor(member.robot), detection)
 
     def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
         """Mark a component as found."""
@@ -442,9 +437,7 @@ class PmbFilter:
             'counters': np.array([self._scans, self._last_id]),
             'last_time': np.array(np.nan if self._last_time is None else self._last_time),
             **offset_arrays(self._offsets),
-            **pmb_state.to_arrays(
-                self.components, (self._clutter, self._noise), (number, self.dimension), grid
-            ),
+            **pmb_state.to_arrays(self.components, self._learnt, (number, self.dimension), grid),
         }
 
     @classmethod
@@ -474,6 +467,6 @@ class PmbFilter:
         number = search._numbers.pmb.particles
         search.components = pmb_state.components_of(state, number, grid, search._frame)
         search.clusters = clusters_of(state)
-        search._clutter, search._noise = pmb_state.learnt_of(state)
+        search._learnt = pmb_state.learnt_of(state)
         restore_offsets(search._offsets, state)
         return search

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from maasi_filter.models.custom_kernel import renew_addresses
 from maasi_filter.models.label import LabelTally
-from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import Component
+from maasi_filter.pmb.consistency import NOTHING
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import FIRST, HEAD, KIND, MODEL, TERM, TERMS
-from maasi_filter.pmb.noise_scale import NoiseScale
+from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offset_state import OFFSET_ARRAYS
+from maasi_filter.pmb.position_error import LEVELS, PRIOR
 from maasi_filter.records import FoundTarget
 from maasi_filter.state_check import (
     COMMON,
@@ -58,9 +59,11 @@ _ARRAYS: dict[str, tuple[str, str]] = {
     'clutter_counts': ('f', 'r'),
     'noise_detections': ('f', 'r'),
     'noise_squares': ('f', 'r'),
+    'position_errors': ('f', 'r LEVEL'),
+    'consistency': ('f', 'r 3'),
     **OFFSET_ARRAYS,
 }
-_SIZES = {'HEAD': HEAD, 'TERM': TERM}
+_SIZES = {'HEAD': HEAD, 'TERM': TERM, 'LEVEL': len(LEVELS)}
 _NOT_NEGATIVE = (
     'hits',
     'pose_error',
@@ -70,6 +73,8 @@ _NOT_NEGATIVE = (
     'clutter_counts',
     'noise_detections',
     'noise_squares',
+    'position_errors',
+    'consistency',
     'offset_ways',
 )
 # Arrays that may contain non-finite numbers: no step yet, unlimited radius.
@@ -78,11 +83,11 @@ _UNDEFINED = ('last_time', 'found_radius', 'heads')
 
 def to_arrays(
     items: Sequence[Component],
-    learnt: tuple[ClutterEstimate, NoiseScale],
+    learnt: Learnt,
     particles: tuple[int, int],
     grid: tuple[int, ...],
 ) -> dict[str, NDArray[Any]]:
-    """Return components, clutter and noise as arrays for a file.
+    """Return components, and what is learnt of robots, as arrays for a file.
 
     Parameters
     ----------
@@ -92,7 +97,8 @@ def to_arrays(
         Shape of e's grid.
     """
     n, d = particles
-    clutter, noise = learnt
+    clutter, noise = learnt.clutter, learnt.noise
+    probabilities, sums = learnt.errors.probabilities, learnt.consistency.sums
     densities = [item.density for item in items]
     grids: list[NDArray[Any]] = []
     numbers: dict[int, int] = {}
@@ -127,6 +133,10 @@ def to_arrays(
         'clutter_counts': np.array([clutter.counts[name] for name in robots], float),
         'noise_detections': np.array([noise.detections.get(name, 0.0) for name in robots], float),
         'noise_squares': np.array([noise.squares.get(name, 0.0) for name in robots], float),
+        'position_errors': np.array(
+            [probabilities.get(name, PRIOR) for name in robots], float
+        ).reshape(-1, len(LEVELS)),
+        'consistency': np.array([sums.get(name, NOTHING) for name in robots]).reshape(-1, 3),
     }
 
 
@@ -199,21 +209,24 @@ def _labels_of(state: Arrays, number: int) -> list[LabelTally]:
     return [LabelTally.from_json(values) for values in labels]
 
 
-def learnt_of(state: Arrays) -> tuple[ClutterEstimate, NoiseScale]:
-    """Return what a checked state has learnt of clutter and noise.
+def learnt_of(state: Arrays) -> Learnt:
+    """Return what a checked state has learnt of robots.
 
     Raises
     ------
     ValueError
         If names and counts of robots do not match.
     """
-    clutter, noise = ClutterEstimate(), NoiseScale()
+    learnt = Learnt()
+    clutter, noise = learnt.clutter, learnt.noise
     robots = names_of(state, 'clutter_robots', len(state['clutter_scans']))
     clutter.scans = dict(zip(robots, state['clutter_scans'].tolist()))
     clutter.counts = dict(zip(robots, state['clutter_counts'].tolist()))
     noise.detections = dict(zip(robots, state['noise_detections'].tolist()))
     noise.squares = dict(zip(robots, state['noise_squares'].tolist()))
-    return clutter, noise
+    learnt.errors.probabilities = dict(zip(robots, state['position_errors']))
+    learnt.consistency.sums = dict(zip(robots, state['consistency']))
+    return learnt
 
 
 def check(state: Arrays) -> None:

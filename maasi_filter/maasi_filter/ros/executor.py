@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
+
+
+class _NoNode:
+    """Stands beside the node of an events executor.
+
+    rclpy 7.1 crashes (SIGSEGV) where a task raises and its events executor has exactly one node
+    (ros2/rclpy, pull request 1718); with two the exception ends the spin.
+    """
+
+    executor: Any = None
+    subscriptions = timers = clients = services = waitables = guards = ()
 
 
 def executor_of(node: Node, context: Context | None = None) -> Executor:
@@ -20,5 +33,7 @@ def executor_of(node: Node, context: Context | None = None) -> Executor:
         executor: Executor = SingleThreadedExecutor(context=context)
     else:
         executor = EventsExecutor(context=context)
+        beside: Any = _NoNode()
+        executor.add_node(beside)
     executor.add_node(node)
     return executor

@@ -5,17 +5,20 @@ from __future__ import annotations
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable
 from functools import partial
-from typing import Any, Generic
+from typing import Any, Generic, TypeVar
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
 from maasi_filter.ros.bad_requests import survive_bad_requests
 from maasi_filter.ros.clock_watch import ClockWatch
@@ -24,7 +27,7 @@ from maasi_filter.ros.loopback import loopback_fault
 from maasi_filter.ros.node_entities import NodeEntities
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.ros.qos import LATCHED, RELIABLE
-from maasi_filter.ros.readiness import subscribers_connected, unpublished_topics
+from maasi_filter.ros.readiness import Unconnected, subscribers_connected, unpublished_topics
 from maasi_filter.ros.stamps import stamp_problem
 from maasi_msgs.msg import LockstepDone, LockstepStep
 
@@ -37,8 +40,15 @@ _WARNING_PERIOD = 2.0
 # From activation until a node says what it waits for [s].
 _NOTICE_DELAY = 1.0
 
+T = TypeVar('T')
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+
+def _has_lists(msg_type: Any) -> bool:
+    """Return whether messages of a type have lists of messages, which are slow to read."""
+    fields = msg_type.get_fields_and_field_types().values()
+    return any(field.startswith('sequence<') and '/' in field for field in fields)
 
 
 class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
@@ -97,6 +107,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._unconnected = Unconnected(self)
         self._clock_watch = ClockWatch(self, self.warn_throttled, self._on_restart)
         self.create_wall_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics)
         survive_bad_requests(self, self.drop)
@@ -249,6 +260,23 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.step_subscription = None
         self._parameters_read.release()
 
+    def permanent(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return an entity that *cleanup* must not destroy, as others wait for its answer.
+
+        That is an action client, an action server or a subscription with event callbacks. It is
+        made at the first call with this key, and lives as long as the node (`NodeEntities`).
+        """
+        return self._entities_made.permanent(key, make)
+
+    def offer_service(
+        self, name: str, answer: Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
+    ) -> None:
+        """Offer a service (std_srvs/Trigger) that lives as long as the node."""
+        service = self.permanent(
+            self.resolve_service_name(name), lambda: self.create_service(Trigger, name, answer)
+        )
+        service.callback = answer
+
     # ---- readiness and lockstep --------------------------------------------------------------
 
     def expect(self, condition: Callable[[], bool]) -> None:
@@ -356,13 +384,50 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
 
     # ---- messages ----------------------------------------------------------------------------
 
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
+        """Return a publisher without the event callbacks of rclpy; see `Unconnected`."""
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        return super().create_publisher(
+            msg_type, topic, qos_profile, **{'event_callbacks': quiet, **options}
+        )
+
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
-        """Return a subscription that drops messages with an invalid stamp."""
+        """Return a subscription that drops messages with an invalid stamp, and far too large ones.
+
+        It is never called after its destruction; the executor may already have queued a message.
+        It has no event callbacks of rclpy; see `Unconnected`.
+        """
+        options.setdefault(
+            'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
+        )
+        take = callback
         if not options.get('raw'):
-            callback = partial(self.check_stamp, topic, callback)
-        return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
+            take = partial(self.check_stamp, topic, callback)
+            if _has_lists(msg_type):
+                # Reading 100,000 items of a list alone takes a second.
+                take, options['raw'] = partial(self._check_size, topic, msg_type, take), True
+
+        def call(message: Any) -> None:
+            if any(item is made for item in self.subscriptions):
+                take(message)
+
+        made = super().create_subscription(msg_type, topic, call, qos_profile, **options)
+        return made
+
+    def _check_size(
+        self, topic: str, msg_type: Any, callback: Callable[[Any], None], data: bytes
+    ) -> None:
+        """Call back with a serialised message unless it is too large."""
+        limit = self.settings.largest_message
+        if len(data) <= limit:
+            callback(deserialize_message(data, msg_type))
+        else:
+            self.drop(
+                'too large message',
+                f'{topic}: read {len(data)} bytes, allowed are {limit} (parameter largest_message)',
+            )
 
     def check_stamp(self, topic: str, callback: Callable[[Any], None], message: Any) -> None:
         """Call back unless the stamp of a message is invalid."""
@@ -411,7 +476,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def _publish_diagnostics(self) -> None:
         self._clock_watch.look()
         fault = self.fault() if self.active else ''
-        warnings = self.warnings() if self.active else []
+        warnings = [*(self.warnings() if self.active else []), *self._unconnected.look()]
         if sum(self.dropped.values()):
             counts = (f'{reason} {number}' for reason, number in sorted(self.dropped.items()))
             warnings = [*warnings, f'dropped: {", ".join(counts)}']

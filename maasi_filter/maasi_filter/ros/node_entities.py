@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
 
 from rclpy.event_handler import EventHandler
 from rclpy.node import Node
 
+T = TypeVar('T')
+
 
 class NodeEntities:
     """Publishers, subscriptions, services, clients, timers and actions made since `mark`.
+
+    Action clients, action servers and subscriptions with event callbacks are permanent: rclpy's
+    events executor crashes (SIGSEGV) if one is destroyed while an event of it is queued, as it
+    then calls Python without the interpreter's lock.
 
     Parameters
     ----------
@@ -20,6 +27,14 @@ class NodeEntities:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._kept: list[Any] | None = None
+        self._permanent: dict[Hashable, Any] = {}
+
+    def permanent(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return the entity of a key, made at the first call, which lives as long as the node."""
+        if key not in self._permanent:
+            self._permanent[key] = make()
+        made: T = self._permanent[key]
+        return made
 
     def mark(self) -> None:
         """Mark the present entities as kept: `clear` destroys only later ones."""
@@ -29,9 +44,10 @@ class NodeEntities:
         """Destroy the entities created since `mark`; nothing without a mark."""
         if self._kept is None:
             return
-        kept, self._kept = {id(item) for item in self._kept}, None
+        kept = {id(item) for item in (*self._kept, *self._permanent.values())}
+        self._kept = None
         node = self._node
-        # Action servers and clients are waitables; owners destroy their event handlers.
+        # Of plugins; owners destroy their event handlers.
         for waitable in list(node.waitables):
             if id(waitable) not in kept and not isinstance(waitable, EventHandler):
                 waitable.destroy()  # type: ignore[attr-defined]

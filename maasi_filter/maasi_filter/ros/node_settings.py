@@ -30,6 +30,12 @@ class NodeSettings(Settings):
         default=False, description='Whether the steps are those of lockstep/step, all awaited'
     )
     frame: str = Field(default='map', min_length=1, description='Name of the common frame')
+    largest_message: int = Field(
+        default=200_000,
+        gt=0,
+        description='Largest message with a list (detections, clusters, found targets) that is '
+        'read; larger ones are dropped [bytes]',
+    )
     autostart: bool = Field(
         default=True, description='Whether the node configures and activates itself'
     )

@@ -146,7 +146,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         )
         self.create_subscription(SearchLinkArray, 'link/rx', self._on_heard, RELIABLE)
         self.expect_publisher(self._odometry.topic_name)
-        offer_services(self, [self.name], self.team_topic, self._take_command)
+        offer_services(self, [self.name], self._take_command)
         if not lockstep:
             self.create_wall_timer(0.02, self._check_link)
         for cell, reason in self._mission.lost:

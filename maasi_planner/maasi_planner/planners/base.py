@@ -13,10 +13,11 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision, RobotView, TeamView
+from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -156,6 +157,51 @@ def check_clusters(clusters: Sequence[Cluster]) -> None:
             raise ValueError(f'clusters[{index}]: got a number that is not finite')
 
 
+def check_decision(planner: Planner, team: TeamView, decision: Decision) -> None:
+    """Refuse a decision that robots cannot follow.
+
+    Raises
+    ------
+    PluginError
+        Naming planner, robot and field, what was read, and what is allowed.
+    """
+    origin = f'planner {type(planner).__module__}:{type(planner).__qualname__}'
+    if not (isinstance(decision, Decision) and isinstance(decision.robots, dict)):
+        raise PluginError(f'{origin}: decide returned {decision!r:.80}, allowed is a Decision')
+    if set(decision.robots) != set(team.planning()):
+        raise PluginError(
+            f'{origin}: decided for {sorted(map(str, decision.robots))}, allowed are exactly the '
+            f'robots that plan, {team.planning()}'
+        )
+    for name, robot in decision.robots.items():
+        if not isinstance(robot, RobotDecision):
+            raise PluginError(f'{origin}: {name}: got {robot!r:.80}, allowed is a RobotDecision')
+        problem = _problem_of(robot, team.bounds)
+        if problem:
+            raise PluginError(f'{origin}: {name}: {problem}')
+
+
+def _problem_of(robot: RobotDecision, bounds: FloatArray) -> str:
+    """Return what is wrong with a decision for one robot; empty if nothing is."""
+    terms = ('control_cost', 'target_refinement', 'exploration', 'objective')
+    rows, steps = np.shape(robot.candidates)[:1], np.shape(robot.positions)[:1]
+    shapes = {'waypoint': (3,), 'positions': (*steps, 3), 'yaws': steps, 'candidates': (*rows, 3)}
+    shapes |= dict.fromkeys((*terms, 'lengths', 'measurements'), rows)
+    for field, shape in shapes.items():
+        value = getattr(robot, field)
+        if not (isinstance(value, np.ndarray) and value.dtype.kind in 'if'):
+            return f'{field}: got {value!r:.80}, allowed is an array of numbers'
+        if value.shape != shape:
+            return f'{field}: got shape {value.shape}, allowed is {shape}'
+        if field not in terms and not finite(value):
+            return f'{field}: got a number that is not finite'
+    if not (isinstance(robot.chosen, int | np.integer) and robot.chosen < rows[0]):
+        return f'chosen: got {robot.chosen!r:.80}, allowed are integers below {rows[0]}'
+    if not robot.stays and not in_bounds(robot.waypoint[None, :], bounds)[0].all():
+        return f'waypoint: got {robot.waypoint.tolist()}, allowed is inside {bounds.tolist()} [m]'
+    return ''
+
+
 def state_problem(view: RobotView) -> str | None:
     """Return what is wrong with a robot's state, if anything."""
     state = view.state
@@ -229,6 +275,8 @@ def usable_candidates(
         if lost:
             dropped.append(f'{lost} in obstacles')
         points = np.array([point for point in moved if point is not None]).reshape(-1, 3)
+        # They move towards the robot, which may be outside.
+        points = points[in_bounds(points, team.bounds)[0]]
     return points, ', '.join(dropped)
 
 

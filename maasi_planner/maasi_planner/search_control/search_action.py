@@ -9,9 +9,9 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.node import Node
 from rclpy.task import Future
 
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_msgs.action import SearchTargets
 
 Result: TypeAlias = SearchTargets.Result
@@ -47,7 +47,7 @@ class SearchAction:
 
     Parameters
     ----------
-    node : Node
+    node : LockstepLifecycleNode
         Owner of the server.
     problem : callable
         Returns why no goal is accepted now; empty if one is.
@@ -59,7 +59,7 @@ class SearchAction:
 
     def __init__(
         self,
-        node: Node,
+        node: LockstepLifecycleNode[Any],
         problem: Callable[[], str],
         on_begin: Callable[[], object],
         on_end: Callable[[], None],
@@ -74,15 +74,18 @@ class SearchAction:
         self._outcome: Future | None = None
         self._feedback = SearchTargets.Feedback()
         self._began: float | None = None
-        self._server = ActionServer(
-            node,
-            SearchTargets,
+        server = node.permanent(
             'search',
-            execute_callback=lambda _: Result(),
-            goal_callback=self._judge,
-            handle_accepted_callback=self._accept,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            lambda: ActionServer(
+                node,
+                SearchTargets,
+                'search',
+                execute_callback=lambda _: Result(),
+                cancel_callback=lambda _: CancelResponse.ACCEPT,
+            ),
         )
+        server.register_goal_callback(self._judge)
+        server.register_handle_accepted_callback(self._accept)
 
     @property
     def active(self) -> bool:

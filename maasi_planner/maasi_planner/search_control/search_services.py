@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_planner.search_control.search_modes import COMMANDS
 
 # Takes a command and robots (none: all), returns whether it was accepted, and an answer as text.
@@ -16,18 +16,18 @@ Commander = Callable[[str, 'list[str] | None'], 'tuple[bool, str]']
 
 
 def offer_services(
-    node: Node, names: Sequence[str], team_topic: Callable[[str], str], commander: Commander
+    node: LockstepLifecycleNode[Any], names: Sequence[str], commander: Commander
 ) -> None:
-    """Create `search/<command>` for the team and `<robot>/search/<command>` for each robot."""
+    """Offer `search/<command>` for the team and `<robot>/search/<command>` for each robot."""
     services: dict[str, list[str] | None] = {}
     for word in COMMANDS:
         for name in names:
-            services[team_topic(f'{name}/search/{word}')] = [name]
+            services[node.team_topic(f'{name}/search/{word}')] = [name]
         # In the namespace of its only robot, the team is that robot.
         services.setdefault(node.resolve_service_name(f'search/{word}'), None)
     for service, robots in services.items():
         word = service.rpartition('/')[2]
-        node.create_service(Trigger, service, partial(_serve, commander, word, robots))
+        node.offer_service(service, partial(_serve, commander, word, robots))
 
 
 def _serve(

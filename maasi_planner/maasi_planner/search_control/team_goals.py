@@ -12,8 +12,8 @@ from typing import Any
 
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
-from rclpy.node import Node
 
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.silence import Silence
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
@@ -75,7 +75,7 @@ class TeamGoals:
 
     Parameters
     ----------
-    node : Node
+    node : LockstepLifecycleNode
         Owner of the clients.
     topics : dict
         Name of the action of each robot.
@@ -87,7 +87,7 @@ class TeamGoals:
 
     def __init__(
         self,
-        node: Node,
+        node: LockstepLifecycleNode[Any],
         topics: dict[str, str],
         lockstep: bool,
         on_answer: Callable[[str, int, bool], None],
@@ -96,7 +96,8 @@ class TeamGoals:
         self._lockstep = lockstep
         self._on_answer = on_answer
         self.clients = {
-            name: ActionClient(node, GoToWaypoint, topic) for name, topic in topics.items()
+            name: node.permanent(topic, partial(ActionClient, node, GoToWaypoint, topic))
+            for name, topic in topics.items()
         }
         self._sent: dict[str, _Sent] = {}
         # Numbers of goals that were cancelled last, with wall time.

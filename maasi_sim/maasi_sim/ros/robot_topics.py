@@ -73,6 +73,7 @@ class RobotTopics:
             power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
             present=True,
         )
+        self._full = 100.0 if robot.battery_unit == 'percent' else 1.0
         self._battery.header.frame_id = f'{name}/base_link'
         #: Sensor topic that the driver needs besides odometry.
         self.sensor_topic = ''
@@ -120,7 +121,7 @@ class RobotTopics:
             self._scan_publisher.publish(self._scan)
         if self._battery_publisher is not None and simulation.step % self._battery_steps == 0:
             self._battery.header.stamp = stamp
-            self._battery.percentage = robot.battery.charge
+            self._battery.percentage = self._full * robot.battery.charge
             self._battery_publisher.publish(self._battery)
         return imaging
 

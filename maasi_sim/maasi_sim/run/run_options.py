@@ -99,12 +99,15 @@ def build_parser() -> argparse.ArgumentParser:
 
 def add_view_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a server of the page."""
-    parser.add_argument('--port', type=_port, metavar='N', help='of the page (default: 8420)')
+    parser.add_argument(
+        '--port', type=_port, metavar='N', help='of the page; the next free one (default: 8420)'
+    )
     parser.add_argument(
         '--host',
         default='127.0.0.1',
         metavar='ADDRESS',
-        help='that the page is served on (default: 127.0.0.1, this machine only)',
+        help='that the page is served on (default: 127.0.0.1, this machine only); others need the '
+        'whole link, which has a token',
     )
     parser.add_argument(
         '--control',

@@ -9,7 +9,6 @@ from maasi_sim.run.mission import Mission
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.view.live_view import LiveView, MessageFeed
 from maasi_sim.view.scene import scene_of
-from maasi_sim.view.server import Commander
 
 
 class RunPage:
@@ -35,15 +34,14 @@ class RunPage:
     def __init__(
         self, mission: Mission[Any], options: ViewOptions, domain: int, namespace: str
     ) -> None:
-        commander: Commander | None = None
+        self._control = None
         if options.control:
             # rclpy starts threads when it is imported.
-            from maasi_sim.view.control_node import ControlNode
+            from maasi_sim.view.control_node import Control
 
-            commander = ControlNode(domain, namespace)
-        self._commander = commander
+            self._control = Control(domain, namespace)
         scene = scene_of(mission.name, mission.scenario)
-        self.view = LiveView(scene, options.port, options.host, commander)
+        self.view = LiveView(scene, options.port, options.host, self._control)
         self._feed = MessageFeed(self.view, load_types())
 
     def put(self, topic: str, type_name: str, data: bytes) -> None:
@@ -53,6 +51,7 @@ class RunPage:
     def close(self) -> None:
         """Show the queued messages, and stop serving."""
         self._feed.close()
+        self.view.maker.end()
         self.view.end('the run has ended')
-        if self._commander is not None:
-            self._commander.close()  # type: ignore[attr-defined]
+        if self._control is not None:
+            self._control.close()

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from maasi_drivers.agent.battery_gauge import BatteryUnit
 from maasi_drivers.agent.driver_settings import DRIVERS
 from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
@@ -86,6 +87,10 @@ class RobotSettings(Settings):
     )
     battery: BatterySettings = Field(
         default_factory=BatterySettings, description='Its battery, simulated'
+    )
+    battery_unit: BatteryUnit = Field(
+        default='fraction',
+        description='Unit of battery_state.percentage: fraction, 0 to 1, or percent, 0 to 100',
     )
     simulated: SimulatedSettings = Field(
         default_factory=SimulatedSettings,

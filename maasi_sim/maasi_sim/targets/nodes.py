@@ -102,6 +102,7 @@ def _robot_plans(
             'motion': robot.motion,
             'sensor': robot.sensor,
             'camera': robot.camera,
+            'battery_unit': robot.battery_unit,
             'link': robot.link,
             'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
             'mavlink': robot.mavlink if robot.link == 'mavlink' else None,

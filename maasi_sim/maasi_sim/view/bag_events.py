@@ -52,6 +52,7 @@ def read_events(path: Path, progress: Callable[[float], None] | None = None) -> 
             if progress is not None and index % _PROGRESS == 0:
                 progress(index / total)
             takes.take(item.topic, item.type, item.message)
+        maker.end()
     # Parts that became known later belong to the scene of a replay.
     return EventLog(maker.scene, [event for event in events if event[1] != 'scene'])
 

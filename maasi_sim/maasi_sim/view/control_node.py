@@ -7,7 +7,6 @@ import threading
 
 import rclpy
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from maasi_planner.search_command import call_all
@@ -16,8 +15,8 @@ from maasi_planner.search_command import call_all
 _PATIENCE = 5.0
 
 
-class ControlNode:
-    """A node that calls the services of planners and drivers, one command at a time.
+class Control:
+    """Calls the services of planners and drivers; no command waits for another one.
 
     Parameters
     ----------
@@ -29,19 +28,13 @@ class ControlNode:
 
     def __init__(self, domain: int | None, namespace: str = '') -> None:
         self._namespace = namespace
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()
+        self._running = 0
         self._context = Context()
         rclpy.init(
             context=self._context,
             domain_id=domain,
             signal_handler_options=SignalHandlerOptions.NO,
-        )
-        self._node = Node(
-            'view_control',
-            context=self._context,
-            start_parameter_services=False,
-            enable_rosout=False,
-            use_global_arguments=False,
         )
 
     def __call__(self, command: str, robot: str | None) -> tuple[bool, str]:
@@ -49,10 +42,25 @@ class ControlNode:
         options = argparse.Namespace(
             command=command, robot=robot, namespace=self._namespace, timeout=_PATIENCE
         )
-        with self._lock:
+        with self._changed:
             if not self._context.ok():
                 return False, 'the run has ended'
-            answers = call_all(self._node, options)
+            self._running += 1
+        # A node of its own for each command, as a node is spun by one thread only.
+        node = rclpy.create_node(
+            'view_control',
+            context=self._context,
+            start_parameter_services=False,
+            enable_rosout=False,
+            use_global_arguments=False,
+        )
+        try:
+            answers = call_all(node, options)
+        finally:
+            node.destroy_node()
+            with self._changed:
+                self._running -= 1
+                self._changed.notify_all()
         if not answers:
             return False, f'no service for {command} within {_PATIENCE:g} s'
         done = all(answer is not None and answer.success for answer in answers.values())
@@ -60,8 +68,7 @@ class ControlNode:
         return done, '; '.join(sorted(words))
 
     def close(self) -> None:
-        """Leave the graph."""
-        with self._lock:
-            if self._context.ok():
-                self._node.destroy_node()
-                rclpy.shutdown(context=self._context)
+        """Leave the graph, after the last command."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._running == 0)
+            rclpy.try_shutdown(context=self._context)

@@ -6,7 +6,8 @@ The last event of a kind and owner at or before a time is what holds at that tim
 ==========  ======================================================================================
 kind        after time, kind and owner
 ==========  ======================================================================================
-robot       [x, y, z, yaw], battery (negative: unknown), goal status, reason
+robot       [x, y, z, yaw], battery (negative: unknown), goal status, reason; beyond the statuses of
+            AgentState: 6 it left, 7 it is silent, 8 the run has ended
 seen        [x, y, z] of the robot, detections [range, bearing, elevation, and a deviation of each]
 filter      expected number, clusters [x, y, z, mass, covariance], measurements so far
 found       targets [id, x, y, z, covariance, robot, time]

@@ -17,7 +17,10 @@ FloatArray = NDArray[np.float64]
 
 # Objectives below this stand for candidates that are not allowed.
 _NOT_ALLOWED = -1e29
-_UNAVAILABLE = 5
+# Status of a robot: of AgentState, and what only those who watch know.
+UNAVAILABLE, LEFT, SILENT, ENDED = 5, 6, 7, 8
+# A robot is silent when others say where they are for so long without it [s].
+_SILENCE = 3.0
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
@@ -101,6 +104,8 @@ class EventMaker:
         self._truth: FloatArray | None = None
         self._found: dict[str, dict[int, FloatArray]] = {}
         self._status: dict[str, int] = {}
+        # Last time, place and battery of each robot.
+        self._heard: dict[str, tuple[float, list[float], float]] = {}
         self._activity: dict[str, str] = {}
         self._measured: set[tuple[str, str, int]] = set()
         #: Latest time of an event [s].
@@ -131,13 +136,35 @@ class EventMaker:
     ) -> None:
         """Add the state of a robot; pose is x, y, z [m] and yaw [rad]."""
         place = [*self._place(pose[:3]), round(float(pose[3]), 3)]
-        self._put(time, 'robot', name, place, round(float(battery), 3), int(status), reason)
-        before, self._status[name] = self._status.get(name), int(status)
-        if (status == _UNAVAILABLE) != (before == _UNAVAILABLE):
-            if status == _UNAVAILABLE:
-                self.message(time, name, 'fault', f'cannot go on: {reason or "no reason given"}')
-            elif before is not None:
-                self.message(time, name, 'team', 'takes part again')
+        # Its last time: after a jump of the clock the others have their turn first.
+        until = self._heard[name][0] if name in self._heard else time
+        self._heard[name] = time, place, round(float(battery), 3)
+        self._set_status(time, name, int(status), reason)
+        for other, (heard, *_) in self._heard.items():
+            if until - heard > _SILENCE and self._status[other] < LEFT:
+                self._set_status(time, other, SILENT, f'not heard for {_SILENCE:g} s')
+
+    def leave(self, time: float, name: str) -> None:
+        """Add that a robot leaves the team."""
+        self.message(time, name, 'team', 'left')
+        if name in self._heard:
+            self._set_status(time, name, LEFT, '')
+
+    def end(self) -> None:
+        """Add that the run has ended: nobody is on the way any more."""
+        for name in self._heard:
+            if self._status[name] < UNAVAILABLE:
+                self._set_status(self.latest, name, ENDED, '')
+
+    def _set_status(self, time: float, name: str, status: int, reason: str) -> None:
+        _, place, battery = self._heard[name]
+        self._put(time, 'robot', name, place, battery, status, reason)
+        before, self._status[name] = self._status.get(name), status
+        words = {UNAVAILABLE: 'cannot go on: ', SILENT: ''}
+        if status in words and status != before:
+            self.message(time, name, 'fault', words[status] + (reason or 'no reason given'))
+        elif before in words and status < UNAVAILABLE:
+            self.message(time, name, 'team', 'takes part again')
 
     def seen(
         self,

@@ -32,7 +32,7 @@ class LiveView:
     scene : dict
         Of the run.
     port : int, optional
-        Of the server; one that is free if not given.
+        Of the server; the next one that is free where it is in use.
     host : str
         Address that it listens on.
     commander : callable, optional
@@ -58,7 +58,12 @@ class LiveView:
 
     def announce(self, say: Callable[[str], object]) -> None:
         """Say where the page is, and open it where there is a browser."""
-        say(f'view: {self.server.address}')
+        server = self.server
+        if server.wanted_port not in (0, server.port):
+            say(f'warning: port {server.wanted_port} is in use: the page is at {server.port}')
+        say(f'view: {server.address}')
+        if not server.is_private:
+            say('view: other machines see it, by this whole link only')
         open_browser(self.server.address)
 
     def restart(self) -> EventMaker:
@@ -138,6 +143,7 @@ class TraceFeed:
     def close(self, text: str) -> None:
         """Take what waits, say how the search ended, and stop serving."""
         self._feed.close()
+        self._view.maker.end()
         self._view.end(text)
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_drivers.agent.battery_gauge import BatteryGauge
 from maasi_sim.run.topics import seconds
 from maasi_sim.view.event_maker import EventMaker, RobotChoice
 
@@ -42,7 +41,6 @@ TOPICS: dict[str, tuple[str, ...]] = {
     'visualization_msgs/msg/MarkerArray': ('ground_truth/markers', 'search_area', 'markers'),
     'rcl_interfaces/msg/Log': ('rosout',),
     'diagnostic_msgs/msg/DiagnosticArray': ('diagnostics',),
-    'sensor_msgs/msg/BatteryState': ('battery_state',),
 }
 
 
@@ -80,9 +78,6 @@ class MessageEvents:
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
-        # By robot: what its battery says itself, for states that do not say it.
-        self._gauges: dict[str, BatteryGauge] = {}
-        self._charges: dict[str, float] = {}
         self._takers: dict[str, Callable[[str, Any], None]] = {
             'LockstepStep': self._take_step,
             'AgentState': self._take_state,
@@ -98,7 +93,6 @@ class MessageEvents:
             'MarkerArray': self._take_markers,
             'Log': self._take_log,
             'DiagnosticArray': self._take_diagnostics,
-            'BatteryState': self._take_battery,
         }
 
     def take(self, topic: str, type_name: str, message: Any) -> None:
@@ -131,7 +125,7 @@ class MessageEvents:
         before, self._team = self._team, set(message.robots)
         if before is not None:
             for name in sorted(before - self._team):
-                self.maker.message(time, name, 'team', 'left')
+                self.maker.leave(time, name)
             for name in sorted(self._team - before):
                 self.maker.message(time, name, 'team', 'joined')
 
@@ -144,21 +138,17 @@ class MessageEvents:
         place = (*_point(pose.position), yaw)
         if all(map(math.isfinite, place)):
             time = self._now(topic, message)
+            # The driver of a robot that left may go on for a while.
+            if self._team is not None and message.robot not in self._team:
+                return
             self.maker.robot(
                 time,
                 message.robot,
                 place,
-                message.battery
-                if math.isfinite(message.battery) and message.battery >= 0.0
-                else self._charges.get(message.robot, -1.0),
+                message.battery if math.isfinite(message.battery) else -1.0,
                 message.goal_status,
                 message.reason,
             )
-
-    def _take_battery(self, topic: str, message: Any) -> None:
-        robot = _owner(topic)
-        gauge = self._gauges.setdefault(robot, BatteryGauge())
-        self._charges[robot] = gauge.charge(float(message.percentage))
 
     def _take_detections(self, _: str, message: Any) -> None:
         detections = []

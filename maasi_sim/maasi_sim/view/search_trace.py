@@ -149,6 +149,7 @@ class SearchTrace:
         maker = EventMaker(scene_of(name, self.scenario, self.seed), events.append)
         for record in self.records:
             hand_over(maker, *record)
+        maker.end()
         return EventLog(maker.scene, events)
 
     def save_replay(self, path: Path) -> None:
@@ -174,7 +175,7 @@ def hand_over(maker: EventMaker, time: float, space: str, record: Any) -> None:
     elif isinstance(record, np.ndarray):
         maker.truth(time, record)
     elif isinstance(record, str):
-        maker.message(time, space, 'team', record)
+        maker.leave(time, space)
     else:
         for name, state in record.items():
             pose = state.pose

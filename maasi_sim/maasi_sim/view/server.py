@@ -1,14 +1,16 @@
 """Serves the page of a live run, its events, and its controls where they are allowed.
 
-GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command with a
-token. Everything else is refused. A browser is served by a thread of its own, which alone waits
-for it.
+GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command. Commands
+need a token, and so does all else unless the server listens on this machine only. Everything else
+is refused. A browser is served by a thread of its own, which alone waits for it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hmac
+import ipaddress
 import json
 import secrets
 import socket
@@ -17,20 +19,25 @@ from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 from maasi_sim.view.hub import Hub
 from maasi_sim.view.page_file import empty_page
 
 PORT = 8420
+# Further ports that are tried where one is in use.
+_MORE_PORTS = 20
 # Takes a command and a robot (None: all); returns whether it was followed, and an answer.
 Commander = Callable[[str, 'str | None'], 'tuple[bool, str]']
 COMMANDS = ('pause', 'resume', 'home', 'stop', 'release')
 # Browsers at once; further ones are refused.
 MOST_BROWSERS = 32
+# Other connections at once; beyond them the oldest is closed.
+MOST_IDLE = 64
 # Longest body of a request [bytes], and longest wait for a browser that reads or writes [s].
 LARGEST_BODY = 4096
 PATIENCE = 10.0
+_EVERYWHERE = ('0.0.0.0', '::')
 # Period of portions, which bounds the load of a browser, and of signs of life [s].
 _PORTION_PERIOD = 0.1
 _BEAT = 5.0
@@ -44,7 +51,7 @@ class ViewServer:
     hub : Hub
         Events.
     port : int
-        0: any that is free. The default is tried first, then any.
+        0: any that is free. Where it is in use, the next one that is free is taken.
     host : str
         Address to listen on.
     commander : callable, optional
@@ -53,7 +60,7 @@ class ViewServer:
     Raises
     ------
     OSError
-        If the port cannot be listened on.
+        If the address cannot be listened on.
     """
 
     def __init__(
@@ -66,16 +73,13 @@ class ViewServer:
         self.hub = hub
         self.host = host
         self.commander = commander
-        self.token = secrets.token_urlsafe(16) if commander is not None else ''
+        self.is_private = _is_loopback(host)
+        self.token = '' if self.is_private and commander is None else secrets.token_urlsafe(16)
+        self.wanted_port = PORT if port is None else port
         self.browsers = 0
         self._closed = threading.Event()
         self._lock = threading.Lock()
-        try:
-            self._server = _Server((host, PORT if port is None else port), _Handler)
-        except OSError:
-            if port is not None:
-                raise
-            self._server = _Server((host, 0), _Handler)
+        self._server = _listen(host, self.wanted_port)
         self._server.view = self
         self._thread = threading.Thread(
             target=self._server.serve_forever, name='view server', daemon=True
@@ -89,8 +93,9 @@ class ViewServer:
 
     @property
     def address(self) -> str:
-        """Address of the page, with the token where commands are allowed."""
-        host = f'[{self.host}]' if ':' in self.host else self.host
+        """Address of the page, with the token where one is needed."""
+        host = _own_address() if self.host in _EVERYWHERE else self.host
+        host = f'[{host}]' if ':' in host else host
         place = f'http://{host}:{self.port}/'
         return f'{place}?token={self.token}' if self.token else place
 
@@ -120,10 +125,75 @@ class ViewServer:
         self._server.server_close()
 
 
+def _is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches an address."""
+    return host == 'localhost' or (_is_number(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def _is_number(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _own_address() -> str:
+    """Return an address by which other machines reach this one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            # Of a documentation network: only the route to it is looked up, nothing is sent.
+            probe.connect(('192.0.2.1', 9))
+            return str(probe.getsockname()[0])
+        except OSError:
+            return socket.gethostname()
+
+
+def _listen(host: str, port: int) -> _Server:
+    """Return a server on a port, or on one of the next where that is in use."""
+    last = min(port + _MORE_PORTS, 65535)
+    while True:
+        try:
+            return _Server((host, port), _Handler)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE or port == last:
+                raise
+            port += 1
+
+
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     view: ViewServer
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._lock = threading.Lock()
+        # Connections without a stream or a command, the oldest first.
+        self._idle: dict[socket.socket, None] = {}
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection in a thread of its own; close the oldest where there are too many."""
+        with self._lock:
+            self._idle[request] = None
+            oldest = next(iter(self._idle)) if len(self._idle) > MOST_IDLE else None
+            if oldest is not None:
+                del self._idle[oldest]
+        if oldest is not None:
+            # Its thread wakes, and ends.
+            with contextlib.suppress(OSError):
+                oldest.shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        self.keep(request)
+        super().shutdown_request(request)
+
+    def keep(self, connection: Any) -> None:
+        """Do not close a connection for others: it has a stream, or a command."""
+        with self._lock:
+            self._idle.pop(connection, None)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Do nothing: a browser that breaks a connection is no error of the run."""
@@ -140,8 +210,12 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer with the page or the stream of events."""
         if not self._is_for_this_host():
             return
-        path = urlsplit(self.path).path
-        if path == '/':
+        parts = urlsplit(self.path)
+        path = parts.path
+        given = parse_qs(parts.query).get('token', [''])[-1]
+        if not (self.server.view.is_private or self._has_token(given)):
+            self._refuse(HTTPStatus.FORBIDDEN, 'wrong token: use the whole link that was printed')
+        elif path == '/':
             self._answer(HTTPStatus.OK, empty_page().encode(), 'text/html; charset=utf-8')
         elif path == '/events':
             self._stream()
@@ -158,14 +232,14 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, 'no such page')
             return
         view = self.server.view
-        token = self.headers.get('X-Maasi-Token', '')
         if view.commander is None:
             self._refuse(HTTPStatus.FORBIDDEN, 'read only: started without --control')
-        elif not hmac.compare_digest(token.encode('utf-8', 'replace'), view.token.encode()):
+        elif not self._has_token(self.headers.get('X-Maasi-Token', '')):
             self._refuse(HTTPStatus.FORBIDDEN, 'wrong token')
         else:
             command = self._read_command()
             if command is not None:
+                self.server.keep(self.connection)
                 done, text = view.commander(*command)
                 self._answer_json(HTTPStatus.OK, {'done': done, 'message': text})
 
@@ -196,13 +270,20 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         return command, robot
 
+    def _has_token(self, given: str) -> bool:
+        token = self.server.view.token
+        return hmac.compare_digest(given.encode('utf-8', 'replace'), token.encode())
+
     def _is_for_this_host(self) -> bool:
         """Refuse what another page asks by a name that it made point here."""
-        view = self.server.view
-        name = urlsplit(f'//{self.headers.get("Host", "")}').hostname
-        allowed = {view.host, 'localhost', '127.0.0.1', '::1'}
-        # Where it listens on all addresses, any name may be the right one.
-        if view.host not in ('0.0.0.0', '::') and name not in allowed:
+        host = self.server.view.host
+        name = urlsplit(f'//{self.headers.get("Host", "")}').hostname or ''
+        allowed = {host, 'localhost', '127.0.0.1', '::1'}
+        own = socket.gethostname()
+        # Where it listens on all addresses, each of them: another page has a name, no number.
+        if host in _EVERYWHERE and (name in (own, f'{own}.local') or _is_number(name)):
+            return True
+        if name not in allowed:
             self._refuse(HTTPStatus.FORBIDDEN, 'Host: allowed is the address that was printed')
             return False
         return True
@@ -214,6 +295,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not view.enter():
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_BROWSERS} browsers are here')
             return
+        self.server.keep(self.connection)
         try:
             self.send_response(HTTPStatus.OK)
             self.send_header('Content-Type', 'text/event-stream')

@@ -22,7 +22,6 @@ from maasi_sim.view.event_log import Scene
 from maasi_sim.view.live_view import LiveView, MessageFeed
 from maasi_sim.view.messages import is_shown
 from maasi_sim.view.scene import empty_scene, scene_of
-from maasi_sim.view.server import Commander
 
 DONE, WRONG_INPUT = 0, 2
 # Period of looks for new topics [s].
@@ -98,7 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     options = build_parser().parse_args(remove_ros_args(['', *given])[1:])
     scene: Scene = empty_scene('live')
-    commander: Commander | None = None
+    control = None
     if options.scenario:
         try:
             mission = load_mission(options.scenario)
@@ -108,11 +107,11 @@ def main(arguments: list[str] | None = None) -> int:
         scene = scene_of(mission.name, mission.scenario)
     rclpy.init(args=given)
     if options.control:
-        from maasi_sim.view.control_node import ControlNode
+        from maasi_sim.view.control_node import Control
 
-        commander = ControlNode(rclpy.get_default_context().get_domain_id(), options.namespace)
+        control = Control(rclpy.get_default_context().get_domain_id(), options.namespace)
     try:
-        view = LiveView(scene, options.port, options.host, commander)
+        view = LiveView(scene, options.port, options.host, control)
     except OSError as error:
         print(f'error: {options.host}: {error.strerror or error}', file=sys.stderr)
         rclpy.try_shutdown()
@@ -128,6 +127,8 @@ def main(arguments: list[str] | None = None) -> int:
         node.destroy_node()
         feed.close()
         view.end('the view was closed')
+        if control is not None:
+            control.close()
         rclpy.try_shutdown()
     return DONE
 

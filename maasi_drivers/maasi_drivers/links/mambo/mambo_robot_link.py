@@ -157,9 +157,9 @@ class MamboRobotLink(RobotLink):
             time.sleep(_LANDING_PERIOD)
 
     def latch_stop(self) -> None:
-        """Have the drone land as after a cancelled goal; on the ground it stays there."""
+        """Have the drone land as `MamboPilot.stop` does; on the ground it stays there."""
         if self._pilot is not None:
-            self._pilot.goal_cancelled(time.monotonic())
+            self._pilot.stop(time.monotonic())
 
     def poll(self) -> None:
         """Report why the drone does not start."""

@@ -127,13 +127,22 @@ class OnboardLink(RobotLink):
             self._send_order()
             time.sleep(_LAST_PERIOD)
 
+    def latch_stop(self) -> None:
+        """End the permission to take off, and a take-off."""
+        self._permission.end()
+        if self._rising_since is not None and not self._up:
+            self._land('its take-off was stopped')
+
     def poll(self) -> None:
-        """Land a drone whose feed has been silent for long."""
+        """Land a drone whose feed has been silent for long; on the ground it needs a new arm."""
         driver = self.driver
-        risen = self._rising_since is not None
-        silent = risen and driver.silence.length > driver.settings.odometry_timeout
+        silent = driver.silence.length > driver.settings.odometry_timeout
+        if silent:
+            self._permission.end()
+            self._feed_state = None
         now = time.monotonic()
-        self._lost_since = (self._lost_since or now) if silent else None
+        risen = self._rising_since is not None
+        self._lost_since = (self._lost_since or now) if silent and risen else None
         if self._lost_since is not None and now - self._lost_since > self._mambo.land_after:
             self._land('nothing heard from the drone')
 

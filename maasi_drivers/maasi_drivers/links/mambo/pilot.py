@@ -220,7 +220,7 @@ class MamboPilot:
 
     def permit(self, now: float) -> str:
         """Let it take off once; return why not, empty where it may; `now` as in `update`."""
-        problem = self._objection()
+        problem = self._objection(now)
         if problem:
             self._permission.end()
             return problem
@@ -228,13 +228,15 @@ class MamboPilot:
         self._permission.give(now)
         return ''
 
-    def _objection(self) -> str:
+    def _objection(self, now: float) -> str:
         if self.phase is Phase.LANDING:
             return 'it lands'
         if self.phase not in (Phase.CONNECTING, Phase.GROUND):
             return 'it is in the air already'
         low = self._battery_text() if self._battery_low else ''
-        return self.link.error or self._unfit() or low
+        unheard = self.problem if self.phase is Phase.CONNECTING else ''
+        silent = self._lost_text(now) if self._is_silent(now) else ''
+        return self.link.error or self._unfit() or low or unheard or silent
 
     def _unfit(self) -> str:
         """Return which parameter keeps it on the ground, or nothing."""
@@ -257,6 +259,13 @@ class MamboPilot:
             self._permission.end()
         self.hover()
         self._cancelled_at = now
+
+    def stop(self, now: float) -> None:
+        """Give up a take-off, and land; in flight as after a cancelled goal."""
+        if self.phase in (Phase.TAKING_OFF, Phase.CLIMBING):
+            self.end('its take-off was stopped')
+        else:
+            self.goal_cancelled(now)
 
     def end(self, reason: str) -> None:
         """Land, and do not take off again."""
@@ -307,6 +316,8 @@ class MamboPilot:
     def _stand(self, now: float) -> str:
         """Take off if nothing prevents it."""
         state = self.link.flying_state
+        if self._is_silent(now):
+            self._permission.end()
         if self._ended:
             return f'{self._ended}, {UNTIL_ARM}'
         if problem := self._unfit():
@@ -429,11 +440,14 @@ class MamboPilot:
             return self._other_at
         return -math.inf if self._event is None else self._event.received
 
+    def _is_silent(self, now: float) -> bool:
+        return now - self.link.heard_at > self.settings.link_timeout
+
     def _lost_text(self, now: float) -> str:
         timeout = self.settings.link_timeout
-        silent = now - self.link.heard_at
-        if silent > timeout:
-            return f'link lost: nothing from the Mambo for {_seconds(silent)}'
+        if self._is_silent(now):
+            silent = _seconds(now - self.link.heard_at)
+            return f'link lost: nothing from the Mambo for {silent}'
         silent = now - self._positioned_at()
         if silent > timeout:
             return f'no position for {_seconds(silent)}'

@@ -12,6 +12,7 @@ from maasi_drivers.links.mavlink.commands import CommandQueue, command_name, res
 from maasi_drivers.links.mavlink.estimate import Estimate
 from maasi_drivers.links.mavlink.failsafes import FailsafeCheck
 from maasi_drivers.links.mavlink.firmware import Firmware, identify
+from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.report_log import DEBUG, ERROR, INFO, WARNING, ReportLog
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
@@ -52,6 +53,8 @@ class Autopilot:
         Packs messages and writes them to the wire.
     log : ReportLog
         Takes reports.
+    place : FlightOrigin
+        Says where the map lies in its local frame.
     on_restart : callable
         Called when the autopilot was restarted.
 
@@ -76,7 +79,12 @@ class Autopilot:
     """
 
     def __init__(
-        self, settings: MavlinkSettings, sender: Any, log: ReportLog, on_restart: Callable[[], None]
+        self,
+        settings: MavlinkSettings,
+        sender: Any,
+        log: ReportLog,
+        place: FlightOrigin,
+        on_restart: Callable[[], None],
     ) -> None:
         self.firmware: Firmware | None = None
         self.failsafes: FailsafeCheck | None = None
@@ -84,7 +92,7 @@ class Autopilot:
         self.armed = False
         self.mode = -1
         self.lost = False
-        self.estimate = Estimate(settings, on_restart)
+        self.estimate = Estimate(settings, place, on_restart)
         self.commands = CommandQueue(settings.system, sender)
         self._settings = settings
         self._sender = sender
@@ -107,12 +115,11 @@ class Autopilot:
     def handle(self, message: Any, now: float) -> ModeChange | None:
         """Take a message; return what a heartbeat says.
 
-        Of other systems only heartbeats with the driver's own id count.
+        Of other systems only messages with the driver's own id count.
         """
         kind = message.get_type()
-        if message.get_srcSystem() == self._settings.own_system:
-            # The driver does not receive its own messages.
-            if kind == 'HEARTBEAT' and self.failsafes is not None:
+        if self._shows_own_id(message):
+            if self.failsafes is not None:
                 self.failsafes.hear_own_id(now)
             return None
         if (
@@ -132,6 +139,21 @@ class Autopilot:
         elif self.firmware is not None:
             self.estimate.take(message, now, self.armed)
         return None
+
+    def _shows_own_id(self, message: Any) -> bool:
+        """Return whether another program has the driver's system id.
+
+        The driver does not receive its own messages. Behind a router that keeps programs apart,
+        the answers to the other one's commands are all that comes.
+        """
+        own = self._settings.own_system
+        if message.get_srcSystem() == own:
+            return True
+        return (
+            message.get_type() == 'COMMAND_ACK'
+            and message.target_system == own
+            and message.target_component not in (0, self._sender.srcComponent)
+        )
 
     def _take_heartbeat(self, message: Any) -> ModeChange | None:
         if self.refusal or (self.firmware is None and not self._recognise(message)):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
 from maasi_drivers.links.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
@@ -58,6 +59,8 @@ class Estimate:
     ----------
     settings : MavlinkSettings
         Of the link.
+    place : FlightOrigin
+        Says where the origin is.
     on_restart : callable
         Called when the autopilot was restarted; earlier data is discarded.
 
@@ -66,7 +69,9 @@ class Estimate:
     telemetry : Telemetry or None
         Newest.
     origin : ndarray, shape (3,)
-        Of the settings, in the local frame, ENU [m].
+        What stands at the start in the map, in the local frame, ENU [m].
+    booted : float
+        When the autopilot was switched on, on the steady clock [s].
     heard_at : float
         When position or attitude were received last, on the steady clock [s].
     landed : int
@@ -77,8 +82,11 @@ class Estimate:
         Messages that could not be used.
     """
 
-    def __init__(self, settings: MavlinkSettings, on_restart: Callable[[], None]) -> None:
+    def __init__(
+        self, settings: MavlinkSettings, place: FlightOrigin, on_restart: Callable[[], None]
+    ) -> None:
         self._settings = settings
+        self._place = place
         self._on_restart = on_restart
         self.dropped: Counter[str] = Counter()
         self._number = -1
@@ -90,6 +98,7 @@ class Estimate:
         self.telemetry: Telemetry | None = None
         self.heard_at = -math.inf
         self.origin = np.zeros(3)
+        self.booted = math.nan
         self.landed = mavlink.MAV_LANDED_STATE_UNDEFINED
         self._good: bool | None = None
         self._fix: int | None = None
@@ -174,8 +183,12 @@ class Estimate:
             # An estimate that moves at all never repeats to the bit: it is frozen.
             self.dropped['LOCAL_POSITION_NED that is frozen'] += 1
             return
-        if self.telemetry is None and self._settings.origin == 'here':
-            self.origin = swap_enu_ned(values[:3])
+        if self.telemetry is None:
+            self.booted = now - 1e-3 * message.time_boot_ms
+            origin = self._place.find(swap_enu_ned(values[:3]), self.booted, armed)
+            if origin is None:
+                return
+            self.origin = origin
         self._number += 1
         self.telemetry = Telemetry(
             self._number, now, swap_enu_ned(values[:3]), swap_enu_ned(values[3:]), *self._attitude

@@ -14,7 +14,7 @@ from maasi_drivers.links.mavlink.settings import MavlinkSettings
 
 # Period and number of requests for a parameter that is not answered [s, 1].
 _ANSWER_TIMEOUT, _TRIES = 0.5, 5
-# A heartbeat with our system id counts for this time [s].
+# A message with our system id counts for this time [s].
 _FOREIGN_AGE = 5.0
 
 
@@ -69,7 +69,7 @@ class FailsafeCheck:
             self.values[name] = value
 
     def hear_own_id(self, now: float) -> None:
-        """Note a heartbeat of another program that has the driver's system id."""
+        """Note a message of another program that has the driver's system id."""
         if now - self._foreign_at > _FOREIGN_AGE:
             self._report(WARNING, self._foreign_text())
         self._foreign_at = now
@@ -114,7 +114,7 @@ class FailsafeCheck:
 
     def _foreign_text(self) -> str:
         return (
-            f'another program sends heartbeats with system id {self._settings.own_system}: the '
+            f'another program sends with system id {self._settings.own_system}: the '
             'autopilot would not miss the driver; mavlink.own_system must be its alone'
         )
 

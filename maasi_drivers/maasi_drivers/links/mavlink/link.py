@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from maasi_drivers.links.mavlink.protocol import mavlink, mavutil
@@ -16,10 +18,22 @@ from maasi_drivers.links.mavlink.vehicle import Vehicle
 _PERIOD = 0.02
 # Between two tries to open a device that is not there [s].
 _RETRY = 1.0
+# Component ids that MAVLink leaves to private networks: no ground station has one of them.
+_COMPONENTS = range(mavlink.MAV_COMP_ID_USER1, mavlink.MAV_COMP_ID_USER43 + 1)
 
 
 class LinkError(RuntimeError):
     """A connection that cannot be opened."""
+
+
+def make_sender(system: int) -> Any:
+    """Return what packs the messages of a driver, without a wire.
+
+    Its component id is another one at each start: ArduPilot does not pass a heartbeat on to a link
+    on which it knows the same system and component (`MAVLink_routing::handle_heartbeat`), so a
+    program with both ids of the driver could not be heard.
+    """
+    return mavlink.MAVLink(None, system, random.choice(_COMPONENTS))
 
 
 def open_connection(url: str, system: int, component: int, baud: int = 57600) -> Any:
@@ -57,8 +71,10 @@ class VehicleLink:
     ----------
     settings : MavlinkSettings
         Of the link.
-    height : float
-        To which the vehicle rises, over its origin [m].
+    start : list of float
+        Where the take-off of the vehicle ends, in the map [m].
+    memory : Path
+        File that keeps the origin of a flight.
 
     Attributes
     ----------
@@ -66,15 +82,13 @@ class VehicleLink:
         What is wrong with the wire; empty where it works.
     """
 
-    def __init__(self, settings: MavlinkSettings, height: float) -> None:
+    def __init__(self, settings: MavlinkSettings, start: list[float], memory: Path) -> None:
         self.settings = settings
         self.failure = ''
         self._connection: Any = None
         # It writes to the wire, once that is there.
-        self._sender = mavlink.MAVLink(
-            None, settings.own_system, mavlink.MAV_COMP_ID_MISSIONPLANNER
-        )
-        self._vehicle = Vehicle(settings, height, self._sender)
+        self._sender = make_sender(settings.own_system)
+        self._vehicle = Vehicle(settings, start, self._sender, memory)
         self._lock = threading.Lock()
         self._end = threading.Event()
         self._open()
@@ -115,7 +129,7 @@ class VehicleLink:
             self._connection = open_connection(
                 self.settings.url,
                 self.settings.own_system,
-                mavlink.MAV_COMP_ID_MISSIONPLANNER,
+                self._sender.srcComponent,
                 self.settings.baud,
             )
         except LinkError as error:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,10 +48,12 @@ class MavlinkRobotLink(RobotLink):
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
         settings = driver.settings
-        self._mavlink = settings.mavlink or MavlinkSettings()
-        self._link: VehicleLink | None = None
         # Whether poses of a localiser define where the autopilot's frame is in the map.
         self._localised = settings.poses != 'odometry'
+        self._mavlink = settings.mavlink or MavlinkSettings()
+        if self._localised:
+            self._mavlink = self._mavlink.model_copy(update={'origin': 'local'})
+        self._link: VehicleLink | None = None
         if not self._localised:
             driver.pose_name = 'LOCAL_POSITION_NED'
         self._local_poses = PoseHistory()
@@ -77,7 +81,9 @@ class MavlinkRobotLink(RobotLink):
     def connect(self) -> None:
         """Open the connection; the vehicle is armed only once the driver is active."""
         driver = self.driver
-        link = VehicleLink(self._mavlink, driver.settings.start[2] - self._mavlink.ground)
+        folder = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
+        name = f'{driver.namespace.replace("/", "_")}_flight_origin.json'
+        link = VehicleLink(self._mavlink, driver.settings.start, folder / 'maasi' / name)
         self._link = link
         driver.create_wall_timer(_POLL_PERIOD, self._update)
         offer_arm(driver, self._arm)
@@ -151,10 +157,10 @@ class MavlinkRobotLink(RobotLink):
         self._local_poses.clear()
 
     def latch_stop(self) -> None:
-        """End the permission to take off."""
+        """End the permission to take off, and a take-off."""
         if self._link is not None:
             with self._link.vehicle() as vehicle:
-                vehicle.forbid()
+                vehicle.stop()
 
     def poll(self) -> None:
         """Report why the vehicle does not start."""
@@ -207,9 +213,10 @@ class MavlinkRobotLink(RobotLink):
         if reports != self._charge_reports:
             self._charge_reports = reports
             driver.take_charge(charge)
-            if BATTERY in driver.health and not self._ending:
-                self._ending = True
-                link.finish(self._mavlink.on_low_battery, 0.0)
+        if BATTERY in driver.health:
+            # Again and again: a vehicle that the pilot has meanwhile may be given back.
+            self._ending = True
+            link.finish(self._mavlink.on_low_battery, 0.0)
         if telemetry is not None and telemetry.number != self._taken:
             self._taken = telemetry.number
             self._take_telemetry(telemetry)

@@ -51,7 +51,8 @@ class MavlinkSettings(Settings):
     origin: Literal['local', 'here'] = Field(
         default='local',
         description='What stands at the start in the map: the origin of the local frame of the '
-        'autopilot, or the vehicle when the driver first hears its position',
+        'autopilot, or the vehicle when the driver first hears its position, which is kept until '
+        'the autopilot is restarted',
     )
     ground: Finite = Field(
         default=0.0, description='Height of that place in the map: the ground, the surface [m]'

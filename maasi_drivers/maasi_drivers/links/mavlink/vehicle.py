@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission
 from maasi_drivers.links.mavlink.autopilot import Autopilot, ModeChange
 from maasi_drivers.links.mavlink.climb import Climb
 from maasi_drivers.links.mavlink.firmware import Firmware
+from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
 from maasi_drivers.links.mavlink.phase import COMMANDED, Phase
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.links.mavlink.report_log import ERROR, INFO, WARNING, ReportLog
@@ -27,6 +29,8 @@ _ENDING_PERIOD = 0.3
 _ARMING_PERIOD = 2.0
 # Time for which set-points are sent before a mode that needs them [s].
 _STREAM_AHEAD = 1.2
+# Phases in which the service `arm` is refused with the fault.
+_UNABLE = (Phase.CONNECTING, Phase.RELEASED, Phase.ENDING, Phase.REFUSED)
 
 
 class Vehicle:
@@ -36,10 +40,12 @@ class Vehicle:
     ----------
     settings : MavlinkSettings
         Of the link.
-    height : float
-        To which it rises, over its origin; a copter's origin is on the ground [m].
+    start : list of float
+        Where its take-off ends, in the map [m].
     sender : MAVLink
         Packs messages and writes them to the wire.
+    memory : Path or None
+        File that keeps the origin of a flight; None: there is none.
 
     Attributes
     ----------
@@ -52,13 +58,21 @@ class Vehicle:
         armed: the estimate drifts until then.
     """
 
-    def __init__(self, settings: MavlinkSettings, height: float, sender: Any) -> None:
+    def __init__(
+        self,
+        settings: MavlinkSettings,
+        start: list[float],
+        sender: Any,
+        memory: Path | None = None,
+    ) -> None:
         self.settings = settings
-        self.height = height
+        # Over its origin; a copter's is on the ground [m].
+        self.height = start[2] - settings.ground
         self.phase = Phase.CONNECTING
         self.active = False
         self._log = ReportLog()
-        self._autopilot = Autopilot(settings, sender, self._log, self._on_restart)
+        self._place = FlightOrigin(settings, start, memory, self._log)
+        self._autopilot = Autopilot(settings, sender, self._log, self._place, self._on_restart)
         self.estimate = self._autopilot.estimate
         self._permission = ArmPermission(settings.arm_timeout)
         self._setpoint = Setpoint(settings, sender)
@@ -100,6 +114,8 @@ class Vehicle:
         """Why it cannot go anywhere; empty where it can."""
         if self._autopilot.lost:
             return f'link: nothing heard from system {self.settings.system}'
+        if self._place.problem:
+            return f'vehicle: {self._place.problem}'
         if self.phase is Phase.FLYING:
             problem = self.estimate.problem(self._fix_needed)
             if problem:
@@ -175,6 +191,12 @@ class Vehicle:
             self._autopilot.commands.clear()
             self._enter(Phase.WAITING)
 
+    def stop(self) -> None:
+        """End the permission; a take-off is given up, and it lands; a flight continues."""
+        if self.phase is Phase.RISING:
+            self.finish('land', 'its take-off was stopped')
+        self.forbid()
+
     def _objection(self, now: float) -> str:
         """Return why it must not be armed, or taken over."""
         autopilot = self._autopilot
@@ -182,7 +204,7 @@ class Vehicle:
             return 'it is in the air already'
         if self._displaced:
             return 'the autopilot has restarted: start the driver again'
-        if autopilot.lost or self.phase in (Phase.RELEASED, Phase.ENDING, Phase.REFUSED):
+        if autopilot.lost or self._place.problem or self.phase in _UNABLE:
             return self.fault
         if autopilot.armed and autopilot.firmware is not None and not autopilot.in_external_mode:
             return f'it is flown in {autopilot.mode_name}'
@@ -410,6 +432,7 @@ class Vehicle:
         if self._firmware.kind == 'copter':
             # On the ground; the barometer may have drifted since the estimator started.
             self.estimate.origin[2] = self._setpoint.position[2]
+            self._place.keep(self.estimate.origin, self.estimate.booted)
         self._climb.begin(now)
         self._enter(Phase.RISING)
 

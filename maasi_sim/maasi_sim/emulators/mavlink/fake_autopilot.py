@@ -5,7 +5,10 @@ The behaviour of ArduCopter is that of its source: the height of NAV_TAKEOFF is 
 is refused in the air (`Mode::do_user_takeoff_U_m`) and ends within a tenth of its height
 (`_AutoTakeoff::run`), EXTENDED_SYS_STATE tells take-off from flight
 (`GCS_MAVLINK_Copter::landed_state`), and the ground station failsafe looks at the system id of
-heartbeats alone (`GCS::sysid_is_gcs`). Heights that it reports are above the EKF's origin.
+heartbeats alone (`GCS::sysid_is_gcs`). Positions that it reports are from the EKF's origin, which
+is where the vehicle is when the EKF starts, also after a restart. What comes on one link is passed
+on to others, heartbeats only where their system and component are not known
+(`MAVLink_routing::check_and_forward`, `handle_heartbeat`).
 """
 
 from __future__ import annotations
@@ -117,6 +120,10 @@ class FakeAutopilot:
         self._rising_to: float | None = None
         # True height at arming, and error of the estimated height [m].
         self._home, self._height_error = 0.0, 0.0
+        # True place of the EKF's origin [m].
+        self._origin = np.zeros(3)
+        # System, component and link of what was heard; the driver is on link 0.
+        self._routes: set[tuple[int, int, int]] = set()
         # Time of the loss of GNSS; the position estimate is lost later.
         self._gnss_lost_at = math.inf
         self._armed_at = -math.inf
@@ -156,8 +163,10 @@ class FakeAutopilot:
 
     def restart(self) -> None:
         """Restart, as after a brown-out: disarmed, with clock and message rates reset."""
-        self.armed = False
-        self.now = 0.0
+        self.armed = self._reported_ready = False
+        # The barometer is calibrated anew.
+        self.now = self._height_error = 0.0
+        self._routes.clear()
         self._hold()
         self.mode = self._first_mode
         self.reports.restart()
@@ -172,6 +181,10 @@ class FakeAutopilot:
             return
         if self.ready and not self._reported_ready:
             self._reported_ready = True
+            self._origin = self.body.position.copy()
+            if self.body.submarine:
+                # Depths are from the surface.
+                self._origin[2] = 0.0
             self.reports.say(6, 'EKF3 IMU0 is using GPS')
         self._move(dt)
         self._look_after_failsafes(dt)
@@ -295,18 +308,37 @@ class FakeAutopilot:
 
     def believed_position(self) -> Array:
         """Return the position that it believes, ENU [m]."""
-        return self.body.position + np.array([0.0, 0.0, self._height_error])
+        return self.body.position + self._offset
+
+    @property
+    def _offset(self) -> Array:
+        """What it believes, less what is true [m]."""
+        return np.array([0.0, 0.0, self._height_error]) - self._origin
 
     # ---- receiving ---------------------------------------------------------------------------
 
-    def handle(self, message: Any) -> None:
-        """Take a message."""
+    def handle(self, message: Any, link: int = 0) -> None:
+        """Take a message from one of its links, 0 is the driver's."""
         if self.crashed:
             return
+        self._route(message, link)
         target = getattr(message, 'target_system', self.settings.system)
         handler = _HANDLERS.get(message.get_type())
         if handler is not None and target in (0, self.settings.system):
             handler(self, message)
+
+    def _route(self, message: Any, link: int) -> None:
+        """Pass a message for all on to the driver, as ArduPilot does."""
+        ids = message.get_srcSystem(), message.get_srcComponent()
+        self._routes.add((*ids, link))
+        if link == 0 or getattr(message, 'target_system', 0) != 0:
+            return
+        if message.get_type() == 'HEARTBEAT':
+            passes = (*ids, 0) not in self._routes
+        else:
+            passes = any(route[2] == 0 for route in self._routes)
+        if passes:
+            self._sender.file.write(bytes(message.get_msgbuf()))
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.get_srcSystem() == self.parameters.get('SYSID_MYGCS'):
@@ -416,7 +448,7 @@ class FakeAutopilot:
         if not (wants_position or wants_velocity):
             return
         self._setpoint = _Setpoint(
-            swap_enu_ned(position) - np.array([0.0, 0.0, self._height_error]),
+            swap_enu_ned(position) - self._offset,
             None if wants_position else swap_enu_ned(velocity),
             None if mask & _YAW_IGNORED else swap_yaw(message.yaw),
         )

@@ -1,6 +1,7 @@
 // Draws a search of buildings: objects, cuboids visited and to visit, and radio links.
 
 import { OPEN, VISITED, robotColour, themed } from './colours.js';
+import { isAway, MOVING } from './run_log.js';
 import { box, path } from './shapes.js';
 
 export function drawBuildings(view, log, time) {
@@ -54,14 +55,15 @@ function drawLinks(view, log, time) {
   for (const name of log.owners('cuboid')) {
     const event = log.at('cuboid', name, time);
     const here = log.at('robot', name, time);
-    if (!event || !here) continue;
+    if (!event || !here || isAway(here)) continue;
     for (const other of event[6]) {
       const there = log.at('robot', other, time);
       const answers = other < name && (log.at('cuboid', other, time) || [])[6];
-      if (!there || (answers && answers.includes(name))) continue;
+      if (!there || isAway(there) || (answers && answers.includes(name))) continue;
       path(context, camera, [here[3], there[3]]);
       context.stroke();
     }
+    if (here[5] !== MOVING) continue;
     context.globalAlpha = 0.9;
     context.strokeStyle = robotColour(view.names, name);
     path(context, camera, [here[3], event[5]]);

@@ -4,7 +4,7 @@ import { RunLog } from './run_log.js';
 import { element } from './text.js';
 
 export function follow(onLog, onEvents, onState) {
-  const source = new EventSource('events');
+  const source = new EventSource(`events${window.location.search}`);
   source.addEventListener('scene', (message) => {
     onLog(new RunLog(JSON.parse(message.data)));
     onState('live');
@@ -28,6 +28,7 @@ export function showControls(parent, selectedRobot) {
   const token = new URLSearchParams(window.location.search).get('token') || '';
   const answer = element('span', 'quiet', '');
   answer.setAttribute('role', 'status');
+  const waiting = new Set();
   for (const [command, title] of COMMANDS) {
     const button = element('button', '', title);
     button.dataset.command = command;
@@ -35,9 +36,16 @@ export function showControls(parent, selectedRobot) {
     button.onclick = async () => {
       const robot = selectedRobot();
       answer.textContent = `${command} ${robot || 'all'} ...`;
+      // A browser queues requests beyond six connections: what a stop supersedes makes room for it.
+      for (const other of waiting) {
+        if (command === 'stop' && (robot === null || other.command !== 'stop')) other.abort.abort();
+      }
+      const request = { command, abort: new AbortController() };
+      waiting.add(request);
       try {
         const reply = await fetch('control', {
           method: 'POST',
+          signal: request.abort.signal,
           headers: { 'Content-Type': 'application/json', 'X-Maasi-Token': token },
           body: JSON.stringify({ command, robot }),
         });
@@ -47,7 +55,9 @@ export function showControls(parent, selectedRobot) {
         answer.textContent = complete ? message : `${command} ${robot || 'all'}: ${message}`;
         answer.title = answer.textContent;
       } catch (error) {
-        answer.textContent = `${command}: no answer`;
+        if (!request.abort.signal.aborted) answer.textContent = `${command}: no answer`;
+      } finally {
+        waiting.delete(request);
       }
     };
     parent.append(button);

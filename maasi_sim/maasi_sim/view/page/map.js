@@ -1,6 +1,7 @@
 // Draws a search for targets at a time.
 
 import { FOUND, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
+import { isAway, MOVING } from './run_log.js';
 import { circle, cross, dropLine, ellipse, matrix, path } from './shapes.js';
 import { drawBuildings } from './buildings.js';
 
@@ -238,6 +239,7 @@ export class MapView {
       context.globalAlpha = 0.75;
       path(context, camera, points);
       context.stroke();
+      if (slot.events[count - 1][5] !== MOVING) continue;
       const way = log.at('way', name, time);
       const decision = log.at('decision', name, time);
       context.lineWidth = 2;
@@ -388,7 +390,7 @@ export class MapView {
     const colour = robotColour(this.names, name);
     context.strokeStyle = colour;
     context.fillStyle = colour;
-    if (this.layers.view && robot.view) this.drawFieldOfView(robot.view, event[3], log.isSpatial);
+    if (this.layers.view && robot.view && !isAway(event)) this.drawFieldOfView(robot.view, event[3], log.isSpatial);
     if (log.isSpatial || z > 0) dropLine(context, camera, [x, y, z], this.floor);
     const nose = 9 / camera.scale;
     const size = Math.max(robot.radius || 0, nose);
@@ -398,7 +400,7 @@ export class MapView {
       z,
     ]);
     path(context, camera, outline, true);
-    context.globalAlpha = event[5] === 5 ? 0.35 : 1;
+    context.globalAlpha = isAway(event) ? 0.35 : 1;
     context.fill();
     context.globalAlpha = 1;
     context.strokeStyle = selected ? themed('--text') : themed('--back');

@@ -3,7 +3,7 @@
 import { FOUND, POTENTIAL, SEEN, OPEN, VISITED, robotColour } from './colours.js';
 import { element, number } from './text.js';
 
-const STATES = ['no goal', 'on the way', 'goal reached', 'goal cancelled', 'goal given up', 'cannot go on'];
+const STATES = ['no goal', 'on the way', 'goal reached', 'goal cancelled', 'goal given up', 'cannot go on', 'left', 'silent', 'run ended'];
 const SIGNS = { found: '●', decision: '→', team: '◇', warning: '!', fault: '✖' };
 // Lines of the log that are shown.
 const MOST_LINES = 60;

@@ -1,5 +1,13 @@
 // The events of a run, by kind and owner, so that what holds at a time is found by binary search.
 
+// Statuses of a robot: on the way; and those in which it takes no part (cannot go on, left, silent).
+export const MOVING = 1;
+const AWAY = [5, 6, 7];
+
+export function isAway(robotEvent) {
+  return AWAY.includes(robotEvent[5]);
+}
+
 export class Slot {
   constructor() {
     this.times = [];

@@ -1,0 +1,90 @@
+"""The commands of a page: none waits for another one."""
+
+import threading
+
+import rclpy
+from browsers import chromium, needs_chromium
+from rclpy.executors import SingleThreadedExecutor
+from std_srvs.srv import Trigger
+from waiting import PATIENCE, wait_until
+
+from maasi_sim.view import control_node
+from maasi_sim.view.control_node import Control
+from maasi_sim.view.hub import Hub
+from maasi_sim.view.server import ViewServer
+
+
+def serve(node, names, done):
+    """Offer services, and note which of them were called."""
+    for name in names:
+
+        def answer(_, response, name=name):
+            done.append(name)
+            response.success, response.message = True, name
+            return response
+
+        node.create_service(Trigger, name, answer)
+
+
+def test_a_stop_of_all_does_not_wait_for_other_commands(domain, context, monkeypatch):
+    monkeypatch.setattr(control_node, '_PATIENCE', PATIENCE)
+    called, answers = [], []
+    drivers = rclpy.create_node('drivers', context=context)
+    stops = ['/mambo/stop', '/rover/stop']
+    serve(drivers, [*stops, '/mambo/release', '/rover/release'], called)
+    # Its services are there; it answers when it is spun.
+    stuck = rclpy.create_node('stuck', context=context)
+    serve(stuck, ['/ghost/search/pause'], called)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(drivers)
+    spinner = threading.Thread(target=executor.spin)
+    spinner.start()
+    control = Control(domain.number)
+
+    def pause():
+        answers.append(control('pause', 'ghost'))
+
+    others = [threading.Thread(target=pause) for _ in range(3)]
+    try:
+        for other in others:
+            other.start()
+        assert control('stop', None) == (True, '; '.join(stops))
+        assert sorted(called) == stops and answers == []
+        executor.add_node(stuck)
+        for other in others:
+            other.join()
+        assert answers == [(True, '/ghost/search/pause')] * 3
+    finally:
+        control.close()
+        executor.shutdown()
+        spinner.join()
+    assert control('stop', None) == (False, 'the run has ended')
+
+
+@needs_chromium
+def test_a_stop_of_all_passes_what_waits_in_the_browser():
+    calls, released = [], threading.Event()
+
+    def commander(command, robot):
+        calls.append(command)
+        if command != 'stop':
+            released.wait()
+        return True, command
+
+    hub = Hub({'name': 'test', 'robots': {}, 'bounds': [[0, 1], [0, 1]]})
+    server = ViewServer(hub, 0, commander=commander)
+    hub.put([0.0, 'log', '', 'team', '', 'begin'])
+    try:
+        with chromium() as shown:
+            shown.open(server.address)
+            # One connection is the stream of events; a browser opens six.
+            for _ in range(10):
+                shown.page.click('button[data-command=pause]')
+            wait_until(lambda: len(calls) == 5, lambda: shown.page.wait_for_timeout(20))
+            shown.page.click('button[data-command=stop]')
+            wait_until(lambda: 'stop' in calls, lambda: shown.page.wait_for_timeout(20))
+            answer = "document.querySelector('#controls [role=status]').innerText"
+            shown.until(f"{answer} == 'stop all: stop'")
+    finally:
+        released.set()
+        server.close()

@@ -1,0 +1,104 @@
+"""Nodes are cycled during a search, each transition as soon as the last one has answered."""
+
+import os
+import signal
+import subprocess
+
+import pytest
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from reserved_domain import reserved_domain
+from scenario_runs import PATIENCE, command
+from waiting import wait_until
+
+from maasi_msgs.msg import FilterUpdate
+
+pytestmark = pytest.mark.system
+CYCLE = (
+    Transition.TRANSITION_DEACTIVATE,
+    Transition.TRANSITION_CLEANUP,
+    Transition.TRANSITION_CONFIGURE,
+    Transition.TRANSITION_ACTIVATE,
+)
+# How often each node is cycled; MAASI_CYCLES takes another number for all.
+DEMO = {
+    '/planner_node': 50,
+    '/filter_node': 10,
+    '/mambo/driver': 10,
+    '/turtlebot/guard': 10,
+    '/turtlebot/driver': 10,
+    '/sim_node': 5,
+}
+OTHERS = {
+    'ranging_drone_3d': {'/drone/driver': 10},
+    'buildings_one': {'/red/cuboid_planner': 10, '/sim_node': 5},
+}
+
+
+class Cycler:
+    """A client of the life cycles of nodes."""
+
+    def __init__(self, domain):
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = Node('cycler', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def until(self, condition, what):
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.05), what)
+
+    def cycle(self, name, times):
+        client = self.node.create_client(ChangeState, f'{name}/change_state')
+        self.until(client.service_is_ready, f'{name} is not there')
+        for number in range(times):
+            for transition in CYCLE:
+                request = ChangeState.Request()
+                request.transition.id = transition
+                future = client.call_async(request)
+                where = f'{name}, cycle {number}, transition {transition}'
+                self.until(future.done, f'{where}: no answer')
+                assert future.result().success, where
+
+    def hear(self, kind, topic):
+        heard = []
+        subscription = self.node.create_subscription(kind, topic, heard.append, 10)
+        self.until(lambda: heard, f'nothing on {topic}')
+        self.node.destroy_subscription(subscription)
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.mark.parametrize('scenario, cycles', [('mambo_turtlebot', DEMO), *OTHERS.items()])
+def test_nodes_survive_cycles_back_to_back_and_the_search_goes_on(tmp_path, scenario, cycles):
+    with reserved_domain() as domain:
+        log = tmp_path / 'run.log'
+        options = ('--domain-id', domain.number, '--no-record', '--rate', 1, '--time-limit', 3000)
+        with log.open('w') as output:
+            run = subprocess.Popen(
+                command(scenario, tmp_path / 'run', *options), stdout=output, stderr=output
+            )
+        cycler = Cycler(domain.number)
+        try:
+            searches = not scenario.startswith('buildings')
+            if searches:
+                cycler.hear(FilterUpdate, 'filter_update')
+            for name, times in cycles.items():
+                cycler.cycle(name, int(os.environ.get('MAASI_CYCLES', times)))
+            if searches:
+                cycler.hear(FilterUpdate, 'filter_update')
+            assert run.poll() is None, log.read_text()
+            run.send_signal(signal.SIGINT)
+            # Interrupted; 3 if a node had died.
+            assert run.wait(PATIENCE) == 130, log.read_text()
+        finally:
+            cycler.close()
+            run.kill()
+            run.wait()
