@@ -382,7 +382,7 @@ class FilterSettings(Settings):
     @classmethod
     def _gone(cls, value: Any) -> Any:
         if value == 'recommended':
-            raise ValueError("read 'recommended', which is gone; write method: pmb in its place")
+            raise ValueError("'recommended' is gone, write method: pmb in its place")
         return value
 
     def resolved(self) -> FilterSettings:

@@ -56,3 +56,12 @@ def test_a_terminal_gets_a_line_that_changes_and_lines_that_stay():
     assert 'begin [with brackets]' in text
     assert '7 measurements' in text
     assert 'a warning' in text
+
+
+def test_the_share_of_what_is_done_comes_now_and_then():
+    for period, said in ((0.0, ['replay: 0 %', 'replay: 50 %']), (1e6, ['replay: 0 %'])):
+        stream = io.StringIO()
+        display = ProgressDisplay(stream, period=period)
+        display.share('replay', 0.0)
+        display.share('replay', 0.5)
+        assert stream.getvalue().splitlines() == said

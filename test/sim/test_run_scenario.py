@@ -190,6 +190,20 @@ def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, scenario, f
     check_report(run.report)
 
 
+def test_report_and_replay_of_a_long_run_may_be_skipped(tmp_path, scenario):
+    run = Run(tmp_path / 'run', scenario(), '--lockstep', script={'long': True})
+    run.wait_for('Ctrl-C skips each')
+    for _ in ('report', 'replay'):
+        run.wait_for('busy')
+        run.process.send_signal(signal.SIGTERM)
+        run.process.send_signal(signal.SIGINT)
+    code, output = run.wait()
+    assert code == 0, output
+    assert not (run.folder / 'report.json').exists()
+    with Bag(run.folder / 'bag') as bag:
+        assert bag.counts['/filter_update'] == 3
+
+
 def test_a_run_without_a_home_folder(tmp_path, scenario, monkeypatch):
     for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR'):
         monkeypatch.delenv(name, raising=False)

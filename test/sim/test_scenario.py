@@ -391,7 +391,7 @@ def test_an_event_after_the_end_is_taken_with_a_warning(tmp_path):
 
 
 def test_the_preset_of_earlier_files_is_refused_with_what_to_write(load):
-    words = r"filter\.preset: read 'recommended', which is gone; write method: pmb in its place"
+    words = r"filter\.preset: 'recommended' is gone, write method: pmb in its place"
     with pytest.raises(ScenarioError, match=words):
         load(changed(('filter', {'preset': 'recommended'})))
 

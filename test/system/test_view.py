@@ -298,7 +298,9 @@ def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
             writer.write(topic, time, data)
     writer.close()
     log = read_events(tmp_path)
-    whole = read_events(run.folder)
+    shares = []
+    whole = read_events(run.folder, shares.append)
+    assert shares[0] == 0.0 and shares == sorted(shares) and shares[-1] < 1.0
     # The exploration function is in single precision.
     assert np.allclose(log.scene['bounds'], whole.scene['bounds'], atol=1e-3)
     kinds = ('robot', 'plan', 'found', 'filter', 'truth')

@@ -216,7 +216,8 @@ def check(
         if item['type'] == 'missing' or not values:
             missing.append(name)
         else:
-            problems[name] = f'parameter {name}: {item["msg"]}, read {item["input"]!r}'
+            text = item['msg'].removeprefix('Value error, ')
+            problems[name] = f'parameter {name}: {text}, read {item["input"]!r}'
     if missing:
         several = 's' if len(missing) > 1 else ''
         problems[missing[0]] = (

@@ -226,7 +226,7 @@ class CuboidObserver:
         record.active = np.array(sorted(active.items()), dtype=float).reshape(-1, 2)
         record.solve_times = np.array(times)
         for name, raw in self._states.items():
-            states = [self._team.decode(data, 'AgentState') for data in raw]
+            states = (self._team.decode(data, 'AgentState') for data in raw)
             record.trajectories[name] = self._team.trajectory(
                 state for state in states if self._team.time(state.header.stamp) <= end_time
             )

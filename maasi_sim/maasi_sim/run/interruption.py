@@ -7,29 +7,32 @@ import signal
 from collections.abc import Iterator
 from types import FrameType
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 class Interruption:
     """Handles SIGINT, SIGTERM and SIGHUP; true once one of them has arrived."""
 
     def __init__(self) -> None:
         self.count = 0
-        self._at_once = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        self._at_once: tuple[signal.Signals, ...] = ()
+        for number in _SIGNALS:
             signal.signal(number, self._note)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.count += 1
-        if self._at_once:
+        if number in self._at_once:
             raise KeyboardInterrupt
 
     @contextlib.contextmanager
-    def at_once(self) -> Iterator[None]:
-        """Raise KeyboardInterrupt inside the context: for what takes long and needs no clean-up."""
-        self._at_once = True
-        try:
-            yield
-        finally:
-            self._at_once = False
+    def at_once(self, *signals: signal.Signals) -> Iterator[None]:
+        """End the context at one of `signals` (none: any): for what needs no clean-up."""
+        self._at_once = signals or _SIGNALS
+        with contextlib.suppress(KeyboardInterrupt):
+            try:
+                yield
+            finally:
+                self._at_once = ()
 
     def __bool__(self) -> bool:
         """Whether a signal has arrived."""

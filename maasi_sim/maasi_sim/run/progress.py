@@ -72,16 +72,24 @@ class ProgressDisplay:
         """Show a status, if an update is due or it has a new target."""
         if not self.due and (self._terminal or status.found == self._found):
             return
-        self._last = time.monotonic()
         self._found = status.found
+        self._write(status.text())
+
+    def share(self, what: str, part: float) -> None:
+        """Show how much of something is done, if an update is due."""
+        if self.due:
+            self._write(f'{what}: {100.0 * part:.0f} %')
+
+    def _write(self, text: str) -> None:
+        self._last = time.monotonic()
         if not self._terminal:
-            self.say(status.text())
+            self.say(text)
             return
         if self._live is None:
             self._live = _live(self._stream)
             self._live.start()
         # Without markup and without highlighting of numbers.
-        self._live.update(_plain_text(status.text()), refresh=True)
+        self._live.update(_plain_text(text), refresh=True)
 
     def close(self) -> None:
         """Leave the terminal as it was."""

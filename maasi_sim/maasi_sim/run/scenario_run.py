@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
+import signal
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from maasi_sim.run.node_plan import (
 )
 from maasi_sim.run.processes import Domain
 from maasi_sim.run.progress import ProgressDisplay
-from maasi_sim.run.report_files import store_report
+from maasi_sim.run.report_files import StoredReport, store_report
 from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
 from maasi_sim.run.run_options import Options, ViewOptions
 from maasi_sim.run.run_page import RunPage
@@ -94,7 +95,7 @@ class ScenarioRun:
             for text in self._doubts:
                 self.display.say(f'warning: {text}')
             # An interruption here is reported once the session starts.
-            with contextlib.suppress(KeyboardInterrupt), self.interruption.at_once():
+            with self.interruption.at_once():
                 self.supervisor.load(self.mission.warm_up)
             return self._execute(domain)
 
@@ -150,7 +151,10 @@ class ScenarioRun:
         end = RunEnd(
             ending.reason, session.recorder.elapsed, session.wall_time, self.supervisor.events
         )
-        stored = store_report(self.mission, session.observer.record(end), self.folder)
+        stored = StoredReport({}, 'report: skipped', None)
+        with self.interruption.at_once(signal.SIGINT):
+            self.display.say('writing report and replay (Ctrl-C skips each)')
+            stored = store_report(self.mission, session.observer.record(end), self.folder)
         self.display.say(stored.words)
         if ending.text:
             self.display.say(f'ended: {ending.text}')
@@ -160,13 +164,14 @@ class ScenarioRun:
         unwritten = session.unwritten + ([stored.problem] if stored.problem else [])
         for problem in unwritten:
             self.display.say(f'error: {problem}')
-        place = 'nowhere'
-        if stored.folder is not None:
-            place = short(stored.folder / 'report.json')
-        self.display.say(f'report: {place}')
-        self._leave_replay()
+        if stored.report:
+            place = 'nowhere' if stored.folder is None else short(stored.folder / 'report.json')
+            self.display.say(f'report: {place}')
+        with self.interruption.at_once(signal.SIGINT):
+            self._leave_replay()
+        self.display.close()
         code = ending.code
-        if ending.reason == 'planner_done' and stored.report['missed'] == 0:
+        if ending.reason == 'planner_done' and stored.report.get('missed') == 0:
             code = DONE
         return NOT_WRITTEN if unwritten and code in (DONE, NOT_ALL_FOUND) else code
 
@@ -186,7 +191,7 @@ class ScenarioRun:
             return
         file = self.folder / REPLAY
         try:
-            write_replay(read_events(self.folder), file)
+            write_replay(read_events(self.folder, partial(self.display.share, REPLAY)), file)
         except (BagError, ResultsError) as error:
             self.display.say(f'warning: no {REPLAY}: {error}')
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -229,10 +230,10 @@ class TargetObserver:
         self._add_decisions(record, last_step)
         lost: list[dict[str, Any]] = []
         for topic, name in self._state_topics.items():
-            states = self._until(topic, 'AgentState', end_time)
-            record.trajectories[name] = self._team.trajectory(states)
+            kind = 'AgentState'
+            record.trajectories[name] = self._team.trajectory(self._until(topic, kind, end_time))
             if self._team.robots is None:
-                lost += _absences(name, states)
+                lost += _absences(name, self._until(topic, kind, end_time))
         for topic, name in self._detection_topics.items():
             arrays = self._until(topic, 'DetectionArray', end_time)
             poses = [_pose(item.pose.pose) for item in arrays if item.batch_id]
@@ -240,10 +241,12 @@ class TargetObserver:
         record.add_events(self._team.events, lost, end.events)
         return record
 
-    def _until(self, topic: str, kind: str, end_time: float) -> list[Any]:
-        """Return the messages of a topic up to a time [s]."""
-        messages = [self._team.decode(data, kind) for data in self._kept[topic]]
-        return [item for item in messages if self._team.time(item.header.stamp) <= end_time]
+    def _until(self, topic: str, kind: str, end_time: float) -> Iterator[Any]:
+        """Yield the messages of a topic up to a time [s]; all at once would take much memory."""
+        for data in self._kept[topic]:
+            item = self._team.decode(data, kind)
+            if self._team.time(item.header.stamp) <= end_time:
+                yield item
 
     def _add_decisions(self, record: TargetRecord, last_step: int | None) -> None:
         waypoints: dict[str, list[tuple[float, float, float]]] = {
@@ -277,7 +280,7 @@ def _pose(message: Any) -> Pose | None:
         return None
 
 
-def _absences(name: str, states: list[Any]) -> list[dict[str, Any]]:
+def _absences(name: str, states: Iterable[Any]) -> list[dict[str, Any]]:
     """Return the events of a robot that became unavailable and available again."""
     events: list[dict[str, Any]] = []
     away = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 from maasi_sim.run.bag import Bag, BagError
@@ -15,8 +16,19 @@ from maasi_sim.view.scene import empty_scene, scene_of_facts
 _MARKERS = 'visualization_msgs/msg/MarkerArray'
 
 
-def read_events(path: Path) -> EventLog:
+# Messages between two words on the progress.
+_PROGRESS = 1000
+
+
+def read_events(path: Path, progress: Callable[[float], None] | None = None) -> EventLog:
     """Return the event log of a recording, or of the run whose folder holds one.
+
+    Parameters
+    ----------
+    path : Path
+        Recording or folder.
+    progress : callable, optional
+        Called now and then with the share that is read.
 
     Raises
     ------
@@ -34,7 +46,11 @@ def read_events(path: Path) -> EventLog:
         # Markers hold what a scenario says better.
         known = 'bounds' in scene
         topics = [topic for topic, kind in shown.items() if not (known and kind == _MARKERS)]
-        for item in bag.messages(topics):
+        counts = bag.counts
+        total = sum(counts[topic] for topic in topics)
+        for index, item in enumerate(bag.messages(topics)):
+            if progress is not None and index % _PROGRESS == 0:
+                progress(index / total)
             takes.take(item.topic, item.type, item.message)
         maker.end()
     # Parts that became known later belong to the scene of a replay.
