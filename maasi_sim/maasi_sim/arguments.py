@@ -1,11 +1,26 @@
-"""Numbers on command lines: what was read and what is allowed, when one is wrong."""
+"""Command lines: what was read and what is allowed, when an option or a number is wrong."""
 
 from __future__ import annotations
 
-from argparse import ArgumentTypeError
+from argparse import ArgumentParser, ArgumentTypeError
+from difflib import get_close_matches
+from typing import Any
 
 # Largest parameter of a ROS node.
 LARGEST = 2**63 - 1
+
+
+class Parser(ArgumentParser):
+    """Names the closest option for one that is unknown."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Return the options; a wrong one ends the process with 2."""
+        options, rest = self.parse_known_args(args, namespace)
+        if rest:
+            close = get_close_matches(rest[0].partition('=')[0], self._option_string_actions, 1)
+            hint = f' (did you mean {close[0]}?)' if close else ''
+            self.error(f'unknown: {" ".join(rest)}{hint}')
+        return options
 
 
 def whole(text: str, least: int = 0, most: int = LARGEST) -> int:

@@ -4,11 +4,15 @@ import pytest
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 from waiting import wait_until
 
+from maasi_filter.ros import readiness
 from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.processes import Domain
 
@@ -117,3 +121,23 @@ def test_the_end_of_the_context_ends_the_spin(pair):
     pair.listener.context.try_shutdown()
     with pytest.raises(ExternalShutdownException):
         pair.executor.spin_once(0.05)
+
+
+def test_an_endpoint_that_does_not_fit_is_named(pair, monkeypatch):
+    monkeypatch.setattr(readiness, '_CONNECTION_PATIENCE', 0.5)
+    node = LockstepLifecycleNode('searcher', NodeSettings, context=pair.talker.context)
+    node.create_publisher(Int32, 'found', 10)
+    node.create_subscription(Int32, 'seen', print, RELIABLE)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    assert node._unconnected.look() == []
+    odd = pair.talker.create_subscription(Int32, 'found', print, latched)
+    hurried = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    pair.talker.create_publisher(Int32, 'seen', hurried)
+    expected = [
+        '/found: a subscription does not connect: its quality of service or type differs',
+        '/seen: a publisher does not connect: its quality of service or type differs',
+    ]
+    wait_until(lambda: node._unconnected.look() == expected)
+    pair.talker.destroy_subscription(odd)
+    wait_until(lambda: node._unconnected.look() == expected[1:])
+    node.destroy_node()

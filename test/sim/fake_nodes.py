@@ -1,7 +1,7 @@
 """Nodes that play a run by a script: what they find, when they die. Started as processes by tests.
 
 Usage: fake_nodes.py ROLE --ros-args ... with parameters `robots`, `lockstep`, `step`, `fault`
-(none, die, hang, loop, raise, deaf, silent), `fault_step`, `targets` (flat), `finished_step`,
+(none, die, hang, loop, raise, deaf, silent, mute), `fault_step`, `targets` (flat), `finished_step`,
 `marker`.
 """
 
@@ -200,7 +200,8 @@ class Driver(Fake):
         state = AgentState(step=message.step, robot=self.name, goal_status=AgentState.MOVING)
         state.header.stamp = message.stamp
         state.pose.pose.position.x = 0.01 * message.step
-        self.state.publish(state)
+        if self.fault != 'mute' or message.step > self.fault_step > 0:
+            self.state.publish(state)
         command = TwistStamped()
         command.header.stamp = message.stamp
         command.twist.linear.x = 0.2

@@ -77,9 +77,11 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     unconfigured = made_by(node)
     assert node.trigger_configure().name == 'SUCCESS', node.problem
     wait_until(lambda: is_known(node))
+    waitables = set(node.waitables)
     assert node.trigger_cleanup().name == 'SUCCESS', node.problem
     wait_until(lambda: is_known(node), spin)
-    # Services and actions live as long as the node.
+    # Services and actions live as long as the node: the executor crashes without its waitables.
+    assert set(node.waitables) == waitables
     cleaned = made_by(node), in_graph(node)
     for entities in ('publishers', 'timers', 'clients'):
         assert cleaned[0][entities] == unconfigured[entities]

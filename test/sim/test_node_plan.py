@@ -98,6 +98,13 @@ def test_the_sim_gets_the_file_and_how_fast_it_goes(lockstep, rate, expected):
     assert not simulated
 
 
+@pytest.mark.parametrize('lockstep', [True, False])
+def test_the_recorder_needs_the_last_publisher_of_the_sim(lockstep):
+    """Of a run that follows a clock, `/clock` says nothing about the topics of its own sim."""
+    sim = plans_of(load_scenario('mambo'), lockstep=lockstep)['/sim_node']
+    assert with_followed_clock(in_team(sim, 'south')).topics[-1] == '/south/lockstep/step'
+
+
 def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there():
     plans = plans_of(load_scenario('mambo_turtlebot'), lockstep=False)
     for name, plan in plans.items():

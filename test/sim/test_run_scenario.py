@@ -12,6 +12,7 @@ import yaml
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from report_check import check_report
 from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
 from waiting import wait_until
@@ -171,6 +172,30 @@ def test_free_running(tmp_path, scenario):
     assert code == 0, output
     assert run.report['true_found'] == 3
     assert not (run.folder / 'bag').exists()
+
+
+@pytest.mark.parametrize(
+    ('from_step', 'said'),
+    [(0, 'the recording lacks /second/state'), (120, 'the recording lacks the first 6')],
+)
+def test_a_gap_of_the_recording_is_in_report_and_exit_code(tmp_path, scenario, from_step, said):
+    script = {'second/driver': {'fault': 'mute', 'fault_step': from_step}, 'found': 2}
+    path = scenario(limits={'time': 8.0, 'start': 30.0, 'silence': 20.0})
+    run = Run(tmp_path / 'run', path, script=script)
+    code, output = run.wait()
+    assert f'error: {said}' in output
+    assert code == 4
+    (gap,) = (event for event in run.report['events'] if event['event'] == 'gap')
+    assert gap['reason'].startswith(said) and gap['reason'].endswith('/second/state')
+    check_report(run.report)
+
+
+def test_a_run_without_a_home_folder(tmp_path, scenario, monkeypatch):
+    for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR'):
+        monkeypatch.delenv(name, raising=False)
+    run = Run(tmp_path / 'run', scenario(), '--lockstep')
+    code, output = run.wait()
+    assert code == 0, output
 
 
 @pytest.fixture
@@ -367,6 +392,7 @@ def test_wrong_input_is_told_before_anything_starts(tmp_path, scenario):
         (['--time-limit', 'nan'], '--time-limit'),
         (['--time-limit', 'inf'], '--time-limit'),
         (['--lockstepp'], '--lockstepp'),
+        (['--lokstep'], 'unknown: --lokstep (did you mean --lockstep?)'),
     ],
 )
 def test_wrong_options_are_named(options, words, capsys):

@@ -190,7 +190,6 @@ WRONG = [
     ([('robots.mambo.driver', 'ranging_driver')], 'robots.mambo.camera', ['has none']),
     ([('events', [{'at': 5.0, 'robot': 'mamba', 'do': 'leave'}])], 'events[0].robot', ["'mambo'"]),
     ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'back'}])], 'events[0].do', ['is there']),
-    ([('events', [{'at': 900.0, 'robot': 'mambo', 'do': 'leave'}])], 'events[0].at', ['limits']),
     ([('events', [{'at': 5.0, 'robot': 'mambo', 'do': 'go'}])], 'events[0].do', ['leave, back']),
     ([('on_exit', 'restart')], 'on_exit', ['end, respawn']),
 ]  # fmt: skip
@@ -379,6 +378,22 @@ def test_events_in_turn_are_taken(load):
         {'at': 30.0, 'robot': 'mambo', 'do': 'leave'},
     ]
     assert len(load(changed(('events', events))).events) == 3
+
+
+def test_an_event_after_the_end_is_taken_with_a_warning(tmp_path):
+    path = tmp_path / 'scenario.yaml'
+    event = {'at': 20.0, 'robot': 'mambo', 'do': 'leave'}
+    path.write_text(yaml.safe_dump(changed(('events', [event]))))
+    words = r'scenario.yaml:\d+: events\[0\]\.at: read 20, but the run ends at 5 s'
+    with pytest.warns(ScenarioWarning, match=words):
+        scenario = load_scenario(path, {'--time-limit': (('limits', 'time'), 5.0)})
+    assert len(scenario.events) == 1
+
+
+def test_the_preset_of_earlier_files_is_refused_with_what_to_write(load):
+    words = r"filter\.preset: read 'recommended', which is gone; write method: pmb in its place"
+    with pytest.raises(ScenarioError, match=words):
+        load(changed(('filter', {'preset': 'recommended'})))
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,8 @@ def teams(tmp_path_factory):
         options = ['--domain-id', domain.number, '--namespace']
         operator = Operator(domain)
         leading = launched(*command(first, folder / 'team_a', *options, 'team_a'))
+        # A robot that does not take part yet is not paused.
+        read_until(leading, 'measurements')
         operator.call('/team_a/search/pause')
         following = launched(
             *command(second, folder / 'team_b', *options, 'team_b', '--follow-clock')

@@ -13,6 +13,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
@@ -26,7 +27,7 @@ from maasi_filter.ros.loopback import loopback_fault
 from maasi_filter.ros.node_entities import NodeEntities
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.ros.qos import LATCHED, RELIABLE
-from maasi_filter.ros.readiness import subscribers_connected, unpublished_topics
+from maasi_filter.ros.readiness import Unconnected, subscribers_connected, unpublished_topics
 from maasi_filter.ros.stamps import stamp_problem
 from maasi_msgs.msg import LockstepDone, LockstepStep
 
@@ -106,6 +107,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._unconnected = Unconnected(self)
         self._clock_watch = ClockWatch(self, self.warn_throttled, self._on_restart)
         self.create_wall_timer(_DIAGNOSTICS_PERIOD, self._publish_diagnostics)
         survive_bad_requests(self, self.drop)
@@ -382,13 +384,24 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
 
     # ---- messages ----------------------------------------------------------------------------
 
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
+        """Return a publisher without the event callbacks of rclpy; see `Unconnected`."""
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        return super().create_publisher(
+            msg_type, topic, qos_profile, **{'event_callbacks': quiet, **options}
+        )
+
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Subscription:
         """Return a subscription that drops messages with an invalid stamp, and far too large ones.
 
         It is never called after its destruction; the executor may already have queued a message.
+        It has no event callbacks of rclpy; see `Unconnected`.
         """
+        options.setdefault(
+            'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
+        )
         take = callback
         if not options.get('raw'):
             take = partial(self.check_stamp, topic, callback)
@@ -463,7 +476,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def _publish_diagnostics(self) -> None:
         self._clock_watch.look()
         fault = self.fault() if self.active else ''
-        warnings = self.warnings() if self.active else []
+        warnings = [*(self.warnings() if self.active else []), *self._unconnected.look()]
         if sum(self.dropped.values()):
             counts = (f'{reason} {number}' for reason, number in sorted(self.dropped.items()))
             warnings = [*warnings, f'dropped: {", ".join(counts)}']

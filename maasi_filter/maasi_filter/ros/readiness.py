@@ -53,6 +53,43 @@ def _takes_part(name: str) -> bool:
     return name not in ('recorder', 'guard', 'rosbag2_recorder') and not name.startswith('_')
 
 
+class Unconnected:
+    """Topics with an endpoint that is known but never connects.
+
+    In place of the event callbacks of rclpy, which publishers and subscriptions that are destroyed
+    while their node spins must not have (`NodeEntities`).
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        # Since when an endpoint has been known, but not connected [s of wall time].
+        self._since: dict[str, float] = {}
+        self._said: set[str] = set()
+
+    def look(self) -> list[str]:
+        """Return a warning for each such topic, logged once; call about once per second."""
+        node, now = self._node, time.monotonic()
+        unconnected = {
+            f'{item.topic_name}: a publisher does not connect'
+            for item in node.subscriptions
+            if item.handle.get_publisher_count() < node.count_publishers(item.topic_name)
+        } | {
+            f'{item.topic_name}: a subscription does not connect'
+            for item in node.publishers
+            if item.get_subscription_count() < node.count_subscribers(item.topic_name)
+        }
+        self._since = {text: self._since.get(text, now) for text in unconnected}
+        lasting = [
+            f'{text}: its quality of service or type differs'
+            for text, since in sorted(self._since.items())
+            if now - since > _CONNECTION_PATIENCE
+        ]
+        for text in set(lasting) - self._said:
+            node.get_logger().warning(text)
+        self._said = set(lasting)
+        return lasting
+
+
 def unpublished_topics(node: Node) -> list[str]:
     """Return the topics that a node subscribes to and nobody publishes."""
     topics = {item.topic_name for item in node.subscriptions}

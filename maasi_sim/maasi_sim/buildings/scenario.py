@@ -104,7 +104,7 @@ def check_cuboid_scenario(
         layer = with_overrides(layer, overrides)
     scenario = validate(CuboidScenario, layer)
     refuse(layer, _problems(scenario))
-    doubt(layer, doubts_about(scenario.robots))
+    doubt(layer, doubts_about(scenario))
     return scenario
 
 
@@ -140,7 +140,7 @@ def _problems(scenario: CuboidScenario) -> Iterator[tuple[Key, str]]:
     for name in scenario.names():
         for text in check_names(name):
             yield ('robots', name), text
-    yield from event_problems(scenario.events, scenario.names(), scenario.limits)
+    yield from event_problems(scenario.events, scenario.names())
     try:
         mission = scenario.mission()
     except ValueError as error:

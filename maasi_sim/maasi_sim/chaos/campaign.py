@@ -16,7 +16,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from maasi_sim.arguments import count, whole
+from maasi_sim.arguments import Parser, count, whole
 from maasi_sim.chaos.cases import Case, all_cases
 from maasi_sim.chaos.execution import execute
 from maasi_sim.chaos.verdict import judge
@@ -44,7 +44,7 @@ class Result:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog='chaos',
         description='Run scenarios in which nodes are killed or hang, and check the results: '
         'exit code, robots at rest, found targets, recording, report, processes.',

@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from maasi_sim.arguments import count, positive, whole
+from maasi_sim.arguments import Parser, count, positive, whole
 from maasi_sim.experiments.campaign import Plan, plan
 from maasi_sim.experiments.comparison import SearchComparison, compared
 from maasi_sim.experiments.comparison_tables import document, facts, table_text, verdicts
@@ -36,7 +36,7 @@ class WrongRequest(ValueError):
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog='compare',
         description='Compare planners and filters in whole searches on the same seeds, each '
         'search in one process; the same command resumes an interrupted comparison.',

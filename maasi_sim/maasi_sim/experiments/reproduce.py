@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from maasi_sim.arguments import count, whole
+from maasi_sim.arguments import Parser, count, whole
 from maasi_sim.experiments.campaign import Plan, plan
 from maasi_sim.experiments.document import write_document
 from maasi_sim.experiments.execution import (
@@ -28,7 +28,7 @@ class UnknownCase(ValueError):
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog='reproduce',
         description="Run the papers' experiments; the same command resumes an interrupted run.",
         epilog=EXIT_CODES,

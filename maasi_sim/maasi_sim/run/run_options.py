@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from maasi_sim.arguments import positive, whole
+from maasi_sim.arguments import Parser, positive, whole
 
 LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
@@ -44,7 +44,7 @@ class ViewOptions:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog='run_scenario',
         description='Run a scenario as separate ROS 2 processes, or replay a recording of one.',
         epilog='Exit codes: 0 all targets found (or, with stop: planner_done, ended as meant), '

@@ -24,6 +24,8 @@ def main(arguments: list[str] | None = None) -> int:
     interruption = Interruption()
     for key, value in _NODE_ENVIRONMENT.items():
         os.environ.setdefault(key, value)
+    # ROS has its logs there.
+    os.environ.setdefault('HOME', os.path.abspath(os.path.expanduser('~')))
     options = parse(arguments)
     # NumPy reads the environment when it is imported.
     from maasi_sim.run.bag import BagError, BagWriteError

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
 from maasi_drivers.agent.driver_settings import DRIVERS
 from maasi_filter.settings import DETECTIONS
-from maasi_sim.scenario.base import EventSettings, LimitSettings
+from maasi_sim.scenario.base import BaseScenario, EventSettings
 from maasi_sim.scenario.layering import Key, unknown
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.scenario.visibility import robot_candidates
@@ -43,7 +42,7 @@ def problems_of(scenario: Scenario) -> Iterator[tuple[Key, str]]:
             yield ('robots', name, *inner), text
     yield from _mambo_problems(scenario)
     yield from _mavlink_problems(scenario)
-    yield from event_problems(scenario.events, scenario.names(), scenario.limits)
+    yield from event_problems(scenario.events, scenario.names())
     for index, event in enumerate(scenario.events):
         if event.robot in scenario.robots and scenario.robots[event.robot].external:
             yield (
@@ -310,8 +309,12 @@ def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
             )
 
 
-def doubts_about(robots: Mapping[str, Any]) -> Iterator[tuple[Key, str]]:
+def doubts_about(scenario: BaseScenario) -> Iterator[tuple[Key, str]]:
     """Yield valid but probably unintended values: key and text."""
+    robots, limit = scenario.robots, scenario.limits.time
+    for index, event in enumerate(scenario.events):
+        if event.at > limit:
+            yield ('events', index, 'at'), f'read {event.at:g}, but the run ends at {limit:g} s'
     for name, robot in robots.items():
         if abs(robot.yaw) > 2.0 * math.pi:
             yield (
@@ -330,7 +333,7 @@ def doubts_about(robots: Mapping[str, Any]) -> Iterator[tuple[Key, str]]:
 
 
 def event_problems(
-    events: Sequence[EventSettings], names: Sequence[str], limits: LimitSettings
+    events: Sequence[EventSettings], names: Sequence[str]
 ) -> Iterator[tuple[Key, str]]:
     """Yield problems of the events: key and text."""
     away: set[str] = set()
@@ -341,11 +344,6 @@ def event_problems(
         if event.robot not in names:
             yield (*key, 'robot'), unknown(event.robot, list(names), 'robot')
             continue
-        if event.at > limits.time:
-            yield (
-                (*key, 'at'),
-                f'read {event.at}, allowed is at most limits.time, {limits.time}',
-            )
         if (event.do == 'back') != (event.robot in away):
             state = 'is there' if event.do == 'back' else 'has left'
             yield (*key, 'do'), f"read '{event.do}', but {event.robot} {state} at that time"

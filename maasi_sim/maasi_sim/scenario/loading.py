@@ -192,7 +192,7 @@ def check_scenario(
         layer = with_overrides(layer, overrides)
     scenario = validate(Scenario, layer)
     refuse(layer, problems_of(scenario))
-    doubt(layer, doubts_about(scenario.robots))
+    doubt(layer, doubts_about(scenario))
     return scenario
 
 

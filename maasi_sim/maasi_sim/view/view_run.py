@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from maasi_sim.arguments import Parser
 from maasi_sim.run.bag import BagError
 from maasi_sim.run.run_folder import ResultsError
 from maasi_sim.view.bag_events import read_events
@@ -17,7 +18,7 @@ DONE, WRONG_INPUT, NOT_WRITTEN = 0, 2, 4
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog='view',
         description=f'Makes {REPLAY}, a page with the whole run inside, and opens it.',
         epilog='Exit codes: 0 done, 2 no recording of a search, 4 it could not be written.',
