@@ -36,9 +36,11 @@ DOCUMENTS = [
     *sorted((ROOT / 'examples').rglob('*.md')),
 ]
 NOT_CODE = ('text', 'mermaid')
-# Programs of others: what follows them is not checked.
+# Programs and packages of others: what follows them is not checked.
 FOREIGN = {
     'apt-get',
+    'arducopter',
+    'camera_ros',
     'cd',
     'dask',
     'git',
@@ -50,6 +52,7 @@ FOREIGN = {
     'source',
     'sudo',
     'touch',
+    'turtlebot3_bringup',
 }
 ROS_VERBS = {'action', 'bag', 'lifecycle', 'node', 'param', 'pkg', 'service', 'topic'}
 NODES = {'filter_node': FilterNodeSettings, '/**': DriverSettings}
@@ -205,6 +208,8 @@ def check_command(words: list[str]) -> None:
     program, *rest = words
     if program.startswith('./scripts/'):
         check_script(ROOT / program, rest)
+    elif program == 'ros2' and rest[1] in FOREIGN:
+        assert rest[0] in ('run', 'launch'), rest[0]
     elif program == 'ros2' and rest[0] == 'run':
         check_module(module_of(rest[1], rest[2]), rest[3:])
     elif program == 'ros2' and rest[0] == 'launch':

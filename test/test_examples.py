@@ -14,11 +14,18 @@ import numpy as np
 import pytest
 import yaml
 
+from maasi_drivers.agent.driver_settings import DriverSettings, GuardSettings
 from maasi_filter import plugins
+from maasi_filter.ros.node_parameters import check
+from maasi_filter.ros.node_settings import FilterNodeSettings
+from maasi_filter.ros.parameters import flatten
+from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.run.bag import Bag
+from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.run.processes import Domain, find_executable
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search
+from maasi_sim.targets.nodes import plan_nodes
 
 EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
 # Far more than anything takes, on a machine that is busy with something else [s].
@@ -158,3 +165,108 @@ def test_detections_of_ones_own_are_found_without_a_warning():
     match = re.match(r'found a target at \((.*), (.*)\) m after', done.stdout)
     assert match and np.allclose([float(part) for part in match.groups()], [3.0, 2.0], atol=0.1)
     assert 'came late' not in log and 'allowed is' not in log, log
+
+
+def test_the_team_of_the_field_finds_its_targets_in_simulation():
+    result = search(load_scenario(EXAMPLES / 'field_team' / 'search.yaml'), 1)
+    assert result.missed == 0 and result.false_found == 0
+
+
+# What differs from the simulation, by node: the rest of the parameters has to be the same.
+OF_THE_FIELD = {
+    'turtlebot_driver': {'battery_minimum', 'image_transport', 'tf_rate'},
+    'turtlebot_guard': set(),
+    'drone_driver': {'battery_minimum', 'image_transport', 'link'},
+    'filter_node': set(),
+    'planner_node': set(),
+}
+
+
+def of_the_field(name):
+    """Return the parameters in a file."""
+    text = (EXAMPLES / 'field_team' / f'{name}.yaml').read_text()
+    return yaml.safe_load(text)['/**']['ros__parameters']
+
+
+def test_the_parameters_of_the_field_are_those_of_its_simulation():
+    file = EXAMPLES / 'field_team' / 'search.yaml'
+    plans = {
+        '_'.join(filter(None, (plan.namespace, plan.name))): plan
+        for plan in plan_nodes(load_scenario(file), RunSettings(1, False, None, False, file))
+    }
+    models = {'driver': DriverSettings, 'guard': GuardSettings}
+    models |= {'filter_node': FilterNodeSettings, 'planner_node': PlannerNodeSettings}
+    for node, allowed in OF_THE_FIELD.items():
+        model = models.get(node) or models[node.rpartition('_')[2]]
+        settings, problems = check(model, of_the_field(node))
+        assert problems == {}, node
+        simulated = dict(plans[node].parameters)
+        del simulated['use_sim_time']
+        there = flatten(check(model, simulated)[0].resolved())
+        here = flatten(settings.resolved())
+        # Of the autopilot the simulation knows nothing.
+        different = {key for key in here if here[key] != there.get(key)}
+        different = {key for key in different if not key.startswith('mavlink.')}
+        assert different == allowed, node
+    autopilot = dict(
+        line.split()
+        for line in (EXAMPLES / 'field_team' / 'arducopter.parm').read_text().splitlines()
+        if not line.startswith('#')
+    )
+    assert int(autopilot['MAV_GCS_SYSID']) == of_the_field('drone_driver')['mavlink.own_system']
+
+
+def test_the_nodes_of_the_field_become_active_with_their_file(domain, tmp_path):
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.context import Context
+    from rclpy.executors import SingleThreadedExecutor
+    from waiting import wait_until
+
+    started = {
+        '/turtlebot/driver': 'maasi_drivers.turtlebot_driver',
+        '/turtlebot/guard': 'maasi_drivers.guard_node',
+        '/drone/driver': 'maasi_drivers.mavlink_camera_driver',
+        '/filter_node': 'maasi_filter.filter_node',
+        '/planner_node': 'maasi_planner.planner_node',
+    }
+    processes = []
+    heard = {}
+    context = Context()
+    rclpy.init(context=context, domain_id=domain.number)
+    node = rclpy.create_node('listener', context=context)
+
+    def listen(message):
+        heard.update({status.name: status.message for status in message.status})
+
+    node.create_subscription(DiagnosticArray, '/diagnostics', listen, 50)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    try:
+        for name, module in started.items():
+            namespace = name.rpartition('/')[0] or '/'
+            file = f'{name.strip("/").replace("/", "_")}.yaml'
+            words = ['--ros-args', '-r', f'__ns:={namespace}', '--params-file', file]
+            with (tmp_path / module).open('w') as log:
+                processes.append(
+                    subprocess.Popen(
+                        [sys.executable, '-m', module, *words],
+                        cwd=EXAMPLES / 'field_team',
+                        stdout=log,
+                        stderr=log,
+                    )
+                )
+
+        def active():
+            assert all(process.poll() is None for process in processes)
+            return all(heard.get(name, '').startswith('active') for name in started)
+
+        wait_until(active, lambda: executor.spin_once(0.1), lambda: heard)
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.wait(PATIENCE)
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
