@@ -337,6 +337,21 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
     flight.fly()
 
 
+def test_a_vehicle_in_the_air_is_taken_over_and_the_answer_says_so(fly):
+    flight = fly()
+    autopilot = flight.vehicle.autopilot
+    flight.until(lambda: flight.team.states and UNTIL_ARM in flight.state.reason)
+    with flight.vehicle._lock:
+        # A pilot has brought it there.
+        autopilot.armed = True
+        autopilot.body.position[2] = 1.0
+        autopilot.take_mode('GUIDED')
+    flight.until(lambda: flight.driver.link.status().get('in the air'))
+    flight.until(lambda: 'it is armed in GUIDED' in flight.state.reason)
+    assert flight.team.call('arm').message == 'it is in the air: it is taken over where it is'
+    flight.wait_for_flight()
+
+
 def test_an_autopilot_that_restarts_is_said(fly, capfd):
     flight = fly().fly()
     result = flight.under_way()
@@ -358,8 +373,8 @@ def test_what_the_autopilot_does_by_itself_is_shown(fly, capfd):
     assert not flight.vehicle.autopilot.armed
     said = capfd.readouterr().err
     assert (
-        'failsafe for when the heartbeats of the driver stop: FS_GCS_ENABLE is 0, which is off'
-        in said
+        'failsafe for when the heartbeats of the driver stop: FS_GCS_ENABLE is 0, which does not '
+        'help' in said
     )
     flight.until(
         lambda: any(

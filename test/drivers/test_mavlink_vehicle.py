@@ -144,7 +144,7 @@ def test_failsafes_are_read_and_shown(firmware):
     assert play.vehicle.parameters[guard] == value
     assert f'{guard} is {value}' in play.said
     if firmware == 'ardusub':
-        assert 'FS_EKF_ACTION is 0, which is off' in play.said
+        assert 'FS_EKF_ACTION is 0, which does not help' in play.said
 
 
 @pytest.mark.parametrize(
@@ -276,6 +276,57 @@ def test_the_loss_of_gnss_is_seen_in_flight():
     assert play.vehicle.fault == 'vehicle: the autopilot has lost its position estimate'
 
 
+@pytest.mark.parametrize(
+    ('muted', 'text'),
+    [
+        ('EKF_STATUS_REPORT', 'vehicle: no EKF_STATUS_REPORT any more'),
+        ('GPS_RAW_INT', 'vehicle: GNSS is lost (no GPS_RAW_INT any more)'),
+    ],
+)
+def test_a_status_that_stops_coming_does_not_count_any_more(muted, text):
+    play = Play().fly().go(SPEED)
+    play.autopilot.reports.muted = {muted}
+    play.run(2.5)
+    assert play.vehicle.fault == ''
+    play.run(1.0)
+    assert play.vehicle.fault == text
+    play.autopilot.reports.muted = set()
+    play.run(2.0)
+    assert play.vehicle.fault == ''
+
+
+def test_a_status_that_another_program_turned_off_is_asked_for_again():
+    play = Play().fly()
+    play.autopilot.reports._periods['EKF_STATUS_REPORT'] = math.inf
+    play.run(10.0)
+    assert play.vehicle.fault == ''
+    assert math.isfinite(play.autopilot.reports._periods['EKF_STATUS_REPORT'])
+
+
+def test_one_of_two_gnss_receivers_is_enough():
+    play = Play(autopilot={'second_gnss': True}).fly().go(SPEED)
+    play.autopilot.lose_gnss()
+    play.run(12.0)
+    assert play.vehicle.fault == ''
+    play.autopilot.reports.muted = {'GPS2_RAW'}
+    play.run(4.0)
+    assert play.vehicle.fault == (
+        'vehicle: GNSS is lost (GPS_RAW_INT.fix_type 1, no GPS2_RAW any more)'
+    )
+
+
+@pytest.mark.parametrize(
+    ('firmware', 'name', 'value'),
+    [('px4', 'COM_OBL_RC_ACT', 6), ('px4', 'COM_OBL_RC_ACT', 7), ('ardusub', 'FS_GCS_ENABLE', 2)],
+)
+def test_a_failsafe_that_turns_the_motors_off_is_none(firmware, name, value):
+    play = Play(firmware, autopilot={'parameters': {name: value}})
+    play.run(10.0)
+    assert not play.commands(ARM)
+    assert f'failsafe {name} is {value}, and require_failsafe is true' in play.vehicle.fault
+    assert f'{name} is {value}, which does not help' in play.said
+
+
 def test_an_autopilot_that_restarts_is_left_alone():
     play = Play().fly().go(SPEED)
     play.autopilot.restart()
@@ -361,6 +412,7 @@ def test_a_driver_restarted_in_the_air_sends_it_nowhere_before_it_may():
     assert len(play.sent('SET_POSITION_TARGET_LOCAL_NED')) == sent
     assert_allclose(play.autopilot.body.position, here, atol=0.05)
     assert 'not by this driver' in play.vehicle.fault
+    assert play.vehicle.in_air
     # Its end is not the end of what others fly.
     play.vehicle.finish('land')
     play.run(2.0)

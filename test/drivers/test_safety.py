@@ -198,6 +198,24 @@ def test_a_camera_that_was_never_there_is_said(play):
     assert team.refused([1.0, 1.0, 0.0])
 
 
+def test_a_guard_that_has_gone_is_reported(play, context, capfd):
+    driver, team = play()
+    guard = start_guard(context, team)
+    team.until(lambda: team.move() or driver.link.status() == {'guard': 'is there'})
+    assert 'guard' not in driver._warned
+    guard.destroy_node()
+    team.until(lambda: team.move() or 'guard' in driver._warned)
+    assert 'the guard has gone' in capfd.readouterr().err
+
+
+def test_a_goal_before_any_odometry_is_refused(play, capfd):
+    _, team = play()
+    assert team.refused([1.0, 1.0, 0.0])
+    assert 'go_to: no odometry yet' in capfd.readouterr().err
+    team.move()
+    team.send_accepted([1.0, 1.0, 0.0])
+
+
 def test_a_minimum_without_a_charge_is_warned_of(play, monkeypatch):
     monkeypatch.setattr('maasi_drivers.agent.battery_watch._PATIENCE', 0.3)
     driver, team = play(battery_minimum=0.2)

@@ -44,6 +44,8 @@ def flown(**faults):
         if count == 200:
             for name, value in faults.items():
                 setattr(flight, name, value)
+            if 'low' in faults:
+                flight.firmware.charge.charge = faults['low']
     return flight
 
 
@@ -75,6 +77,11 @@ def test_it_does_not_take_off_with_a_low_battery():
         for _ in MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps():
             flight.step()
     assert flight.firmware.take_offs == 0
+
+
+def test_it_ends_with_a_battery_that_becomes_low_in_flight():
+    with pytest.raises(MeasurementError, match=r'battery: read 0\.15'):
+        flown(low=0.15)
 
 
 def leg(places):

@@ -45,7 +45,11 @@ class ArmPermission:
         return now >= self._end and self.end()
 
 
-def offer_arm(node: LockstepLifecycleNode[Any], arm: Callable[[], str]) -> None:
+def offer_arm(
+    node: LockstepLifecycleNode[Any],
+    arm: Callable[[], str],
+    in_air: Callable[[], bool] = lambda: False,
+) -> None:
     """Offer the service `arm` (std_srvs/Trigger) of a node.
 
     Parameters
@@ -54,16 +58,21 @@ def offer_arm(node: LockstepLifecycleNode[Any], arm: Callable[[], str]) -> None:
         Of a robot that takes off.
     arm : callable
         Gives the permission, or returns the reason of a refusal; empty where it is given.
+    in_air : callable
+        Whether it flies already, and is taken over.
     """
 
     def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         problem = arm() if node.active else 'the driver is not active'
         response.success = not problem
-        response.message = problem or 'it takes off as soon as it is ready'
         if problem:
+            response.message = problem
             node.get_logger().warning(f'arm: refused: {problem}')
-        else:
-            node.get_logger().info('arm: it may take off')
+            return response
+        response.message = 'it takes off as soon as it is ready'
+        if in_air():
+            response.message = 'it is in the air: it is taken over where it is'
+        node.get_logger().info(f'arm: {response.message}')
         return response
 
     node.offer_service('arm', answer)

@@ -110,6 +110,8 @@ class GoalServer:
         if driver.health.text:
             return f'the robot cannot go on: {driver.health.text}'
         latest = driver.history.latest
+        if latest is None and not driver.settings.lockstep:
+            return f'no {driver.pose_name} yet'
         now = driver.get_clock().now().nanoseconds if latest is None else latest.stamp
         if problem := self._frames.to_map(request.waypoint, now):
             return problem

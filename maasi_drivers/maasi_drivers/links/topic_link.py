@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from geometry_msgs.msg import TwistStamped
 
@@ -18,6 +19,8 @@ from maasi_filter.ros.conversions import stamp_to_ros
 _ZERO = (0.0, 0.0, 0.0, 0.0)
 # At the end: commands, and longest wait until the last one has arrived [s].
 _STOP_COMMANDS, _STOP_TIME = 3, 0.3
+# Polls from one look for the guard to the next.
+_GUARD_POLLS = 5
 
 
 class TopicLink(RobotLink):
@@ -42,6 +45,9 @@ class TopicLink(RobotLink):
             None, driver.bounds, settings.radius, 0.0, settings.start[2]
         )
         self._publisher: CommandPublisher | None = None
+        self._polls = 0
+        # Whether it has a guard, and whether it had one.
+        self._guarded = self._was_guarded = False
         self._command = TwistStamped()
         self._command.header.frame_id = f'{driver.robot}/base_link'
 
@@ -85,6 +91,19 @@ class TopicLink(RobotLink):
         self._publisher.refresh()
         if problem := self._publisher.problem():
             self.driver.warn_throttled('cmd_vel', problem)
+        if self._polls % _GUARD_POLLS == 0:
+            readers = self.driver.get_subscriptions_info_by_topic('state')
+            self._guarded = any(item.node_name == 'guard' for item in readers)
+            self._was_guarded |= self._guarded
+        self._polls += 1
+        if self._was_guarded and not self._guarded:
+            self.driver.warn_throttled(
+                'guard', 'the guard has gone: nobody stops the robot if this driver dies'
+            )
+
+    def status(self) -> dict[str, Any]:
+        """Return whether there is a guard."""
+        return {'guard': 'is there' if self._guarded else 'is not there'}
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Refuse heights far from that of the start; a ground robot has none."""

@@ -114,15 +114,10 @@ class TurtlebotLink(TopicLink):
             self.hold()
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
-        """Refuse goals without Nav2, or without a pose, where Nav2 is to drive."""
+        """Refuse goals without Nav2, where Nav2 is to drive."""
         if self._nav2 is None:
             return super().goal_problem(position)
-        if not self._nav2.available:
-            return 'navigate_to_pose: Nav2 is not there'
-        if self.driver.history.latest is None:
-            # Nav2 would drive while nothing here could notice that the pose is lost.
-            return f'no {self.driver.pose_name} yet'
-        return None
+        return None if self._nav2.available else 'navigate_to_pose: Nav2 is not there'
 
     def goal_taken(self, goal: Goal) -> None:
         """Send the goal to Nav2."""

@@ -93,10 +93,10 @@ class MamboRobotLink(RobotLink):
     def connect(self) -> None:
         """Connect; it takes off once the driver is active."""
         driver = self.driver
-        self._link = self._make_link()
-        self._link.connect()
+        self._link = link = self._make_link()
+        link.connect()
         driver.create_wall_timer(min(driver.settings.step, _POLL_PERIOD), self._update)
-        offer_arm(driver, self._arm)
+        offer_arm(driver, self._arm, lambda: link.airborne)
         if self._mambo.pose == 'odometry':
             OdometryTopic(driver)
         elif self._mambo.pose == 'pose':

@@ -446,8 +446,8 @@ class MamboPilot:
     def _lost_text(self, now: float) -> str:
         timeout = self.settings.link_timeout
         if self._is_silent(now):
-            silent = _seconds(now - self.link.heard_at)
-            return f'link lost: nothing from the Mambo for {silent}'
+            age = _seconds(now - self.link.heard_at)
+            return f'link lost: nothing from the Mambo for {age}'
         silent = now - self._positioned_at()
         if silent > timeout:
             return f'no position for {_seconds(silent)}'

@@ -126,14 +126,17 @@ class MeasuringFlight:
                 link.flying_state == 'landed' and link.battery >= 0.0 and link.position is not None
             ),
         )
-        if link.battery < _LEAST_BATTERY:
-            raise MeasurementError(
-                f'battery: read {link.battery:.2f}, allowed is {_LEAST_BATTERY} or more'
-            )
+        self._check_battery()
         link.take_off()
         yield from self._await('taking off', lambda: link.flying_state in ('hovering', 'flying'))
         for number in range(self.number):
             yield from self._fly_leg(1.0 if number % 2 == 0 else -1.0)
+
+    def _check_battery(self) -> None:
+        if self.link.battery < _LEAST_BATTERY:
+            raise MeasurementError(
+                f'battery: read {self.link.battery:.2f}, allowed is {_LEAST_BATTERY} or more'
+            )
 
     def _await(self, what: str, condition: Callable[[], bool]) -> Iterator[str]:
         end = self.clock() + _PATIENCE
@@ -177,6 +180,7 @@ class MeasuringFlight:
             raise MeasurementError(f'link: no position for {_SILENCE} s')
         if link.error:
             raise MeasurementError(link.error)
+        self._check_battery()
         if link.flying_state not in ('hovering', 'flying'):
             raise MeasurementError(f'the drone is {link.flying_state}, allowed is that it flies')
         if event is self._event:

@@ -18,7 +18,7 @@ from maasi_drivers.links.mavlink.report_log import DEBUG, ERROR, INFO, WARNING, 
 from maasi_drivers.links.mavlink.settings import MavlinkSettings
 
 _HEARTBEAT_PERIOD = 1.0
-# Without attitude and position for so long their messages are requested again [s].
+# Without attitude, position or their status for so long the messages are requested again [s].
 _STREAM_PATIENCE = 2.0
 # Rates of messages [Hz]; None: that of the settings.
 _MESSAGES = {
@@ -29,6 +29,7 @@ _MESSAGES = {
     'EXTENDED_SYS_STATE': 2.0,
     'EKF_STATUS_REPORT': 2.0,
     'GPS_RAW_INT': 2.0,
+    'GPS2_RAW': 2.0,
 }
 
 
@@ -222,7 +223,7 @@ class Autopilot:
         """Request parameters and messages that are missing."""
         if self.failsafes is not None:
             self.failsafes.read(now)
-        silence = now - max(self.estimate.heard_at, self._requested_at)
+        silence = now - max(self.estimate.silent_since, self._requested_at)
         known = self._requested_at > -math.inf
         if self.commands or self.lost or (known and silence < _STREAM_PATIENCE):
             return

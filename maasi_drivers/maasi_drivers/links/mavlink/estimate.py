@@ -24,6 +24,9 @@ _RESTART = 1000
 _FIX_3D = 3
 # Of EKF_STATUS_REPORT: a level or absolute position, and none that is only assumed.
 _EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
+# A status counts for this time; it is asked for twice a second [s].
+_STATUS_AGE = 3.0
+_EKF, _RECEIVERS = 'EKF_STATUS_REPORT', ('GPS_RAW_INT', 'GPS2_RAW')
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,10 @@ class Estimate:
         self.booted = math.nan
         self.landed = mavlink.MAV_LANDED_STATE_UNDEFINED
         self._good: bool | None = None
-        self._fix: int | None = None
+        # Fix by receiver, and time of each message on estimate and fixes.
+        self._fixes: dict[str, int] = {}
+        self._status_at: dict[str, float] = {}
+        self._now = -math.inf
         self._charges: dict[int, float] = {}
         self._from_batteries = False
         self._boot_time: int | None = None
@@ -111,12 +117,24 @@ class Estimate:
     @property
     def ready(self) -> bool:
         """Whether there is a position, and nothing against it."""
-        return self.telemetry is not None and self._good is not False
+        return self.telemetry is not None and not self.problem(False)
 
     @property
     def has_fix(self) -> bool:
-        """Whether GNSS has a fix."""
-        return self._fix is not None and self._fix >= _FIX_3D
+        """Whether one GNSS receiver has a fix."""
+        return any(fix >= _FIX_3D and not self._silence(name) for name, fix in self._fixes.items())
+
+    @property
+    def silent_since(self) -> float:
+        """Since when something that was heard is missing, on the steady clock [s]."""
+        status = [self._status_at[_EKF]] if _EKF in self._status_at else []
+        fixes = [self._status_at[name] for name in self._fixes]
+        return min([self.heard_at, *status, *([max(fixes)] if fixes else [])])
+
+    def _silence(self, name: str) -> str:
+        """Return that a status does not come any more, or nothing."""
+        silent = self._now - self._status_at.get(name, math.inf) > _STATUS_AGE
+        return f'no {name} any more' if silent else ''
 
     @property
     def charge(self) -> float:
@@ -129,13 +147,19 @@ class Estimate:
         """Return why the position is not to be trusted in flight; empty where it is."""
         if self._good is False:
             return 'the autopilot has lost its position estimate'
-        if fix_needed and self._fix is not None and not self.has_fix:
-            return f'GNSS is lost (GPS_RAW_INT.fix_type {self._fix})'
+        if silence := self._silence(_EKF):
+            return silence
+        if fix_needed and not self.has_fix:
+            receivers = (
+                self._silence(name) or f'{name}.fix_type {fix}' for name, fix in self._fixes.items()
+            )
+            return f'GNSS is lost ({", ".join(receivers)})'
         return ''
 
     def take(self, message: Any, now: float, armed: bool) -> None:
         """Take a message; those of other kinds are left out."""
         kind = message.get_type()
+        self._now = now
         if kind == 'LOCAL_POSITION_NED':
             self._take_position(message, now, armed)
         elif kind == 'ATTITUDE_QUATERNION':
@@ -153,10 +177,10 @@ class Estimate:
                 self.charge_reports += 1
         elif kind == 'EXTENDED_SYS_STATE':
             self.landed = int(message.landed_state)
-        elif kind == 'GPS_RAW_INT':
-            self._fix = int(message.fix_type)
-        elif kind == 'EKF_STATUS_REPORT':
-            flags = message.flags
+        elif kind in _RECEIVERS:
+            self._fixes[kind], self._status_at[kind] = int(message.fix_type), now
+        elif kind == _EKF:
+            flags, self._status_at[kind] = message.flags, now
             self._good = bool(flags & _EKF_POSITION) and not flags & _EKF_ASSUMED
 
     def _note_time(self, milliseconds: int, now: float) -> None:

@@ -154,7 +154,7 @@ class FailsafeCheck:
             value = self.values[name]
             off = value is None or value in failsafe.off
             state = 'is not known' if value is None else f'is {value:g}'
-            state += ', which is off' if value is not None and off else ''
+            state += ', which does not help' if value is not None and off else ''
             self._report(
                 WARNING if off else INFO, f'failsafe for when {failsafe.meaning}: {name} {state}'
             )

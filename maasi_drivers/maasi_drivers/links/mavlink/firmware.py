@@ -150,8 +150,8 @@ ARDUSUB = Firmware(
     streams_first=False,
     returns=True,
     failsafes={
-        # 1 only warns.
-        'FS_GCS_ENABLE': Failsafe('the heartbeats of the driver stop', (0.0, 1.0), True),
+        # 1 only warns, 2 disarms: it drifts.
+        'FS_GCS_ENABLE': Failsafe('the heartbeats of the driver stop', (0.0, 1.0, 2.0), True),
         'FS_EKF_ACTION': Failsafe('the position estimate fails'),
         'FS_LEAK_ENABLE': Failsafe('water comes in', (0.0, 1.0)),
         'BATT_FS_LOW_ACT': Failsafe('the battery is low'),
@@ -186,8 +186,9 @@ PX4_COPTER = Firmware(
     # OFFBOARD needs setpoints before it, and after the pilot took over none are sent.
     returns=False,
     failsafes={
-        # Any of its values acts, once the setpoints stop for COM_OF_LOSS_T.
-        'COM_OBL_RC_ACT': Failsafe('the setpoints of the driver stop', (), True),
+        # Acts once the setpoints stop for COM_OF_LOSS_T; 6 terminates the flight, 7 disarms: it
+        # falls (`Failsafe::fromOffboardLossActParam`).
+        'COM_OBL_RC_ACT': Failsafe('the setpoints of the driver stop', (6.0, 7.0), True),
         'NAV_DLL_ACT': Failsafe('the heartbeats of the driver stop'),
         'COM_LOW_BAT_ACT': Failsafe('the battery is low'),
         'GF_ACTION': Failsafe('it leaves the fence of the autopilot'),

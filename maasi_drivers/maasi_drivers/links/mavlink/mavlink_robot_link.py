@@ -86,7 +86,12 @@ class MavlinkRobotLink(RobotLink):
         link = VehicleLink(self._mavlink, driver.settings.start, folder / 'maasi' / name)
         self._link = link
         driver.create_wall_timer(_POLL_PERIOD, self._update)
-        offer_arm(driver, self._arm)
+
+        def in_air() -> bool:
+            with link.vehicle() as vehicle:
+                return vehicle.in_air
+
+        offer_arm(driver, self._arm, in_air)
 
         def flying() -> bool:
             with link.vehicle() as vehicle:
@@ -177,6 +182,7 @@ class MavlinkRobotLink(RobotLink):
         with self._link.vehicle() as vehicle:
             return {
                 'vehicle': vehicle.phase.name,
+                'in the air': vehicle.in_air,
                 **{f'parameter {key}': item for key, item in vehicle.parameters.items()},
                 **{f'ignored: {key}': number for key, number in vehicle.estimate.dropped.items()},
             }

@@ -95,6 +95,12 @@ class Vehicle:
         return self.phase is Phase.FLYING and not self._autopilot.lost
 
     @property
+    def in_air(self) -> bool:
+        """Whether it is armed, and not on the ground."""
+        on_ground = self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND
+        return self._autopilot.armed and not on_ground
+
+    @property
     def parameters(self) -> Mapping[str, float | None]:
         """Of the failsafes, as read; None where the autopilot does not have it."""
         failsafes = self._autopilot.failsafes
@@ -391,10 +397,10 @@ class Vehicle:
         elif autopilot.armed and permitted:
             self._log.add(INFO, f'it is armed, in {name}: taken over')
             self._permission.end()
-            if self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND:
-                self._begin_rising(now)
-            else:
+            if self.in_air:
                 self._begin_flying()
+            else:
+                self._begin_rising(now)
         elif autopilot.armed:
             self._detail = f'it is armed in {name}, not by this driver, {UNTIL_ARM}'
         elif not self.settings.arm:

@@ -43,7 +43,7 @@ class AutopilotState(Protocol):
 
     @property
     def has_fix(self) -> bool:
-        """Whether it has a GNSS fix."""
+        """Whether its first GNSS receiver has a fix."""
 
     def landed_state(self) -> int:
         """Return MAV_LANDED_STATE."""
@@ -66,6 +66,8 @@ class AutopilotReports:
 
     Attributes
     ----------
+    muted : set of str
+        Messages that do not come any more.
     frozen : tuple of float or None
         Position and velocity that are sent instead of the true ones.
     """
@@ -74,6 +76,7 @@ class AutopilotReports:
         self._pilot = pilot
         self._sender = sender
         self._generator = generator
+        self.muted: set[str] = set()
         self.frozen: tuple[float, ...] | None = None
         self.restart()
 
@@ -107,7 +110,7 @@ class AutopilotReports:
         for name, send in _MESSAGES.items():
             period = self._periods.get(name, math.inf)
             since = self._pilot.now - self._last.get(name, -math.inf)
-            if math.isinf(period) or since < period - 1e-6:
+            if math.isinf(period) or since < period - 1e-6 or name in self.muted:
                 continue
             self._last[name] = self._pilot.now
             send(self)
@@ -176,6 +179,13 @@ class AutopilotReports:
             self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12
         )
 
+    def _send_second_gnss(self) -> None:
+        if self._pilot.settings.second_gnss:
+            fix = mavlink.GPS_FIX_TYPE_3D_FIX
+            self._sender.gps2_raw_send(
+                self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12, 0, 0
+            )
+
 
 _MESSAGES: dict[str, Callable[[AutopilotReports], None]] = {
     'HEARTBEAT': AutopilotReports._send_heartbeat,
@@ -185,4 +195,5 @@ _MESSAGES: dict[str, Callable[[AutopilotReports], None]] = {
     'EXTENDED_SYS_STATE': AutopilotReports._send_landed,
     'EKF_STATUS_REPORT': AutopilotReports._send_estimator,
     'GPS_RAW_INT': AutopilotReports._send_gnss,
+    'GPS2_RAW': AutopilotReports._send_second_gnss,
 }

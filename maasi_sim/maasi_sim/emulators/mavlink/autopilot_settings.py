@@ -27,6 +27,7 @@ class AutopilotSettings(Settings):
     estimator_time: float = Field(
         default=2.0, ge=0.0, description='Until its position estimate is ready [s]'
     )
+    second_gnss: bool = Field(default=False, description='Whether it has a second GNSS receiver')
     noise: float = Field(
         default=0.005, ge=0.0, description='Deviation of its reported position [m]'
     )

@@ -158,7 +158,7 @@ class FakeAutopilot:
         self.reports.freeze()
 
     def lose_gnss(self) -> None:
-        """Lose GNSS: the fix at once, the position estimate when dead reckoning ends."""
+        """Lose the first receiver's fix; without a second one the position estimate later."""
         self._gnss_lost_at = self.now
 
     def restart(self) -> None:
@@ -286,11 +286,12 @@ class FakeAutopilot:
     @property
     def estimating(self) -> bool:
         """Whether its position estimate is good."""
-        return self.ready and not self._gnss_lost_for(_DEAD_RECKONING)
+        gnss = self.settings.second_gnss or not self._gnss_lost_for(_DEAD_RECKONING)
+        return self.ready and gnss
 
     @property
     def has_fix(self) -> bool:
-        """Whether it has a GNSS fix."""
+        """Whether its first GNSS receiver has a fix."""
         return not self._gnss_lost_for(0.0)
 
     def _gnss_lost_for(self, time: float) -> bool:
