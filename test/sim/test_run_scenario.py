@@ -212,6 +212,14 @@ def test_a_run_without_a_home_folder(tmp_path, scenario, monkeypatch):
     assert code == 0, output
 
 
+def test_an_error_of_the_planner_is_said_once(tmp_path, scenario):
+    script = {'planner_node': {'said': 'no goal accepted for 12 s'}, 'found': 2}
+    run = Run(tmp_path / 'run', scenario(), '--time-limit', '6', '--no-record', script=script)
+    code, output = run.wait()
+    assert code == 1, output
+    assert output.count('warning: /planner_node: no goal accepted for 12 s') == 1
+
+
 @pytest.fixture
 def follower():
     """Return a domain, and the simulation of another run in it that follows its clock."""
