@@ -43,6 +43,8 @@ _CHECK_PERIOD = 0.1
 _ANSWERS, _LAST_TASKS = 0.5, 5
 # Period of republishing a batch without an update [s].
 _ANSWER_PATIENCE = 1.0
+# Simulated time in which every goal is refused, until it is an error [s].
+_REFUSAL_PATIENCE = 10.0
 
 
 class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
@@ -179,8 +181,11 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self._keeper.forget()
 
     def fault(self) -> str:
-        """Return why the robots are held."""
-        return f'robots are held: {self._held}' if self._held else ''
+        """Return why the robots are held, or that they take no goals."""
+        if self._held:
+            return f'robots are held: {self._held}'
+        refused = self._orders.refused_for
+        return f'no goal accepted for {refused:.0f} s' if refused >= _REFUSAL_PATIENCE else ''
 
     def _command(self, word: str, names: list[str] | None) -> tuple[bool, str]:
         """Execute a command for robots (None: all); return acceptance and an answer as text."""

@@ -293,7 +293,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         now = time.monotonic()
         missing = self._missing()
         if missing:
-            if now - self._wall_start > _PATIENCE:
+            # The recorder comes last: it waits for all others.
+            if now - self._wall_start > _PATIENCE and missing != self.team_topic(RECORDER):
                 self._say_waiting(f'waits for {missing}', now)
             return
         if self._ready_since is None:

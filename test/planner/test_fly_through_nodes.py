@@ -1,6 +1,7 @@
 """Free running: goals that preempt one another, and robots whose planner dies meanwhile."""
 
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,3 +93,26 @@ def test_a_robot_that_refuses_the_next_waypoint_is_stopped_and_planned_anew():
         stopped = [state.goal_status for state in a.states if state.goal_id == refused[0] - 1]
         assert AgentState.CANCELED in stopped
         assert not world.logged('of another client')
+
+
+def test_robots_that_refuse_every_goal_are_an_error(monkeypatch):
+    monkeypatch.setattr('maasi_planner.planner_node._REFUSAL_PATIENCE', 1.0)
+    with driven(robots=ROBOTS) as world:
+        world.until(world.moving)
+        problems = [driver.goals.problem for driver in world.drivers]
+        for driver in world.drivers:
+            driver.goals.problem = lambda request: 'tested'
+        world.until(lambda: world.planner.fault().startswith('no goal accepted for '))
+        for driver, problem in zip(world.drivers, problems, strict=True):
+            driver.goals.problem = problem
+        world.until(lambda: world.moving() and not world.planner.fault())
+
+
+def test_a_driver_that_is_ended_is_no_warning():
+    with driven(robots=ROBOTS) as world:
+        world.until(world.moving)
+        infos, warnings = [], []
+        world.planner._goals._logger = SimpleNamespace(info=infos.append, warning=warnings.append)
+        assert world.drivers[0].trigger_deactivate().name == 'SUCCESS'
+        world.until(lambda: any(text.endswith('the driver stops') for text in infos + warnings))
+        assert warnings == []

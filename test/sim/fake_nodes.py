@@ -2,7 +2,7 @@
 
 Usage: fake_nodes.py ROLE --ros-args ... with parameters `robots`, `lockstep`, `step`, `fault`
 (none, die, hang, loop, raise, deaf, silent, mute), `fault_step`, `targets` (flat), `finished_step`,
-`marker`.
+`marker`, `said` (an error in the diagnostics).
 """
 
 import os
@@ -51,6 +51,7 @@ class Fake(Node):
         self.length = self.value('step', 0.05)
         self.fault = self.value('fault', 'none')
         self.fault_step = self.value('fault_step', 0)
+        self.said = self.value('said', '')
         self.full_name = self.get_fully_qualified_name()
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self.beat)
@@ -64,7 +65,9 @@ class Fake(Node):
 
     def beat(self):
         """Publish a sign of life, as all nodes do."""
-        self.diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(name=self.full_name)]))
+        status = DiagnosticStatus(name=self.full_name, message=self.said)
+        status.level = DiagnosticStatus.ERROR if self.said else DiagnosticStatus.OK
+        self.diagnostics.publish(DiagnosticArray(status=[status]))
 
     def say_ready(self, *peers):
         """Say so once each publisher has as many subscriptions as named, the recorder's apart."""

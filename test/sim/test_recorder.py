@@ -145,6 +145,11 @@ def test_the_share_explored_is_that_of_the_planners_diagnostics(session):
         publisher.publish(DiagnosticArray(status=[DiagnosticStatus(name=name, values=values)]))
     session.until(lambda: '/camera' in session.recorder.heartbeats)
     assert session.recorder.explored == 0.25
+    for level in (DiagnosticStatus.ERROR, DiagnosticStatus.OK):
+        status = DiagnosticStatus(name='/planner_node', level=level, message='refused')
+        publisher.publish(DiagnosticArray(status=[status]))
+        faults = {} if level == DiagnosticStatus.OK else {'/planner_node': 'refused'}
+        session.until(lambda faults=faults: session.recorder.faults == faults)
 
 
 def test_a_state_of_the_last_step_counts_also_after_the_end(session):

@@ -1,6 +1,7 @@
 """Runs with nodes that play by a script: how they end, what they leave, who is blamed."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -204,12 +205,26 @@ def test_report_and_replay_of_a_long_run_may_be_skipped(tmp_path, scenario):
         assert bag.counts['/filter_update'] == 3
 
 
-def test_a_run_without_a_home_folder(tmp_path, scenario, monkeypatch):
-    for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR'):
+def test_a_run_without_a_home_folder_in_a_poor_environment(tmp_path, scenario, monkeypatch):
+    for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR', 'XDG_RUNTIME_DIR', 'XDG_CACHE_HOME'):
         monkeypatch.delenv(name, raising=False)
-    run = Run(tmp_path / 'run', scenario(), '--lockstep')
+    monkeypatch.setenv('LC_ALL', 'C')
+    mask = os.umask(0o077)
+    try:
+        run = Run(tmp_path / """it's "here" """, scenario(), '--lockstep')
+    finally:
+        os.umask(mask)
     code, output = run.wait()
     assert code == 0, output
+    assert run.report['true_found'] == 3
+
+
+def test_an_error_of_the_planner_is_said_once(tmp_path, scenario):
+    script = {'planner_node': {'said': 'no goal accepted for 12 s'}, 'found': 2}
+    run = Run(tmp_path / 'run', scenario(), '--time-limit', '6', '--no-record', script=script)
+    code, output = run.wait()
+    assert code == 1, output
+    assert output.count('warning: /planner_node: no goal accepted for 12 s') == 1
 
 
 @pytest.fixture

@@ -333,11 +333,14 @@ def test_two_runs_are_the_same_to_the_bit_and_another_seed_is_not(make_team):
     assert runs[0][1] != runs[2][1]
 
 
-def test_nothing_is_published_until_everybody_is_there(make_team):
+def test_nothing_is_published_until_everybody_is_there(make_team, monkeypatch):
+    monkeypatch.setattr('maasi_sim.sim_node._PATIENCE', 0.0)
     team = make_team(recorder=True)
     team.say_ready()
     team.settle()
     assert team.sim.status()['waits for'] == '/recorder'
+    # It always comes last.
+    assert team.sim._said != 'waits for /recorder'
     assert not team.drivers['mambo'].of('odom') and not team.filter.steps
     recorder = team.add('recorder')
     recorder.say_ready()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rclpy.duration import Duration
 from rclpy.qos import (
     DurabilityPolicy,
@@ -84,3 +86,15 @@ def sensor_reader(lockstep: bool) -> QoSProfile:
 def sensor_writer(lockstep: bool) -> QoSProfile:
     """Return the QoS of publishers of sensor data."""
     return RELIABLE if lockstep else SENSOR
+
+
+def reader_of(profiles: Sequence[QoSProfile]) -> QoSProfile:
+    """Return the quality of service that gets all messages of publishers."""
+    reliable = all(item.reliability == ReliabilityPolicy.RELIABLE for item in profiles)
+    latched = all(item.durability == DurabilityPolicy.TRANSIENT_LOCAL for item in profiles)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL if reliable else HistoryPolicy.KEEP_LAST,
+        depth=1000,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

@@ -47,6 +47,9 @@ class Orders:
         self.lent: dict[str, int] = {}
         # Robots on their way to their start, with the number of that goal; 0: arrived.
         self._homing: dict[str, int] = {}
+        # Simulated time since which each goal was refused, and for how long by now [s].
+        self._refused_since: float | None = None
+        self.refused_for = 0.0
 
     def set_up(self, names: Sequence[str], answered: Callable[[], None]) -> TeamGoals:
         """Create the clients of the robots; `answered` is called after an answer to a goal."""
@@ -119,6 +122,10 @@ class Orders:
 
     def refuse(self, name: str) -> None:
         """Note that a robot did not take its goal: it gets another one."""
+        now = self._node.step * self._node.settings.step
+        if self._refused_since is None:
+            self._refused_since = now
+        self.refused_for = now - self._refused_since
         self.goals.forget(name)
         self._coordinator.refuse(name)
 
@@ -127,6 +134,8 @@ class Orders:
         coordinator, logger = self._coordinator, self._node.get_logger()
         if not coordinator.is_idle(name):
             number = coordinator.decision_index(name) + 1
+            if heard.goal == number:
+                self._refused_since, self.refused_for = None, 0.0
             course = self.goals.course(name, number, heard)
             if course is Course.UNDER_WAY:
                 return False

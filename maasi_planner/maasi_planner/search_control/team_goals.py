@@ -22,6 +22,8 @@ from maasi_planner.motion import RobotState
 ENDED = (AgentState.IDLE, AgentState.REACHED, AgentState.CANCELED, AgentState.ABORTED)
 # Reason in the result of a preempted goal, set by the driver.
 REPLACED = 'replaced'
+# Reason of a driver that ends, as it does at the end of a run.
+_DRIVER_STOPS = 'the driver stops'
 # Time after acceptance from which a state with another goal means that the goal is lost [s].
 _PATIENCE = 1.0
 
@@ -202,4 +204,6 @@ class TeamGoals:
         sent.status, sent.reason = int(answer.status), str(answer.result.reason)
         sent.ended_at = time.monotonic()
         if sent.status == GoalStatus.STATUS_ABORTED and self._sent.get(name) is sent:
-            self._logger.warning(f'{name}: goal {sent.number} was aborted: {sent.reason}')
+            text = f'{name}: goal {sent.number} was aborted: {sent.reason}'
+            # The states of the robot say that it takes part no more.
+            (self._logger.info if sent.reason == _DRIVER_STOPS else self._logger.warning)(text)

@@ -18,13 +18,13 @@ from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 
 from maasi_filter.ros.conversions import stamp_of_step
-from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, reader_of
 from maasi_msgs.msg import (
     AgentState,
     CuboidDecision,
@@ -144,6 +144,8 @@ class Recorder:
         self.first: dict[str, int] = {}
         #: Share of the environment explored, published by planners each second.
         self.explored = 0.0
+        #: Present errors of planners, by the name of the node.
+        self.faults: dict[str, str] = {}
         #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
         self._held: list[tuple[str, bytes]] = []
@@ -194,7 +196,7 @@ class Recorder:
             infos = self.node.get_publishers_info_by_topic(full)
             if not infos:
                 continue
-            qos = _reader_of([info.qos_profile for info in infos])
+            qos = reader_of([info.qos_profile for info in infos])
             try:
                 kind = message_class(types[0])
                 if self.bag is not None:
@@ -316,7 +318,7 @@ class Recorder:
             elif topic == DIAGNOSTICS:
                 for status in deserialize_message(data, DiagnosticArray).status:
                     self.heartbeats[status.name] = now
-                    self._note_explored(status)
+                    self._note_planner(status)
             # Also those of the last step that arrive after the end.
             self.observer.add(topic, data)
             if self.listener is not None and topic in self._shown:
@@ -327,10 +329,15 @@ class Recorder:
             taken = self._until(taken, self._last_step)
         self._record(taken)
 
-    def _note_explored(self, status: DiagnosticStatus) -> None:
-        """Note the exploration that a planner publishes between its decisions."""
+    def _note_planner(self, status: DiagnosticStatus) -> None:
+        """Note what a planner says between its decisions: its error, and the exploration."""
+        if not status.name.endswith('/planner_node'):
+            return
+        self.faults.pop(status.name, None)
+        if status.level == DiagnosticStatus.ERROR:
+            self.faults[status.name] = status.message
         for item in status.values:
-            if item.key == 'explored' and status.name.endswith('/planner_node'):
+            if item.key == 'explored':
                 with contextlib.suppress(ValueError):
                     self.explored = max(self.explored, float(item.value))
 
@@ -478,18 +485,6 @@ def _take(subscription: Subscription) -> list[bytes]:
         if item is None:
             return taken
         taken.append(item[0])
-
-
-def _reader_of(profiles: Sequence[QoSProfile]) -> QoSProfile:
-    """Return the quality of service that gets all messages of publishers."""
-    reliable = all(item.reliability == ReliabilityPolicy.RELIABLE for item in profiles)
-    latched = all(item.durability == DurabilityPolicy.TRANSIENT_LOCAL for item in profiles)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_ALL if reliable else HistoryPolicy.KEEP_LAST,
-        depth=1000,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
 
 
 def _never(_: bytes) -> None:

@@ -48,8 +48,8 @@ def build_parser() -> argparse.ArgumentParser:
         prog='run_scenario',
         description='Run a scenario as separate ROS 2 processes, or replay a recording of one.',
         epilog='Exit codes: 0 all targets found (or, with stop: planner_done, ended as meant), '
-        '1 not all found, 2 wrong input, 3 a node died or hung, 4 bag or report could not be '
-        'written (disk full), 130 interrupted.',
+        '1 not all found, 2 wrong input, 3 a node died or hung, 4 bag or report not '
+        'written (disk full) or with gaps, 130 interrupted.',
     )
     parser.add_argument(
         'scenario', nargs='?', metavar='FILE', help='scenario file, or name of one in config'

@@ -91,6 +91,8 @@ class Session:
         self._interruption = interruption
         self._display = display
         self._bag: BagWriter | None = None
+        # Planners whose present error was printed.
+        self._told: set[str] = set()
         self._open = contextlib.ExitStack()
         # Wall time of the first step and of the end.
         self._begun: float | None = None
@@ -293,8 +295,15 @@ class Session:
                         f'{self._limits.silence:g} s',
                     )
                 return supervisor.standstill(recorder)
+            self._tell_faults()
             if self._display.due or self.observer.news:
                 self._show()
+
+    def _tell_faults(self) -> None:
+        """Print an error of a planner when it begins."""
+        for name in self.recorder.faults.keys() - self._told:
+            self._display.say(f'warning: {name}: {self.recorder.faults[name]}')
+        self._told = set(self.recorder.faults)
 
     def _finish_step(self) -> None:
         """Report that the recorder is done with a step, once the disk keeps up."""
