@@ -73,7 +73,9 @@ class RobotTopics:
             power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
             present=True,
         )
-        self._full = 100.0 if robot.battery_unit == 'percent' else 1.0
+        # Robots that search buildings have no such setting.
+        unit = getattr(robot, 'battery_unit', 'fraction')
+        self._full = 100.0 if unit == 'percent' else 1.0
         self._battery.header.frame_id = f'{name}/base_link'
         #: Sensor topic that the driver needs besides odometry.
         self.sensor_topic = ''
