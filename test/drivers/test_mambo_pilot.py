@@ -375,3 +375,24 @@ def test_a_permission_ends_with_the_link():
     assert flight.pilot.phase is Phase.GROUND
     assert UNTIL_ARM in flight.pilot.problem
     assert flight.firmware.take_offs == 0
+
+
+@pytest.mark.parametrize('pose', ['events', 'pose'])
+@pytest.mark.parametrize('drag', [0.3, 3.0])
+def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
+    flight = Flight(drag=drag, delay=0.2, pose=pose, lost_link='hover')
+
+    def step():
+        if flight.where[2] > 0.05:
+            # Wind.
+            flight.firmware._body.velocity[0] += 0.2 * STEP
+        if pose == 'pose':
+            flight.pilot.take_pose(flight.time, flight.firmware.state)
+        flight.step()
+        return np.linalg.norm(flight.where - flight.goal)
+
+    flight.goal = np.array([1.5, 0.3, 1.0])
+    while flight.time < 30.0:
+        step()
+    assert flight.pilot.phase is Phase.FLYING
+    assert max(step() for _ in range(100)) < 0.03

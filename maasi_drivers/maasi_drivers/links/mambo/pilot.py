@@ -144,7 +144,7 @@ class MamboPilot:
         """Take a pose of another system, at `now` of the monotonic clock [s]."""
         self._note_place(now, state.pose.position)
         self._now = self._other_at = now
-        self.reckoning.take(state, now)
+        self.reckoning.take(state, now, self.flying)
 
     def _note_place(self, now: float, place: FloatArray) -> None:
         commanded = float(np.abs(self._command[:3]).max()) > _LEAST_SPEED
@@ -191,7 +191,8 @@ class MamboPilot:
         self._desired = self._now, self._stoppable(course, ramped)
         desired = turned @ self._desired[1]
         speed = turned @ course.velocity[:2]
-        tilts = model.shares(model.drag * desired + _SPEED_GAIN * (desired - speed))
+        against = turned @ self.reckoning.push
+        tilts = model.shares(model.drag * desired + _SPEED_GAIN * (desired - speed) - against)
         rest = [command[2] / model.climb, command[3] / model.turn]
         self._send(command, np.clip([*tilts, *rest], -1.0, 1.0))
 

@@ -30,6 +30,10 @@ _JUMP = 0.5
 _LONGEST = 1.0
 _HISTORY = 64
 _STILL = np.zeros(4)
+# Share of a position event's error that is the push; with poses of another system the time in
+# which it is learnt [s]; the largest [m/s^2]; and the speed above which the model's errors are
+# larger than it [m/s].
+_PUSH_GAIN, _PUSH_TIME, _MOST_PUSH, _SLOW = 0.08, 2.0, 0.5, 0.1
 
 
 class DeadReckoning:
@@ -55,9 +59,13 @@ class DeadReckoning:
         self.origin = origin
         self.settings = settings
         self.course = Course(origin.position, np.zeros(3), origin.yaw)
+        #: Steady acceleration by wind, or by a level that is off, (2,) [m/s^2, map].
+        self.push = np.zeros(2)
         #: Time of flight since the last correction [s].
         self.age = 0.0
         self._turn = origin.rotation()
+        # By the last event [m].
+        self._measured = origin.position
         # Recent commands, and the time at which each takes effect.
         self._sent: deque[tuple[float, FloatArray]] = deque([(-math.inf, _STILL)])
         self._now: float | None = None
@@ -126,12 +134,15 @@ class DeadReckoning:
         for (acts, shares), until in zip(sent, ends, strict=True):
             h = min(until, end) - max(acts, begin)
             if h > 0.0:
-                course = self.model.advance(course, shares, h)
+                course = self.model.advance(course, shares, h, self.push)
         return course
 
-    def take(self, state: RobotState, now: float) -> None:
+    def take(self, state: RobotState, now: float, flying: bool) -> None:
         """Take the pose of another system, of `now` on the monotonic clock [s]."""
         self._now = now
+        if flying:
+            change = (state.velocity - self.course.velocity) / _PUSH_TIME
+            self._learn(change, state.velocity)
         self.course = Course(state.pose.position, state.velocity, state.pose.yaw)
 
     def correct(self, event: PositionEvent, flying: bool) -> None:
@@ -146,6 +157,9 @@ class DeadReckoning:
             self.course = Course(measured, velocity, heading)
             self._past.clear()
             return
+        change = _PUSH_GAIN / _EVENT_PERIOD**2 * error
+        self._learn(change, (measured - self._measured) / _EVENT_PERIOD)
+        self._measured = measured
         turn = _wrapped(heading - yaw)
         move = _POSITION_GAIN * error
         course = self.course
@@ -156,6 +170,11 @@ class DeadReckoning:
         )
         moved = [(at, place + move, yaw + turn) for at, place, yaw in self._past]
         self._past = deque(moved, maxlen=_HISTORY)
+
+    def _learn(self, change: FloatArray, measured: FloatArray) -> None:
+        """Correct the push by what the last prediction missed, at a measured velocity."""
+        if float(np.hypot(*measured[:2])) < _SLOW:
+            self.push = np.clip(self.push + change[:2], -_MOST_PUSH, _MOST_PUSH)
 
     def _at(self, now: float) -> tuple[FloatArray, float]:
         """Return position and heading at a time of the monotonic clock."""

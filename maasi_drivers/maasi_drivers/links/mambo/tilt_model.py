@@ -19,6 +19,7 @@ FloatArray = NDArray[np.float64]
 _GRAVITY = 9.81
 # Approximate rate at which the firmware brakes without roll and pitch [1/s].
 _HOVER_RATE = 2.0
+_STILL_AIR = np.zeros(2)
 
 
 @dataclass(frozen=True)
@@ -67,16 +68,21 @@ class TiltModel:
         """Deceleration for each m/s of speed [1/s]."""
         return self.thrust / self.full_speed
 
-    def advance(self, course: Course, shares: FloatArray, h: float) -> Course:
-        """Return the course after `h` seconds under shares (4,): forward, left, up, turn."""
+    def advance(
+        self, course: Course, shares: FloatArray, h: float, push: FloatArray = _STILL_AIR
+    ) -> Course:
+        """Return the course after `h` seconds under shares (4,): forward, left, up, turn.
+
+        `push` (2,) is a steady acceleration by what is not commanded [m/s^2, map].
+        """
         forward, left, up, turn = shares.tolist()
         cosine, sine = math.cos(course.yaw), math.sin(course.yaw)
         rate = self.drag if forward or left else self.drag + _HOVER_RATE
         pull = self.thrust / rate
         steady = np.array(
             [
-                pull * (cosine * forward - sine * left),
-                pull * (sine * forward + cosine * left),
+                pull * (cosine * forward - sine * left) + push[0] / rate,
+                pull * (sine * forward + cosine * left) + push[1] / rate,
                 self.climb * up,
             ]
         )
