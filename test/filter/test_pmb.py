@@ -249,6 +249,53 @@ def test_found_target_that_is_missed_again_and_again_is_withdrawn():
     assert search.found_targets == []
 
 
+def answering(share, targets, scans=80, seed=0, later=None):
+    """Return a filter of places that answer with a share of pi each, and whether each is found.
+
+    After 20 scans the shares are those of `later`.
+    """
+    generator = np.random.default_rng(seed)
+    # Precise enough for one place not to be taken for another.
+    sensor = plane_sensor(range_noise=0.5, bearing=0.01)
+    search = plane_filter(seed=seed, expected_targets=5.0)
+    for step in range(scans):
+        place = generator.uniform(20.0, 80.0, 2)
+        pose = Pose(place)
+        share = later if later and step == 20 else share
+        chance = np.asarray(share) * sensor.detection.probability(targets, pose)
+        seen = targets[generator.random(len(targets)) < chance]
+        values = observe(generator, sensor, seen, place)
+        search.step([measured(sensor, place, values, step)], 1, step)
+    found = np.array([target.position for target in search.found_targets]).reshape(-1, 2)
+    gaps = np.linalg.norm(targets[:, None] - found[None], axis=2)
+    return search, (gaps < 3.0).any(axis=1).tolist()
+
+
+FOUR = np.array([[20.0, 30.0], [70.0, 60.0], [60.0, 20.0], [30.0, 75.0]])
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_place_that_answers_too_rarely_is_not_found(seed):
+    search, found = answering([1.0, 1.0, 1.0, 0.3], FOUR, seed=seed)
+    assert found == [True, True, True, False]
+    # It is hardly worth another look.
+    assert sum(cluster.mass for cluster in search.clusters) < 0.5
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_where_all_answer_half_as_often_all_are_targets(seed):
+    assert answering(0.5, FOUR, seed=seed)[1] == [True] * 4
+
+
+def test_found_target_that_answers_too_rarely_is_withdrawn():
+    _, found = answering(1.0, FOUR, scans=20)
+    assert found == [True] * 4
+    search, found = answering(1.0, FOUR, scans=100, later=[1.0, 1.0, 1.0, 0.3])
+    assert found == [True, True, True, False]
+    # Its detections restore its existence.
+    assert sum(item.existence > 0.9 for item in search.components) == 4
+
+
 def test_walking_targets_widen_and_spread_what_is_unexplored():
     sensor = plane_sensor(range_noise=0.5, bearing=0.01)
     generator = np.random.default_rng(0)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.models.label import LabelTally
+from maasi_filter.pmb.answers import RATES, log_answers
 from maasi_filter.pmb.births import LEAST_SUPPORT, Births
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
@@ -88,6 +89,8 @@ class Component:
         Its class and identity.
     stale : bool
         Whether `density` has changed since `target` was estimated.
+    answers : (k,) array
+        Log likelihood of its detections and misses since birth, with each of RATES.
     """
 
     existence: float
@@ -100,6 +103,7 @@ class Component:
     target: FoundTarget | None = None
     labels: LabelTally = field(default_factory=LabelTally)
     stale: bool = False
+    answers: FloatArray = field(default_factory=lambda: np.zeros(len(RATES)))
 
     @property
     def foreign(self) -> bool:
@@ -158,6 +162,7 @@ class Component:
         if self.foreign or not self.existence > 0.0:
             return False
         self.hits += detections / self.existence
+        self.answers = self.answers + log_answers(detected, nothing / self.existence)
         share = own / self.existence
         taken = (share > LEAST_SHARE).nonzero()[0]
         head = scan.head.copy()

@@ -28,6 +28,7 @@ from maasi_filter.measurement_check import (
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb import state as pmb_state
+from maasi_filter.pmb.answers import PRIOR, rate_of_targets, reflects
 from maasi_filter.pmb.association import Marginals, associate
 from maasi_filter.pmb.births import Births, born, draw_births
 from maasi_filter.pmb.component import Component, View, merge, views
@@ -59,6 +60,10 @@ LEAST_EXISTENCE = 1e-4
 LEAST_CLUSTER_MASS = 0.1
 # Default of T_r, in standard deviations of the range.
 FOUND_RADIUS_DEVIATIONS = 2.0
+# Probability of being a reflection below which a target can be found, and above which a found one
+# is withdrawn.
+MOST_REFLECTING = 0.3
+SURELY_REFLECTING = 0.5
 # Gate on the squared normalised distance for merging components.
 SAME_PLACE = 6.0
 # Existence probability of targets that other filters found.
@@ -103,6 +108,7 @@ class PmbFilter:
         self.clusters: list[Cluster] = []
         self._learnt = Learnt()
         self._offsets = Offsets(self._numbers.pmb.offset, self.dimension)
+        self._rates: FloatArray = PRIOR
         self._scans = 0
         self._last_id = 0
         self._last_time: float | None = None
@@ -162,6 +168,7 @@ class PmbFilter:
         dropped: dict[str, int] = {}
         newly_found: list[FoundTarget] = []
         changed = self._predict(time)
+        self._rates = self._rate_of_targets()
         for member in members:
             changed |= self._correct(member, newly_found, dropped, time)
         self._estimate_found()
@@ -257,6 +264,7 @@ class PmbFilter:
             elif (
                 moved
                 and can_be_found(item, self._numbers.pmb.found_probability)
+                and reflects(item.answers, self._rates) < MOST_REFLECTING
                 and not is_known(i, self.components, marginals.caused)
             ):
                 newly_found.append(self._find(item, member, time))
@@ -304,10 +312,16 @@ class PmbFilter:
         if item.foreign:
             item.existence = CERTAIN
             return False
-        if item.existence < self._numbers.pmb.withdrawn_probability:
+        reflecting = reflects(item.answers, self._rates) > SURELY_REFLECTING
+        if reflecting or item.existence < self._numbers.pmb.withdrawn_probability:
             item.target = None
             return True
         return moved
+
+    def _rate_of_targets(self) -> FloatArray:
+        """Return how often targets answer, of what pi says, from all that probably exist."""
+        items = [item for item in self.components if item.existence >= LEAST_CLUSTER_MASS]
+        return rate_of_targets([item.answers for item in items], [item.existence for item in items])
 
     def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
         """Return a target with the moments of its particles and the position error of the robot."""
@@ -359,19 +373,17 @@ class PmbFilter:
         self.components = found + merge(others, SAME_PLACE)
 
     def _cluster(self) -> None:
-        self.clusters = sorted(
-            (
-                Cluster(
-                    item.density.mean.copy(),
-                    item.density.covariance.copy(),
-                    item.density.radius,
-                    item.existence,
-                )
-                for item in self.components
-                if item.target is None and item.existence >= LEAST_CLUSTER_MASS
-            ),
-            key=lambda cluster: -cluster.mass,
-        )
+        """Publish what may be a target that is not found; a place that reflects weighs less."""
+        clusters = []
+        for item in self.components:
+            if item.target is not None or item.existence < LEAST_CLUSTER_MASS:
+                continue
+            mass = item.existence * (1.0 - reflects(item.answers, self._rates))
+            if mass >= LEAST_CLUSTER_MASS:
+                density = item.density
+                mean, covariance = density.mean.copy(), density.covariance.copy()
+                clusters.append(Cluster(mean, covariance, density.radius, mass))
+        self.clusters = sorted(clusters, key=lambda cluster: -cluster.mass)
 
     def _found_radius(self, member: CheckedMeasurement) -> float:
         """Return T_r [m]."""

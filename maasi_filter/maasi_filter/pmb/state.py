@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from maasi_filter.models.custom_kernel import renew_addresses
 from maasi_filter.models.label import LabelTally
+from maasi_filter.pmb.answers import RATES
 from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.consistency import NOTHING
 from maasi_filter.pmb.density import Density
@@ -38,6 +39,7 @@ _ARRAYS: dict[str, tuple[str, str]] = {
     'last_time': ('f', ''),
     'existence': ('f', 'b'),
     'hits': ('f', 'b'),
+    'answers': ('f', 'b RATE'),
     'scan': ('i', 'b'),
     'pose_error': ('f', 'b'),
     'found_radius': ('f', 'b'),
@@ -63,7 +65,7 @@ _ARRAYS: dict[str, tuple[str, str]] = {
     'consistency': ('f', 'r 3'),
     **OFFSET_ARRAYS,
 }
-_SIZES = {'HEAD': HEAD, 'TERM': TERM, 'LEVEL': len(LEVELS)}
+_SIZES = {'HEAD': HEAD, 'TERM': TERM, 'LEVEL': len(LEVELS), 'RATE': len(RATES)}
 _NOT_NEGATIVE = (
     'hits',
     'pose_error',
@@ -114,6 +116,7 @@ def to_arrays(
         'method': text('pmb'),
         'existence': np.array([item.existence for item in items], float),
         'hits': np.array([item.hits for item in items], float),
+        'answers': np.array([item.answers for item in items]).reshape(-1, len(RATES)),
         'scan': np.array([item.scan for item in items], np.int64),
         'pose_error': np.array([item.pose_error for item in items], float),
         'found_radius': np.array([item.found_radius for item in items], float),
@@ -190,6 +193,7 @@ def components_of(
                 births[c],
                 target if target.id else None,
                 labels[c],
+                answers=state['answers'][c].copy(),
             )
         )
     return components
