@@ -138,3 +138,10 @@ def test_a_robot_that_touches_something_may_leave():
     model.see([[0.1, 0.0]])
     command = model.command(RobotState.at_rest([0.0, 0.0, 0.0]), [1.0, 0.0, 0.0])
     assert command[0] == 0.0
+
+
+def test_it_keeps_a_margin_to_a_wall():
+    along = np.arange(-0.8, 0.81, 0.03)
+    wall = np.stack([np.full(len(along), 1.0), along], axis=1)
+    _, least = drive([0.95, 0.0], wall, np.full(len(along), 0.02), seconds=25.0)
+    assert least > RADIUS + 0.02

@@ -199,7 +199,7 @@ class ScanUnicycle(Unicycle):
         seen = np.zeros((int(near.sum()), 5))
         seen[:, :2] = self.points[near]
         seen[:, 3] = np.minimum(
-            self.keep_out.radius + 0.1 * self.keep_out.clearance, away[near] - _SKIN
+            self.keep_out.radius + 0.5 * self.keep_out.clearance, away[near] - _SKIN
         )
         circles = np.concatenate([self.keep_out.circles, seen])
         target_x, target_y, self._heading = way_around(
