@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from maasi_filter.pmb.association import associate
+from maasi_filter.pmb.association import associate, propagate
 
 
 def enumerated(odds, other):
@@ -74,3 +74,15 @@ def test_nothing_to_associate(shape):
     np.testing.assert_array_equal(found.missed, np.ones(shape[0]))
     np.testing.assert_array_equal(found.new, np.ones(shape[1]))
     assert found.caused.shape == shape
+
+
+@pytest.mark.parametrize(('n', 'm'), [(1, 3), (3, 1), (3, 3)])
+def test_the_log_of_the_sum_of_all_weights_is_that_of_enumeration(n, m):
+    ratios = np.exp(2.0 * np.random.default_rng(n + m).standard_normal((n, m)))
+    total = sum(
+        np.prod([ratios[i, j] for i, j in enumerate(choice) if j >= 0])
+        for choice in itertools.product(range(-1, m), repeat=n)
+        if all(choice.count(j) <= 1 for j in range(m))
+    )
+    log_sum = propagate(ratios, np.empty(n), np.empty((n, m)), np.empty(m))
+    assert log_sum == pytest.approx(np.log(total), abs=1e-9 if min(n, m) == 1 else 0.3)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
@@ -25,17 +27,15 @@ _RARE = MOST_OF_REFLECTION * COMMON[:, None] >= RATES
 _REFLECTION = REFLECTIONS * _RARE / _RARE.sum(axis=1, keepdims=True)
 
 
-def log_answers(detected: float, missed: float) -> FloatArray:
-    """Return the log likelihood of a look with each rate, (k,).
+@njit(cache=True, error_model='numpy')
+def add_look(answers, detected, missed):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Add the log likelihood of a look with each rate to `answers` (k,).
 
-    Parameters
-    ----------
-    detected : float
-        p_D, as it is believed.
-    missed : float
-        Probability that the place did not answer.
+    `detected` is p_D as it is believed, `missed` the probability that the place did not answer.
     """
-    return missed * np.log1p(-RATES * detected) + (1.0 - missed) * np.log(RATES)
+    for k in range(len(RATES)):
+        answers[k] += missed * math.log1p(-RATES[k] * detected)
+        answers[k] += (1.0 - missed) * math.log(RATES[k])
 
 
 def rate_of_targets(answers: Sequence[FloatArray], existence: Sequence[float]) -> FloatArray:
@@ -50,8 +50,15 @@ def rate_of_targets(answers: Sequence[FloatArray], existence: Sequence[float]) -
     return np.asarray(weights / weights.sum())
 
 
-def reflects(answers: FloatArray, rates: FloatArray) -> float:
+@njit(cache=True, error_model='numpy')
+def reflects(answers, rates):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Return the probability that a place is a reflection, from its answers and those of all."""
-    likelihoods = np.exp(answers - answers.max())
-    target, reflection = rates @ _TARGET @ likelihoods, rates @ _REFLECTION @ likelihoods
-    return float(reflection / (target + reflection))
+    peak = answers.max()
+    target = 0.0
+    reflection = 0.0
+    for k in range(len(answers)):
+        likelihood = math.exp(answers[k] - peak)
+        for c in range(len(rates)):
+            target += rates[c] * _TARGET[c, k] * likelihood
+            reflection += rates[c] * _REFLECTION[c, k] * likelihood
+    return reflection / (target + reflection)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maasi_filter.models.label import LabelTally
-from maasi_filter.pmb.answers import RATES, log_answers
+from maasi_filter.pmb.answers import RATES, add_look
 from maasi_filter.pmb.births import LEAST_SUPPORT, Births
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
@@ -162,7 +162,7 @@ class Component:
         if self.foreign or not self.existence > 0.0:
             return False
         self.hits += detections / self.existence
-        self.answers = self.answers + log_answers(detected, nothing / self.existence)
+        add_look(self.answers, detected, nothing / self.existence)
         share = own / self.existence
         taken = (share > LEAST_SHARE).nonzero()[0]
         head = scan.head.copy()

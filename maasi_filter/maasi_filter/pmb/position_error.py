@@ -24,6 +24,8 @@ PRIOR = np.array([0.96, 0.01, 0.01, 0.01, 0.01])
 CHANGE = 0.005
 # Components below this r are not considered.
 LEAST_EXISTENCE = 0.1
+# Gate on the range, in deviations of the largest error and root mean square radii.
+GATE = 4.0
 
 
 @njit(cache=True, error_model='numpy')
@@ -61,6 +63,18 @@ def _log_sums(errors, jacobians, covariances, noise, variances, odds, out):  # t
         out[k] = propagate(psi, missed, caused, new)
 
 
+def _near(member: CheckedMeasurement, items: Sequence[Component], reach: float) -> list[Component]:
+    """Return the components whose distance from the robot is that of a detection, nearly."""
+    if not (items and len(member.values)):
+        return []
+    means = np.array([item.density.mean for item in items])
+    radii = np.array([item.density.radius for item in items])
+    offsets = means - member.pose.position[: means.shape[1]]
+    gaps = np.abs(np.sqrt(np.square(offsets).sum(axis=1))[:, None] - member.values[:, 0])
+    near = gaps.min(axis=1) < reach + GATE * radii
+    return [item for item, kept in zip(items, near.tolist()) if kept]
+
+
 class PositionErrors:
     """Probabilities of the errors in LEVELS, for each robot.
 
@@ -90,9 +104,10 @@ class PositionErrors:
             N0 / V, per m^d: the largest intensity of undetected targets.
         """
         before = self.probabilities.get(member.robot, PRIOR)
-        likely = [item for item in components if item.existence >= LEAST_EXISTENCE]
         unit = math.sqrt(member.sensor.covariance[0, 0])
-        if likely and len(member.values):
+        likely = [item for item in components if item.existence >= LEAST_EXISTENCE]
+        likely = _near(member, likely, GATE * unit * LEVELS[-1])
+        if likely:
             logs = self._log_likelihoods(member, likely, clutter, unseen, unit)
             after = ((1.0 - CHANGE) * before + CHANGE * PRIOR) * np.exp(logs - logs.max())
             before = self.probabilities[member.robot] = after / after.sum()
