@@ -398,6 +398,7 @@ def test_goals_that_are_not_finite_or_outside_the_geofence_are_refused(fly, capf
 
 def test_without_a_geofence_it_is_not_sent_into_the_ground(fly):
     flight = fly()
+    flight.until(lambda: flight.driver.history.latest)
     assert 'the geofence' in flight.driver.goals.problem(flight.team.goal([0.0, 1.0, -0.1]))
     assert flight.driver.goals.problem(flight.team.goal([0.0, 1.0, 0.1])) is None
 
@@ -474,7 +475,7 @@ def test_a_sensor_that_falls_silent(fly):
         if flight.team.states:
             flight.team.ranges.publish(RangeArray(header=flight.state.header))
 
-    assert flight.team.call('arm').success
+    flight.until(lambda: flight.team.call('arm').success)
     flight.until(
         lambda: (
             sweep() or (flight.team.states and flight.state.goal_status != AgentState.UNAVAILABLE)

@@ -59,8 +59,8 @@ def test_files_of_a_killed_node_go_and_those_of_a_live_one_stay(domain):
     killed, left = started()
     killed.kill()
     killed.wait(PATIENCE)
-    assert left and all(path.exists() for path in left)
-    # Another process that looks at the same moment has the files open.
+    assert left
+    # Another process that looks at the same moment has the files open, or removes them.
     wait_until(lambda: not any(path.exists() for path in left), remove_dead)
     live, used = started()
     try:

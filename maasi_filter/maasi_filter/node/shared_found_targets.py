@@ -67,7 +67,8 @@ class SharedFoundTargets:
         """
         for subscription in self._subscriptions:
             # Lockstep only guarantees that the messages have arrived, not that they were read.
-            while (taken := subscription.handle.take_message(FoundTargetArray, False)) is not None:
+            handle, raw = subscription.handle, subscription.raw
+            while (taken := handle.take_message(FoundTargetArray, raw)) is not None:
                 subscription.callback(taken[0])
         changed = False
         for name, waiting in self._waiting.items():
