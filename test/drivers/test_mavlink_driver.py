@@ -397,8 +397,7 @@ def test_goals_that_are_not_finite_or_outside_the_geofence_are_refused(fly, capf
 
 
 def test_without_a_geofence_it_is_not_sent_into_the_ground(fly):
-    flight = fly()
-    flight.until(lambda: flight.driver.history.latest)
+    flight = fly().fly()
     assert 'the geofence' in flight.driver.goals.problem(flight.team.goal([0.0, 1.0, -0.1]))
     assert flight.driver.goals.problem(flight.team.goal([0.0, 1.0, 0.1])) is None
 
