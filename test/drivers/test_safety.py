@@ -109,6 +109,7 @@ def test_a_low_battery_ends_the_way(play):
 
 def test_a_twist_without_a_stamp_for_a_robot_that_wants_it(play):
     _, team = play(command_type='twist')
+    team.move()
     team.send_accepted([1.0, 1.0, 0.0])
     team.move(3)
     assert np.any(team.command != 0.0)
@@ -279,6 +280,7 @@ def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play, height)
 def test_the_type_of_the_commands_is_found_out(play):
     """Humble's TurtleBot3 listens to Twist, Jazzy's to TwistStamped."""
     _, team = play(wants=Twist)
+    team.move()
     team.send_accepted([1.0, 1.0, 0.0])
     team.move(3)
     assert np.any(team.command != 0.0)

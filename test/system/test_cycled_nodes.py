@@ -103,3 +103,4 @@ def test_nodes_survive_cycles_back_to_back_and_the_search_goes_on(tmp_path, scen
             cycler.close()
             run.kill()
             run.wait()
+            print(log.read_text())

@@ -206,4 +206,7 @@ class TeamGoals:
         if sent.status == GoalStatus.STATUS_ABORTED and self._sent.get(name) is sent:
             text = f'{name}: goal {sent.number} was aborted: {sent.reason}'
             # The states of the robot say that it takes part no more.
-            (self._logger.info if sent.reason == _DRIVER_STOPS else self._logger.warning)(text)
+            if sent.reason == _DRIVER_STOPS:
+                self._logger.info(text)
+            else:
+                self._logger.warning(text)
