@@ -172,14 +172,15 @@ class _User:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line."""
     options = build_parser().parse_args(arguments)
-    # Ctrl-C cancels the goal before the context ends.
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node('robot_command', use_global_arguments=False)
     try:
+        # Ctrl-C cancels the goal before the context ends.
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node('robot_command', use_global_arguments=False)
         user = _User(node, options)
         return user.show() if options.word == 'state' else user.go()
+    except KeyboardInterrupt:  # before the user's own handler
+        return INTERRUPTED
     finally:
-        node.destroy_node()
         rclpy.try_shutdown()
 
 
