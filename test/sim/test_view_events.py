@@ -64,7 +64,7 @@ def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_en
         taken.take('/lockstep/step', step(float(seconds), *present))
         taken.take('/rover/state', state(float(seconds), goal_status=AgentState.MOVING))
         for name in ('crawler', 'walker'):
-            # One falls silent; the other's driver goes on after it has left.
+            # One falls silent; the other's driver still publishes after it has left.
             if name == 'walker' or seconds < 2:
                 other = state(float(seconds), goal_status=AgentState.MOVING)
                 other.robot = name

@@ -175,7 +175,7 @@ def test_half_open_connections_make_room(hub, server):
         socket.create_connection(('127.0.0.1', server.port), timeout=PATIENCE)
         for _ in range(3 * MOST_IDLE)
     ]
-    # The oldest were closed, without a thread that goes on.
+    # The oldest were closed, and their threads ended.
     assert held[0].recv(1) == b'' and held[MOST_IDLE].recv(1) == b''
     wait_until(lambda: threading.active_count() <= threads + MOST_IDLE)
     assert ask(server, 'GET', '/')[0] == 200

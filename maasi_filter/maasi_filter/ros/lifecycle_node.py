@@ -261,10 +261,10 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._parameters_read.release()
 
     def permanent(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return an entity that *cleanup* must not destroy, as others wait for its answer.
+        """Return an entity that *cleanup* must not destroy; `NodeEntities` says why.
 
-        That is an action client, an action server or a subscription with event callbacks. It is
-        made at the first call with this key, and lives as long as the node (`NodeEntities`).
+        That is an action client, an action server, a service or a subscription with event
+        callbacks. It is made at the first call with this key, and lives as long as the node.
         """
         return self._entities_made.permanent(key, make)
 

@@ -195,8 +195,8 @@ def _problem_of(robot: RobotDecision, bounds: FloatArray) -> str:
             return f'{field}: got shape {value.shape}, allowed is {shape}'
         if field not in terms and not finite(value):
             return f'{field}: got a number that is not finite'
-    if not (isinstance(robot.chosen, int | np.integer) and robot.chosen < rows[0]):
-        return f'chosen: got {robot.chosen!r:.80}, allowed are integers below {rows[0]}'
+    if not (isinstance(robot.chosen, int | np.integer) and -1 <= robot.chosen < rows[0]):
+        return f'chosen: got {robot.chosen!r:.80}, allowed are -1 (stay) to {rows[0] - 1}'
     if not robot.stays and not in_bounds(robot.waypoint[None, :], bounds)[0].all():
         return f'waypoint: got {robot.waypoint.tolist()}, allowed is inside {bounds.tolist()} [m]'
     return ''

@@ -94,7 +94,7 @@ class ScenarioRun:
             )
             for text in self._doubts:
                 self.display.say(f'warning: {text}')
-            # An interruption here is reported once the session starts.
+            # An interruption here is reported once `Session` starts.
             with self.interruption.at_once():
                 self.supervisor.load(self.mission.warm_up)
             return self._execute(domain)

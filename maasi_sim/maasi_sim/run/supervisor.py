@@ -154,7 +154,7 @@ class Supervisor:
 
     def _check_start(self) -> Ending | None:
         """Return an ending if a restarted node takes too long to start."""
-        # Before the first step the session waits for the nodes.
+        # Before the first step `Session` waits for the nodes.
         late = self.watch.late(self._checked) if self.running else []
         if not late:
             return None

@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 # Objectives below this stand for candidates that are not allowed.
 _NOT_ALLOWED = -1e29
 # Status of a robot: of AgentState, and what only those who watch know.
-UNAVAILABLE, LEFT, SILENT, ENDED = 5, 6, 7, 8
+MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
 # A robot is silent when others say where they are for so long without it [s].
 _SILENCE = 3.0
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])

@@ -138,7 +138,7 @@ class MessageEvents:
         place = (*_point(pose.position), yaw)
         if all(map(math.isfinite, place)):
             time = self._now(topic, message)
-            # The driver of a robot that left may go on for a while.
+            # The driver of a robot that left may publish for a while.
             if self._team is not None and message.robot not in self._team:
                 return
             self.maker.robot(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from maasi_sim.buildings.picture import draw_box
 from maasi_sim.run.run_folder import write_whole
 from maasi_sim.view.event_log import Event, EventLog
-from maasi_sim.view.event_maker import LEFT, SILENT, UNAVAILABLE
+from maasi_sim.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
 FloatArray = NDArray[np.float64]
 
@@ -32,8 +32,6 @@ _ROBOTS = ('#0072B2', '#D55E00', '#8C564B', '#56B4E9', '#7F7F7F', '#CC79A7')
 _NAMED = {'purple': '#7B3294', 'red': '#D62728', 'green': '#2CA02C', 'blue': '#0072B2'}
 # The last picture is shown for so long [s].
 _HOLD = 2.0
-# Status of a robot on its way.
-_MOVING = 1
 # Detections are shown for so long [s].
 _FADE = 1.0
 
@@ -291,11 +289,11 @@ def _draw_robots(axes: Any, moments: Moments, time: float, spatial: bool) -> Non
         path = np.array([event[3][:size] for event in moments.until('robot', name, time)])
         axes.plot(*path.T, '-', color=colour, lw=1.3)
         status = now[name][5]
-        ways = moments.until('way', name, time) if status == _MOVING else []
+        ways = moments.until('way', name, time) if status == MOVING else []
         if ways and ways[-1][3]:
             axes.plot(*np.array(ways[-1][3])[:, :size].T, '--', color=colour, lw=1.3)
         waypoint = moments.waypoint(name, time)
-        if waypoint is not None and status == _MOVING:
+        if waypoint is not None and status == MOVING:
             axes.plot(*np.array(waypoint)[:size, None], 's', color=colour, ms=8, mfc='none')
         *place, yaw = now[name][3]
         away = status in (UNAVAILABLE, LEFT, SILENT)

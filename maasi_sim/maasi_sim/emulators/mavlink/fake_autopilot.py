@@ -164,7 +164,7 @@ class FakeAutopilot:
     def restart(self) -> None:
         """Restart, as after a brown-out: disarmed, with clock and message rates reset."""
         self.armed = self._reported_ready = False
-        # The barometer is calibrated anew.
+        # The barometer is calibrated again.
         self.now = self._height_error = 0.0
         self._routes.clear()
         self._hold()
