@@ -5,15 +5,11 @@ import signal
 import subprocess
 
 import pytest
-import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from reserved_domain import reserved_domain
+from run_operator import Operator
 from scenario_runs import PATIENCE, command
-from waiting import wait_until
 
 from maasi_msgs.msg import FilterUpdate
 
@@ -40,18 +36,16 @@ OTHERS = {
 }
 
 
-class Cycler:
-    """A client of the life cycles of nodes."""
+class Cycler(Operator):
+    """A client of the life cycles of a run's nodes."""
 
-    def __init__(self, domain):
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain)
-        self.node = Node('cycler', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+    def __init__(self, domain, run):
+        super().__init__(domain)
+        self.run = run
 
     def until(self, condition, what):
-        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.05), what)
+        super().until(lambda: condition() or self.run.poll() is not None, what)
+        assert self.run.poll() is None, f'{what}: the run has ended'
 
     def cycle(self, name, times):
         client = self.node.create_client(ChangeState, f'{name}/change_state')
@@ -71,11 +65,6 @@ class Cycler:
         self.until(lambda: heard, f'nothing on {topic}')
         self.node.destroy_subscription(subscription)
 
-    def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
-
 
 @pytest.mark.parametrize('scenario, cycles', [('mambo_turtlebot', DEMO), *OTHERS.items()])
 def test_nodes_survive_cycles_back_to_back_and_the_search_goes_on(tmp_path, scenario, cycles):
@@ -86,7 +75,7 @@ def test_nodes_survive_cycles_back_to_back_and_the_search_goes_on(tmp_path, scen
             run = subprocess.Popen(
                 command(scenario, tmp_path / 'run', *options), stdout=output, stderr=output
             )
-        cycler = Cycler(domain.number)
+        cycler = Cycler(domain, run)
         try:
             searches = not scenario.startswith('buildings')
             if searches:
@@ -95,7 +84,6 @@ def test_nodes_survive_cycles_back_to_back_and_the_search_goes_on(tmp_path, scen
                 cycler.cycle(name, int(os.environ.get('MAASI_CYCLES', times)))
             if searches:
                 cycler.hear(FilterUpdate, 'filter_update')
-            assert run.poll() is None, log.read_text()
             run.send_signal(signal.SIGINT)
             # Interrupted; 3 if a node had died.
             assert run.wait(PATIENCE) == 130, log.read_text()

@@ -11,15 +11,11 @@ import signal
 import subprocess
 
 import pytest
-import rclpy
 import yaml
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from reserved_domain import reserved_domain
 from rosgraph_msgs.msg import Clock
+from run_operator import Operator
 from scenario_runs import PATIENCE, command, processes_with, wait_for
-from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_sim.run.bag import Bag
@@ -140,29 +136,19 @@ def test_the_summary_is_said_where_nothing_can_be_written_at_all(start, tmp_path
     assert list((tmp_path / 'elsewhere').iterdir()) == []
 
 
-class Witness:
+class Witness(Operator):
     """Hears the clock of a run."""
 
     def __init__(self, domain):
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain.number)
-        self.node = Node('witness', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__(domain)
         self.time = 0
         self.node.create_subscription(Clock, '/clock', self.hear, 10)
 
     def hear(self, message):
         self.time = max(self.time, stamp_from_ros(message.clock))
 
-    def until(self, seconds):
-        executor, end = self.executor, seconds * 1e9
-        wait_until(lambda: self.time >= end, lambda: executor.spin_once(0.05), limit=PATIENCE)
-
-    def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
+    def wait_for(self, seconds):
+        self.until(lambda: self.time >= seconds * 1e9, f'{seconds} s of the clock')
 
 
 def test_a_run_that_is_killed_leaves_all_but_its_last_second(start, tmp_path, monkeypatch):
@@ -173,7 +159,7 @@ def test_a_run_that_is_killed_leaves_all_but_its_last_second(start, tmp_path, mo
         # Half as fast as the time of the wall: that is what the promise is about.
         process = start('--domain-id', domain.number, '--rate', '0.5')
         witness = Witness(domain)
-        witness.until(3.0)
+        witness.wait_for(3.0)
         process.send_signal(signal.SIGKILL)
         process.wait(PATIENCE)
         wait_for(lambda: not processes_with(f'{folder}/'), 'all nodes end')

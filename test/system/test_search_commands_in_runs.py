@@ -6,13 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-import rclpy
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from reserved_domain import reserved_domain
-from waiting import wait_until
+from run_operator import Operator
 
 from maasi_filter.ros.qos import sensor_reader
 
@@ -22,15 +18,11 @@ ROBOTS = ('turtlebot', 'mambo')
 SPAN, STILL = 1.5, 0.04
 
 
-class Watcher:
+class Watcher(Operator):
     """Hears where the robots are."""
 
     def __init__(self, domain):
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain)
-        self.node = Node('watcher', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__(domain)
         self.path = {name: [] for name in ROBOTS}
         for name in ROBOTS:
             self.node.create_subscription(
@@ -43,9 +35,6 @@ class Watcher:
     def hear(self, name, message):
         stamp, point = message.header.stamp, message.pose.pose.position
         self.path[name].append((stamp.sec + stamp.nanosec * 1e-9, point.x, point.y, point.z))
-
-    def until(self, condition, what):
-        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.05), what)
 
     def moved(self, name, span):
         """Return how far a robot went in the last `span` seconds; None where not known."""
@@ -65,11 +54,6 @@ class Watcher:
     def forget(self):
         for path in self.path.values():
             path.clear()
-
-    def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
 
 
 @pytest.fixture
@@ -94,7 +78,7 @@ def test_robots_of_a_free_run_stand_while_paused_and_go_on_when_resumed(tmp_path
         stdout=subprocess.DEVNULL,
         stderr=subprocess.STDOUT,
     )
-    watcher = Watcher(number)
+    watcher = Watcher(domain)
 
     def command(word):
         process = subprocess.Popen(

@@ -9,9 +9,9 @@ import subprocess
 import pytest
 import yaml
 from reserved_domain import reserved_domain
+from run_operator import Operator
 from scenario_runs import PATIENCE, command, of_topic, processes_with, run_scenario, wait_for
 from test_mavlink_scenario import short_search
-from test_two_teams import Operator
 
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState, PlanDecision
