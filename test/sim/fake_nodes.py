@@ -237,6 +237,7 @@ class Filter(Fake):
         self.found_targets = self.create_publisher(FoundTargetArray, '/found_targets', LATCHED)
         self.found = []
         self.pending = {}
+        self.answered = set()
         self.create_subscription(MeasurementBatch, '/measurement_batch', self.on_batch, ALL)
         for name in self.robots:
             self.create_subscription(DetectionArray, f'/{name}/detections', self.on_detections, ALL)
@@ -256,8 +257,13 @@ class Filter(Fake):
 
     def process(self, number):
         batch, robots = self.pending[number]
-        if batch is None or robots != {member.robot for member in batch.members}:
+        if (
+            number in self.answered
+            or batch is None
+            or robots != {member.robot for member in batch.members}
+        ):
             return
+        self.answered.add(number)
         new = []
         index = len(self.found)
         if 2 * index < len(self.targets) - 1:
@@ -290,6 +296,9 @@ class Planner(Fake):
         self.batch = self.create_publisher(MeasurementBatch, '/measurement_batch', ALL)
         self.create_subscription(FilterUpdate, '/filter_update', self.on_update, ALL)
         self.number = 0
+        # Repeated until it is answered: a restarted robot may not be connected yet.
+        self.asked = None
+        self.create_timer(1.0, self.ask)
         self.say_ready((self.batch, 1 + len(self.robots)), (self.done, 1))
 
     def on_step(self, message):
@@ -313,9 +322,15 @@ class Planner(Fake):
             BatchMember(robot=name, decision=self.number, measurement=self.number)
             for name in self.robots
         ]
-        self.batch.publish(batch)
+        self.asked = batch
+        self.ask()
+
+    def ask(self):
+        if self.asked is not None:
+            self.batch.publish(self.asked)
 
     def on_update(self, update):
+        self.asked = None
         self.finish(update.step)
 
 

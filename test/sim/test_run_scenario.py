@@ -250,7 +250,8 @@ def test_a_clock_that_another_run_follows_goes_on_until_that_has_ended(
     tmp_path, scenario, follower
 ):
     number, node, executor = follower
-    run = Run(tmp_path / 'run', scenario(), '--domain-id', str(number))
+    # Slow enough to discover the follower before the end.
+    run = Run(tmp_path / 'run', scenario(), '--domain-id', str(number), '--rate', '0.1')
     run.wait_for('report: ')
     run.wait_for('the clock goes on for /other')
     assert run.report['end_reason'] == 'all_found'
@@ -275,8 +276,11 @@ def test_the_time_limit_ends_a_run_at_the_same_step_each_time(tmp_path, scenario
     assert run.report['true_found'] == 2 and run.report['missed'] == 1
     assert run.report['measurements_to_find_all'] is None
     with Bag(run.folder) as bag:
-        assert [item.message.step for item in bag.messages(['/mambo/state'])] == list(range(20))
-        assert [item.message.step for item in bag.messages(['/filter_update'])] == [0, 10]
+        # A step that a busy machine holds up is repeated.
+        steps = {item.message.step: None for item in bag.messages(['/mambo/state'])}
+        assert list(steps) == list(range(20))
+        steps = {item.message.step: None for item in bag.messages(['/filter_update'])}
+        assert list(steps) == [0, 10]
 
 
 @pytest.mark.parametrize('stop, code', [('planner_done', 0), ('all_found', 1)])
