@@ -364,7 +364,7 @@ def test_wrong_detection_models_are_refused_before_anything_starts(folder, body,
         ('rover.waypoint[0] = np.nan', 'rover: waypoint: got a number that is not finite'),
         ('rover.waypoint = [1.0, 1.0, 0.0]', r'rover: waypoint: got \[1.0, 1.0, 0.0\], allowed is'),
         ('rover.yaws = rover.yaws[1:]', r'rover: yaws: got shape \('),
-        ('rover.chosen = 4', 'rover: chosen: got 4, allowed are integers below 4'),
+        ('rover.chosen = 4', r'rover: chosen: got 4, allowed are -1 \(stay\) to 3'),
     ],
 )
 def test_wrong_decisions_are_refused(folder, spoil, message):

@@ -2,6 +2,7 @@
 
 import mmap
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -76,8 +77,7 @@ def test_files_of_a_killed_node_go_and_those_of_a_live_one_stay(domain):
 
 def test_a_run_removes_them_at_its_start_and_at_its_end():
     def dead():
-        name = f'fastrtps_port{os.getpid() + 10**6}'
-        return SHARED / write(SHARED, name).pop()
+        return SHARED / write(SHARED, f'fastrtps_port{os.getpid() + 10**6}').pop()
 
     def at_start():
         path = dead()
@@ -94,6 +94,39 @@ def test_a_run_removes_them_at_its_start_and_at_its_end():
     wait_until(at_end)
 
 
+def test_ports_that_were_ready_go_only_with_their_domain(folder):
+    # Domain 5 has the ports from 7400 + 5 * 250.
+    ready = {'fastrtps_port8650', 'fastrtps_port8899', 'fastrtps_port8900'}
+    for name in ready:
+        (folder / name).write_bytes((2).to_bytes(4, sys.byteorder) + bytes(60))
+    locks = write(folder, 'fastrtps_port8650_el', 'fastrtps_port8900_el', 'fastrtps_port8902_el')
+    assert remove_dead(folder=folder) == []
+    assert set(remove_dead(5, folder)) == {
+        'fastrtps_port8650',
+        'fastrtps_port8650_el',
+        'fastrtps_port8899',
+    }
+    assert {'fastrtps_port8900'} | locks - {'fastrtps_port8650_el'} == {
+        path.name for path in folder.iterdir()
+    }
+
+
+def test_a_port_of_a_live_node_has_the_mark_by_which_it_is_known(domain):
+    process, files = started()
+    try:
+        ports = [path for path in files if re.fullmatch(r'fastrtps_port\d+', path.name)]
+        assert ports
+        for port in ports:
+            with port.open('rb') as file:
+                assert file.read(4) == (2).to_bytes(4, sys.byteorder)
+        numbers = {int(port.name.removeprefix('fastrtps_port')) for port in ports}
+        # Those below 7400 are common to all domains.
+        assert {(number - 7400) // 250 for number in numbers if number >= 7400} == {domain.number}
+    finally:
+        process.kill()
+        process.wait(PATIENCE)
+
+
 def test_a_port_goes_as_a_whole_where_nobody_uses_a_part_of_it(folder):
     dead = write(folder, 'fastrtps_port7411', 'fastrtps_port7411_el', 'sem.fastrtps_port7411_mutex')
     dead |= write(folder, 'fastrtps_0017a085580e8ff0', 'fastrtps_0017a085580e8ff0_el')
@@ -103,20 +136,20 @@ def test_a_port_goes_as_a_whole_where_nobody_uses_a_part_of_it(folder):
     with (folder / 'fastrtps_port7413').open('r+b') as file:
         memory = mmap.mmap(file.fileno(), 64)
     with (folder / 'fastrtps_0017a085580e8ff1_el').open('rb'):
-        assert set(remove_dead(folder)) == dead
+        assert set(remove_dead(folder=folder)) == dead
         assert {path.name for path in folder.iterdir()} == mapped | opened | others
     memory.close()
-    assert set(remove_dead(folder)) == mapped | opened
+    assert set(remove_dead(folder=folder)) == mapped | opened
 
 
 def test_what_another_user_put_there_is_left(folder, monkeypatch):
     write(folder, 'precious')
     (folder / 'fastrtps_port7411').symlink_to(folder / 'precious')
     os.mkfifo(folder / 'fastrtps_port7413')
-    assert remove_dead(folder) == []
+    assert remove_dead(folder=folder) == []
     write(folder, 'fastrtps_port7415')
     monkeypatch.setattr(shared_memory.os, 'getuid', lambda: -1)
-    assert remove_dead(folder) == []
+    assert remove_dead(folder=folder) == []
     assert len(list(folder.iterdir())) == 4
 
 

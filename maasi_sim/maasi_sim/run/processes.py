@@ -19,11 +19,10 @@ from typing import Any, BinaryIO, NoReturn
 
 from setproctitle import setproctitle
 
-from maasi_sim.run.shared_memory import remove_dead
+from maasi_sim.run.shared_memory import FIRST_PORT, PORTS_PER_DOMAIN, remove_dead
 
 # Domains whose ports lie below the ephemeral ports of Linux (from 32768).
 DOMAINS = range(0, 102)
-_FIRST_PORT, _PORTS_PER_DOMAIN = 7400, 250
 _PR_SET_PDEATHSIG = 1
 # Environment variable of the profiles of Fast DDS.
 _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -72,17 +71,19 @@ class Domain:
 
         if fault := loopback_fault():
             raise ProcessError(fault)
-        remove_dead()
         self._purpose = purpose
+        self._shared = shared
+        self._locks: list[socket.socket] = []
         if number is not None and number not in DOMAINS:
             raise ProcessError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
         for candidate in DOMAINS[1:] if number is None else [number]:
             # A requested domain may be in use by other nodes.
-            if number is None and _port_used(_FIRST_PORT + _PORTS_PER_DOMAIN * candidate):
+            if number is None and _port_used(FIRST_PORT + PORTS_PER_DOMAIN * candidate):
                 continue
             problem = self._take(candidate, team, shared)
             if not problem:
                 self.number = candidate
+                self._remove_dead()
                 return
             if number is not None:
                 raise ProcessError(f'domain id: {problem} is used by another run')
@@ -92,11 +93,10 @@ class Domain:
         """Lock a domain and a namespace in it; return the name of a taken one, else empty."""
         wanted = {} if shared else {f'{number}': f'{number}'}
         wanted[f'{number} {team}'] = f'namespace /{team} in {number}'
-        self._locks: list[socket.socket] = []
         for name, words in wanted.items():
             lock = self._lock(name)
             if lock is None:
-                self.release()
+                self._unlock()
                 return words
             self._locks.append(lock)
         return ''
@@ -127,7 +127,14 @@ class Domain:
 
     def release(self) -> None:
         """Release the domain; what killed nodes left in shared memory goes before."""
-        remove_dead()
+        self._remove_dead()
+        self._unlock()
+
+    def _remove_dead(self) -> None:
+        # Nodes of other runs may be starting in a shared domain.
+        remove_dead(None if self._shared else self.number)
+
+    def _unlock(self) -> None:
         while self._locks:
             self._locks.pop().close()
 

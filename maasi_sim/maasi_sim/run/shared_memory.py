@@ -7,32 +7,58 @@ import fcntl
 import os
 import re
 import signal
+import sys
 from collections import defaultdict
 from pathlib import Path
 
 # A port or a segment, its locks, and the semaphore under which a port is opened (Fast DDS 2.14).
 _NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
+# Ports of the RTPS specification: this many for each domain, from this one.
+FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
+# First word of a memory that its creator has made ready (Boost.Interprocess).
+_READY = (2).to_bytes(4, sys.byteorder)
 
 
-def remove_dead(folder: Path = Path('/dev/shm')) -> list[str]:
-    """Remove ports and segments of this user that no process has open; return the removed files.
+def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> list[str]:
+    """Remove segments and ports of this user that no process has open; return the removed files.
 
     They fill the memory, and a process that opens a port whose creator died before it was ready
     waits for ever, on this host in all domains.
+
+    Parameters
+    ----------
+    domain : int, optional
+        Domain that no process uses, of which all ports are removed; of others only those that were
+        never ready. New processes use the names of ports again, some of them in all domains: who
+        opens a port while it is removed shares it with nobody.
+    folder : Path
+        Where Fast DDS keeps them.
     """
     parts: dict[str, list[Path]] = defaultdict(list)
     for path in folder.iterdir() if folder.is_dir() else ():
         if match := _NAME.fullmatch(path.name):
             parts[match[1]].append(path)
     removed = []
-    for paths in parts.values():
+    for name, paths in parts.items():
         # Not the lock alone: without it Fast DDS takes the port of a dead reader for a live one.
-        if all(map(_is_unused, paths)):
+        if all(map(_is_unused, paths)) and _may_go(folder / name, domain):
             for path in paths:
                 with contextlib.suppress(OSError):
                     path.unlink()
                     removed.append(path.name)
     return removed
+
+
+def _may_go(path: Path, domain: int | None) -> bool:
+    """Return whether no process can be about to open an unused port or segment again."""
+    number = path.name.removeprefix('fastrtps_port')
+    if number == path.name:
+        return True
+    if domain is not None and (int(number) - FIRST_PORT) // PORTS_PER_DOMAIN == domain:
+        return True
+    with contextlib.suppress(OSError), path.open('rb') as file:
+        return file.read(4) != _READY
+    return False
 
 
 def _is_unused(path: Path) -> bool:
