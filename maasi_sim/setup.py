@@ -7,7 +7,7 @@ setup(
     version='0.1.0',
     packages=find_packages(),
     package_data={
-        'maasi_sim.experiments': ['papers/*.yaml'],
+        'maasi_sim.experiments': ['papers/*'],
         'maasi_sim.run': ['discovery.xml', 'report.schema.json'],
         'maasi_sim.view': ['page/*'],
     },

@@ -17,32 +17,31 @@ from quality_conditions import SEEDS
 from search_regimes import KINDS, REGIMES, prepared
 
 from maasi_sim.experiments.campaign import plan
-from maasi_sim.experiments.cases import Case
-from maasi_sim.experiments.comparison import SearchComparison, search_settings
-from maasi_sim.experiments.comparison_tables import markdown
+from maasi_sim.experiments.compared_searches import comparison_of, search_settings
 from maasi_sim.experiments.execution import carry_out_all, run_command
-from maasi_sim.experiments.experiment import Results
+from maasi_sim.experiments.experiment import Case, Experiment, Results
+from maasi_sim.experiments.tables import compared_markdown
 
 # What differences are to.
 REFERENCE = 'before'
 BEGIN, END = '<!-- table: begin -->', '<!-- table: end -->'
 
 
-def comparison(regime: str, kinds: Sequence[str]) -> SearchComparison:
+def comparison(regime: str, kinds: Sequence[str]) -> Experiment:
     """Return the comparison of a regime; the reference stands first."""
     cases = []
     for kind in sorted(kinds, key=lambda name: name != REFERENCE):
         how = KINDS[kind]
-        settings = search_settings(prepared(regime, kind), how.clairvoyant)
+        settings = search_settings(prepared(regime, kind), how.maker)
         cases.append(Case(kind, settings, runs=how.runs))
-    return SearchComparison(regime, cases)
+    return comparison_of(regime, cases)
 
 
 def tables(every: Sequence[Results]) -> str:
     """Return the tables of all regimes in Markdown."""
     return '\n'.join(
         f'**{item.experiment.name}** (limit {REGIMES[item.experiment.name].limit:g} s)\n\n'
-        f'{markdown(item)}'
+        f'{compared_markdown(item)}'
         for item in every
     )
 

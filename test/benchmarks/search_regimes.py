@@ -55,15 +55,15 @@ class Kind:
         Whether robots stop at every waypoint.
     neighbours : bool
         Whether it chooses among a regime's `neighbours`.
-    clairvoyant : bool
-        Whether it is told the true targets.
+    maker : str, optional
+        Function that makes the planner, as of `search`, in place of the scenario's.
     """
 
     change: dict[str, Any]
     runs: int = 64
     stops: bool = False
     neighbours: bool = False
-    clairvoyant: bool = False
+    maker: str | None = None
 
 
 def drones(*starts: tuple[float, float, float], **change: Any) -> dict[str, Any]:
@@ -121,7 +121,7 @@ KINDS: dict[str, Kind] = {
     'paper': Kind({'name': 'maasi', **PAPER}, stops=True),
     'before': Kind({'name': 'maasi'}, stops=True),
     'maasi': Kind({'name': 'maasi'}),
-    'clairvoyant': Kind({'name': 'maasi'}, runs=32, clairvoyant=True),
+    'clairvoyant': Kind({'name': 'maasi'}, runs=32, maker='clairvoyant:clairvoyant'),
 }
 
 

@@ -16,7 +16,7 @@ from maasi_planner.coordinator import Coordinator
 from maasi_sim.buildings.mission import CuboidMission
 from maasi_sim.buildings.scenario import CuboidScenario, mission_of
 from maasi_sim.experiments.experiment import Experiment
-from maasi_sim.experiments.registry import experiments
+from maasi_sim.experiments.papers import experiments
 from maasi_sim.missions import load_mission
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.search import search

@@ -163,7 +163,7 @@ def test_a_search_passes_waypoints_without_slowing_down():
 
 
 def test_the_experiments_of_the_papers_stop_at_each_waypoint():
-    from maasi_sim.experiments.registry import experiments
+    from maasi_sim.experiments.papers import experiments
 
     for name, experiment in experiments().items():
         for case in experiment.cases(True):

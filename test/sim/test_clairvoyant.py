@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from clairvoyant import Clairvoyant, _expected_end, _Robots, clairvoyant
 
 from maasi_filter.models.detection import BoxDetection
 from maasi_planner.settings import PlannerSettings
-from maasi_sim.experiments.clairvoyant import Clairvoyant, _expected_end, _Robots, clairvoyant
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import pickle
 
 import numpy as np
 import pytest
 import yaml
-from scipy import stats
 from small_field import SMALL_FIELD
 
-from maasi_sim.experiments import campaign, compare, comparison, statistics
-from maasi_sim.experiments.comparison_tables import verdict
-from maasi_sim.experiments.statistics import Difference
+from maasi_sim.experiments import campaign, compare, compared_searches
 
 PLANNERS = ['nearest_widest', 'lawnmower']
 
@@ -112,7 +108,7 @@ def test_other_settings_and_other_code_are_noticed(
     assert command(scenario, out, '--time-limit', '5', seeds=1) == 2
     said = capsys.readouterr().err
     assert '2 searches there are of other settings' in said and '--again' in said
-    monkeypatch.setattr(comparison, 'code_digest', lambda: 'another')
+    monkeypatch.setattr(compared_searches, 'code_digest', lambda: 'another')
     assert command(scenario, out, seeds=1) == 2
     assert not executed
     assert command(scenario, out, '--again', seeds=1) == 0
@@ -122,12 +118,11 @@ def test_other_settings_and_other_code_are_noticed(
 
 
 def test_worker_of_other_code_is_noticed(scenario, tmp_path, monkeypatch):
-    work = campaign.plan(comparison.compared(scenario, PLANNERS), tmp_path, 1)
+    work = campaign.plan(compared_searches.compared(scenario, PLANNERS), tmp_path, 1)
     # What a cluster sends.
     task = pickle.loads(pickle.dumps(work.tasks[0]))
-    monkeypatch.setattr(comparison, 'code_digest', lambda: 'another')
-    text, problem = campaign.execute(task)
-    assert not text and 'another version of the code' in problem
+    monkeypatch.setattr(compared_searches, 'code_digest', lambda: 'another')
+    assert 'another version of the code' in campaign.execute(task)
 
 
 def test_planner_of_ones_own_is_compared_and_its_changes_are_noticed(
@@ -153,7 +148,7 @@ def test_planner_of_ones_own_is_compared_and_its_changes_are_noticed(
 
 
 def test_filters_are_compared_with_each_planner(scenario):
-    cases = comparison.compared(scenario, PLANNERS, ['pmb', 'ic_phd'], 4.0).cases(False)
+    cases = compared_searches.compared(scenario, PLANNERS, ['pmb', 'ic_phd'], 4.0).cases(False)
     assert [case.name for case in cases] == [
         f'{planner}, {method}' for method in ('pmb', 'ic_phd') for planner in PLANNERS
     ]
@@ -185,51 +180,3 @@ def test_bad_input(scenario, monkeypatch, arguments, words, capsys):
     assert code == 2
     assert words in capsys.readouterr().err
     assert not (scenario.parent / 'runs').exists()
-
-
-# Statistics
-
-
-@pytest.mark.parametrize(('effect', 'expected'), [(0.2, 199), (0.5, 34), (0.8, 15)])
-def test_pairs_needed_are_those_of_cohens_tables(effect, expected):
-    values = np.array([-1.0, 1.0] * 50)
-    gaps = values / values.std(ddof=1) + effect
-    assert statistics.pairs_needed(gaps) == expected
-
-
-def test_bootstrap_interval_of_normal_differences_is_near_students():
-    generator = np.random.default_rng(1)
-    first, second = generator.normal(3.0, 1.0, 60), generator.normal(1.0, 2.0, 60)
-    low, high = stats.ttest_rel(first, second).confidence_interval(0.95)
-    gap = statistics.bootstrap_difference([*first, math.nan], [*second, 1.0])
-    assert gap.number == 60 and gap.mean == pytest.approx(np.mean(first - second))
-    assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.1)
-    assert gap.told_from_zero
-    assert statistics.bootstrap_difference(first, second) == gap
-
-
-def test_bootstrap_of_few_or_equal_values():
-    assert math.isnan(statistics.bootstrap_difference([], []).mean)
-    one = statistics.bootstrap_difference([3.0], [1.0])
-    assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
-    same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
-    assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
-
-
-def test_survival_is_that_of_freireichs_patients():
-    """Weeks in remission with 6-mercaptopurine, and the estimates that textbooks print."""
-    weeks = [6, 6, 6, 6, 7, 9, 10, 10, 11, 13, 16, 17, 19, 20, 22, 23, 25, 32, 32, 34, 35]
-    relapsed = [1, 1, 1, 0, 1, 0, 1, 0, 0, 1, 1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0]
-    times, shares = statistics.survival(weeks, np.array(relapsed, bool))
-    at = dict(zip(times, shares))
-    printed = {0: 1.0, 6: 0.857, 7: 0.807, 10: 0.753, 13: 0.690, 16: 0.627, 22: 0.538, 23: 0.448}
-    assert {week: at[week] for week in printed} == pytest.approx(printed, abs=5e-4)
-
-
-def test_verdict_says_when_the_seeds_are_too_few():
-    few = Difference(-2.0, -6.0, 2.0, -1.0, 10, 85)
-    assert 'too few' in verdict('a', 'b', few) and 'about 85' in verdict('a', 'b', few)
-    none = Difference(0.0, 0.0, 0.0, 0.0, 10, None)
-    assert 'no difference on any of 10 seeds' in verdict('a', 'b', none)
-    clear = Difference(-2.0, -3.0, -1.0, -2.0, 10, 7)
-    assert 'sooner' in verdict('a', 'b', clear) and 'too few' not in verdict('a', 'b', clear)

@@ -14,10 +14,12 @@ import pytest
 import yaml
 from waiting import wait_until
 
-from maasi_sim.experiments import reproduce, results, searches, terrain
-from maasi_sim.experiments.campaign import SerialExecutor, carry_out, plan
+from maasi_sim.experiments import reproduce, searches, terrain
+from maasi_sim.experiments.campaign import carry_out, plan
 from maasi_sim.experiments.outputs import write_outputs
-from maasi_sim.experiments.registry import experiments
+from maasi_sim.experiments.papers import experiments
+from maasi_sim.experiments.runs import load_run
+from maasi_sim.experiments.workers import Workers
 
 KNOWN = experiments()
 
@@ -26,13 +28,13 @@ KNOWN = experiments()
 def test_small_version_writes_what_makes_sense(name, tmp_path):
     experiment = KNOWN[name]
     work = plan(experiment, tmp_path, 1, small=True)
-    assert carry_out(work, SerialExecutor()) == []
+    assert carry_out(work, Workers()) == []
     write_outputs(work.folder, work.results(), 1)
     folder = tmp_path / name
     assert not plan(experiment, tmp_path, 1, small=True).tasks
 
-    for case in work.cases:
-        run = results.load_run(work.folder.file(case, 0))
+    for case in work.cases.values():
+        run = load_run(work.folder.file(case, 0))
         assert run.seed == experiment.seed(0) and run.columns
         if 'mission' in case.settings:
             check_mission(experiment, run, case.settings)
@@ -41,12 +43,12 @@ def test_small_version_writes_what_makes_sense(name, tmp_path):
     with (folder / 'runs.csv').open() as stream:
         assert len(list(csv.DictReader(stream))) == len(work.cases)
     configuration = yaml.safe_load((folder / 'configuration.yaml').read_text())
-    assert list(configuration['cases']) == [case.name for case in work.cases]
+    assert list(configuration['cases']) == list(work.cases)
     # Whoever repeats the paper has had to choose something, and says why.
     assert configuration['choices']
     assert all(item['reason'] for item in configuration['choices'])
     table = (folder / 'table.csv').read_text()
-    for case in work.cases:
+    for case in work.cases.values():
         assert case.name in table
     picture = (folder / 'figure.png').read_bytes()
     assert picture.startswith(b'\x89PNG') and len(picture) > 5000

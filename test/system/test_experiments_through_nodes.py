@@ -4,7 +4,7 @@ import pytest
 import yaml
 from scenario_runs import run_scenario
 
-from maasi_sim.experiments.registry import find
+from maasi_sim.experiments.papers import find
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.recording import plain
 from maasi_sim.scenario.loading import scenario_from_content

@@ -1,6 +1,5 @@
-"""The papers' experiments: what is run, how it is measured, and what the papers report.
+"""The papers' experiments, and comparisons of searches.
 
-`cases` and `experiment` define what an experiment is, `registry` lists them, `campaign` runs them
-and `results` stores the runs. `statistics`, `tables` and `figures` compare them with the paper.
-One module per paper holds its experiments.
+`experiment` defines what an experiment is, `papers` reads those of the papers, `campaign` makes
+their runs by `workers`, and `runs` stores them; `tables`, `figures` and `outputs` show them.
 """

@@ -9,9 +9,8 @@ import numpy as np
 from maasi_planner.buildings import plan_mission
 from maasi_sim.buildings.picture import draw_mission, legend
 from maasi_sim.experiments.building_runs import mission_settings
-from maasi_sim.experiments.experiment import Results
-from maasi_sim.experiments.results import Run
-from maasi_sim.experiments.statistics import array, mean_interval
+from maasi_sim.experiments.experiment import Results, Run
+from maasi_sim.experiments.statistics import mean_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +101,7 @@ def draw_mission_times(figure: Figure, results: Results) -> None:
     """Draw the mission time of each case as a bar, the paper's of 3 agents as lines."""
     axes = figure.subplots()
     names = results.names()
-    times = [mean_interval(array(results.values(name, 'steps'))) for name in names]
+    times = [mean_interval(results.values(name, 'steps')) for name in names]
     places = np.arange(len(names))
     errors = np.nan_to_num([time.half_width for time in times])
     axes.barh(places, [time.mean for time in times], xerr=errors, color='#56B4E9')
@@ -121,7 +120,7 @@ def draw_decision_times(figure: Figure, results: Results) -> None:
     names = results.names()
     places = np.arange(len(names))
     for offset, quantity in ((-0.2, 'centralized'), (0.2, 'distributed')):
-        ours = [float(np.mean(array(results.values(name, quantity)))) for name in names]
+        ours = [float(np.mean(results.values(name, quantity))) for name in names]
         axes.bar(places + offset, ours, 0.35, label=f'{quantity}, ours')
         theirs = {p.case: p.value for p in results.experiment.published if p.quantity == quantity}
         axes.plot(

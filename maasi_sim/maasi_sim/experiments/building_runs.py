@@ -14,7 +14,7 @@ from maasi_planner.buildings import (
     plan_mission,
 )
 from maasi_sim.buildings.mission import CuboidMission, SearchRobot, summary
-from maasi_sim.experiments.cases import Outcome, Quantity
+from maasi_sim.experiments.experiment import Outcome, Quantity
 
 # Largest number of steps of a mission.
 _LIMIT = 1000
@@ -35,6 +35,7 @@ QUANTITIES = (
     Quantity('distributed', 'time of a decision of one robot, P2', 's'),
 )
 _STEPS_TIMED = 8
+_SNAPSHOT = ('cuboid', 'robot', 'step', 'distance', 'detection_probability')
 
 
 def mission_settings(settings: dict[str, Any]) -> CuboidSettings:
@@ -107,14 +108,7 @@ def run_mission(settings: dict[str, Any], seed: int) -> Outcome:
         columns,
         {
             'snapshots': [
-                {
-                    'cuboid': shot.cuboid,
-                    'robot': shot.robot,
-                    'step': shot.step,
-                    'distance': shot.distance,
-                    'detection_probability': shot.detection_probability,
-                }
-                for shot in record.snapshots
+                {name: getattr(shot, name) for name in _SNAPSHOT} for shot in record.snapshots
             ],
             'plans': {
                 str(step): {name: plan.tolist() for name, plan in plans.items()}

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from maasi_sim.arguments import Parser, count, positive, whole
-from maasi_sim.experiments.campaign import Plan, plan
-from maasi_sim.experiments.comparison import SearchComparison, compared
-from maasi_sim.experiments.comparison_tables import document, facts, table_text, verdicts
+from maasi_sim.experiments.campaign import Campaign, plan
+from maasi_sim.experiments.compared_searches import compared
 from maasi_sim.experiments.execution import (
     DONE,
     EXIT_CODES,
@@ -23,8 +22,10 @@ from maasi_sim.experiments.execution import (
     run_command,
 )
 from maasi_sim.experiments.experiment import Results
+from maasi_sim.experiments.figures import draw_comparison
 from maasi_sim.experiments.outputs import as_png
-from maasi_sim.experiments.results import runs_text, write_file
+from maasi_sim.experiments.runs import runs_text, write_file
+from maasi_sim.experiments.tables import compared_facts, compared_page, compared_text, verdicts
 from maasi_sim.scenario.layering import ScenarioError
 
 _RUNS = Path('runs')
@@ -111,33 +112,7 @@ def compare(options: argparse.Namespace) -> int:
     names = [item.name for item in comparisons]
     if len(set(names)) < len(names):
         raise WrongRequest(f'SCENARIO: read {", ".join(names)}, allowed are different names')
-    wanted = request(comparisons, options)
-    out = options.out or unfinished(wanted) or _new_folder()
-    plans = [
-        plan(item, out, options.seeds, first=options.first_seed, small=False)
-        for item in comparisons
-    ]
-    for work in plans:
-        for complaint in work.complaints:
-            print(f'warning: {complaint}', file=sys.stderr)
-    if not options.again:
-        _refuse_others(plans, out)
-    print(f'results: {out}', file=sys.stderr)
-    write_file(out / 'request.json', json.dumps(wanted, indent=2) + '\n')
-    problems = carry_out_all(plans, options.workers, options.cluster, options.mixed_workers)
-    results = [work.results() for work in plans if work.done]
-    if results:
-        seeds = range(options.first_seed, options.first_seed + options.seeds)
-        write_comparison(out, results, seeds)
-        for item in results:
-            print(f'\n{item.experiment.name}', *verdicts(item), sep='\n  ')
-        print(f'\n{out}/comparison.md')
-    return SOME_FAILED if problems else DONE
-
-
-def request(comparisons: Sequence[SearchComparison], options: argparse.Namespace) -> dict[str, Any]:
-    """Return the request: seeds, and a hash of the settings of each case."""
-    return {
+    wanted = {
         'first_seed': options.first_seed,
         'seeds': options.seeds,
         'scenarios': {
@@ -145,9 +120,24 @@ def request(comparisons: Sequence[SearchComparison], options: argparse.Namespace
             for item in comparisons
         },
     }
+    out = options.out or _unfinished(wanted) or _new_folder()
+    campaigns = [plan(item, out, options.seeds, first=options.first_seed) for item in comparisons]
+    if not options.again:
+        _refuse_others(campaigns, out)
+    print(f'results: {out}', file=sys.stderr)
+    write_file(out / 'request.json', json.dumps(wanted, indent=2) + '\n')
+    problems = carry_out_all(campaigns, options.workers, options.cluster, options.mixed_workers)
+    results = [work.results() for work in campaigns if work.done]
+    if results:
+        seeds = range(options.first_seed, options.first_seed + options.seeds)
+        _write(out, results, seeds)
+        for item in results:
+            print(f'\n{item.experiment.name}', *verdicts(item), sep='\n  ')
+        print(f'\n{out}/comparison.md')
+    return SOME_FAILED if problems else DONE
 
 
-def unfinished(wanted: dict[str, Any]) -> Path | None:
+def _unfinished(wanted: dict[str, Any]) -> Path | None:
     """Return the newest folder of an interrupted comparison with the same request."""
     for folder in sorted(_RUNS.glob('compare_*'), reverse=True):
         try:
@@ -168,15 +158,12 @@ def _new_folder() -> Path:
     return folder
 
 
-def _refuse_others(plans: Sequence[Plan], out: Path) -> None:
+def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
     """Refuse a folder with whole searches of the same names and seeds but other settings."""
-    other = 0
-    for work in plans:
-        cases = {case.name: case for case in work.cases}
-        damaged = '\n'.join(work.complaints)
-        for task in work.tasks:
-            file = work.folder.file(cases[task.case], task.number)
-            other += file.exists() and str(file) not in damaged
+    missing = [
+        (work, work.file(task.case, task.number)) for work in campaigns for task in work.tasks
+    ]
+    other = sum(file.exists() and file not in work.complaints for work, file in missing)
     if other:
         raise WrongRequest(
             f'--out: {out}: {other} searches there are of other settings, or of another version '
@@ -184,23 +171,14 @@ def _refuse_others(plans: Sequence[Plan], out: Path) -> None:
         )
 
 
-def write_comparison(out: Path, results: Sequence[Results], seeds: Sequence[int]) -> None:
-    """Write tables, picture and JSON.
-
-    Raises
-    ------
-    NoRoom
-        If one cannot be written; the searches are stored already.
-    """
-    from maasi_sim.experiments.comparison_figure import draw_comparison
-
+def _write(out: Path, results: Sequence[Results], seeds: Sequence[int]) -> None:
+    """Write tables, picture and JSON; NoRoom is raised if one cannot be written."""
     for item in results:
-        runs = [run for name in item.names() for run in item.runs[name]]
-        write_file(out / item.experiment.name / 'runs.csv', runs_text(runs))
-    write_file(out / 'comparison.csv', table_text(results))
+        write_file(out / item.experiment.name / 'runs.csv', runs_text(item.every()))
+    write_file(out / 'comparison.csv', compared_text(results))
     write_file(out / 'comparison.png', as_png(lambda figure: draw_comparison(figure, results)))
-    write_file(out / 'comparison.md', document(results, seeds))
-    text = json.dumps(facts(results, seeds), indent=2, allow_nan=False)
+    write_file(out / 'comparison.md', compared_page(results, seeds))
+    text = json.dumps(compared_facts(results, seeds), indent=2, allow_nan=False)
     write_file(out / 'comparison.json', text + '\n')
 
 

@@ -1,9 +1,8 @@
-"""What the commands that run campaigns share: options, workers, progress, exit codes."""
+"""What the commands that run campaigns share: options, progress, exit codes."""
 
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 import time
@@ -15,25 +14,15 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 
 from maasi_sim.arguments import count
-from maasi_sim.experiments.campaign import (
-    Cluster,
-    MixedWorkers,
-    Plan,
-    Processes,
-    SerialExecutor,
-    Workers,
-    WorkersLost,
-    carry_out,
-    one_machine,
-)
-from maasi_sim.experiments.results import NoRoom, Run
+from maasi_sim.experiments.campaign import Campaign, MixedWorkers, Task, carry_out, one_machine
+from maasi_sim.experiments.runs import NoRoom
+from maasi_sim.experiments.workers import Workers, WorkersLost, make_workers
 
 DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
 EXIT_CODES = (
@@ -83,61 +72,43 @@ def run_command(command: Callable[[], int], *wrong_input: type[Exception]) -> in
     return code
 
 
-def make_workers(number: int, wanted: int | None, cluster: str | None) -> Workers:
-    """Return workers for `number` runs; the other parameters are those of `carry_out_all`."""
-    if cluster is not None:
-        return Cluster(cluster)
-    processes = min(wanted or os.cpu_count() or 1, number)
-    return Processes(processes) if processes > 1 else SerialExecutor()
-
-
 def carry_out_all(
-    plans: list[Plan],
+    campaigns: list[Campaign],
     workers: int | None = None,
     cluster: str | None = None,
     mixed: bool = False,
-    finished: Callable[[Plan], str] = lambda work: '',
+    finished: Callable[[Campaign], str] = lambda work: '',
 ) -> list[str]:
-    """Make the missing runs of all plans, print a summary, and return the errors.
+    """Make the missing runs of all campaigns, print a summary, and return the errors.
 
-    Parameters
-    ----------
-    plans : list of Plan
-        One after the other.
-    workers : int, optional
-        Processes; none: one for each core.
-    cluster : str, optional
-        Scheduler of a Dask cluster, instead of processes.
-    mixed : bool
-        Whether runs of different processors or versions are mixed.
-    finished : function of a Plan
-        Called when its runs are done; returns a line to print, '' for none.
+    `workers` and `cluster` are those of `make_workers`; `mixed` allows runs of different
+    processors or versions. `finished` is called when the runs of a campaign are done, and returns
+    a line to print, '' for none.
 
     Raises
     ------
     MixedWorkers, NoRoom, WorkersLost
         See `one_machine` and `carry_out`; also if the cluster cannot be reached.
     """
-    number = sum(len(work.tasks) for work in plans)
+    for work in campaigns:
+        for complaint in work.complaints.values():
+            print(f'warning: {complaint}; this run is repeated', file=sys.stderr)
+    number = sum(len(work.tasks) for work in campaigns)
     problems: list[str] = []
-    team: Workers | None = None
+    team = Workers()
     begin = time.monotonic()
     try:
         if number:
             team = make_workers(number, workers, cluster)
-        machine = one_machine(team, plans) if team is not None and not mixed else None
-        with _Display(plans) as display:
-            for work in plans:
-                if work.tasks and team is not None:
-                    problems += carry_out(work, team, display.advance(work), machine)
-                line = finished(work)
-                if line:
-                    display.say(line)
+        machine = one_machine(team, campaigns) if number and not mixed else None
+        with _Display(number) as display:
+            for work in campaigns:
+                problems += carry_out(work, team, display.advance, machine)
+                display.say(finished(work))
     finally:
-        if team is not None:
-            team.close()
-    used = f' by {team.number} workers in {time.monotonic() - begin:.0f} s' if team else ''
-    kept = sum(len(work.done) for work in plans)
+        team.close()
+    used = f' by {team.number} workers in {time.monotonic() - begin:.0f} s' if number else ''
+    kept = sum(len(work.done) for work in campaigns)
     print(f'{number - len(problems)} runs made{used}; {kept} there in all')
     for problem in problems:
         print(f'error: {problem}', file=sys.stderr)
@@ -147,57 +118,42 @@ def carry_out_all(
 class _Display:
     """Progress and remaining time: a bar, or lines without a terminal."""
 
-    def __init__(self, plans: list[Plan]) -> None:
-        self._plans = plans
-        self._total = sum(len(work.tasks) for work in plans)
+    def __init__(self, total: int) -> None:
+        columns = BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn('left')
+        shown = sys.stderr.isatty() and total > 0
+        self._bar = Progress(
+            TextColumn('{task.description}'),
+            *columns,
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            disable=not shown,
+        )
+        self._task = self._bar.add_task('', total=total)
+        self._total = total
         self._made = 0
         self._begin = self._last = time.monotonic()
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
 
     def __enter__(self) -> _Display:
-        if sys.stderr.isatty() and self._total:
-            self._bar = Progress(
-                TextColumn('{task.description}'),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TextColumn('left'),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-            )
-            self._bar.start()
-            self._task = self._bar.add_task('', total=self._total)
+        self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        self._bar.stop()
 
-    def advance(self, work: Plan):  # type: ignore[no-untyped-def]
-        """Return the function to call after each run of an experiment."""
-
-        def note(run: Run | None) -> None:
-            self._made += 1
-            what = work.experiment.name if run is None else f'{run.experiment} {run.case}'
-            if self._bar is not None and self._task is not None:
-                self._bar.update(self._task, completed=self._made, description=what)
-                return
-            now = time.monotonic()
-            if now - self._last >= _QUIET_PERIOD:
-                self._last = now
-                left = (now - self._begin) * (self._total - self._made) / self._made
-                print(
-                    f'{self._made} of {self._total} runs, about {left:.0f} s left ({what})',
-                    file=sys.stderr,
-                    flush=True,
-                )
-
-        return note
+    def advance(self, task: Task) -> None:
+        """Count a run."""
+        self._made += 1
+        what = f'{task.experiment} {task.case}'
+        self._bar.update(self._task, completed=self._made, description=what)
+        now = time.monotonic()
+        if self._bar.disable and now - self._last >= _QUIET_PERIOD:
+            self._last = now
+            left = (now - self._begin) * (self._total - self._made) / self._made
+            self.say(f'{self._made} of {self._total} runs, about {left:.0f} s left ({what})')
 
     def say(self, text: str) -> None:
-        """Print a line."""
-        if self._bar is not None:
-            self._bar.console.print(text, markup=False, highlight=False)
-        else:
+        """Print a line, if there is one."""
+        if text and self._bar.disable:
             print(text, file=sys.stderr, flush=True)
+        elif text:
+            self._bar.console.print(text, markup=False, highlight=False)

@@ -1,17 +1,162 @@
-"""Experiments and their results."""
+"""Experiments: their cases and quantities, the papers' numbers, and runs."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
-from maasi_sim.experiments.cases import Case, Choice, Comparison, Outcome, Published, Quantity
-from maasi_sim.experiments.results import Run
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class OpenPoint:
+    """Something that the paper leaves open, the value taken here, and the reason."""
+
+    what: str
+    taken: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One configuration of an experiment, such as a method, that is run on every map.
+
+    Attributes
+    ----------
+    name : str
+        Unique within the experiment, such as 'ASI' or 'ASI, alpha 0.5, beta 5'.
+    settings : dict
+        Everything that a run needs, as plain values for YAML and JSON.
+    preset : str
+        'paper': the best reading of the paper; 'recommended': our own choice.
+    runs : int, optional
+        Number of maps at most; none: as many as asked for.
+    """
+
+    name: str
+    settings: dict[str, Any]
+    preset: Literal['paper', 'recommended'] = 'paper'
+    runs: int | None = None
+
+    @property
+    def slug(self) -> str:
+        """The name as part of a file name."""
+        return ''.join(c if c.isalnum() or c in '.-' else '_' for c in self.name.lower())
+
+    def digest(self) -> str:
+        """Return a short hash of the settings, by which stored runs are recognised."""
+        text = json.dumps(self.settings, sort_keys=True, allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measured quantity: a key of `Outcome.summary` or `Outcome.timing`.
+
+    A restricted one is a duration that is None in unfinished runs; its mean is restricted to the
+    shortest of the limits, which have the key `limit`.
+    """
+
+    name: str
+    label: str
+    unit: str = ''
+    kind: Literal['mean', 'restricted'] = 'mean'
+    limit: str = 'limit'
+
+    def title(self, unit: str | None = None) -> str:
+        """Return label and unit, or another unit."""
+        shown = self.unit if unit is None else unit
+        return f'{self.label} [{shown}]' if shown else self.label
+
+
+@dataclass(frozen=True)
+class Published:
+    """A number that the paper reports, as printed or (then the note says so) as read from a figure.
+
+    `half_width` is that of its 95 % confidence interval, and `note` its place in the paper.
+    """
+
+    case: str
+    quantity: str
+    value: float
+    half_width: float | None = None
+    runs: int = 10
+    note: str = ''
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A paired difference on the same maps, first minus second."""
+
+    first: str
+    second: str
+    quantity: str
+
+
+@dataclass
+class Outcome:
+    """Results of one run.
+
+    Attributes
+    ----------
+    summary : dict
+        A number, text or None by quantity.
+    columns : dict of arrays
+        One row per step, all columns of the same length.
+    details : dict
+        Other data of figures, such as true positions: lists and numbers.
+    timing : dict
+        Wall times; the one part that differs when a run is repeated.
+    """
+
+    summary: dict[str, float | int | str | bool | None]
+    columns: Mapping[str, ArrayLike] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
+    timing: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class Run:
+    """One run of one case on one map; see `Outcome`.
+
+    `number` is that of the map, from 0, `digest` that of the case's settings, and `machine` what
+    made it, see `this_machine`.
+    """
+
+    experiment: str
+    case: str
+    number: int
+    seed: int
+    digest: str
+    machine: dict[str, str]
+    summary: dict[str, Any]
+    columns: dict[str, NDArray[np.float64]]
+    details: dict[str, Any]
+    timing: dict[str, float]
+
+    def value(self, quantity: str) -> float | None:
+        """Return a measured quantity; None if the run has none."""
+        read = self.summary.get(quantity, self.timing.get(quantity))
+        return None if read is None or isinstance(read, str) else float(read)
+
+
+def plain(value: Any) -> Any:
+    """Return a value for JSON; non-finite numbers become None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @dataclass(frozen=True)
@@ -29,19 +174,13 @@ class Experiment:
     run : function of settings and seed
         Runs one case once. The seed is that of the map, the same for every case.
     quantities : sequence of Quantity
-        Columns of the table.
+        Rows of the table for each case.
     draw : function of an empty figure and the results
         Draws a figure in the form of the paper's.
-    published : sequence of Published
-        Numbers of the paper.
-    comparisons : sequence of Comparison
-        Paired differences to report.
-    choices : sequence of Choice
-        Open points of the paper.
-    causes : str
-        Likely causes of differences from the paper; not tested.
-    tested : str
-        Causes of differences that were tested by runs.
+    published, comparisons, choices : sequences
+        The paper's numbers, paired differences to report, and open points of the paper.
+    causes, tested : str
+        Causes of differences from the paper: likely ones, and those that were tested by runs.
     runs : int
         Number of maps in the paper.
     seconds : float
@@ -50,6 +189,9 @@ class Experiment:
         Experiments with the same value have the same maps; none: maps of its own.
     note : str
         Further information for readers.
+    compared : bool
+        Whether searches are compared: the seed is the number of the map, and workers are sent the
+        settings, as they do not know the experiment.
     """
 
     name: str
@@ -60,13 +202,14 @@ class Experiment:
     draw: Callable[[Figure, Results], None]
     published: Sequence[Published] = ()
     comparisons: Sequence[Comparison] = ()
-    choices: Sequence[Choice] = ()
+    choices: Sequence[OpenPoint] = ()
     causes: str = ''
     tested: str = ''
     runs: int = 10
     seconds: float = 2.0
     maps: str | None = None
     note: str = ''
+    compared: bool = False
 
     @property
     def paper(self) -> str:
@@ -74,17 +217,15 @@ class Experiment:
         return self.name[:3]
 
     def seed(self, number: int, seed: int = 1) -> int:
-        """Return the seed of a map; it depends on `maps`, the number and the seed only.
-
-        Parameters
-        ----------
-        number : int
-            Of the map, from 0.
-        seed : int
-            Of the whole campaign.
-        """
+        """Return the seed of a map of a campaign; it depends on `maps` and the arguments only."""
+        if self.compared:
+            return number
         key = f'{self.maps or self.name}/{seed}/{number}'
         return int.from_bytes(hashlib.sha256(key.encode()).digest()[:6], 'big')
+
+    def maps_of(self, case: Case, runs: int) -> int:
+        """Return on how many maps a case is run, of `runs` that are asked for."""
+        return runs if case.runs is None else min(runs, case.runs)
 
     def quantity(self, name: str) -> Quantity:
         """Return a quantity by its name."""
@@ -93,17 +234,7 @@ class Experiment:
 
 @dataclass
 class Results:
-    """The runs of one experiment.
-
-    Attributes
-    ----------
-    experiment : Experiment
-        Which.
-    cases : list of Case
-        All of its cases.
-    runs : dict
-        Runs of each case by name, in the order of the maps.
-    """
+    """The runs of one experiment: those of each case by its name, in the order of the maps."""
 
     experiment: Experiment
     cases: list[Case]
@@ -113,15 +244,24 @@ class Results:
         """Return the cases that have runs."""
         return [case.name for case in self.cases if self.runs.get(case.name)]
 
+    def every(self) -> list[Run]:
+        """Return all runs, case by case."""
+        return [run for case in self.cases for run in self.runs[case.name]]
+
     def case(self, name: str) -> Case:
         """Return a case by its name."""
         return next(case for case in self.cases if case.name == name)
 
-    def values(self, case: str, quantity: str) -> list[float | None]:
-        """Return a quantity in each run of a case."""
-        return [run.value(quantity) for run in self.runs[case]]
+    def values(self, case: str, quantity: str) -> NDArray[np.float64]:
+        """Return a quantity in each run of a case; nan where a run has none."""
+        return _values(self.runs[case], quantity)
 
-    def pairs(self, first: str, second: str) -> list[tuple[Run, Run]]:
-        """Return the runs of two cases on the same maps."""
-        other = {run.number: run for run in self.runs.get(second, [])}
-        return [(run, other[run.number]) for run in self.runs.get(first, []) if run.number in other]
+    def pairs(self, first: str, second: str, quantity: str) -> list[NDArray[np.float64]]:
+        """Return a quantity of two cases on the maps that both have."""
+        sides = [{run.number: run for run in self.runs.get(name, [])} for name in (first, second)]
+        both = [number for number in sides[0] if number in sides[1]]
+        return [_values([side[number] for number in both], quantity) for side in sides]
+
+
+def _values(runs: Sequence[Run], quantity: str) -> NDArray[np.float64]:
+    return np.array([run.value(quantity) for run in runs], dtype=float)

@@ -1,4 +1,4 @@
-"""Figures in the form of the papers'."""
+"""Figures in the form of the papers', and that of a comparison of searches."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_sim.experiments.experiment import Results
-from maasi_sim.experiments.results import Run
-from maasi_sim.experiments.statistics import mean_interval
-from maasi_sim.experiments.tables import interval, shown
+from maasi_sim.experiments.experiment import Results, Run
+from maasi_sim.experiments.statistics import mean_interval, survival
+from maasi_sim.experiments.tables import COMPLETE, TIME, difference, interval, shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,28 +30,20 @@ STYLES: dict[str, tuple[str, str]] = {
     'event': ('#0B5D1E', '-'),
     'recommended': ('#7B3294', '-'),
 }
+# For colour-blind readers (Okabe and Ito).
 _OTHERS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#8C564B')
+_COMPARED = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#D55E00', '#8C564B')
+_LINES = ('-', '--', '-.', ':')
 _FEWEST_SHADED = 4
 _TRUE, _FOUND, _PALE = '#222222', '#D62728', '#9A9A9A'
 
 
-def over(run: Run, grid: FloatArray, column: str = 'true_found', by: str = 'measurements') -> Any:
-    """Return a column of a run as a function of another: the last value at or before each point.
-
-    Parameters
-    ----------
-    run : Run
-        With both columns.
-    grid : (n,) array
-        Where.
-    column, by : str
-        Names; `by` must not fall.
-    """
-    places = run.columns[by]
-    if not len(places):
+def _found_over(run: Run, grid: FloatArray, by: str) -> FloatArray:
+    """Return the true targets found at or before each point of a grid of another column."""
+    if not len(run.columns[by]):
         return np.zeros(len(grid))
-    index = np.searchsorted(places, grid, side='right') - 1
-    return np.where(index >= 0, run.columns[column][np.maximum(index, 0)], 0.0)
+    index = np.searchsorted(run.columns[by], grid, side='right') - 1
+    return np.where(index >= 0, run.columns['true_found'][np.maximum(index, 0)], 0.0)
 
 
 def draw_curves(
@@ -66,22 +57,9 @@ def draw_curves(
 ) -> None:
     """Draw the mean number of targets found, of four or more runs with its 95 % confidence.
 
-    Over measurements, triangles mark where the paper's methods have found all.
-
-    Parameters
-    ----------
-    figure : Figure
-        Empty.
-    results : Results
-        Of searches.
-    styles : mapping
-        Which cases, and the key in `STYLES` of each; an unknown key takes another colour.
-    path : str, optional
-        Case whose first run is drawn beside the curves.
-    by, label : str
-        Column of the horizontal axis and its name.
-    end : float, optional
-        Of the horizontal axis; none: the longest run.
+    Over measurements, triangles mark where the paper's methods have found all. `styles` has the
+    cases to draw with the key in `STYLES` of each, `path` is the case whose first run is drawn
+    beside the curves, and `by` the column of the horizontal axis, up to `end`.
     """
     if path is not None:
         figure.set_size_inches(10.5, 4.6)
@@ -102,7 +80,7 @@ def draw_curves(
         if not runs:
             continue
         colour, line = STYLES.get(key, (_OTHERS[index % len(_OTHERS)], '-'))
-        values = np.array([over(run, grid, by=by) for run in runs])
+        values = np.array([_found_over(run, grid, by) for run in runs])
         spans = [mean_interval(column) for column in values.T]
         mean = np.array([span.mean for span in spans])
         half = np.nan_to_num(np.array([span.half_width for span in spans]))
@@ -226,18 +204,7 @@ def draw_against(
 ) -> None:
     """Draw means of quantities with their 95 % confidence against a number that cases differ in.
 
-    Parameters
-    ----------
-    figure : Figure
-        Empty.
-    results : Results
-        Of which.
-    setting : sequence of str
-        Keys of the number in the scenario.
-    label : str
-        Its name and unit.
-    quantities : sequence of str
-        One picture each, side by side.
+    `setting` are the keys of the number in the scenario; each quantity has a picture.
     """
     figure.set_size_inches(4.6 * len(quantities), 3.8)
     for index, quantity in enumerate(map(results.experiment.quantity, quantities)):
@@ -254,8 +221,7 @@ def draw_against(
         halves = np.nan_to_num([span.half_width for _, span in found])
         axes.errorbar(places, means, yerr=halves, fmt='o-', color=_OTHERS[index], ms=4, capsize=2)
         axes.set_xlabel(label)
-        unit = f' [{quantity.unit}]' if quantity.unit else ''
-        axes.set_ylabel(f'{quantity.label}{unit}')
+        axes.set_ylabel(quantity.title())
         axes.grid(color='#E6E6E6', lw=0.8)
         axes.spines[['top', 'right']].set_visible(False)
 
@@ -265,16 +231,7 @@ def draw_table(
 ) -> None:
     """Draw a table of means as the papers print theirs, the paper's number below ours.
 
-    Parameters
-    ----------
-    figure : Figure
-        Empty.
-    results : Results
-        Of which.
-    axes : one or two sequences of str
-        Heads of the rows and of the columns; joined by ', ' they name the cases.
-    quantity : str
-        What is shown.
+    `axes` are the heads of the rows and, if any, of the columns: joined they name the cases.
     """
     measured = results.experiment.quantity(quantity)
     rows = axes[0]
@@ -317,3 +274,61 @@ def draw_table(
         if i > 0 and j >= 0 and np.isfinite(means[i - 1, j]) and high > low:
             share = (means[i - 1, j] - low) / (high - low)
             cell.set_facecolor((1.0, 1.0 - 0.45 * share, 1.0 - 0.55 * share))
+
+
+def draw_comparison(figure: Figure, every: Sequence[Results]) -> None:
+    """Draw a row for each scenario: survival curves, and paired differences to the first case."""
+    most = max(len(results.names()) for results in every)
+    figure.set_size_inches(11.0, max(3.6, 1.6 + 0.4 * most) * len(every))
+    axes = figure.subplots(len(every), 2, squeeze=False)
+    for results, (left, right) in zip(every, axes):
+        _draw_survival(left, results)
+        _draw_differences(right, results)
+
+
+def _draw_survival(axes: Axes, results: Results) -> None:
+    end = 0.0
+    for index, name in enumerate(results.names()):
+        durations = results.values(name, TIME.name)
+        times, shares = survival(durations, results.values(name, COMPLETE.name) > 0.0)
+        last = float(durations.max())
+        end = max(end, last)
+        line = _LINES[index // len(_COMPARED) % len(_LINES)]
+        colour = _COMPARED[index % len(_COMPARED)]
+        axes.step(
+            [*times, last],
+            [*(100.0 * shares), 100.0 * shares[-1]],
+            line,
+            where='post',
+            color=colour,
+            lw=1.8,
+            label=name,
+        )
+    axes.set_xlim(0.0, 1.02 * end or 1.0)
+    axes.set_ylim(0.0, 103.0)
+    axes.set_xlabel('time [s]')
+    axes.set_ylabel('searches that still miss targets [%]')
+    axes.set_title(results.experiment.name, loc='left', fontsize=10, fontweight='bold')
+    axes.grid(color='#E6E6E6', lw=0.8)
+    axes.spines[['top', 'right']].set_visible(False)
+    axes.legend(fontsize=8, frameon=False)
+
+
+def _draw_differences(axes: Axes, results: Results) -> None:
+    names = results.names()
+    axes.axvline(0.0, color='#222222', lw=0.8)
+    for row, name in enumerate(names[1:]):
+        colour = _COMPARED[(row + 1) % len(_COMPARED)]
+        gaps = np.subtract(*results.pairs(name, names[0], TIME.name))
+        # Spread, always the same way, so that equal values can be seen.
+        lift = np.random.default_rng(0).uniform(0.12, 0.3, len(gaps))
+        axes.plot(gaps, row + lift, 'o', color=colour, ms=4, alpha=0.45, mew=0)
+        mean = difference(results, name, TIME)
+        axes.plot([mean.low, mean.high], [row, row], '-', color=colour, lw=3, solid_capstyle='butt')
+        axes.plot([mean.mean], [row], 'D', color=colour, ms=7, mec='white')
+    axes.set_yticks(range(len(names) - 1), names[1:])
+    axes.set_ylim(len(names) - 1.5, -0.5)
+    axes.set_xlabel(f'time to find all, minus {names[0] if names else ""} [s]')
+    axes.set_title('Each seed, mean and 95 % interval', loc='left', fontsize=10)
+    axes.grid(axis='x', color='#E6E6E6', lw=0.8)
+    axes.spines[['top', 'right', 'left']].set_visible(False)

@@ -1,49 +1,31 @@
-"""Output files of an experiment beside the single runs."""
+"""What an experiment leaves beside its runs, and the page of all experiments with its figures."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+import json
+import textwrap
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import yaml
 
-from maasi_sim.experiments.experiment import Experiment, Results
-from maasi_sim.experiments.results import RunFolder, runs_text, steps_text, write_file
-from maasi_sim.experiments.tables import markdown, table_text
+from maasi_sim.experiments.campaign import plan
+from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
+from maasi_sim.experiments.papers import experiments, introduction, title_of
+from maasi_sim.experiments.runs import RunFolder, runs_text, steps_text, write_file
+from maasi_sim.experiments.tables import markdown_table, table_cells, table_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
-def configuration_text(results: Results, seed: int) -> str:
-    """Return the configuration as YAML: choices, cases with their settings, seeds."""
-    experiment = results.experiment
-    numbers = sorted({run.number for runs in results.runs.values() for run in runs})
-    content = {
-        'experiment': experiment.name,
-        'title': experiment.title,
-        'seed': seed,
-        'maps': {number: experiment.seed(number, seed) for number in numbers},
-        'choices': [
-            {'what': item.what, 'taken': item.taken, 'reason': item.reason}
-            for item in experiment.choices
-        ],
-        'cases': {
-            case.name: {
-                'preset': case.preset,
-                'runs': len(results.runs[case.name]),
-                'settings': case.settings,
-            }
-            for case in results.cases
-        },
-    }
-    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
-
-
-def picture(results: Results, dpi: int = 110) -> bytes:
-    """Return the experiment's figure as PNG."""
-    return as_png(lambda figure: results.experiment.draw(figure, results), dpi)
+_PICTURE_DPI = 130
+_COLUMNS = 118
+EARLIER = ', from an earlier campaign'
+EARLIER_ROW = ' (earlier)'
 
 
 def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
@@ -59,30 +41,33 @@ def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
     return stream.getvalue()
 
 
-def table_markdown(results: Results) -> str:
-    """Return the tables with title, note, causes and choices."""
+def picture(results: Results, dpi: int = 110) -> bytes:
+    """Return the experiment's figure as PNG."""
+    return as_png(lambda figure: results.experiment.draw(figure, results), dpi)
+
+
+def configuration_text(results: Results, seed: int) -> str:
+    """Return the configuration as YAML: choices, cases with their settings, seeds."""
     experiment = results.experiment
-    parts = [f'# {experiment.name}: {experiment.title}\n', described(experiment, markdown(results))]
-    return '\n'.join(parts)
-
-
-def described(experiment: Experiment, tables: str) -> str:
-    """Return tables, note, causes and choices in Markdown."""
-    parts = [tables]
-    if experiment.note:
-        parts.append(f'{experiment.note}\n')
-    if experiment.causes:
-        parts.append(f'Likely causes of differences, not tested: {experiment.causes}\n')
-    if experiment.tested:
-        parts.append(f'Causes of differences, tested: {experiment.tested}\n')
-    if experiment.choices:
-        parts.append(
-            '\n'.join(
-                f'- {item.what}: **{item.taken}**. {item.reason}' for item in experiment.choices
-            )
-            + '\n'
-        )
-    return '\n'.join(parts)
+    content = {
+        'experiment': experiment.name,
+        'title': experiment.title,
+        'seed': seed,
+        'maps': {
+            number: experiment.seed(number, seed)
+            for number in sorted({run.number for run in results.every()})
+        },
+        'choices': [asdict(item) for item in experiment.choices],
+        'cases': {
+            case.name: {
+                'preset': case.preset,
+                'runs': len(results.runs[case.name]),
+                'settings': case.settings,
+            }
+            for case in results.cases
+        },
+    }
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
 
 
 def write_outputs(folder: RunFolder, results: Results, seed: int) -> None:
@@ -93,10 +78,160 @@ def write_outputs(folder: RunFolder, results: Results, seed: int) -> None:
     NoRoom
         If one cannot be written; the runs are stored already.
     """
-    runs = [run for case in results.cases for run in results.runs[case.name]]
-    write_file(folder.path / 'steps.csv', steps_text(runs))
-    write_file(folder.path / 'runs.csv', runs_text(runs))
+    experiment = results.experiment
+    parts = [
+        f'# {experiment.name}: {experiment.title}\n',
+        *_described(experiment, table_cells(results)),
+        listed(experiment.choices),
+    ]
+    write_file(folder.path / 'steps.csv', steps_text(results.every()))
+    write_file(folder.path / 'runs.csv', runs_text(results.every()))
     write_file(folder.path / 'table.csv', table_text(results))
-    write_file(folder.path / 'table.md', table_markdown(results))
+    write_file(folder.path / 'table.md', '\n'.join(filter(None, parts)))
     write_file(folder.path / 'configuration.yaml', configuration_text(results, seed))
     write_file(folder.path / 'figure.png', picture(results))
+
+
+def _described(experiment: Experiment, tables: list[list[list[str]]]) -> list[str]:
+    """Return tables, note and causes in Markdown."""
+    parts = [*map(markdown_table, tables), experiment.note and f'{experiment.note}\n']
+    if experiment.causes:
+        parts.append(f'Likely causes of differences, not tested: {experiment.causes}\n')
+    if experiment.tested:
+        parts.append(f'Causes of differences, tested: {experiment.tested}\n')
+    return parts
+
+
+def listed(choices: Sequence[OpenPoint]) -> str:
+    """Return open points of the paper as a list in Markdown."""
+    return ''.join(f'- {item.what}: **{item.taken}**. {item.reason}\n' for item in choices)
+
+
+@dataclass
+class Section:
+    """What the page shows of an experiment, stored beside its figure.
+
+    `rests` is the number of runs in words, `duration` the time of a run in words or '', and
+    `tables` are the texts of cells.
+    """
+
+    rests: str
+    duration: str
+    tables: list[list[list[str]]]
+
+    def completed(self, earlier: Section) -> Section:
+        """Return the section with the rows of an earlier one that it does not have, marked."""
+        tables = [list(table) for table in self.tables]
+        for old in earlier.tables:
+            new = next((table for table in tables if table[0] == old[0]), None)
+            if new is None:
+                new = old[:1]
+                tables.append(new)
+            keys = 1 if old[0][0] == 'case' else 2
+            known = {tuple(row[:keys]) for row in new}
+            for row in old[1:]:
+                if tuple(row[:keys]) not in known:
+                    runs = row[2].removesuffix(EARLIER_ROW) + EARLIER_ROW
+                    new.append([*row[:2], runs, *row[3:]])
+        return Section(self.rests, self.duration, tables)
+
+
+def section_of(results: Results, every: bool = True) -> Section:
+    """Return the section of an experiment; `every`: cases without runs count."""
+    shown = [case for case in results.cases if every or results.runs[case.name]]
+    experiment = results.experiment
+    wanted = [experiment.maps_of(case, experiment.runs) for case in shown]
+    made = [len(results.runs[case.name]) for case in shown]
+    maps = f'{made[0]}' if len(set(made)) == 1 else f'{min(made)} to {max(made)}'
+    rests = f'{maps} run{"" if maps == "1" else "s"} of each case'
+    if any(number < least for number, least in zip(made, wanted)):
+        rests = f'**not in full: {rests}, the paper has {max(wanted)}**'
+    times = np.concatenate([results.values(name, 'processor_time') for name in results.names()])
+    times = times[~np.isnan(times)]
+    duration = f' A run takes about {np.median(times):.1f} s on one core.' if len(times) else ''
+    return Section(rests, duration, table_cells(results))
+
+
+def page(sections: dict[str, Section]) -> str:
+    """Return the page of all experiments, from what is shown of each by its name."""
+    known = experiments()
+    rows = [['experiment', 'shows', 'rests on']]
+    for name, experiment in known.items():
+        rests = sections[name].rests if name in sections else '**not run**'
+        rows.append([f'[{name}](#{name})' if name in sections else name, experiment.title, rests])
+    parts = [introduction(), '## What was run\n', markdown_table(rows)]
+    papers: dict[str, list[Experiment]] = {}
+    for name in known:
+        if name in sections:
+            papers.setdefault(known[name].paper, []).append(known[name])
+    for paper, items in papers.items():
+        parts.append(f'## Paper {paper}\n\n{title_of(paper)}\n')
+        # Each open point once, with a letter that the experiments name.
+        choices = list(dict.fromkeys(choice for item in items for choice in item.choices))
+        parts.append('What the paper leaves open, and what is taken here:\n')
+        parts.append(''.join(f'{n}. {listed([c])[2:]}' for n, c in enumerate(choices, start=1)))
+        for item in items:
+            section = sections[item.name]
+            parts.append(
+                f'### {item.name}\n\n{item.title}.\nRests on {section.rests}.{section.duration}\n'
+            )
+            parts.append(f'![{item.title}](reproduction/{item.name}.png)\n')
+            parts += _described(item, section.tables)
+            numbers = ', '.join(str(choices.index(choice) + 1) for choice in item.choices)
+            parts.append(f'Open points of paper {paper}: {numbers}.\n' if numbers else '')
+    return '\n'.join(filter(None, parts))
+
+
+def wrapped(text: str) -> str:
+    """Return Markdown with long lines of paragraphs and lists wrapped; tables stay."""
+    lines = []
+    for line in text.split('\n'):
+        if len(line) <= _COLUMNS or line.startswith(('|', '#', '!', '    ')):
+            lines.append(line)
+            continue
+        mark = line.split(' ', 1)[0]
+        indent = ' ' * (len(mark) + 1) if mark == '-' or mark.rstrip('.').isdecimal() else ''
+        lines += textwrap.wrap(
+            line,
+            _COLUMNS,
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    return '\n'.join(lines)
+
+
+def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) -> list[str]:
+    """Write the page of the experiments in the folder `out`, and return those that have runs there.
+
+    Figures and tables are written to `reproduction/` beside the page; experiments and cases
+    without runs keep theirs.
+
+    Raises
+    ------
+    NoRoom
+        If something cannot be written.
+    """
+    sections, shown = {}, []
+    for name, experiment in experiments().items():
+        image = file.parent / 'reproduction' / f'{name}.png'
+        store = image.with_suffix('.json')
+        earlier = Section(**json.loads(store.read_text())) if store.exists() else None
+        maps = RunFolder(out / name, name).maps()
+        results = plan(experiment, out, maps, seed, small).results()
+        every = len(results.names()) == len(results.cases)
+        if results.names():
+            shown.append(name)
+            section = section_of(results, every or earlier is None)
+            if earlier is not None and not every:
+                section = section.completed(earlier)
+            # A figure of all cases is not replaced by one of some.
+            if every or not image.exists():
+                write_file(image, picture(results, _PICTURE_DPI))
+            write_file(store, json.dumps(asdict(section), indent=1, ensure_ascii=False) + '\n')
+            sections[name] = section
+        elif earlier is not None:
+            earlier.rests += EARLIER
+            sections[name] = earlier
+    write_file(file, wrapped(page(sections)))
+    return shown

@@ -7,6 +7,7 @@ case. A list of mappings of cases means all combinations of them.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping
 from functools import cache, partial
 from itertools import product
@@ -17,8 +18,7 @@ import yaml
 
 from maasi_sim.experiments import building_figures, building_runs, figures, searches
 from maasi_sim.experiments.building_runs import run_mission, run_timing
-from maasi_sim.experiments.cases import Case, Choice, Comparison, Published
-from maasi_sim.experiments.experiment import Experiment
+from maasi_sim.experiments.experiment import Case, Comparison, Experiment, OpenPoint, Published
 from maasi_sim.experiments.searches import (
     merged,
     run_among_obstacles,
@@ -48,7 +48,35 @@ FIGURES: dict[str, Callable[..., None]] = {
     'mission_times': building_figures.draw_mission_times,
     'decision_times': building_figures.draw_decision_times,
 }
+PAPERS = ('000', '001', '002', '003', '004')
 _FOLDER = Path(__file__).with_name('papers')
+
+
+class UnknownExperiment(ValueError):
+    """There is no experiment of this name."""
+
+
+def experiments() -> dict[str, Experiment]:
+    """Return all experiments by name, in the order of the papers."""
+    return {item.name: item for number in PAPERS for item in paper_experiments(number)}
+
+
+def find(name: str) -> Experiment:
+    """Return an experiment by its name.
+
+    Raises
+    ------
+    UnknownExperiment
+        Names the nearest ones.
+    """
+    known = experiments()
+    if name in known:
+        return known[name]
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4) or [
+        item for item in known if item[:3] == name[:3]
+    ]
+    hint = f'; nearest are {", ".join(near)}' if near else ''
+    raise UnknownExperiment(f"unknown experiment '{name}'{hint}; --list names all")
 
 
 @cache
@@ -56,6 +84,16 @@ def _paper(number: str) -> dict[str, Any]:
     text = (_FOLDER / f'{number}.yaml').read_text(encoding='utf-8')
     content: dict[str, Any] = yaml.safe_load(text)
     return content
+
+
+def introduction() -> str:
+    """Return the beginning of the page of all experiments, in Markdown."""
+    return (_FOLDER / 'introduction.txt').read_text(encoding='utf-8')
+
+
+def title_of(paper: str) -> str:
+    """Return authors and title of a paper, '' of an unknown one."""
+    return str(_paper(paper)['title']) if paper in PAPERS else ''
 
 
 def paper_experiments(number: str) -> list[Experiment]:
@@ -87,7 +125,7 @@ def _experiment(name: str, content: Mapping[str, Any], paper: Mapping[str, Any])
             for row in entry.pop('comparisons', [])
             for names in product(row['first'], row['second'], row['quantities'])
         ],
-        choices=[Choice(**paper['choices'][key]) for key in entry.pop('choices')],
+        choices=[OpenPoint(**paper['choices'][key]) for key in entry.pop('choices')],
         **entry,
     )
 

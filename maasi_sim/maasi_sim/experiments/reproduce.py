@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from maasi_sim.arguments import Parser, count, whole
-from maasi_sim.experiments.campaign import Plan, plan
-from maasi_sim.experiments.document import write_document
+from maasi_sim.experiments.campaign import Campaign, plan
 from maasi_sim.experiments.execution import (
     DONE,
     EXIT_CODES,
@@ -18,8 +18,8 @@ from maasi_sim.experiments.execution import (
     run_command,
 )
 from maasi_sim.experiments.experiment import Experiment
-from maasi_sim.experiments.outputs import write_outputs
-from maasi_sim.experiments.registry import UnknownExperiment, experiments, find
+from maasi_sim.experiments.outputs import write_document, write_outputs
+from maasi_sim.experiments.papers import UnknownExperiment, experiments, find
 
 
 class UnknownCase(ValueError):
@@ -80,7 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _reproduce(options: argparse.Namespace) -> int:
     if options.list:
-        print('\n'.join(listing(list(experiments().values()))))
+        print('\n'.join(map(_line, experiments().values())))
         return DONE
     if options.names == ['all']:
         wanted = list(experiments().values())
@@ -91,45 +91,39 @@ def _reproduce(options: argparse.Namespace) -> int:
         if name not in known:
             allowed = ', '.join(sorted(known))
             raise UnknownCase(f"unknown case '{name}'; allowed are {allowed}")
-    code = run_all(wanted, options) if wanted else DONE
+    problems = _run(wanted, options) if wanted else []
     if options.document is not None:
         shown = write_document(options.document, options.out, options.seed, options.small)
         print(f'wrote {options.document} with {len(shown)} experiments')
-    return code
+    return SOME_FAILED if problems else DONE
 
 
-def listing(known: list[Experiment]) -> list[str]:
-    """Return a line for each experiment: name, cases, runs, time and title."""
-    lines = []
-    for item in known:
-        cases = item.cases(False)
-        runs = sum(item.runs if case.runs is None else case.runs for case in cases)
-        minutes = runs * item.seconds / 60.0
-        takes = f'{len(cases)} cases, {runs} runs, {max(minutes, 0.1):.1f} min on a core'
-        lines.append(f'{item.name:12s} {takes:38s} {item.title}')
-    return lines
+def _line(item: Experiment) -> str:
+    """Return name, cases, runs, time and title of an experiment."""
+    cases = item.cases(False)
+    runs = sum(item.runs if case.runs is None else case.runs for case in cases)
+    minutes = runs * item.seconds / 60.0
+    takes = f'{len(cases)} cases, {runs} runs, {max(minutes, 0.1):.1f} min on a core'
+    return f'{item.name:12s} {takes:38s} {item.title}'
 
 
-def run_all(wanted: list[Experiment], options: argparse.Namespace) -> int:
-    """Run experiments one after the other and return the exit code."""
-    plans = []
+def _run(wanted: Sequence[Experiment], options: argparse.Namespace) -> list[str]:
+    """Run experiments one after the other and return the errors."""
+    campaigns = []
     for experiment in wanted:
         runs = options.runs or experiment.runs
         work = plan(experiment, options.out, runs, options.seed, options.small)
         if options.case:
             work.tasks = [task for task in work.tasks if task.case in options.case]
-        for complaint in work.complaints:
-            print(f'warning: {complaint}', file=sys.stderr)
-        plans.append(work)
+        campaigns.append(work)
 
-    def finished(work: Plan) -> str:
+    def finished(work: Campaign) -> str:
         write_outputs(work.folder, work.results(), options.seed)
         return f'{work.experiment.name}: {work.folder.path}/table.md'
 
-    problems = carry_out_all(
-        plans, options.workers, options.cluster, options.mixed_workers, finished
+    return carry_out_all(
+        campaigns, options.workers, options.cluster, options.mixed_workers, finished
     )
-    return SOME_FAILED if problems else DONE
 
 
 if __name__ == '__main__':

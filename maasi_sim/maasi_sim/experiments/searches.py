@@ -10,7 +10,7 @@ import numpy as np
 
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_sim.experiments.cases import Case, Outcome, Quantity
+from maasi_sim.experiments.experiment import Case, Outcome, Quantity
 from maasi_sim.scenario.loading import scenario_from_content, scenario_from_values
 from maasi_sim.search import search
 from maasi_sim.search_result import SearchResult
@@ -55,20 +55,8 @@ def search_case(
 ) -> Case:
     """Return a case that is a search; robots stop at each waypoint, as in the papers.
 
-    Parameters
-    ----------
-    name : str
-        Of the case.
-    values : mapping
-        Content of a scenario file; robot types come from config/robots.
-    most_measurements : int
-        Cap on the measurements of all robots.
-    preset : str
-        'paper' or 'recommended'.
-    small : bool
-        Whether to use few measurements and particles.
-    runs : int, optional
-        See `Case`.
+    `values` is the content of a scenario file, `most_measurements` the cap on those of all robots;
+    a small case has few measurements and particles.
     """
     if small:
         most_measurements = min(most_measurements, _SMALL)
@@ -81,7 +69,7 @@ def search_case(
 
 
 def run_search(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search and return its results."""
+    """Run a search of a case and return its results."""
     scenario = scenario_from_content(settings['scenario'], 'settings')
     result = search(scenario, seed, settings['most_measurements'])
     return outcome_of(result, settings['most_measurements'], scenario.limits.time)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -12,22 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 LEVEL = 0.95
+_TAIL = 0.5 + 0.5 * LEVEL
+# Power of a paired test for which the number of pairs is given, and the largest such number.
+_POWER = 0.8
+_MOST_PAIRS = 1_000_000
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with a confidence interval.
+    """A mean with half the width of its confidence interval, and Student's degrees of freedom.
 
-    Attributes
-    ----------
-    mean : float
-        nan without values.
-    half_width : float
-        Of the interval; nan with fewer than two values.
-    number : int
-        Number of values.
-    degrees : float
-        Of freedom, of Student's t.
+    The mean is nan without values, the half width with fewer than two.
     """
 
     mean: float
@@ -39,6 +33,11 @@ class Interval:
     def error(self) -> float:
         """Standard error of the mean."""
         return self.half_width / _student(self.degrees)
+
+
+def _student(degrees: float) -> float:
+    """Return the half width of the interval of Student's t with variance 1."""
+    return float(stats.t.ppf(_TAIL, degrees))
 
 
 def mean_interval(values: ArrayLike) -> Interval:
@@ -56,19 +55,10 @@ def mean_interval(values: ArrayLike) -> Interval:
 
 
 def restricted_mean(durations: ArrayLike, finished: ArrayLike, limit: float) -> Interval:
-    """Return the restricted mean of durations T, of which some are censored.
+    """Return the restricted mean of durations T, censored where they are not `finished`.
 
     The area under Kaplan and Meier's curve up to the limit. Without censoring before the limit it
     is the mean of min(T, limit) with Student's interval; otherwise Greenwood's variance is used.
-
-    Parameters
-    ----------
-    durations : (n,) array
-        T, or the time of censoring.
-    finished : (n,) array of bool
-        False where censored.
-    limit : float
-        At least 0.
 
     Raises
     ------
@@ -89,8 +79,8 @@ def restricted_mean(durations: ArrayLike, finished: ArrayLike, limit: float) -> 
     number = len(times)
     steps, deaths = np.unique(times[ended], return_counts=True)
     risk = (times >= steps[:, None]).sum(axis=1)
-    survival = np.concatenate([[1.0], np.cumprod(1.0 - deaths / risk)])
-    areas = np.cumsum(survival * np.diff([0.0, *steps, limit]))
+    alive = np.concatenate([[1.0], np.cumprod(1.0 - deaths / risk)])
+    areas = np.cumsum(alive * np.diff([0.0, *steps, limit]))
     left = risk > deaths
     spread = (deaths / (risk * np.maximum(risk - deaths, 1)))[left]
     variance = float(((areas[-1] - areas[:-1][left]) ** 2 * spread).sum())
@@ -100,9 +90,19 @@ def restricted_mean(durations: ArrayLike, finished: ArrayLike, limit: float) -> 
     )
 
 
-def _student(degrees: float) -> float:
-    """Return the half width of the interval of Student's t with variance 1."""
-    return float(stats.t.ppf(0.5 + 0.5 * LEVEL, degrees))
+def survival(
+    durations: ArrayLike, finished: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return Kaplan and Meier's curve: times, and the share not finished from each time on.
+
+    Durations that are not `finished` are censored.
+    """
+    times, ended = np.asarray(durations, dtype=float), np.asarray(finished, dtype=bool)
+    curve = stats.ecdf(stats.CensoredData.right_censored(times, ~ended)).sf
+    return (
+        np.concatenate([[0.0], curve.quantiles]),
+        np.concatenate([[1.0], curve.probabilities]),
+    )
 
 
 def _gaps(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
@@ -113,31 +113,16 @@ def _gaps(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike) -> Interval:
-    """Return the mean of first minus second on the same maps; pairs with a nan are left out.
-
-    Raises
-    ------
-    ValueError
-        If the lengths differ.
-    """
+    """Return the mean of first minus second on the same maps; pairs with a nan are left out."""
     return mean_interval(_gaps(first, second))
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The mean of paired differences with its bootstrap interval.
+    """The mean of paired differences with the bounds of its bootstrap interval, and their median.
 
-    Attributes
-    ----------
-    mean, low, high : float
-        With the bounds of the 95 % interval; nan where there are too few values.
-    median : float
-        Of the differences.
-    number : int
-        Pairs.
-    needed : int or None
-        Pairs for a power of 0.8 at a difference of this size; None without difference or spread,
-        and above a million.
+    What too few values do not give is nan. `needed` is the number of pairs for a power of 0.8 at a
+    difference of this size; None without difference or spread, and above a million.
     """
 
     mean: float
@@ -158,11 +143,6 @@ def bootstrap_difference(first: ArrayLike, second: ArrayLike) -> Difference:
 
     The interval is the bias-corrected and accelerated bootstrap (Efron) of pairs, with fixed random
     numbers.
-
-    Raises
-    ------
-    ValueError
-        If the lengths differ.
     """
     gaps = _gaps(first, second)
     gaps = gaps[~np.isnan(gaps)]
@@ -185,52 +165,21 @@ def _bootstrap_interval(gaps: tuple[float, ...]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def pairs_needed(gaps: ArrayLike, power: float = 0.8, most: int = 1_000_000) -> int | None:
-    """Return the number of pairs that a paired t test needs for a mean difference as found.
-
-    Parameters
-    ----------
-    gaps : (n,) array
-        Differences, two or more.
-    power : float
-        Probability of a significant result.
-    most : int
-        Return None above it.
-    """
+def pairs_needed(gaps: ArrayLike) -> int | None:
+    """Return the number of pairs that a paired t test needs for a mean difference as found."""
     values = np.asarray(gaps, dtype=float)
     deviation = float(values.std(ddof=1))
     if deviation == 0.0 or values.mean() == 0.0:
         return None
     effect = abs(float(values.mean())) / deviation
-    tail = 0.5 + 0.5 * LEVEL
     # Start from the normal approximation, which is slightly too small.
-    number = max(2, int(((stats.norm.ppf(tail) + stats.norm.ppf(power)) / effect) ** 2))
-    while number <= most:
-        limit = stats.t.ppf(tail, number - 1)
-        if stats.nct.sf(limit, number - 1, effect * math.sqrt(number)) >= power:
+    number = max(2, int(((stats.norm.ppf(_TAIL) + stats.norm.ppf(_POWER)) / effect) ** 2))
+    while number <= _MOST_PAIRS:
+        limit = stats.t.ppf(_TAIL, number - 1)
+        if stats.nct.sf(limit, number - 1, effect * math.sqrt(number)) >= _POWER:
             return number
         number += 1
     return None
-
-
-def survival(
-    durations: ArrayLike, finished: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Kaplan and Meier's curve: times, and the share not finished from each time on.
-
-    Parameters
-    ----------
-    durations : (n,) array
-        Of each, or time of censoring.
-    finished : (n,) array of bool
-        False where censored.
-    """
-    times, ended = np.asarray(durations, dtype=float), np.asarray(finished, dtype=bool)
-    curve = stats.ecdf(stats.CensoredData.right_censored(times, ~ended)).sf
-    return (
-        np.concatenate([[0.0], curve.quantiles]),
-        np.concatenate([[1.0], curve.probabilities]),
-    )
 
 
 def independent_difference(first: Interval, second: Interval) -> Interval:
@@ -259,8 +208,3 @@ def from_published(value: float, half_width: float | None, runs: int) -> Interva
     if half_width is None or runs < 2:
         return Interval(value, math.nan, runs, 0.0)
     return Interval(value, half_width, runs, runs - 1.0)
-
-
-def array(values: Sequence[float | None]) -> np.ndarray:
-    """Return values as an array, None as nan."""
-    return np.array([np.nan if value is None else float(value) for value in values])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from maasi_sim.experiments.cases import Outcome
+from maasi_sim.experiments.experiment import Outcome
 from maasi_sim.experiments.searches import run_search
 from maasi_sim.world.noise_streams import noise_stream
 
@@ -26,24 +26,10 @@ DEVIATION = 150.0
 def self_affine_map(
     generator: np.random.Generator, nodes: int = MAP_NODES, hurst: float = HURST
 ) -> FloatArray:
-    """Return heights of a periodic self-affine map by spectral synthesis.
+    """Return heights of a periodic map, (nodes, nodes), with mean 0 and deviation 1.
 
     The power of a wave number k falls with k^-(2 H + 2), so that the mean square difference of
     two heights grows with their distance to the power 2 H.
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-        Where the randomness comes from.
-    nodes : int
-        On each axis.
-    hurst : float
-        H, between 0 and 1.
-
-    Returns
-    -------
-    (nodes, nodes) array
-        With mean 0 and deviation 1.
     """
     spectrum = np.fft.rfft2(generator.standard_normal((nodes, nodes)))
     waves = np.hypot(np.fft.fftfreq(nodes)[:, None], np.fft.rfftfreq(nodes)[None, :])
@@ -53,17 +39,7 @@ def self_affine_map(
 
 
 def chunk(generator: np.random.Generator, size: float, nodes: int) -> FloatArray:
-    """Return the heights of a small area of a map of 12 km, (nodes, nodes) [m].
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-        Source of random numbers.
-    size : float
-        Side of the area [m].
-    nodes : int
-        On each axis.
-    """
+    """Return the heights of an area of `size` metres in a map of 12 km, (nodes, nodes) [m]."""
     heights = DEVIATION * self_affine_map(generator)
     corner = generator.uniform(0.0, MAP_NODES, size=2)
     along = np.linspace(0.0, size * MAP_NODES / MAP_SIZE, nodes)
@@ -81,22 +57,8 @@ def littered(
 ) -> FloatArray:
     """Return targets in two clusters: around the lowest and around the highest place.
 
-    Of ten places drawn around each, the lowest (highest) one is taken, one target after the other.
-
-    Parameters
-    ----------
-    heights : (n, n) array
-        [m].
-    bounds : (2, 2) array
-        Of the area [m].
-    number : int
-        Of targets, even.
-    spread : float
-        Deviation of the draws [m].
-    margin : float
-        Least distance from the bounds [m].
-    generator : numpy.random.Generator
-        Where the randomness comes from.
+    Of ten places drawn around each, with deviation `spread`, the lowest (highest) one is taken, one
+    target after the other, at least `margin` from the bounds.
     """
     nodes = heights.shape[0]
     low, high = bounds[:, 0] + margin, bounds[:, 1] - margin

@@ -1,21 +1,21 @@
-"""Searches of a scenario with several planners and filters on the same seeds, as an experiment."""
+"""Searches with several planners and filters on the same seeds, as an experiment."""
 
 from __future__ import annotations
 
 import hashlib
 import inspect
+import pkgutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maasi_planner.settings import PLANNERS
 from maasi_sim.buildings.scenario import is_cuboid_scenario
-from maasi_sim.experiments.cases import Case, Outcome
-from maasi_sim.experiments.clairvoyant import clairvoyant
-from maasi_sim.experiments.experiment import Experiment, Results
+from maasi_sim.experiments.experiment import Case, Experiment, Outcome
+from maasi_sim.experiments.figures import draw_comparison
 from maasi_sim.experiments.searches import outcome_of
 from maasi_sim.machine import code_digest
 from maasi_sim.scenario.layering import Key, ScenarioError
@@ -29,57 +29,30 @@ from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import leaving, search
 from maasi_sim.search_result import SearchResult
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
+def comparison_of(name: str, cases: Sequence[Case]) -> Experiment:
+    """Return searches as an experiment; differences are to the first case.
 
-class SearchComparison(Experiment):
-    """Searches that are compared; the number of a map is the seed of the search.
-
-    Parameters
-    ----------
-    name : str
-        Of the scenario, or of what is searched.
-    cases : sequence of Case
-        With settings from `search_settings`. Differences are to the first one.
+    The cases have settings from `search_settings`.
     """
-
-    def __init__(self, name: str, cases: Sequence[Case]) -> None:
-        super().__init__(
-            name=name,
-            title='Searches on the same seeds',
-            cases=lambda small: list(cases),
-            run=run_compared,
-            quantities=(),
-            draw=_draw,
-        )
-
-    def seed(self, number: int, seed: int = 1) -> int:
-        """Return the number of the map."""
-        return number
+    return Experiment(
+        name=name,
+        title='Searches on the same seeds',
+        cases=lambda small: list(cases),
+        run=run_compared,
+        quantities=(),
+        draw=lambda figure, results: draw_comparison(figure, [results]),
+        compared=True,
+    )
 
 
-def _draw(figure: Figure, results: Results) -> None:
-    from maasi_sim.experiments.comparison_figure import draw_comparison
-
-    draw_comparison(figure, [results])
-
-
-def search_settings(scenario: Scenario, clairvoyant: bool = False) -> dict[str, Any]:
+def search_settings(scenario: Scenario, planner: str | None = None) -> dict[str, Any]:
     """Return the settings of a case.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        To run.
-    clairvoyant : bool
-        Whether to use the planner that knows the true targets, not the scenario's.
+    `planner` is a function to make planners, as of `search`, as `module:function`; None: the
+    scenario's planner.
     """
-    return {
-        'scenario': scenario.content(),
-        'clairvoyant': clairvoyant,
-        'code': code_of(scenario),
-    }
+    return {'scenario': scenario.content(), 'planner': planner, 'code': code_of(scenario)}
 
 
 def code_of(scenario: Scenario) -> str:
@@ -104,7 +77,8 @@ def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
     if settings['code'] != code_of(scenario):
         raise RuntimeError('this worker has another version of the code')
     limit = scenario.limits.time
-    result = search(scenario, seed, planner=clairvoyant if settings['clairvoyant'] else None)
+    planner = settings['planner'] and pkgutil.resolve_name(settings['planner'])
+    result = search(scenario, seed, planner=planner)
     outcome = outcome_of(result, None, limit)
     times = find_times(result, limit)
     complete = outcome.summary['time_to_find_all']
@@ -131,17 +105,11 @@ def compared(
     planners: Sequence[str] = (),
     filters: Sequence[str] = (),
     time_limit: float | None = None,
-) -> SearchComparison:
+) -> Experiment:
     """Return the comparison of planners and filters in a scenario.
 
-    Parameters
-    ----------
-    scenario : str or Path
-        File, or the name of one in `config/scenarios`.
-    planners, filters : sequence of str
-        Values of `planner.name` and `filter.method`; without any, the scenario's own.
-    time_limit : float, optional
-        Instead of the scenario's [s].
+    `planners` and `filters` are values of `planner.name` and `filter.method`; without any, the
+    scenario's own. `time_limit` is instead of the scenario's [s].
 
     Raises
     ------
@@ -171,4 +139,4 @@ def compared(
             if len(filters) > 1:
                 names.append(str(method))
             cases.append(Case(', '.join(names), search_settings(loaded)))
-    return SearchComparison(path.stem, cases)
+    return comparison_of(path.stem, cases)

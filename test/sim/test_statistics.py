@@ -1,0 +1,123 @@
+"""Tests of means and their confidence intervals, against SciPy and printed tables."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from maasi_sim.experiments import statistics
+from maasi_sim.experiments.statistics import Difference, mean_interval
+from maasi_sim.experiments.tables import verdict
+
+GENERATOR = np.random.default_rng(3)
+FIRST, SECOND, OTHER = (GENERATOR.normal(5.0, 2.0, number) for number in (12, 12, 7))
+
+
+def welch(first, second):
+    """Return the difference to a published mean."""
+    paper = mean_interval(second)
+    published = statistics.from_published(paper.mean, paper.half_width, len(second))
+    return statistics.independent_difference(mean_interval(first), published)
+
+
+@pytest.mark.parametrize(
+    ('ours', 'theirs'),
+    [
+        (mean_interval([*FIRST, math.nan]), stats.ttest_1samp(FIRST, 0.0)),
+        (statistics.paired_difference(FIRST, SECOND), stats.ttest_rel(FIRST, SECOND)),
+        (welch(FIRST, OTHER), stats.ttest_ind(FIRST, OTHER, equal_var=False)),
+    ],
+)
+def test_intervals_are_those_of_scipy(ours, theirs):
+    low, high = theirs.confidence_interval(0.95)
+    assert ours.number == 7 or ours.number == 12
+    bounds = ours.mean - ours.half_width, ours.mean + ours.half_width
+    assert bounds == pytest.approx((low, high))
+
+
+def test_intervals_of_few_values():
+    assert math.isnan(mean_interval([]).mean)
+    one = mean_interval([4.0])
+    assert one.mean == 4.0 and math.isnan(one.half_width)
+    # A number without spread: the interval has our spread only.
+    ours = mean_interval([1.0, 2.0, 4.0])
+    result = statistics.independent_difference(ours, statistics.from_published(2.0, None, 10))
+    assert result.half_width == pytest.approx(ours.half_width)
+    assert result.mean == pytest.approx(ours.mean - 2.0)
+
+
+def test_restricted_mean_is_the_area_under_scipys_survival_curve():
+    times = np.array([2.0, 3.0, 3.0, 5.0, 6.0, 8.0, 9.0, 11.0])
+    ended = np.array([True, True, False, True, False, True, True, True])
+    limit = 10.0
+    survival = stats.ecdf(stats.CensoredData.right_censored(times, ~ended)).sf
+    grid = np.linspace(0.0, limit, 200_001)
+    area = survival.evaluate(0.5 * (grid[1:] + grid[:-1])).sum() * (grid[1] - grid[0])
+    result = statistics.restricted_mean(times, ended, limit)
+    assert result.mean == pytest.approx(area, abs=1e-4)
+    assert 0.0 < result.half_width < limit
+
+
+def test_restricted_mean_of_runs_that_did_not_get_there():
+    result = statistics.restricted_mean([10.0, 20.0, 30.0, 30.0], [True, True, False, False], 30.0)
+    assert result == mean_interval([10.0, 20.0, 30.0, 30.0])
+    # A run cut short after all others have ended, below the limit, takes the other way.
+    other = statistics.restricted_mean([1.0, 2.0, 4.0, 7.0, 8.0], [True] * 4 + [False], 9.0)
+    assert other.mean == pytest.approx((1.0 + 2.0 + 4.0 + 7.0 + 9.0) / 5.0)
+
+
+@pytest.mark.parametrize(
+    ('times', 'ended', 'limit'),
+    [([1.0, math.nan], [True, True], 2.0), ([1.0], [True], math.inf), ([1.0], [True, True], 2.0)],
+)
+def test_restricted_mean_refuses(times, ended, limit):
+    with pytest.raises(ValueError):
+        statistics.restricted_mean(times, ended, limit)
+
+
+@pytest.mark.parametrize(('effect', 'expected'), [(0.2, 199), (0.5, 34), (0.8, 15)])
+def test_pairs_needed_are_those_of_cohens_tables(effect, expected):
+    values = np.array([-1.0, 1.0] * 50)
+    gaps = values / values.std(ddof=1) + effect
+    assert statistics.pairs_needed(gaps) == expected
+
+
+def test_bootstrap_interval_of_normal_differences_is_near_students():
+    generator = np.random.default_rng(1)
+    first, second = generator.normal(3.0, 1.0, 60), generator.normal(1.0, 2.0, 60)
+    low, high = stats.ttest_rel(first, second).confidence_interval(0.95)
+    gap = statistics.bootstrap_difference([*first, math.nan], [*second, 1.0])
+    assert gap.number == 60 and gap.mean == pytest.approx(np.mean(first - second))
+    assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.1)
+    assert gap.told_from_zero
+    assert statistics.bootstrap_difference(first, second) == gap
+
+
+def test_bootstrap_of_few_or_equal_values():
+    assert math.isnan(statistics.bootstrap_difference([], []).mean)
+    one = statistics.bootstrap_difference([3.0], [1.0])
+    assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
+    same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
+    assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
+
+
+def test_survival_is_that_of_freireichs_patients():
+    """Weeks in remission with 6-mercaptopurine, and the estimates that textbooks print."""
+    weeks = [6, 6, 6, 6, 7, 9, 10, 10, 11, 13, 16, 17, 19, 20, 22, 23, 25, 32, 32, 34, 35]
+    relapsed = [1, 1, 1, 0, 1, 0, 1, 0, 0, 1, 1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0]
+    times, shares = statistics.survival(weeks, np.array(relapsed, bool))
+    at = dict(zip(times, shares))
+    printed = {0: 1.0, 6: 0.857, 7: 0.807, 10: 0.753, 13: 0.690, 16: 0.627, 22: 0.538, 23: 0.448}
+    assert {week: at[week] for week in printed} == pytest.approx(printed, abs=5e-4)
+
+
+def test_verdict_says_when_the_seeds_are_too_few():
+    few = Difference(-2.0, -6.0, 2.0, -1.0, 10, 85)
+    assert 'too few' in verdict('a', 'b', few) and 'about 85' in verdict('a', 'b', few)
+    none = Difference(0.0, 0.0, 0.0, 0.0, 10, None)
+    assert 'no difference on any of 10 seeds' in verdict('a', 'b', none)
+    clear = Difference(-2.0, -3.0, -1.0, -2.0, 10, 7)
+    assert 'sooner' in verdict('a', 'b', clear) and 'too few' not in verdict('a', 'b', clear)
