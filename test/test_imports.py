@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
 from fnmatch import fnmatch
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,8 +58,6 @@ ROS_FILES = (
 )
 # Not ament_index_python, which looks up where files are installed.
 ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*')
-# Sets of modules that import each other. None is to be added.
-KNOWN_CYCLES: tuple[frozenset[str], ...] = ()
 
 
 @cache
@@ -92,38 +90,13 @@ def imports(name: str) -> list[tuple[str, int]]:
     return found
 
 
-def components(graph: dict[str, set[str]]) -> Iterator[frozenset[str]]:
-    """Yield the sets of nodes that reach each other (Tarjan's strongly connected components)."""
-    numbers: dict[str, int] = {}
-    lowest: dict[str, int] = {}
-    stack: list[str] = []
-
-    def visit(node: str) -> Iterator[frozenset[str]]:
-        numbers[node] = lowest[node] = len(numbers)
-        stack.append(node)
-        for other in sorted(graph[node]):
-            if other not in numbers:
-                yield from visit(other)
-                lowest[node] = min(lowest[node], lowest[other])
-            elif other in stack:
-                lowest[node] = min(lowest[node], numbers[other])
-        if lowest[node] == numbers[node]:
-            position = stack.index(node)
-            yield frozenset(stack[position:])
-            del stack[position:]
-
-    for node in graph:
-        if node not in numbers:
-            yield from visit(node)
-
-
-def cycles(graph: dict[str, set[str]]) -> set[frozenset[str]]:
-    """Return the sets of modules that import each other, or one that imports itself."""
-    return {
-        found
-        for found in components(graph)
-        if len(found) > 1 or any(node in graph[node] for node in found)
-    }
+def cycle(graph: dict[str, set[str]]) -> list[str]:
+    """Return modules that import each other in a circle, if there are any."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
 
 
 def test_packages_import_one_way():
@@ -160,13 +133,6 @@ def test_modules_do_not_import_each_other_in_circles():
     graph = {
         name: {other for other, _ in imports(name) if other in modules()} for name in modules()
     }
-    found = cycles(graph)
-    new = found - set(KNOWN_CYCLES)
-    assert not new, '\n'.join(', '.join(sorted(cycle)) for cycle in new)
-    gone = set(KNOWN_CYCLES) - found
-    assert not gone, f'no longer there, take out of KNOWN_CYCLES: {gone}'
-
-
-def test_cycles_are_found():
-    graph = {'a': {'b'}, 'b': {'c', 'd'}, 'c': {'a'}, 'd': set(), 'e': {'e'}, 'f': {'d'}}
-    assert cycles(graph) == {frozenset('abc'), frozenset('e')}
+    assert cycle(graph) == []
+    assert cycle({'a': {'b'}, 'b': {'c', 'd'}, 'c': {'a'}, 'd': set()})
+    assert cycle({'e': {'e'}})
