@@ -357,6 +357,15 @@ def test_planners_of_several_robots_are_done_together(two_filters):
     assert one.observer.end_step == 30
 
 
+def test_updates_after_the_planner_is_done_do_not_count(run):
+    run.update(0.9)
+    give_up(run, 1.0)
+    run.update(1.0)
+    run.update(1.0 + run.scenario.step)
+    report = build_report(run.observer.record(RunEnd('planner_done', 1.0, 1.0)))
+    assert report['measurements']['mambo'] == 2
+
+
 def test_planner_without_a_robot_is_not_waited_for(two_filters):
     one, two = two_filters
     one.step(0.0, ['mambo', 'second'])

@@ -148,6 +148,8 @@ class TargetObserver:
         """
         updates, self._updates = self._updates, []
         for namespace, message in updates:
+            if self._ending is not None and message.step > self._ending[0]:
+                continue
             # Updates of the same step from other filters may still arrive.
             if self.completed is not None and (
                 len(self._update_topics) == 1 or message.step > self.completed.step
