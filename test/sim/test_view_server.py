@@ -12,8 +12,7 @@ from browsers import chromium, needs_chromium
 from waiting import wait_until
 
 from maasi_sim.view.event_log import STATE_PERIOD
-from maasi_sim.view.hub import Hub
-from maasi_sim.view.live_feed import LiveFeed
+from maasi_sim.view.hub import Hub, LiveFeed
 from maasi_sim.view.live_view import LiveView
 from maasi_sim.view.server import LARGEST_BODY, MOST_BROWSERS, MOST_IDLE, ViewServer
 

@@ -13,10 +13,9 @@ from waiting import wait_until
 
 from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.bag import Bag, BagWriter, load_types
-from maasi_sim.view.bag_events import read_events
 from maasi_sim.view.event_log import EventLog
 from maasi_sim.view.live_view import LiveView, MessageFeed
-from maasi_sim.view.messages import is_shown
+from maasi_sim.view.messages import is_shown, read_events
 from maasi_sim.view.page_file import REPLAY, write_replay
 from maasi_sim.view.scene import empty_scene
 from maasi_sim.view.view_node import ViewNode

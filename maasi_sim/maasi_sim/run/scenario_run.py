@@ -30,7 +30,7 @@ from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning
-from maasi_sim.view.bag_events import read_events
+from maasi_sim.view.messages import read_events
 from maasi_sim.view.page_file import REPLAY, write_replay
 
 if TYPE_CHECKING:

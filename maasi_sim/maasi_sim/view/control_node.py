@@ -18,12 +18,7 @@ _PATIENCE = 5.0
 class Control:
     """Calls the services of planners and drivers; no command waits for another one.
 
-    Parameters
-    ----------
-    domain : int
-        ROS domain.
-    namespace : str
-        Of the team, without slashes at its ends.
+    The namespace is that of the team, without slashes at its ends.
     """
 
     def __init__(self, domain: int | None, namespace: str = '') -> None:

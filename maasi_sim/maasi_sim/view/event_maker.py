@@ -28,19 +28,8 @@ _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 class RobotChoice:
     """The decision of one robot.
 
-    Attributes
-    ----------
-    robot : str
-    decision : int
-        Index d.
-    chosen : int
-        Index into the candidates; negative: none.
-    waypoint : (3,) array
-        [m].
-    candidates : iterable of 9 numbers
-        x, y, z [m], C, T, E, J, K, M.
-    reason : str
-        Why, in words; empty where that is the objective.
+    `decision` is its index d, `chosen` that of a candidate (negative: none). Candidates are x, y, z
+    [m], C, T, E, J, K, M; the reason is empty where it is the objective.
     """
 
     robot: str
@@ -82,15 +71,7 @@ def _explored(values: FloatArray) -> float:
 
 
 class EventMaker:
-    """Make events, and hand each to a listener.
-
-    Parameters
-    ----------
-    scene : dict
-        Of the run: see `scene_of`.
-    listener : callable
-        Takes each event.
-    """
+    """Makes the events of a run with a scene, see `scene_of`, and hands each to a listener."""
 
     def __init__(self, scene: Scene, listener: Listener) -> None:
         self.scene = scene
@@ -241,36 +222,24 @@ class EventMaker:
             for values in choice.candidates:
                 x, y, z, *terms, length, measurements = (float(value) for value in values)
                 allowed = math.isfinite(terms[3]) and terms[3] > _NOT_ALLOWED
-                numbers = [significant(value) for value in terms]
+                *numbers, objective_of = map(significant, terms)
                 candidates.append(
                     [
                         *self._place([x, y, z]),
-                        *numbers[:3],
-                        numbers[3] if allowed else None,
+                        *numbers,
+                        objective_of if allowed else None,
                         int(length),
                         int(measurements),
                     ]
                 )
             waypoint = self._place(choice.waypoint)
-            rows.append(
-                [
-                    choice.robot,
-                    int(choice.decision),
-                    int(choice.chosen),
-                    waypoint,
-                    candidates,
-                    choice.reason,
-                ]
-            )
+            numbers = [int(choice.decision), int(choice.chosen)]
+            rows.append([choice.robot, *numbers, waypoint, candidates, choice.reason])
             where = ', '.join(f'{value:g}' for value in waypoint)
-            stays = f'stays: {choice.reason or reason or "no candidate"}'
-            word = f'decision {choice.decision}: '
-            self.message(
-                time,
-                choice.robot,
-                'decision',
-                word + (f'to ({where})' if choice.chosen >= 0 else stays),
-            )
+            words = f'stays: {choice.reason or reason or "no candidate"}'
+            if choice.chosen >= 0:
+                words = f'to ({where})'
+            self.message(time, choice.robot, 'decision', f'decision {choice.decision}: {words}')
         if not rows and reason:
             self.message(time, space or planner, 'decision', reason)
         total = significant(objective) if objective > _NOT_ALLOWED else None
@@ -331,18 +300,8 @@ class EventMaker:
             self.message(time, robot, 'team', activity)
         for shot in shots:
             self.message(time, robot, 'found', f'snapshot of cuboid {shot[0]}')
-        self._put(
-            time,
-            'cuboid',
-            robot,
-            activity,
-            how,
-            self._place(target),
-            list(heard),
-            [int(item) for item in planned],
-            shots,
-            bool(done),
-        )
+        lists = list(heard), [int(item) for item in planned], shots
+        self._put(time, 'cuboid', robot, activity, how, self._place(target), *lists, bool(done))
 
     def add_to_scene(self, part: Scene) -> None:
         """Add to the scene what became known later."""
@@ -363,13 +322,7 @@ class EventMaker:
         scores = score(found, self._truth[:, :size], radius, self.scene.get('scoring_order', 2.0))
         match = scores.match
         rmse = float(match.rmse)
-        self._put(
-            time,
-            'score',
-            '',
-            int(match.true_found),
-            int(match.missed),
-            len(found) - int(match.true_found),
-            significant(rmse) if math.isfinite(rmse) else None,
-            significant(float(scores.gospa.total)),
-        )
+        error = significant(rmse) if math.isfinite(rmse) else None
+        numbers = [match.true_found, match.missed, len(found) - match.true_found]
+        total = significant(float(scores.gospa.total))
+        self._put(time, 'score', '', *map(int, numbers), error, total)

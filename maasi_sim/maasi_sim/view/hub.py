@@ -1,10 +1,13 @@
-"""Where the events of a live run wait for browsers: each reads at its own pace."""
+"""Between a live run and its browsers: neither waits for the other."""
 
 from __future__ import annotations
 
 import json
 import threading
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from maasi_sim.view.event_log import STATE_PERIOD, Event, Scene, line, thin
 
@@ -12,22 +15,18 @@ from maasi_sim.view.event_log import STATE_PERIOD, Event, Scene, line, thin
 MOST_EVENTS = 200_000
 # Events in one message to a browser.
 _MOST_AT_ONCE = 2000
+# Items that wait at most; further ones are dropped, and that is said.
+MOST_WAITING = 50_000
+# Wait for more before the next look, so that the run has the processor [s].
+_PERIOD = 0.05
 
 
 @dataclass(frozen=True)
 class Portion:
     """What a browser gets next.
 
-    Attributes
-    ----------
-    scene : str
-        JSON of the scene, where the browser is to begin anew; else empty.
-    events : str
-        JSON list of events.
-    generation, position : int
-        Where the next portion begins.
-    closed : bool
-        Whether nothing follows.
+    `scene` is JSON where the browser is to begin anew, else empty; `events` is a JSON list;
+    `generation` and `position` say where the next portion begins, `closed` that nothing follows.
     """
 
     scene: str
@@ -40,13 +39,7 @@ class Portion:
 class Hub:
     """Keeps the events of a run; nothing that puts an event waits for a browser.
 
-    Parameters
-    ----------
-    scene : dict
-        Of the run.
-    most : int
-        Events that are kept. When there are more, those that change gradually are thinned, and
-        browsers begin anew.
+    With more than `most` events those that change gradually are thinned, and browsers begin anew.
     """
 
     def __init__(self, scene: Scene, most: int = MOST_EVENTS) -> None:
@@ -119,3 +112,41 @@ class Hub:
         del self._events[: max(0, len(self._events) - self._most)]
         self._scene['thinned'] = self._period
         self._generation += 1
+
+
+class LiveFeed:
+    """Hand items to a function in a thread of its own; `put` never waits."""
+
+    def __init__(self, take: Callable[[Any], object], most: int = MOST_WAITING) -> None:
+        self._take = take
+        self._most = most
+        self._waiting: deque[Any] = deque()
+        self._ended = threading.Event()
+        self.dropped = 0
+        self.refused = 0
+        self._thread = threading.Thread(target=self._work, name='view feed', daemon=True)
+        self._thread.start()
+
+    def put(self, item: Any) -> None:
+        """Take an item; where too many wait it is dropped."""
+        if len(self._waiting) < self._most:
+            self._waiting.append(item)
+        else:
+            self.dropped += 1
+
+    def close(self, patience: float = 5.0) -> None:
+        """Take what waits, and end."""
+        self._ended.set()
+        self._thread.join(patience)
+
+    def _work(self) -> None:
+        while True:
+            ended = self._ended.wait(_PERIOD)
+            while self._waiting:
+                try:
+                    self._take(self._waiting.popleft())
+                except (ValueError, ArithmeticError, LookupError, AttributeError, TypeError):
+                    # A message that cannot be shown must not end the view.
+                    self.refused += 1
+            if ended:
+                return

@@ -8,14 +8,13 @@ from typing import Any
 
 from rosbags.typesys.store import Typestore
 
-from maasi_sim.view.browser import open_browser
 from maasi_sim.view.event_log import Scene
 from maasi_sim.view.event_maker import EventMaker
-from maasi_sim.view.hub import Hub
-from maasi_sim.view.live_feed import LiveFeed
+from maasi_sim.view.hub import Hub, LiveFeed
 from maasi_sim.view.messages import MessageEvents
+from maasi_sim.view.page_file import open_browser
 from maasi_sim.view.scene import scene_of
-from maasi_sim.view.search_trace import SearchTrace, hand_over
+from maasi_sim.view.search_trace import Call, SearchTrace
 from maasi_sim.view.server import Commander, ViewServer
 
 # For browsers to take the last events [s].
@@ -25,24 +24,7 @@ _MARKERS = 'visualization_msgs/msg/MarkerArray'
 
 
 class LiveView:
-    """Serve the page of a run that goes on.
-
-    Parameters
-    ----------
-    scene : dict
-        Of the run.
-    port : int, optional
-        Of the server; the next one that is free where it is in use.
-    host : str
-        Address that it listens on.
-    commander : callable, optional
-        Carries out commands; None: read only.
-
-    Raises
-    ------
-    OSError
-        If the port cannot be listened on.
-    """
+    """Serve the page of a run that goes on; address and commands as of `ViewServer`."""
 
     def __init__(
         self,
@@ -86,14 +68,7 @@ class LiveView:
 class MessageFeed:
     """Feeds a page with serialised messages.
 
-    Parameters
-    ----------
-    view : LiveView
-        Is fed.
-    types : Typestore
-        Message types.
-    waits : bool
-        Whether the run begins with a `LockstepStep`; what comes before it is shown at its time.
+    `waits`: the run begins with a `LockstepStep`; what comes before it is shown at its time.
     """
 
     def __init__(self, view: LiveView, types: Typestore, waits: bool = True) -> None:
@@ -130,15 +105,16 @@ class MessageFeed:
 
 
 class TraceFeed:
-    """Feeds a page with the records of a search in this process."""
+    """Feeds a page with the calls of a search in this process."""
 
     def __init__(self, view: LiveView) -> None:
         self._view = view
-        self._feed = LiveFeed(lambda item: hand_over(view.maker, *item))
+        self._feed = LiveFeed(self._take)
+        self.put = self._feed.put
 
-    def put(self, time: float, space: str, record: Any) -> None:
-        """Take a record; never waits."""
-        self._feed.put((time, space, record))
+    def _take(self, call: Call) -> None:
+        function, arguments = call
+        function(self._view.maker, *arguments)
 
     def close(self, text: str) -> None:
         """Take what waits, say how the search ended, and stop serving."""
@@ -152,7 +128,7 @@ def open_view(trace: SearchTrace) -> TraceFeed:
     view = LiveView(scene_of('search', trace.scenario, trace.seed))
     view.announce(print)
     feed = TraceFeed(view)
-    for record in trace.records:
-        feed.put(*record)
+    for call in trace.calls:
+        feed.put(call)
     trace.live = feed.put
     return feed

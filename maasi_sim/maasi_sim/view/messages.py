@@ -7,40 +7,57 @@ so that recordings of `ros2 bag record -a` and teams in a namespace are read as 
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_sim.run.topics import seconds
+from maasi_sim.run.bag import Bag, BagError
+from maasi_sim.run.topics import STEP, seconds
+from maasi_sim.view.event_log import Event, EventLog, Scene
 from maasi_sim.view.event_maker import EventMaker, RobotChoice
+from maasi_sim.view.scene import empty_scene, scene_of_facts
 
 FloatArray = NDArray[np.float64]
 
+_MARKERS = 'visualization_msgs/msg/MarkerArray'
+# Messages between two words on the progress.
+_PROGRESS = 1000
 _ACTIVITIES = ('searching', 'returning', 'recharging')
+# Of a candidate, besides its place.
+_TERMS = (
+    'control_cost',
+    'target_refinement',
+    'exploration',
+    'objective',
+    'length',
+    'measurements',
+)
 # Levels of rcl_interfaces/msg/Log and of diagnostic_msgs/msg/DiagnosticStatus.
 _WARNING, _ERROR = 30, 40
 _FINE, _STALE = 0, 3
 _DIAGNOSTIC_WORDS = {0: 'well again', 1: 'warning', 2: 'error', 3: 'stale'}
 # A stamp that is earlier than the topic's last one by more than this begins another run [s].
 _REWIND = 10.0
-# From type to the last parts that the name may have; empty: any.
+# By type: the method that takes it, and the last parts that the name may have; none: any.
 TOPICS: dict[str, tuple[str, ...]] = {
-    'maasi_msgs/msg/LockstepStep': (),
-    'maasi_msgs/msg/AgentState': (),
-    'maasi_msgs/msg/DetectionArray': (),
-    'maasi_msgs/msg/FilterUpdate': (),
-    'maasi_msgs/msg/FoundTargetArray': ('found_targets',),
-    'maasi_msgs/msg/PlanDecision': (),
-    'maasi_msgs/msg/CuboidDecision': (),
-    'nav_msgs/msg/Path': ('plan',),
-    'nav_msgs/msg/OccupancyGrid': ('exploration',),
-    'sensor_msgs/msg/PointCloud2': ('exploration',),
-    'geometry_msgs/msg/PoseArray': ('ground_truth/targets',),
-    'visualization_msgs/msg/MarkerArray': ('ground_truth/markers', 'search_area', 'markers'),
-    'rcl_interfaces/msg/Log': ('rosout',),
-    'diagnostic_msgs/msg/DiagnosticArray': ('diagnostics',),
+    'maasi_msgs/msg/LockstepStep': ('_take_step',),
+    'maasi_msgs/msg/AgentState': ('_take_state',),
+    'maasi_msgs/msg/DetectionArray': ('_take_detections',),
+    'maasi_msgs/msg/FilterUpdate': ('_take_update',),
+    'maasi_msgs/msg/FoundTargetArray': ('_take_found', 'found_targets'),
+    'maasi_msgs/msg/PlanDecision': ('_take_plan',),
+    'maasi_msgs/msg/CuboidDecision': ('_take_cuboid',),
+    'nav_msgs/msg/Path': ('_take_path', 'plan'),
+    'nav_msgs/msg/OccupancyGrid': ('_take_grid', 'exploration'),
+    'sensor_msgs/msg/PointCloud2': ('_take_cloud', 'exploration'),
+    'geometry_msgs/msg/PoseArray': ('_take_truth', 'ground_truth/targets'),
+    _MARKERS: ('_take_markers', 'ground_truth/markers', 'search_area', 'markers'),
+    'rcl_interfaces/msg/Log': ('_take_log', 'rosout'),
+    'diagnostic_msgs/msg/DiagnosticArray': ('_take_diagnostics', 'diagnostics'),
 }
 
 
@@ -48,21 +65,15 @@ def is_shown(topic: str, type_name: str) -> bool:
     """Return whether messages of a topic are shown."""
     if type_name not in TOPICS or '/_' in topic:
         return False
-    names = TOPICS[type_name]
+    names = TOPICS[type_name][1:]
     return not names or any(topic.endswith(f'/{name}') for name in names)
 
 
 class MessageEvents:
     """Take messages, of `rosbags` or of ROS, and hand their events to a maker.
 
-    Parameters
-    ----------
-    maker : EventMaker
-        Makes the events.
-    begin : float, optional
-        Time of the first step [s]; that of the first state if not given.
-    on_restart : callable, optional
-        Called when the time jumps back, as a bag that is played again does; nothing is then kept.
+    `begin` is the time of the first step [s], that of the first state if not given; `on_restart` is
+    called when the time jumps back, as a bag that is played again does: nothing is then kept.
     """
 
     def __init__(
@@ -78,26 +89,10 @@ class MessageEvents:
         # Time of the last message of each topic with the time of the run [s].
         self._last: dict[str, float] = {}
         self._levels: dict[str, int] = {}
-        self._takers: dict[str, Callable[[str, Any], None]] = {
-            'LockstepStep': self._take_step,
-            'AgentState': self._take_state,
-            'DetectionArray': self._take_detections,
-            'FilterUpdate': self._take_update,
-            'FoundTargetArray': self._take_found,
-            'PlanDecision': self._take_plan,
-            'CuboidDecision': self._take_cuboid,
-            'Path': self._take_path,
-            'OccupancyGrid': self._take_grid,
-            'PointCloud2': self._take_cloud,
-            'PoseArray': self._take_truth,
-            'MarkerArray': self._take_markers,
-            'Log': self._take_log,
-            'DiagnosticArray': self._take_diagnostics,
-        }
 
     def take(self, topic: str, type_name: str, message: Any) -> None:
         """Take a message of a topic for which `is_shown` is true."""
-        self._takers[type_name.rpartition('/')[2]](topic, message)
+        getattr(self, TOPICS[type_name][0])(topic, message)
 
     def _now(self, topic: str, message: Any) -> float:
         """Return the time of a message with the time of the run; begin again if it jumps back.
@@ -157,86 +152,52 @@ class MessageEvents:
             size = round(len(own) ** 0.5)
             covariance = own.reshape(size, size) if size in (2, 3) and size**2 == len(own) else None
             detections.append(((item.range, item.bearing, item.elevation), covariance))
-        self.maker.seen(
-            self._time(message),
-            message.robot,
-            _point(message.pose.pose.position),
-            detections,
-        )
+        place = _point(message.pose.pose.position)
+        self.maker.seen(self._time(message), message.robot, place, detections)
 
     def _take_update(self, topic: str, message: Any) -> None:
-        self.maker.filter(
-            self._time(message),
-            _space(topic),
-            message.expected_number,
-            [
-                (_point(item.position), item.mass, _matrix(item.covariance))
-                for item in message.clusters
-            ],
-            [(item.robot, int(item.measurement)) for item in message.members],
-        )
+        clusters = [
+            (_point(item.position), item.mass, _matrix(item.covariance))
+            for item in message.clusters
+        ]
+        members = [(item.robot, int(item.measurement)) for item in message.members]
+        space, expected = _space(topic), message.expected_number
+        self.maker.filter(self._time(message), space, expected, clusters, members)
 
     def _take_found(self, topic: str, message: Any) -> None:
         time = self._time(message)
-        self.maker.found(
-            time,
-            _space(topic),
-            [
-                (
-                    int(item.id),
-                    _point(item.position),
-                    _matrix(item.covariance),
-                    item.robot,
-                    max(seconds(item.stamp) - (self._begin or 0.0), 0.0),
-                )
-                for item in message.targets
-            ],
-        )
+        targets = []
+        for item in message.targets:
+            when = max(seconds(item.stamp) - (self._begin or 0.0), 0.0)
+            place, covariance = _point(item.position), _matrix(item.covariance)
+            targets.append((int(item.id), place, covariance, item.robot, when))
+        self.maker.found(time, _space(topic), targets)
 
     def _take_plan(self, topic: str, message: Any) -> None:
-        choices = [
-            RobotChoice(
-                robot.robot,
-                int(robot.decision),
-                int(robot.chosen),
-                _point(robot.waypoint),
-                [
-                    (
-                        *_point(item.position),
-                        item.control_cost,
-                        item.target_refinement,
-                        item.exploration,
-                        item.objective,
-                        item.length,
-                        item.measurements,
-                    )
-                    for item in robot.candidates
-                ],
-            )
-            for robot in message.robots
-        ]
-        self.maker.plan(
-            self._time(message),
-            _space(topic),
-            choices,
-            message.planner,
-            message.explored,
-            message.objective,
-            message.reason,
-        )
+        choices = []
+        for robot in message.robots:
+            rows = [
+                (*_point(item.position), *(getattr(item, name) for name in _TERMS))
+                for item in robot.candidates
+            ]
+            waypoint, chosen = _point(robot.waypoint), int(robot.chosen)
+            choices.append(RobotChoice(robot.robot, int(robot.decision), chosen, waypoint, rows))
+        values = message.planner, message.explored, message.objective, message.reason
+        self.maker.plan(self._time(message), _space(topic), choices, *values)
 
     def _take_cuboid(self, _: str, message: Any) -> None:
         activity = min(int(message.activity), len(_ACTIVITIES) - 1)
+        shots = [
+            (int(shot.cuboid), _point(shot.position), shot.detection_probability)
+            for shot in message.snapshots
+        ]
         self.maker.cuboid(
             self._time(message),
             message.robot,
             (_ACTIVITIES[activity], message.how, _point(message.target)),
             list(message.heard),
             [int(item) for item in message.planned],
-            [
-                (int(shot.cuboid), _point(shot.position), shot.detection_probability)
-                for shot in message.snapshots
-            ],
+            shots,
             bool(message.done),
         )
 
@@ -261,13 +222,9 @@ class MessageEvents:
         corner = np.array([axis[0] for axis in axes], dtype=float)
         last = np.array([axis[-1] for axis in axes], dtype=float)
         self._learn_bounds(corner, last)
-        self.maker.map(
-            self._time(message),
-            _space(topic),
-            corner,
-            (last - corner) / (np.array(shape) - 1),
-            rows[:, 3].reshape(shape).astype(float),
-        )
+        step = (last - corner) / (np.array(shape) - 1)
+        values = rows[:, 3].reshape(shape).astype(float)
+        self.maker.map(self._time(message), _space(topic), corner, step, values)
 
     def _learn_bounds(self, lower: FloatArray, upper: FloatArray) -> None:
         if 'bounds' not in self.maker.scene:
@@ -337,3 +294,52 @@ def _space(topic: str) -> str:
 def _owner(topic: str) -> str:
     """Return the last part of a topic's namespace: its robot."""
     return _space(topic).rpartition('/')[2]
+
+
+def read_events(path: Path, progress: Callable[[float], None] | None = None) -> EventLog:
+    """Return the event log of a recording, or of the run whose folder holds one.
+
+    `progress` is called now and then with the share that is read.
+
+    Raises
+    ------
+    BagError
+        If it cannot be read, or shows no search.
+    """
+    with Bag(path) as bag:
+        shown = {topic: kind for topic, kind in bag.types.items() if is_shown(topic, kind)}
+        if not any(kind.startswith('maasi_msgs/') for kind in shown.values()):
+            raise BagError(f'{path}: holds no topic of a search')
+        scene = _scene(bag)
+        events: list[Event] = []
+        maker = EventMaker(scene, events.append)
+        takes = MessageEvents(maker, _begin(bag, shown))
+        # Markers hold what a scenario says better.
+        known = 'bounds' in scene
+        topics = [topic for topic, kind in shown.items() if not (known and kind == _MARKERS)]
+        counts = bag.counts
+        total = sum(counts[topic] for topic in topics)
+        for index, item in enumerate(bag.messages(topics)):
+            if progress is not None and index % _PROGRESS == 0:
+                progress(index / total)
+            takes.take(item.topic, item.type, item.message)
+        maker.end()
+    # Parts that became known later belong to the scene of a replay.
+    return EventLog(maker.scene, [event for event in events if event[1] != 'scene'])
+
+
+def _scene(bag: Bag) -> Scene:
+    try:
+        return scene_of_facts(bag.scenario())
+    except (BagError, ValueError, KeyError):
+        return empty_scene(bag.path.name)
+
+
+def _begin(bag: Bag, shown: dict[str, str]) -> float | None:
+    """Return the time of the first step, where the recording has steps [s]."""
+    steps = [topic for topic in shown if topic.endswith(STEP)]
+    for _, _, _, data in bag.raw(steps):
+        # Header of the serialisation, step, stamp.
+        sec, nanosec = struct.unpack_from('<iI', data, 12)
+        return float(sec) + 1e-9 * float(nanosec)
+    return None

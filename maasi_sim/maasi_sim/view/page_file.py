@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
+import sys
+import webbrowser
 from functools import cache
 from pathlib import Path
 
@@ -70,3 +74,14 @@ def _with(place: str, text: str, content: str) -> str:
     before, mark, after = text.partition(f'/*{place}*/')
     assert mark, place
     return before + content + after
+
+
+def open_browser(address: str) -> bool:
+    """Open an address in a browser; return whether there is one with a display."""
+    if sys.platform.startswith('linux') and not (
+        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+    ):
+        return False
+    with contextlib.suppress(webbrowser.Error, OSError):
+        return webbrowser.open(address)
+    return False

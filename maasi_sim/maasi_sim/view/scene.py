@@ -31,17 +31,7 @@ def empty_scene(name: str = '') -> Scene:
 
 
 def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scene:
-    """Return the scene of a scenario.
-
-    Parameters
-    ----------
-    name : str
-        Of the scenario.
-    scenario : Scenario or CuboidScenario
-        With all layers.
-    seed : int, optional
-        Of the run; that of the scenario if not given.
-    """
+    """Return the scene of a scenario; the seed of a run is that of the scenario if not given."""
     seed = scenario.seed if seed is None else seed
     scene: Scene = {
         'name': name,

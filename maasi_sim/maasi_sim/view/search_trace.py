@@ -1,15 +1,14 @@
-"""What a search in one process leaves for its replay, and how that becomes events."""
+"""What a search in one process leaves for its replay, as calls of what makes events."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.records import AgentMeasurement, FilterResult, FoundTarget
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion.base import RobotState
@@ -20,74 +19,37 @@ from maasi_sim.view.event_maker import EventMaker, RobotChoice
 from maasi_sim.view.page_file import write_replay
 from maasi_sim.view.scene import scene_of
 
-FloatArray = NDArray[np.float64]
-
 # Between exploration functions [s].
 _MAP_PERIOD = 1.0
+# A function of an `EventMaker`, and what it takes besides.
+Call = tuple[Callable[..., None], tuple[Any, ...]]
 
 
-@dataclass(frozen=True)
-class _Choice:
-    """A joint decision, and the explored share that it was made with."""
-
-    decision: Decision
-    indices: Mapping[str, int]
-    planner: str
-    explored: float
-
-
-@dataclass(frozen=True)
-class _Map:
-    """The exploration function, e in ninths."""
-
-    corner: FloatArray
-    spacing: FloatArray
-    ninths: NDArray[np.uint8]
-    explored: float
-
-
-@dataclass(frozen=True)
-class _Update:
-    """Measurements and the filter's update; found targets where they have changed."""
-
-    measurements: Sequence[AgentMeasurement]
-    result: FilterResult
-    found: Sequence[FoundTarget] | None
-
-
-@dataclass
 class SearchTrace:
-    """Gathers the records of a search; only references are kept, so that it costs little.
+    """Gathers calls that make the events of a search; they are carried out when it is shown.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        What is searched.
-    seed : int
-        Of the run.
-    live : callable, optional
-        Called with each record as it comes.
+    Only references are kept, so that it costs a search little. `live` is called with each call.
     """
 
-    scenario: Scenario
-    seed: int
-    live: Callable[[float, str, Any], None] | None = None
-    records: list[tuple[float, str, Any]] = field(default_factory=list)
-    _last_states: float = -np.inf
-    _last_maps: dict[str, float] = field(default_factory=dict)
-    _indices: dict[str, int] = field(default_factory=dict)
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self.scenario = scenario
+        self.seed = seed
+        self.live: Callable[[Call], None] | None = None
+        self.calls: list[Call] = []
+        self._last_states = -np.inf
+        self._last_maps: dict[str, float] = {}
+        self._indices: dict[str, int] = {}
 
-    def _add(self, time: float, space: str, record: Any) -> None:
-        self.records.append((time, space, record))
+    def _add(self, function: Callable[..., None], *arguments: Any) -> None:
+        self.calls.append((function, arguments))
         if self.live is not None:
-            self.live(time, space, record)
+            self.live((function, arguments))
 
     def robots(self, time: float, states: Mapping[str, RobotState]) -> None:
         """Add where robots are; no more often than is shown."""
-        if time - self._last_states < STATE_PERIOD - 1e-9:
-            return
-        self._last_states = time
-        self._add(time, '', dict(states))
+        if time - self._last_states >= STATE_PERIOD - 1e-9:
+            self._last_states = time
+            self._add(_robots, time, dict(states))
 
     def decision(
         self, time: float, space: str, decision: Decision, exploration: UnexploredMap
@@ -95,34 +57,20 @@ class SearchTrace:
         """Add a joint decision."""
         for name in decision.robots:
             self._indices[name] = self._indices.get(name, -1) + 1
-        self._add(
-            time,
-            space,
-            _Choice(
-                decision,
-                {name: self._indices[name] for name in decision.robots},
-                self.scenario.planner.name,
-                exploration.explored_fraction(),
-            ),
-        )
+        indices = {name: self._indices[name] for name in decision.robots}
+        explored = exploration.explored_fraction()
+        self._add(_plan, time, space, decision, indices, self.scenario.planner.name, explored)
         self._last_maps.pop(space, None)
         self.explored(time, space, exploration)
 
     def explored(self, time: float, space: str, exploration: UnexploredMap) -> None:
         """Add the exploration function; as the planner node, once a second and at decisions."""
-        if time - self._last_maps.get(space, -np.inf) < _MAP_PERIOD - 1e-9:
-            return
-        self._last_maps[space] = time
-        self._add(
-            time,
-            space,
-            _Map(
-                exploration.bounds[:, 0],
-                exploration.step,
-                np.rint(9.0 * exploration.values).astype(np.uint8),
-                exploration.explored_fraction(),
-            ),
-        )
+        if time - self._last_maps.get(space, -np.inf) >= _MAP_PERIOD - 1e-9:
+            self._last_maps[space] = time
+            # As coarse as it is shown.
+            ninths = np.rint(9.0 * exploration.values).astype(np.uint8)
+            grid = exploration.bounds[:, 0], exploration.step, ninths
+            self._add(_map, time, space, *grid, exploration.explored_fraction())
 
     def update(
         self,
@@ -133,108 +81,88 @@ class SearchTrace:
         found: Sequence[FoundTarget] | None,
     ) -> None:
         """Add measurements and the filter's update; found targets only where they have changed."""
-        self._add(time, space, _Update(measurements, result, found))
+        self._add(_update, time, space, measurements, result, found)
 
     def truth(self, time: float, targets: FloatArray) -> None:
         """Add where the true targets are, (n, d) [m]."""
-        self._add(time, '', np.array(targets, dtype=float))
+        self._add(EventMaker.truth, time, np.array(targets, dtype=float))
 
     def leave(self, time: float, name: str) -> None:
         """Add that a robot leaves."""
-        self._add(time, name, 'left')
+        self._add(EventMaker.leave, time, name)
 
     def log(self, name: str = 'search') -> EventLog:
         """Return the event log of the search."""
         events: list[Event] = []
         maker = EventMaker(scene_of(name, self.scenario, self.seed), events.append)
-        for record in self.records:
-            hand_over(maker, *record)
+        for function, arguments in self.calls:
+            function(maker, *arguments)
         maker.end()
         return EventLog(maker.scene, events)
 
     def save_replay(self, path: Path) -> None:
-        """Write the page with the search inside.
-
-        Raises
-        ------
-        ResultsError
-            If it cannot be written.
-        """
+        """Write the page with the search inside; ResultsError if it cannot be written."""
         write_replay(self.log(Path(path).stem), Path(path))
 
 
-def hand_over(maker: EventMaker, time: float, space: str, record: Any) -> None:
-    """Hand a record of a trace to what makes events."""
-    if isinstance(record, _Update):
-        _hand_over_update(maker, time, space, record)
-    elif isinstance(record, _Choice):
-        _hand_over_choice(maker, time, space, record)
-    elif isinstance(record, _Map):
-        values = record.ninths / 9.0
-        maker.map(time, space, record.corner, record.spacing, values, record.explored)
-    elif isinstance(record, np.ndarray):
-        maker.truth(time, record)
-    elif isinstance(record, str):
-        maker.leave(time, space)
-    else:
-        for name, state in record.items():
-            pose = state.pose
-            maker.robot(time, name, (*pose.position.tolist(), float(pose.yaw)))
+def _robots(maker: EventMaker, time: float, states: Mapping[str, RobotState]) -> None:
+    for name, state in states.items():
+        pose = state.pose
+        maker.robot(time, name, (*pose.position.tolist(), float(pose.yaw)))
 
 
-def _hand_over_update(maker: EventMaker, time: float, space: str, record: _Update) -> None:
-    for item in record.measurements:
-        covariances: Sequence[FloatArray | None] = [None] * len(item.values)
-        if item.covariances is not None:
-            covariances = list(item.covariances)
-        maker.seen(time, item.robot, item.pose.position, list(zip(item.values, covariances)))
-    if record.found is not None:
-        maker.found(
-            time,
-            space,
-            [
-                (target.id, target.position, target.covariance, target.robot, target.time)
-                for target in record.found
-            ],
-        )
-    maker.filter(
-        time,
-        space,
-        record.result.expected_number,
-        [(item.position, item.mass, item.covariance) for item in record.result.clusters],
-        [(item.robot, item.index) for item in record.measurements],
-    )
+def _map(
+    maker: EventMaker,
+    time: float,
+    space: str,
+    corner: FloatArray,
+    spacing: FloatArray,
+    ninths: FloatArray,
+    explored: float,
+) -> None:
+    maker.map(time, space, corner, spacing, ninths / 9.0, explored)
 
 
-def _hand_over_choice(maker: EventMaker, time: float, space: str, record: _Choice) -> None:
-    decision = record.decision
+def _update(
+    maker: EventMaker,
+    time: float,
+    space: str,
+    measurements: Sequence[AgentMeasurement],
+    result: FilterResult,
+    found: Sequence[FoundTarget] | None,
+) -> None:
+    for item in measurements:
+        own = [None] * len(item.values) if item.covariances is None else item.covariances
+        maker.seen(time, item.robot, item.pose.position, zip(item.values, own))
+    if found is not None:
+        targets = [(one.id, one.position, one.covariance, one.robot, one.time) for one in found]
+        maker.found(time, space, targets)
+    clusters = [(item.position, item.mass, item.covariance) for item in result.clusters]
+    members = [(item.robot, item.index) for item in measurements]
+    maker.filter(time, space, result.expected_number, clusters, members)
+
+
+def _plan(
+    maker: EventMaker,
+    time: float,
+    space: str,
+    decision: Decision,
+    indices: Mapping[str, int],
+    planner: str,
+    explored: float,
+) -> None:
     reason = '' if decision.robots else decision.reason
-    maker.plan(
-        time,
-        space,
-        _choices(decision, record.indices),
-        record.planner,
-        record.explored,
-        decision.objective,
-        reason,
-    )
+    choices = _choices(decision, indices)
+    maker.plan(time, space, choices, planner, explored, decision.objective, reason)
     for name, robot in sorted(decision.robots.items()):
         maker.way(time, name, robot.positions)
 
 
 def _choices(decision: Decision, indices: Mapping[str, int]) -> Iterator[RobotChoice]:
     for name, robot in sorted(decision.robots.items()):
-        rows = np.column_stack(
-            [
-                robot.candidates.reshape(-1, 3),
-                robot.control_cost,
-                robot.target_refinement,
-                robot.exploration,
-                robot.objective,
-                robot.lengths,
-                robot.measurements,
-            ]
-        )
+        terms = robot.control_cost, robot.target_refinement, robot.exploration, robot.objective
+        places = robot.candidates.reshape(-1, 3)
+        rows = np.column_stack([places, *terms, robot.lengths, robot.measurements])
         yield RobotChoice(
             name, indices[name], robot.chosen, robot.waypoint, rows.tolist(), robot.reason
         )

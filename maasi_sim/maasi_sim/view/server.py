@@ -46,16 +46,8 @@ _BEAT = 5.0
 class ViewServer:
     """Serve a hub to browsers until it is closed.
 
-    Parameters
-    ----------
-    hub : Hub
-        Events.
-    port : int
-        0: any that is free. Where it is in use, the next one that is free is taken.
-    host : str
-        Address to listen on.
-    commander : callable, optional
-        Carries out commands; None: read only.
+    Where the port is in use, the next one that is free is taken; 0: any that is free. `commander`
+    carries out commands; None: read only.
 
     Raises
     ------

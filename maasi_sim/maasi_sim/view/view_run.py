@@ -9,9 +9,8 @@ from pathlib import Path
 from maasi_sim.arguments import Parser
 from maasi_sim.run.bag import BagError
 from maasi_sim.run.run_folder import ResultsError
-from maasi_sim.view.bag_events import read_events
-from maasi_sim.view.browser import open_browser
-from maasi_sim.view.page_file import REPLAY, write_replay
+from maasi_sim.view.messages import read_events
+from maasi_sim.view.page_file import REPLAY, open_browser, write_replay
 
 DONE, WRONG_INPUT, NOT_WRITTEN = 0, 2, 4
 
