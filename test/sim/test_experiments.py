@@ -274,14 +274,14 @@ def test_page_says_what_was_run_and_keeps_what_was_not_run_again(toy, tmp_path, 
     # Of the case that is run again there is the new row only; the others are marked.
     assert command(tmp_path / 'new', '--case', 'first', '--runs', 2, *write) == 0
     rows = [line for line in file.read_text().splitlines() if line.startswith('| ')]
-    assert sum(row.startswith('| first | steps |') for row in rows) == 1
-    [row] = [row for row in rows if row.startswith('| first | steps |')]
-    assert ' of 2 |' in row
+    assert sum(row.startswith('| first |') for row in rows) == 1
+    assert any(row.startswith('| first | 2 |') for row in rows)
     old = [row for row in first.splitlines() if row.startswith(('| second', '| once', '| first m'))]
     assert len(old) == 3
     for row in old:
         cells = row.split(' | ')
-        assert ' | '.join([*cells[:2], f'{cells[2]} (earlier)', *cells[3:]]) in rows
+        cells[2 if row.startswith('| first m') else 1] += ' (earlier)'
+        assert ' | '.join(cells) in rows
     assert picture.read_bytes() == shown
     assert command(tmp_path / 'new', '--case', 'none such') == 2
     assert 'first' in capsys.readouterr().err

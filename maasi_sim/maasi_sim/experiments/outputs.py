@@ -17,7 +17,7 @@ from maasi_sim.experiments.campaign import plan
 from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
 from maasi_sim.experiments.papers import experiments, introduction, title_of
 from maasi_sim.experiments.runs import RunFolder, runs_text, steps_text, write_file
-from maasi_sim.experiments.tables import markdown_table, table_cells, table_text
+from maasi_sim.experiments.tables import by_case, markdown_table, table_cells, table_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -94,7 +94,8 @@ def write_outputs(folder: RunFolder, results: Results, seed: int) -> None:
 
 def _described(experiment: Experiment, tables: list[list[list[str]]]) -> list[str]:
     """Return tables, note and causes in Markdown."""
-    parts = [*map(markdown_table, tables), experiment.note and f'{experiment.note}\n']
+    shown = [by_case(table) if table[0][0] == 'case' else table for table in tables]
+    parts = [*map(markdown_table, shown), experiment.note and f'{experiment.note}\n']
     if experiment.causes:
         parts.append(f'Likely causes of differences, not tested: {experiment.causes}\n')
     if experiment.tested:
@@ -118,6 +119,11 @@ class Section:
     rests: str
     duration: str
     tables: list[list[list[str]]]
+
+    def text(self) -> str:
+        """Return it as JSON, a row of a table on each line."""
+        text = json.dumps(asdict(self), ensure_ascii=False)
+        return text.replace('], [', '],\n [') + '\n'
 
     def completed(self, earlier: Section) -> Section:
         """Return the section with the rows of an earlier one that it does not have, marked."""
@@ -228,7 +234,7 @@ def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) ->
             # A figure of all cases is not replaced by one of some.
             if every or not image.exists():
                 write_file(image, picture(results, _PICTURE_DPI))
-            write_file(store, json.dumps(asdict(section), indent=1, ensure_ascii=False) + '\n')
+            write_file(store, section.text())
             sections[name] = section
         elif earlier is not None:
             earlier.rests += EARLIER

@@ -175,6 +175,24 @@ def table_cells(results: Results) -> list[list[list[str]]]:
     return [table for table in (cases, pairs) if len(table) > 1]
 
 
+def by_case(table: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Return the table of cases of `table_cells` with a row a case and a column a quantity."""
+    quantities = list(dict.fromkeys(row[1] for row in table[1:]))
+    found: dict[str, dict[str, str]] = {}
+    for case, quantity, runs, ours, paper, gap in table[1:]:
+        cells = found.setdefault(case, {'runs': runs.rpartition(' of ')[2]})
+        finished, _, total = runs.partition(' (')[0].partition(' of ')
+        parts = [ours if finished in (total, '0') or not total else f'{ours}, {finished} runs']
+        if paper != '-':
+            parts.append(f'paper {paper}')
+        if gap != '-':
+            parts.append(f'difference {gap}')
+        cells[quantity] = '<br>'.join(parts)
+    columns = ['runs', *quantities]
+    rows = [[case, *(cells.get(name, '-') for name in columns)] for case, cells in found.items()]
+    return [['case', *columns], *rows]
+
+
 def table_text(results: Results) -> str:
     """Return the table of ours against the paper's as CSV, in full precision."""
 
