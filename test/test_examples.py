@@ -25,7 +25,7 @@ from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.run.processes import Domain, find_executable
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.nodes import plan_nodes
+from maasi_sim.targets.mission import plan_nodes
 
 EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
 # Far more than anything takes, on a machine that is busy with something else [s].

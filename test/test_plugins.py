@@ -20,7 +20,7 @@ from maasi_planner.settings import PLANNERS, PlannerSettings
 from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.scenario import ScenarioError, load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.nodes import plan_nodes
+from maasi_sim.targets.mission import plan_nodes
 
 ONE_BY_ONE = '''
 from pydantic import BaseModel, ConfigDict, Field

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from maasi_drivers.agent.odometry import MapOdometry, StampedPose
@@ -16,6 +13,7 @@ from maasi_drivers.agent.sensor_reading import SensorReading
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_drivers.vision.marker_reading import read_markers
+from maasi_filter.arrays import FloatArray
 from maasi_filter.make_filter import make_filter
 from maasi_filter.metrics import match_targets
 from maasi_filter.models.pose import Pose
@@ -27,15 +25,13 @@ from maasi_planner.planners import Planner
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
-from maasi_sim.search_result import Found, SearchResult
+from maasi_sim.search_result import SearchProgress, SearchResult
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
+from maasi_sim.targets.tally import numbered
 from maasi_sim.view.live_view import open_view
 from maasi_sim.view.search_trace import SearchTrace
 from maasi_sim.world.simulation import simulated_robot, step_of_event
 from maasi_sim.world.world import World
-
-FloatArray = NDArray[np.float64]
-
 
 # From the settings, and a function that returns the true targets that are not found yet.
 MakePlanner = Callable[[PlannerSettings, Callable[[], FloatArray]], Planner]
@@ -275,7 +271,7 @@ class _Search:
         self.trace.truth(0.0, truth)
         self._radius = scoring_radius(scenario, truth)
         self._counts = dict.fromkeys(self._robots, 0)
-        self._progress: list[Found] = []
+        self._progress: list[SearchProgress] = []
         self._decisions: list[Decision] = []
         # Whether the last score of a step was complete.
         self._complete = False
@@ -346,13 +342,13 @@ class _Search:
         scores = self._scores(found, truth)
         self._complete = self._complete or (bool(len(truth)) and scores.complete)
         self._progress.append(
-            Found(
+            SearchProgress(
                 time,
+                self.step,
                 sum(self._counts.values()),
                 len(found),
                 scores.match.true_found,
                 scores.match.rmse,
-                self.step,
                 tuple(measured),
                 {name: r.body.state.pose.position for name, r in self._robots.items()},
             )
@@ -369,7 +365,7 @@ class _Search:
         return None
 
     def _found_targets(self) -> list[FoundTarget]:
-        return _numbered([group.filter.own_found_targets() for group in self._groups])
+        return numbered([group.filter.own_found_targets() for group in self._groups])
 
     def _missing(self) -> FloatArray:
         """Return the true targets that are not found yet, (n, 3) [m]."""
@@ -378,8 +374,7 @@ class _Search:
         return np.delete(self.world.targets_3d_at(self.step), [j for _, j in pairs], axis=0)
 
     def _scores(self, found: list[FoundTarget], truth: FloatArray) -> Scores:
-        positions = [target.position for target in found]
-        return score(positions, truth, self._radius, self.scenario.scoring.order)
+        return score(found, truth, self._radius, self.scenario.scoring.order)
 
     def result(self, end_reason: str) -> SearchResult:
         """Return the result after `run`."""
@@ -404,11 +399,3 @@ class _Search:
             pairs=scores.match.pairs,
             origin=self.scenario.environment.origin,
         )
-
-
-def _numbered(found: list[list[FoundTarget]]) -> list[FoundTarget]:
-    """Return the found targets of all filters as one list, numbered in the order of time."""
-    if len(found) == 1:
-        return found[0]
-    every = sorted(itertools.chain(*found), key=lambda item: (item.time, item.robot, item.id))
-    return [replace(item, id=number) for number, item in enumerate(every, start=1)]

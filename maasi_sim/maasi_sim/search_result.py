@@ -6,46 +6,38 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
 from maasi_planner.team import Decision
 from maasi_sim.scenario.base import OriginSettings
-from maasi_sim.targets.data_frames import data_frame
+from maasi_sim.targets.tables import data_frame
+from maasi_sim.targets.tally import FoundCount
 from maasi_sim.view.search_trace import SearchTrace
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchProgress(FoundCount):
     """State of a search after a measurement batch.
 
     Attributes
     ----------
     time : float
         [s].
+    step : int
+        k.
     measurements : int
         Number so far, of all robots.
     found, true_found : int
         Targets found so far, and the number of true ones among them.
     rmse : float
         Of the true ones [m]; nan without any.
-    step : int
-        k.
     members : tuple of str
         Robots that measured.
     positions : dict
         Of all robots, (3,) [m].
     """
 
-    time: float
-    measurements: int
-    found: int
-    true_found: int
     rmse: float
-    step: int
     members: tuple[str, ...]
     positions: dict[str, FloatArray]
 
@@ -72,7 +64,7 @@ class SearchResult:
         Distance travelled by each robot [m].
     steps : int
         Length of the search.
-    progress : list of Found
+    progress : list of SearchProgress
         After each measurement batch.
     decisions : list of Decision
         In their order.
@@ -95,7 +87,7 @@ class SearchResult:
     measurements: dict[str, int]
     distance: dict[str, float]
     steps: int
-    progress: list[Found] = field(default_factory=list)
+    progress: list[SearchProgress] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     filter_times: list[float] = field(default_factory=list)
     planning_times: list[float] = field(default_factory=list)
@@ -121,7 +113,8 @@ class SearchResult:
         ----------
         table : str
             'found_targets': a row for each, with the columns of `found_targets.csv`. 'progress': a
-            row for each measurement batch, with the fields of `Found` and the places of robots.
+            row for each measurement batch, with the fields of `SearchProgress` and the
+            places of robots.
 
         Raises
         ------

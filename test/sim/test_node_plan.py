@@ -13,7 +13,7 @@ from maasi_sim.run.node_plan import NodePlan, RunSettings, in_team, with_followe
 from maasi_sim.scenario.loading import config_folder, load_scenario
 from maasi_sim.scenario.schema import ScenarioError
 from maasi_sim.sim_settings import SimNodeSettings
-from maasi_sim.targets.nodes import plan_nodes
+from maasi_sim.targets.mission import plan_nodes
 
 SCENARIOS = sorted(
     path.stem

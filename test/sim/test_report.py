@@ -262,7 +262,7 @@ def test_report_of_a_complete_run(run, tmp_path):
     run.decide(0.7, {'mambo': None, 'second': [1.5, 0.5]}, explored=0.4)
     run.declare(0.9, [1.0, 1.51])
     run.update(0.9, ['mambo'])
-    assert run.observer.completed.batch == 3
+    assert run.observer.completed.step == 18
     report = write(run.observer.record(RunEnd('all_found', 1.0, 0.3)), tmp_path)
     table = list(csv.DictReader((tmp_path / 'found_targets.csv').open()))
     assert [(row['x'], row['target']) for row in table] == [

@@ -22,8 +22,8 @@ from maasi_sim.scenario.base import OriginSettings
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
-from maasi_sim.targets.found_table import csv_text, found_rows, geodetic, geojson_text
-from maasi_sim.targets.nodes import plan_nodes
+from maasi_sim.targets.mission import plan_nodes
+from maasi_sim.targets.tables import csv_text, found_rows, geodetic, geojson_text
 
 ORIGIN = OriginSettings(latitude=46.0, longitude=23.5, altitude=350.0)
 COVARIANCE = np.array([[0.04, 0.01, 0.02], [0.01, 0.09, 0.03], [0.02, 0.03, 0.16]])

@@ -1,4 +1,4 @@
-"""A search of buildings, as a run sees it."""
+"""A search of buildings, as a run sees it: its nodes, observer and report."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
 
-from maasi_sim.buildings.nodes import plan_nodes
+from maasi_filter.ros.parameters import flatten
+from maasi_planner.buildings.node_settings import CuboidPlannerSettings, box_numbers, face_words
 from maasi_sim.buildings.observer import CuboidObserver, CuboidRecord
 from maasi_sim.buildings.report import build_cuboid_report, cuboid_summary
 from maasi_sim.buildings.scenario import CuboidScenario
-from maasi_sim.run.node_plan import NodePlan, RunSettings
+from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
 from maasi_sim.warm_up import warm_up_buildings
 
 if TYPE_CHECKING:
@@ -18,15 +19,7 @@ if TYPE_CHECKING:
 
 
 class BuildingMission:
-    """See `Mission`.
-
-    Parameters
-    ----------
-    name : str
-        Of the scenario.
-    scenario : CuboidScenario
-        With all layers.
-    """
+    """See `Mission`."""
 
     found_word = 'visited'
 
@@ -83,3 +76,44 @@ class BuildingMission:
         from maasi_sim.buildings.report_figure import plot_cuboid_report
 
         return plot_cuboid_report(record)
+
+
+def plan_nodes(scenario: CuboidScenario, run: RunSettings) -> list[NodePlan]:
+    """Return the simulation, and for each robot a planner and a guard."""
+    common = run.common(scenario)
+    plans = [sim_plan('cuboid_sim_node', scenario, run)]
+    for name in scenario.names():
+        plans.append(_planner_plan(name, scenario, common))
+        # It plans once per step, and a command is valid for one step.
+        plans.append(guard_plan(name, common, scenario.step))
+    return plans
+
+
+def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -> NodePlan:
+    """Return the planner of a robot that searches buildings for itself."""
+    robot, search = scenario.robots[name], scenario.planner
+    floor = float(scenario.environment.array()[2, 0])
+    settings = CuboidPlannerSettings.model_validate(
+        {
+            **common,
+            'environment': scenario.environment.of_nodes(),
+            'start': robot.start,
+            'yaw': robot.yaw,
+            'dynamics': robot.dynamics,
+            'hazard': robot.hazard,
+            'planner': search.model_dump(exclude={'name', 'objects', 'obstacles'}),
+            'objects': [box_numbers(item, floor) for item in search.objects],
+            'faces': [face_words(item) for item in search.objects],
+            'obstacles': [box_numbers(item, floor) for item in search.obstacles],
+        }
+    )
+    return NodePlan(
+        'maasi_planner',
+        'cuboid_planner_node',
+        'cuboid_planner',
+        name,
+        {**flatten(settings), **SIMULATED},
+        topics=tuple(f'/{name}/{topic}' for topic in ('state', 'decision', 'cmd_vel', 'link/tx')),
+        given={'search_on_start': True},
+        drives=True,
+    )

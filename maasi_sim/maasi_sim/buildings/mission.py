@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_planner.buildings import (
     Activity,
     Broadcast,
@@ -26,24 +27,12 @@ from maasi_planner.buildings import (
     solve_jointly,
 )
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Scheme = Literal['distributed', 'sequential', 'centralized']
 
 
 @dataclass
 class SearchRobot:
-    """A robot of a mission.
-
-    Attributes
-    ----------
-    start : (3,) array
-        Where it starts, and recharges [m].
-    dynamics : DynamicsSettings
-        Of its body.
-    hazard : HazardSettings
-        Of its battery.
-    """
+    """A robot of a mission; it starts, and recharges, at `start`, (3,) [m]."""
 
     start: FloatArray
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
@@ -58,22 +47,16 @@ class MissionRecord:
     ----------
     mission : Mission
         What was searched.
-    steps : int
-        Until all cuboids were visited, or until it was given up.
-    complete : bool
-        Whether all were visited.
+    steps, complete : int, bool
+        Until all cuboids were visited, or it was given up; whether all were.
     paths : dict
         By robot: positions at all steps, (steps + 1, 3) [m].
-    visited : (steps + 1,) array
-        Number of cuboids visited by the team.
-    active : (steps + 1,) array
-        Robots that search.
+    visited, active : (steps + 1,) array
+        Cuboids visited by the team, and robots that search.
     snapshots : list of Snapshot
         In order of time.
-    collisions : int
-        Steps on which a robot's way cut an object or obstacle.
-    outside : int
-        Steps on which a robot was outside the area.
+    collisions, outside : int
+        Steps on which a robot's way cut an object or obstacle, or it was outside the area.
     how : dict
         Number of choices by how they were made.
     solve_times : array
@@ -116,23 +99,10 @@ def within_range(
 
 
 class CuboidMission:
-    """Robots that search the faces of objects, step by step.
+    """Robots that search the faces of objects, step by step of dT [s].
 
-    Parameters
-    ----------
-    settings : CuboidSettings
-        Objects and planner.
-    area : array_like, shape (3, 2)
-        [m].
-    robots : mapping
-        SearchRobot by name.
-    step : float
-        dT [s].
-    seed : int
-        Of all random numbers.
-    scheme : str
-        distributed: each for itself, as in P2; sequential: one after the other, each knowing the
-        new plans of those before it; centralized: all together, P1.
+    `scheme`: distributed is each for itself, as in P2; sequential one after the other, each knowing
+    the new plans of those before it; centralized all together, P1.
 
     Raises
     ------

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.typesys.store import Typestore
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings import Mission
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.run.run_record import RunEnd, RunRecord, TeamLog
 from maasi_sim.run.topics import STEP
-
-FloatArray = NDArray[np.float64]
 
 SEARCHING = 0
 _ACTIVITIES = ('searching', 'returning', 'recharging')
@@ -75,19 +73,7 @@ class CuboidRecord(RunRecord):
 
 
 class CuboidObserver:
-    """Gathers the data of a report from serialised messages, in the order of arrival.
-
-    Parameters
-    ----------
-    name : str
-        Of the scenario.
-    scenario : CuboidScenario
-        What is run.
-    seed : int
-        Of the run.
-    types : Typestore
-        Message types.
-    """
+    """Gathers the data of a report from serialised messages, in the order of arrival."""
 
     #: There are no filters.
     update_topics: Sequence[str] = ()
@@ -104,13 +90,12 @@ class CuboidObserver:
         self._states: dict[str, list[bytes]] = {name: [] for name in scenario.names()}
         self._visited_at: dict[int, Moment] = {}
         self._done: dict[str, int] = {}
-        self._shots = 0
         self.news = False
-
-    @property
-    def topics(self) -> list[str]:
-        """Topics that it needs."""
-        return [STEP, *self._decision_topics, *self._state_topics]
+        #: Number of cuboids, and snapshots so far.
+        self.total = len(self.mission.cells)
+        self.measurements = 0
+        #: Topics that it needs.
+        self.topics = [STEP, *self._decision_topics, *self._state_topics]
 
     @property
     def found(self) -> int:
@@ -118,24 +103,14 @@ class CuboidObserver:
         return len(self._visited_at)
 
     @property
-    def total(self) -> int:
-        """Number of cuboids."""
-        return len(self.mission.cells)
-
-    @property
-    def measurements(self) -> int:
-        """Snapshots so far."""
-        return self._shots
-
-    @property
     def explored(self) -> float:
         """Share of the cuboids visited."""
-        return self.found / len(self.mission.cells)
+        return self.found / self.total
 
     @property
     def completed(self) -> Moment | None:
         """When the last cuboid was visited, if `stop` asks for that."""
-        if self.scenario.stop != 'all_found' or self.found < len(self.mission.cells):
+        if self.scenario.stop != 'all_found' or self.found < self.total:
             return None
         return max(self._visited_at.values(), key=lambda moment: moment.step)
 
@@ -169,7 +144,7 @@ class CuboidObserver:
         self._decisions[name].append(decision)
         moment = Moment(self._team.time(decision.header.stamp), int(decision.step))
         for shot in decision.snapshots:
-            self._shots += 1
+            self.measurements += 1
             known = self._visited_at.get(int(shot.cuboid))
             self.news = self.news or known is None
             if known is None or moment.step < known.step:
@@ -190,7 +165,7 @@ class CuboidObserver:
             end_time=end_time,
             wall_time=end.wall_time,
         )
-        if self.found == len(self.mission.cells):
+        if self.found == self.total:
             record.completed = max(self._visited_at.values(), key=lambda moment: moment.step)
         active: dict[float, int] = {}
         times = []

@@ -6,11 +6,10 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings import Mission
-
-FloatArray = NDArray[np.float64]
 
 # Palette for colour-blind readers (Okabe and Ito).
 COLOURS = ('#CC79A7', '#D62728', '#009E73', '#0072B2', '#E69F00', '#56B4E9', '#8C564B')
@@ -34,21 +33,7 @@ def draw_mission(
     visited: Collection[int],
     plans: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Draw a mission on 3D axes.
-
-    Parameters
-    ----------
-    axes : Axes3D
-        Where.
-    mission : Mission
-        Objects, obstacles and cuboids.
-    paths : mapping
-        Positions of each robot, (n, 3) [m].
-    visited : collection of int
-        Cuboids that were visited.
-    plans : mapping, optional
-        Predicted positions of each robot, (T + 1, 3) [m].
-    """
+    """Draw a mission on 3D axes: ways (n, 3) [m], visited cuboids, predicted positions."""
     for box in mission.objects:
         draw_box(axes, box, OBJECT, 0.35, 'object')
     for box in mission.obstacles:

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_sim.buildings.observer import CuboidRecord
 from maasi_sim.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours_of
 from maasi_sim.buildings.report import build_cuboid_report
@@ -24,8 +24,6 @@ from maasi_sim.run.report_panels import (
     make_panels,
     step_plot,
 )
-
-FloatArray = NDArray[np.float64]
 
 
 def plot_cuboid_report(record: CuboidRecord) -> Figure:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.buildings import Dynamics, Mission
 from maasi_planner.motion import Body, RobotState
@@ -15,8 +16,6 @@ from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.world.odometry import OdometryModel, OdometryReading
 from maasi_sim.world.robots import Battery, Equipment
 from maasi_sim.world.simulation import SimulatedTeam
-
-FloatArray = NDArray[np.float64]
 
 
 class MassPointBody(Body):
@@ -48,17 +47,6 @@ class SearchingRobot:
     """A simulated robot that searches buildings.
 
     A command holds for one step. Without one it brakes and hovers, as autopilots do.
-
-    Parameters
-    ----------
-    name : str
-        Keys its noise.
-    scenario : CuboidScenario
-        With all layers.
-    mission : Mission
-        What it can hit.
-    seed : int
-        Of the run.
     """
 
     camera = ranging = laser = None
@@ -110,15 +98,7 @@ class SearchingRobot:
 
 
 class CuboidSimulation(SimulatedTeam):
-    """The robots of a search of buildings.
-
-    Parameters
-    ----------
-    scenario : CuboidScenario
-        With all layers.
-    seed : int
-        Of the run.
-    """
+    """The robots of a search of buildings."""
 
     scenario: CuboidScenario
     robots: dict[str, SearchingRobot]

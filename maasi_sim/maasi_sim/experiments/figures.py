@@ -8,8 +8,8 @@ from operator import getitem
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_sim.experiments.experiment import Results, Run
 from maasi_sim.experiments.statistics import mean_interval, survival
 from maasi_sim.experiments.tables import COMPLETE, TIME, difference, interval, shown
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
 
 # Colour and line of each method, those of 000, figure 4.
 STYLES: dict[str, tuple[str, str]] = {

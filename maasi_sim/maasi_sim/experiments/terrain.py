@@ -6,14 +6,12 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from maasi_filter.arrays import FloatArray
 from maasi_sim.experiments.experiment import Outcome
 from maasi_sim.experiments.searches import run_search
 from maasi_sim.world.noise_streams import noise_stream
-
-FloatArray = NDArray[np.float64]
 
 # Self-affine with Hurst's exponent of real terrain, about 0.8 (a fractal dimension of 2.2); the
 # deviation of heights over the whole map is that of hills.

@@ -6,17 +6,13 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.models.pose import Pose
 from maasi_sim.run.run_record import RunEnd, TeamLog, rows
 from maasi_sim.run.topics import DECISIONS, FOUND, STEP, UPDATE, seconds, within
 from maasi_sim.scenario.schema import Scenario
-from maasi_sim.targets.tally import Progress, Tally, Update
-from maasi_sim.targets.target_record import TargetRecord
-
-FloatArray = NDArray[np.float64]
+from maasi_sim.targets.tally import FoundCount, Tally, TargetRecord, Update
 
 UNAVAILABLE = 5
 
@@ -26,17 +22,6 @@ class TargetObserver:
 
     Times are those since the first step. Filter updates and found targets are decoded at once, as
     the end of a run depends on them; the rest is decoded by `record`.
-
-    Parameters
-    ----------
-    name : str
-        Of the scenario.
-    scenario : Scenario
-        What is run.
-    seed : int
-        Of the run.
-    types : Typestore
-        Message types.
     """
 
     def __init__(self, name: str, scenario: Scenario, seed: int, types: Typestore) -> None:
@@ -69,24 +54,19 @@ class TargetObserver:
         self._ending: tuple[int, str] | None = None
         self._explored: dict[str, float] = {}
         self.news = False
+        #: Number of true targets.
+        self.total = len(self.truth)
+        #: Topics of the filters' updates, and all that it needs.
+        self.update_topics = list(self._update_topics)
+        self.topics = [*self.update_topics, *self._found_topics, STEP, *self._kept]
 
     @property
-    def update_topics(self) -> list[str]:
-        """Topics of the filters' updates."""
-        return list(self._update_topics)
-
-    @property
-    def topics(self) -> list[str]:
-        """Topics that it needs."""
-        return [*self._update_topics, *self._found_topics, STEP, *self._kept]
-
-    @property
-    def progress(self) -> list[Progress]:
+    def progress(self) -> list[FoundCount]:
         """State of the run after each filter update."""
         return self._tally.progress
 
     @property
-    def completed(self) -> Progress | None:
+    def completed(self) -> FoundCount | None:
         """State of the run when all targets were found."""
         return self._tally.completed
 
@@ -108,11 +88,6 @@ class TargetObserver:
         return self.progress[-1].found if self.progress else 0
 
     @property
-    def total(self) -> int:
-        """Number of true targets."""
-        return len(self.truth)
-
-    @property
     def measurements(self) -> int:
         """Number of measurements so far, of all robots."""
         return sum(self._tally.measurements.values())
@@ -131,13 +106,11 @@ class TargetObserver:
             elif topic in self._state_topics and self._settled and self._team.robots is None:
                 self._note_ending(int(self._team.decode(data, 'AgentState').step))
         elif topic in self._update_topics:
-            self._updates.append(
-                (self._update_topics[topic], self._team.decode(data, 'FilterUpdate'))
-            )
+            update = self._team.decode(data, 'FilterUpdate')
+            self._updates.append((self._update_topics[topic], update))
         elif topic in self._found_topics:
-            self._arrays[self._found_topics[topic]].append(
-                self._team.decode(data, 'FoundTargetArray')
-            )
+            array = self._team.decode(data, 'FoundTargetArray')
+            self._arrays[self._found_topics[topic]].append(array)
         elif topic == STEP and self.completed is None:
             self._note_team(self._team.decode(data, 'LockstepStep'))
 

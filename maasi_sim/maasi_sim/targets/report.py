@@ -5,14 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from maasi_filter.arrays import FloatArray
 from maasi_sim.run.report_files import END_REASONS, ending, identity, pace, path_length
-from maasi_sim.targets.tally import Progress
-from maasi_sim.targets.target_record import TargetRecord
-
-FloatArray = NDArray[np.float64]
+from maasi_sim.targets.tally import FoundCount, TargetRecord
 
 
 def build_report(record: TargetRecord) -> dict[str, Any]:
@@ -31,7 +26,7 @@ def build_report(record: TargetRecord) -> dict[str, Any]:
                 'id': target.id,
                 'position': _numbers(target.position),
                 'covariance': [_numbers(row) for row in target.covariance],
-                'agent': target.agent,
+                'agent': target.robot,
                 'measurement': target.measurement,
                 'time': target.time,
                 'class_id': target.label.class_id,
@@ -82,7 +77,7 @@ def summary(report: dict[str, Any]) -> str:
     return '\n'.join(lines + pace(report))
 
 
-def _completion(record: TargetRecord) -> Progress | None:
+def _completion(record: TargetRecord) -> FoundCount | None:
     """Return when all targets were found and stayed so."""
     complete = None
     for progress in record.progress:

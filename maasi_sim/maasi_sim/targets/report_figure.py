@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Rectangle
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import END_REASONS
 from maasi_sim.run.report_panels import (
@@ -29,9 +29,7 @@ from maasi_sim.run.report_panels import (
     step_plot,
 )
 from maasi_sim.targets.report import build_report
-from maasi_sim.targets.target_record import TargetRecord
-
-FloatArray = NDArray[np.float64]
+from maasi_sim.targets.tally import TargetRecord
 
 _TRUE, _FOUND, _MISSED, _FALSE = '#222222', '#D62728', '#D55E00', '#7B3294'
 _SIGMAS = 3.0

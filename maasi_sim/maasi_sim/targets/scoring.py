@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.metrics import Gospa, Match, gospa, match_targets
+from maasi_filter.records import FoundTarget
 from maasi_sim.scenario.schema import Scenario
-
-FloatArray = NDArray[np.float64]
 
 
 def matching_radius(removal_distance: float, truth: ArrayLike) -> float:
     """Return the distance within which a found target is true [m].
 
     Three times T_z, at most half the smallest distance between two targets, so that none can
-    be matched with its neighbour.
-
-    Parameters
-    ----------
-    removal_distance : float
-        T_z [m].
-    truth : (n, d) array
-        True positions [m].
+    be matched with its neighbour. `removal_distance` is T_z [m], `truth` the true positions [m].
 
     Raises
     ------
@@ -58,18 +52,9 @@ def scoring_radius(scenario: Scenario, truth: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Scores:
-    """Found targets against the truth.
+    """Found targets against the truth: one-to-one pairs, and GOSPA.
 
-    Attributes
-    ----------
-    radius : float
-        Within which a found target is true, and c of GOSPA [m].
-    order : float
-        p of GOSPA.
-    match : Match
-        One-to-one pairs and their RMSE.
-    gospa : Gospa
-        The metric and its parts.
+    `radius` is the distance within which a found target is true, and c of GOSPA [m]; `order` its p.
     """
 
     radius: float
@@ -83,8 +68,12 @@ class Scores:
         return self.match.missed == 0
 
 
-def score(found: ArrayLike, truth: ArrayLike, radius: float, order: float = 2.0) -> Scores:
-    """Return the scores of found targets (n, d) against true ones (m, d) [m]."""
+def score(
+    found: Sequence[FoundTarget] | FloatArray, truth: ArrayLike, radius: float, order: float = 2.0
+) -> Scores:
+    """Return the scores of found targets, or of places (n, d), against true ones (m, d) [m]."""
+    if not isinstance(found, np.ndarray):
+        found = np.array([getattr(item, 'position', item) for item in found])
     return Scores(
         radius,
         order,

@@ -1,42 +1,31 @@
-"""Counts what the filters have found, update by update."""
+"""What the filters have found, update by update, and the record of a search for targets."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maasi_filter.models.label import UNLABELLED, Label
+from maasi_filter.arrays import FloatArray
+from maasi_filter.models.label import Label
+from maasi_filter.models.pose import Pose
+from maasi_filter.records import FoundTarget
+from maasi_sim.run.run_record import RunRecord
 from maasi_sim.run.topics import seconds
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.world.world import World
 
-FloatArray = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
-class Found:
-    """A target that the team has found; covariance (d, d) [m^2], label as in the filter."""
-
-    id: int
-    position: FloatArray
-    covariance: FloatArray
-    agent: str
-    measurement: int
-    time: float
-    label: Label = UNLABELLED
-
-
-@dataclass(frozen=True)
-class Progress:
-    """State of a run after a filter update."""
+class FoundCount:
+    """Measurements and found targets of all robots so far, after a filter update."""
 
     time: float
     step: int
-    batch: int
     measurements: int
     found: int
     true_found: int
@@ -51,6 +40,54 @@ class Update:
     arrays: list[Any]
 
 
+@dataclass
+class TargetRecord(RunRecord):
+    """The record of a search for targets.
+
+    Attributes
+    ----------
+    truth : (n, d) array
+        True targets [m].
+    found : list of FoundTarget
+        At the end.
+    progress : list of FoundCount
+        After each filter update.
+    measurements : dict
+        Number by robot.
+    decisions : int
+        Waypoints chosen, of all robots.
+    waypoints : dict
+        By robot: chosen ones in order, (n, 3) [m].
+    measured_from : dict
+        By robot: poses at which it measured, in order.
+    explored, expected_number : float
+        Share of the environment, and targets believed not yet found, at the end.
+    """
+
+    truth: FloatArray
+    found: list[FoundTarget] = field(default_factory=list)
+    progress: list[FoundCount] = field(default_factory=list)
+    measurements: dict[str, int] = field(default_factory=dict)
+    decisions: int = 0
+    waypoints: dict[str, FloatArray] = field(default_factory=dict)
+    measured_from: dict[str, list[Pose]] = field(default_factory=dict)
+    explored: float = 0.0
+    expected_number: float = 0.0
+
+    def scores(self) -> Scores:
+        """Return the scores at the end."""
+        radius = scoring_radius(self.scenario, self.truth)
+        return score(self.found, self.truth, radius, self.scenario.scoring.order)
+
+
+def numbered(found: Sequence[Sequence[FoundTarget]]) -> list[FoundTarget]:
+    """Return the found targets of several filters as one list, numbered in the order of time."""
+    if len(found) == 1:
+        return list(found[0])
+    every = sorted(chain(*found), key=lambda item: (item.time, item.robot, item.id))
+    return [replace(item, id=number) for number, item in enumerate(every, start=1)]
+
+
 class Tally:
     """Counts what the filters have found, update by update."""
 
@@ -61,25 +98,22 @@ class Tally:
         self.begin = begin
         self.radius = scoring_radius(scenario, self.truth)
         self.measurements = dict.fromkeys(scenario.names(), 0)
-        self.progress: list[Progress] = []
-        self.completed: Progress | None = None
+        self.progress: list[FoundCount] = []
+        self.completed: FoundCount | None = None
         self.expected_number = 0.0
         self._shared = len(scenario.namespaces()) > 1
         # By namespace of the filter.
-        self._found: dict[str, dict[int, Found]] = {name: {} for name in scenario.namespaces()}
+        self._found: dict[str, dict[int, FoundTarget]] = {
+            name: {} for name in scenario.namespaces()
+        }
         self._expected: dict[str, float] = {}
         self._last_scores: Scores | None = None
         self._counted: set[tuple[str, str, int]] = set()
 
     @property
-    def found(self) -> list[Found]:
-        """Targets found so far; those of several filters are numbered in their order."""
-        if not self._shared:
-            (found,) = self._found.values()
-            return [found[key] for key in sorted(found)]
-        every = [item for found in self._found.values() for item in found.values()]
-        every.sort(key=lambda item: (item.time, item.agent, item.id))
-        return [replace(item, id=number) for number, item in enumerate(every, start=1)]
+    def found(self) -> list[FoundTarget]:
+        """Targets found so far."""
+        return numbered([[of[key] for key in sorted(of)] for of in self._found.values()])
 
     def take(self, update: Update) -> bool:
         """Count an update; return whether the number of found targets has changed."""
@@ -106,11 +140,11 @@ class Tally:
             self.truth = self.world.targets_at(int(message.step))
             changed = True
         if changed or self._last_scores is None:
-            self._last_scores = self._scores()
-        now = Progress(
+            order = self.scenario.scoring.order
+            self._last_scores = score(self.found, self.truth, self.radius, order)
+        now = FoundCount(
             seconds(message.header.stamp) - self.begin,
             int(message.step),
-            int(message.batch_id),
             sum(self.measurements.values()),
             sum(len(found) for found in self._found.values()),
             self._last_scores.match.true_found,
@@ -132,18 +166,14 @@ class Tally:
             return list(targets)
         return [item for item in targets if item.robot == update.namespace]
 
-    def _scores(self) -> Scores:
-        positions = [item.position for item in self.found]
-        return score(positions, self.truth, self.radius, self.scenario.scoring.order)
-
-    def _target(self, item: Any) -> Found:
+    def _target(self, item: Any) -> FoundTarget:
         size = self.scenario.dimension
-        return Found(
+        return FoundTarget(
             int(item.id),
             np.array([item.position.x, item.position.y, item.position.z])[:size],
             np.array(item.covariance, dtype=float).reshape(3, 3)[:size, :size],
             item.robot,
             int(item.measurement),
             seconds(item.stamp) - self.begin,
-            Label(item.class_id, item.score, item.identity),
+            label=Label(item.class_id, item.score, item.identity),
         )

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_sim.targets.scoring import score
 from maasi_sim.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning
-
-FloatArray = NDArray[np.float64]
 
 # Objectives below this stand for candidates that are not allowed.
 _NOT_ALLOWED = -1e29

@@ -13,15 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_sim.run.bag import Bag, BagError
 from maasi_sim.run.topics import STEP, seconds
 from maasi_sim.view.event_log import Event, EventLog, Scene
 from maasi_sim.view.event_maker import EventMaker, RobotChoice
 from maasi_sim.view.scene import empty_scene, scene_of_facts
-
-FloatArray = NDArray[np.float64]
 
 _MARKERS = 'visualization_msgs/msg/MarkerArray'
 # Messages between two words on the progress.

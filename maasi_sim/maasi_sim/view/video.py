@@ -21,8 +21,6 @@ from maasi_sim.run.run_folder import write_whole
 from maasi_sim.view.event_log import Event, EventLog
 from maasi_sim.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
-FloatArray = NDArray[np.float64]
-
 # Pictures per second, and size [in] at a resolution [px/in].
 RATE = 10
 _SIZE, _RESOLUTION = (9.6, 7.2), 80

@@ -1,4 +1,4 @@
-"""Found targets as rows of a table: for CSV, GeoJSON and data frames."""
+"""Found targets as rows of a table, for CSV, GeoJSON and data frames."""
 
 from __future__ import annotations
 
@@ -6,35 +6,28 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
+from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
+from maasi_filter.records import FoundTarget
 from maasi_sim.scenario.base import OriginSettings
 
-FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
 
 
 def found_rows(
-    found: Sequence[Any],
+    found: Sequence[FoundTarget],
     truth: FloatArray,
     pairs: Iterable[tuple[int, int]],
     origin: OriginSettings | None,
 ) -> list[Row]:
     """Return a row for each found target, with the columns of `columns`.
 
-    Parameters
-    ----------
-    found : sequence of Found or FoundTarget
-        With positions (d,) [m, map].
-    truth : (n, d) array
-        True targets [m].
-    pairs : iterable of (int, int)
-        Index of a found target, and of the true one that it is.
-    origin : OriginSettings or None
-        Where the map lies; None: rows have no geodetic coordinates.
+    `pairs` are indices of a found target and of the true one that it is. Without an origin of the
+    map rows have no geodetic coordinates.
     """
     true = dict(pairs)
     rows = []
@@ -43,7 +36,7 @@ def found_rows(
         error = None if target is None else float(np.linalg.norm(item.position - truth[target]))
         row: Row = {
             'id': item.id,
-            'agent': item.agent if hasattr(item, 'agent') else item.robot,
+            'agent': item.robot,
             'time': float(item.time),
             'measurement': item.measurement,
             **{axis: float(value) for axis, value in zip('xyz', item.position)},
@@ -82,11 +75,8 @@ def geodetic(position: FloatArray, origin: OriginSettings) -> Row:
     latitude, longitude, altitude = pymap3d.enu2geodetic(
         east, north, up, origin.latitude, origin.longitude, origin.altitude
     )
-    return {
-        'latitude': float(latitude),
-        'longitude': float(longitude),
-        'altitude': float(altitude),
-    }
+    places = map(float, (latitude, longitude, altitude))
+    return dict(zip(('latitude', 'longitude', 'altitude'), places))
 
 
 def csv_text(rows: Sequence[Row], dimension: int, origin: OriginSettings | None) -> str:
@@ -104,16 +94,34 @@ def geojson_text(rows: Sequence[Row]) -> str:
     for row in rows:
         properties = dict(row)
         place = [properties.pop(name) for name in ('longitude', 'latitude', 'altitude')]
-        features.append(
-            {
-                'type': 'Feature',
-                # To a millimetre.
-                'geometry': {
-                    'type': 'Point',
-                    'coordinates': [round(place[0], 8), round(place[1], 8), round(place[2], 3)],
-                },
-                'properties': properties,
-            }
-        )
+        # To a millimetre.
+        place = [round(place[0], 8), round(place[1], 8), round(place[2], 3)]
+        geometry = {'type': 'Point', 'coordinates': place}
+        features.append({'type': 'Feature', 'geometry': geometry, 'properties': properties})
     content = {'type': 'FeatureCollection', 'features': features}
     return json.dumps(content, indent=1, allow_nan=False) + '\n'
+
+
+def data_frame(result: Any, table: str) -> Any:
+    """Return a table of a `SearchResult`, see `SearchResult.to_dataframe`."""
+    if table not in ('found_targets', 'progress'):
+        raise ValueError(f"table: got {table!r}, allowed are 'found_targets', 'progress'")
+    try:
+        pandas = import_module('pandas')
+    except ImportError:
+        raise ImportError(
+            'to_dataframe needs pandas, which is not installed: pip install pandas'
+        ) from None
+    if table == 'found_targets':
+        rows = found_rows(result.found_targets, result.truth, result.pairs, result.origin)
+        names = columns(result.truth.shape[1], result.origin)
+        frame = pandas.DataFrame(rows, columns=names)
+        return frame.astype({'target': 'Int64', 'error': float})
+    rows = []
+    for item in result.progress:
+        counts = ('time', 'step', 'measurements', 'found', 'true_found', 'rmse')
+        row = {name: getattr(item, name) for name in counts}
+        for name, place in item.positions.items():
+            row |= {f'{name}_{axis}': float(value) for axis, value in zip('xyz', place)}
+        rows.append(row | {f'{name}_measures': name in item.members for name in item.positions})
+    return pandas.DataFrame(rows)
