@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.sensor import Sensor
-
-FloatArray = NDArray[np.float64]
 
 # Lower bound of the expected number of false detections in a scan: no sensor is without clutter.
 LEAST_PER_SCAN = 0.05

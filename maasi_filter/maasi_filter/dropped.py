@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
-
-FloatArray = NDArray[np.float64]
 
 # Reasons that are no faults: a found target took it, or another one of the scan is the same.
 FOUND = 'found'

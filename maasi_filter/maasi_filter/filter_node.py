@@ -42,10 +42,6 @@ from maasi_msgs.msg import (
 )
 
 _TIMEOUT_PERIOD = 0.05
-# Largest lead of the stamp of a measurement over that of its batch [ns].
-_STAMP_AHEAD = 60_000_000_000
-# Capacity of the buffer of detections that arrive before their batch.
-_MOST_EARLY = 64
 # Upper bound on predicted steps: a day at 10 steps per second.
 _MOST_STEPS = 864_000
 # Longest wait for other filters to acknowledge found targets [s].

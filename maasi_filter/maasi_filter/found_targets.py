@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
 from maasi_filter.vector_math import squared_distance
-
-FloatArray = NDArray[np.float64]
 
 # Gate on the squared normalised distance of two estimates of the same target.
 SAME_TARGET = 16.0

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from maasi_filter.ic_phd.filter import IcPhdFilter
-from maasi_filter.pmb.filter import PmbFilter
+from maasi_filter.ic_phd.filter import IcPhdFilter, IcPhdState
+from maasi_filter.pmb.filter import PmbFilter, PmbState
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
-from maasi_filter.state_file import read_state
+from maasi_filter.state_file import SavedState
 
 
 def make_filter(
@@ -46,19 +44,18 @@ def load_filter(path: str | os.PathLike[str]) -> SearchFilter:
     StateFileError
         If the file is missing, of another format or version, or damaged; it says which.
     """
-    return filter_from_state(read_state(path), path)
+    return filter_of(SavedState(path))
 
 
-def filter_from_state(
-    state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
-) -> SearchFilter:
-    """Return the filter of a state; `path` is named in errors.
+def filter_of(saved: SavedState) -> SearchFilter:
+    """Return the filter of a file.
 
     Raises
     ------
     StateFileError
-        If an array is missing, or has a wrong shape or number.
+        If something is missing, or has a wrong type, shape or number.
     """
-    if 'method' in state and state['method'].tobytes() == b'pmb':
-        return PmbFilter.from_state(state, path)
-    return IcPhdFilter.from_state(state, path)
+    with saved.named():
+        if PmbState.method in saved:
+            return PmbFilter.from_state(saved.read(PmbState.method, PmbState))
+        return IcPhdFilter.from_state(saved.read(IcPhdState.method, IcPhdState))

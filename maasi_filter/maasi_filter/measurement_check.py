@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
 from maasi_filter.records import AgentMeasurement, FoundTarget
 from maasi_filter.settings import FilterSettings
-
-FloatArray = NDArray[np.float64]
 
 # Default position error of a robot with a box-shaped field of view, as a share of its half size:
 # the position error blurs the edge.
@@ -48,7 +46,7 @@ class CheckedMeasurement:
     pose_error: float
     labels: tuple[Label, ...] = ()
 
-    def only(self, keep: NDArray[np.bool_]) -> CheckedMeasurement:
+    def only(self, keep: BoolArray) -> CheckedMeasurement:
         """Return a copy with some of the detections."""
         labels = tuple(label for label, kept in zip(self.labels, keep.tolist()) if kept)
         return replace(

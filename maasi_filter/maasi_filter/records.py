@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass

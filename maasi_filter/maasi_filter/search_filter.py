@@ -4,16 +4,56 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
 from maasi_filter.unexplored_map import UnexploredMap
 
-FloatArray = NDArray[np.float64]
+
+@dataclass
+class FilterState:
+    """What the saved states of all filters have."""
+
+    settings: FilterSettings
+    bounds: FloatArray
+    generator: np.random.Generator
+    exploration: FloatArray
+    clusters: list[Cluster]
+    #: Name of the filter, under which its state is saved.
+    method: ClassVar[str]
+
+    def check(self, found: Sequence[FoundTarget]) -> None:
+        """Refuse clusters and found targets that a filter cannot continue from.
+
+        Raises
+        ------
+        ValueError
+            Naming what was read and what is allowed.
+        """
+        d = len(self.bounds)
+        items: list[Cluster | FoundTarget] = [*self.clusters, *found]
+        for item in items:
+            shapes = item.position.shape, item.covariance.shape
+            # A cluster of equal particles has zero covariance.
+            if (
+                shapes != ((d,), (d, d))
+                or not (np.isfinite(item.position).all() and np.isfinite(item.covariance).all())
+                or not np.allclose(item.covariance, item.covariance.T)
+                or (np.diagonal(item.covariance) < 0.0).any()
+            ):
+                raise ValueError(
+                    f'{type(item).__name__}: got {item.position.tolist()} with covariance '
+                    f'{item.covariance.tolist()}, allowed are finite numbers of {d} dimensions '
+                    'and a symmetric matrix with a diagonal from 0'
+                )
+        ids = [target.id for target in found]
+        if min(ids, default=1) < 1 or len(set(ids)) < len(ids):
+            raise ValueError(f'found targets: got ids {ids}, allowed are different ones from 1')
 
 
 class SearchFilter(Protocol):
@@ -105,5 +145,5 @@ class SearchFilter(Protocol):
         The file is replaced atomically: a crash leaves the old one or the new one.
         """
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Return the whole state, random generator included, as arrays for a file."""
+    def state(self) -> FilterState:
+        """Return the whole state, random generator included, for `write_state`."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import (
     BoxDetection,
     DetectionModel,
@@ -21,7 +21,6 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.plugins import OwnSettings, PluginGroup
 from maasi_filter.pmb.settings import PmbSettings
 
-FloatArray = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

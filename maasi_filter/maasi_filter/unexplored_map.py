@@ -10,12 +10,12 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import DetectionModel, fill_probabilities
 from maasi_filter.models.pose import Pose
 
-FloatArray = NDArray[np.float64]
 # Cells along the mean side of the environment, in 2D and 3D.
 CELLS = {2: 54, 3: 13}
 MAXIMUM_NODES = 20_000_000
@@ -248,6 +248,22 @@ class UnexploredMap:
         """Return 1 - mean of e over the environment, in [0, 1]."""
         volumes = self.cell_volumes()
         return 1.0 - float((volumes * self.values).sum() / volumes.sum())
+
+    def restore(self, values: FloatArray) -> None:
+        """Put saved values in place of e.
+
+        Raises
+        ------
+        ValueError
+            If they do not fit the nodes, or are not from 0 to 1.
+        """
+        if values.shape != self.values.shape:
+            raise ValueError(
+                f'exploration: got shape {values.shape}, allowed is {self.values.shape}'
+            )
+        if not ((values >= 0.0) & (values <= 1.0)).all():
+            raise ValueError('exploration: got a number that is not from 0 to 1')
+        self.values[...] = values
 
     def copy(self) -> UnexploredMap:
         """Return an independent copy."""

@@ -15,6 +15,7 @@ from maasi_filter import (
     make_filter,
     wrap_angle,
 )
+from maasi_filter.state_file import pack
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)
@@ -22,6 +23,14 @@ FLOOR = np.array([[-0.3, 2.4]] * 2)
 FLOOR_LENGTHS = {'found_radius': 0.02, 'removal_distance': 0.05, 'jitter_deviation': 0.003}
 DEGREES = NoiseSettings(range=1.5, bearing=0.175, elevation=0.295, as_='variance', angles='degrees')
 RADIANS = NoiseSettings(range=1.5, bearing=0.175, elevation=0.295)
+
+
+def same(one, other):
+    """Check that the states of two filters are equal to the bit."""
+    first, second = pack(one.state()), pack(other.state())
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
 
 
 def cube_sensor(noise=DEGREES):

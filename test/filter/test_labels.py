@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pmb_problems import plane_filter, plane_sensor
-from searches import floor_sensor, observe
+from searches import floor_sensor, observe, same
 
-from maasi_filter import AgentMeasurement, FilterSettings, Pose, load_filter
+from maasi_filter import AgentMeasurement, FilterSettings, Pose
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.models.label import Label, LabelTally
-from maasi_filter.pmb.filter import PmbFilter
 
 PAIR = np.array([[50.0, 50.0], [51.0, 50.0]])
 NAMES = ('left', 'right')
@@ -70,29 +69,13 @@ def test_a_detection_far_from_the_target_of_its_identity_is_taken_as_clutter():
         assert np.linalg.norm(target.position - place) < 0.5
 
 
-def test_the_state_with_labels_continues_to_the_bit(tmp_path):
-    scans = pair_scans(30)
-    search = play(plane_filter(found_radius=1.0), scans[:20])
-    search.save(tmp_path / 'state')
-    again = load_filter(tmp_path / 'state')
-    assert isinstance(again, PmbFilter)
-    play(search, scans[20:], 20)
-    play(again, scans[20:], 20)
-    one, two = search.state(), again.state()
-    for name in one:
-        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
-    assert {target.label.identity for target in again.found_targets} <= {'', *NAMES}
-
-
 def test_labels_do_not_depend_on_the_order_of_detections():
     scans = pair_scans(20)
     turned = [
         replace(scan, values=scan.values[::-1], labels=list(scan.labels)[::-1]) for scan in scans
     ]
-    one = play(plane_filter(found_radius=1.0), scans).state()
-    two = play(plane_filter(found_radius=1.0), turned).state()
-    for name in one:
-        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
+    one = play(plane_filter(found_radius=1.0), scans)
+    same(one, play(plane_filter(found_radius=1.0), turned))
 
 
 def test_the_papers_filter_reports_the_label_of_the_nearest_detection():

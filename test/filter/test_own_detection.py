@@ -10,7 +10,7 @@ import pytest
 from numba import njit
 from pydantic import BaseModel
 
-from maasi_filter.make_filter import filter_from_state, make_filter
+from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.models import custom_kernel
 from maasi_filter.models.detection import ExponentialDetection
 from maasi_filter.models.own_detection import OwnDetection
@@ -103,15 +103,14 @@ def step(search, sensor, number):
 
 
 @pytest.mark.parametrize('method', ['pmb', 'ic_phd'])
-def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch):
+def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch, tmp_path):
     """Addresses of functions hold in one process only: they are looked up anew."""
     settings = FilterSettings(method=method, found_radius=1e-6)
     search = make_filter(settings, BOUNDS[2], np.random.default_rng(1))
     sensor = Sensor.ranging('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))
     for number in range(3):
         step(search, sensor, number)
-    # What a file would hold: the filter goes on with its own arrays.
-    state = {name: array.copy() for name, array in search.state().items()}
+    search.save(tmp_path / 'state')
     wanted = step(search, sensor, 3).clusters
     # As in another process, where the function is elsewhere.
     moved = custom_kernel._blocks.copy()
@@ -119,10 +118,10 @@ def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch):
     monkeypatch.setattr(custom_kernel, '_blocks', {})
     if method == 'pmb':
         with pytest.raises(StateFileError, match='make the sensors'):
-            filter_from_state(state, 'file')
+            load_filter(tmp_path / 'state')
     again = Sensor.ranging('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))
     assert again.detection.kernel()[1][custom_kernel.ADDRESS] not in [
         block.entries.ctypes.data for block in moved.values()
     ]
-    found = step(filter_from_state(state, 'file'), again, 3).clusters
+    found = step(load_filter(tmp_path / 'state'), again, 3).clusters
     assert [item.mass for item in found] == [item.mass for item in wanted]

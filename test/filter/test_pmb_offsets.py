@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from searches import CUBE, cube_sensor
 
-from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose, load_filter
+from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.settings import OffsetSettings
@@ -110,16 +110,3 @@ def test_targets_that_are_withdrawn_are_marginalised():
     offsets.keep(set())
     assert offsets.keys == ['a', 'b']
     np.testing.assert_array_equal(offsets.covariance, part)
-
-
-def test_saved_and_loaded_to_the_bit(tmp_path):
-    errors = {'a': np.array([0.5, 0.5, 0.0]), 'b': np.array([-0.5, 0.0, 0.5])}
-    search = looked(new_filter(deviation=1.0, drift=0.1), errors, 6)
-    search.save(tmp_path / 'state')
-    loaded = load_filter(tmp_path / 'state')
-    for one in (search, loaded):
-        looked(one, errors, 6, seed=5)
-    first, second = search.state(), loaded.state()
-    assert first.keys() == second.keys()
-    for name, array in first.items():
-        np.testing.assert_array_equal(array, second[name], err_msg=name)

@@ -6,12 +6,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.records import Cluster
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Particles that are compared with all centres at a time.
 PART = 256

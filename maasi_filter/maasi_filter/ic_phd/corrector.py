@@ -13,15 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import fill_probabilities
 from maasi_filter.models.measurement import TWO_PI, wrap
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
-
-FloatArray = NDArray[np.float64]
 
 CHUNK = 2048
 # Detections that are worked on at a time: bounds the memory of psi.

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.clutter import least_clutter
 from maasi_filter.dropped import FOUND, count_dropped, count_unexplained, within_range
 from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
@@ -25,29 +27,28 @@ from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import make_scan, phd_correct
 from maasi_filter.ic_phd.removal import kept_measurements, nearest_label
 from maasi_filter.ic_phd.resampling import jittered, resample
-from maasi_filter.ic_phd.state import check
 from maasi_filter.measurement_check import CheckedMeasurement, check_measurements, check_taken
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
+from maasi_filter.search_filter import FilterState
 from maasi_filter.settings import FilterSettings, IcPhdNumbers
-from maasi_filter.state_check import (
-    cluster_arrays,
-    common_arrays,
-    construction,
-    exploration_of,
-    found_arrays,
-    found_of,
-    naming,
-)
-from maasi_filter.state_check import clusters_of as saved_clusters
 from maasi_filter.state_file import write_state
 from maasi_filter.unexplored_map import UnexploredMap
-
-FloatArray = NDArray[np.float64]
 
 # Particle sets below this size are faster on one thread.
 PARALLEL_PARTICLES = 65_536
 # Fewest particles of a birth, when many detections share the particle budget.
 LEAST_BIRTHS = 20
+
+
+@dataclass
+class IcPhdState(FilterState):
+    """The whole state of the filter."""
+
+    particles: FloatArray
+    weights: FloatArray
+    centres: FloatArray
+    found_targets: list[FoundTarget]
+    method: ClassVar[str] = 'ic_phd'
 
 
 class IcPhdFilter:
@@ -320,38 +321,44 @@ class IcPhdFilter:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the whole state, random generator included, to one file."""
-        write_state(path, self.state())
+        write_state(path, {IcPhdState.method: self.state()})
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Return the whole state, random generator included, as arrays for a file."""
-        return {
-            **common_arrays(self.settings, self.generator, self.exploration),
-            **found_arrays(self.found_targets, self.dimension),
-            **cluster_arrays(self.clusters, self.dimension),
-            'particles': self.particles,
-            'weights': self.weights,
-            'centres': self._centres,
-        }
+    def state(self) -> IcPhdState:
+        """Return the whole state, random generator included, for `write_state`."""
+        return IcPhdState(
+            self.settings,
+            self.bounds,
+            self.generator,
+            self.exploration.values,
+            self.clusters,
+            self.particles,
+            self.weights,
+            self._centres,
+            self.found_targets,
+        )
 
     @classmethod
-    def from_state(
-        cls, state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
-    ) -> IcPhdFilter:
+    def from_state(cls, state: IcPhdState) -> IcPhdFilter:
         """Return the filter of a state; it continues bit for bit as the saved one would have.
 
         Raises
         ------
-        StateFileError
-            If an array is missing, or has a wrong shape or number; `path` is named.
+        ValueError
+            If a shape or number is wrong.
         """
-        with naming(path):
-            check(state)
-            search = cls(*construction(state))
-            search.exploration = exploration_of(state)
-            search.particles, search.weights = state['particles'], state['weights']
-            search.clusters = saved_clusters(state)
-            search._found = FoundTargets(found_of(state))
-            search._centres = state['centres']
+        search = cls(state.settings, state.bounds, state.generator)
+        search.exploration.restore(state.exploration)
+        state.check(state.found_targets)
+        n, d = len(state.weights), search.dimension
+        if state.particles.shape != (n, d) or state.centres.shape[1:] != (d,):
+            raise ValueError(f'particles: got shape {state.particles.shape}, allowed is {(n, d)}')
+        if not (np.isfinite(state.particles).all() and np.isfinite(state.weights).all()):
+            raise ValueError('particles, weights: got a number that is not finite')
+        if (state.weights < 0.0).any():
+            raise ValueError(f'weights: got {state.weights.min()}, allowed are numbers from 0')
+        search.particles, search.weights = state.particles, state.weights
+        search.clusters, search._centres = state.clusters, state.centres
+        search._found = FoundTargets(state.found_targets)
         return search
 
 

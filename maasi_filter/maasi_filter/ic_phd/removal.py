@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.records import FoundTarget
 
-FloatArray = NDArray[np.float64]
-
 
 def kept_measurements(
     centres: FloatArray, targets: Sequence[FoundTarget], limit: float, every: bool
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return which of m detections remain after removing those of found targets.
 
     Parameters

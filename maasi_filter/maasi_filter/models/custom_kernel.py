@@ -17,9 +17,8 @@ from numba import carray, cfunc, njit, types
 from numba.core import cgutils
 from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray, IntArray
 
 CUSTOM = 3
 # Entries of the parameters; those before are as of the radial models.
@@ -34,7 +33,7 @@ class _Block:
     compiled: Any
     values: FloatArray
     #: Addresses of the function and of the values, and their number.
-    entries: NDArray[np.int64]
+    entries: IntArray
 
 
 _compiled: dict[Any, Any] = {}

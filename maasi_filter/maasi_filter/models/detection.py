@@ -13,13 +13,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.custom_kernel import CUSTOM, custom_probability
 from maasi_filter.models.pose import Pose
 from maasi_filter.vector_math import exponential
-
-FloatArray = NDArray[np.float64]
 
 EXPONENTIAL = 0
 GAUSSIAN = 1

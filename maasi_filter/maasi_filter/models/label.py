@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -87,24 +85,3 @@ class LabelTally:
         total = sum(self.classes[name] for name in sorted(self.classes))
         score = self.classes[best] / total if total > 0.0 else 0.0
         return Label(best, min(score, 1.0), self.identity)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values."""
-        return {'identity': self.identity, 'classes': self.classes}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> LabelTally:
-        """Return the tally of plain values.
-
-        Raises
-        ------
-        ValueError
-            If they are not those of a tally.
-        """
-        identity, classes = values.get('identity'), values.get('classes')
-        numbers = classes.values() if isinstance(classes, dict) else [-1.0]
-        if not isinstance(identity, str) or not all(
-            isinstance(number, float) and 0.0 <= number < float('inf') for number in numbers
-        ):
-            raise ValueError(f'labels: got {str(values)[:100]}, allowed are identity and classes')
-        return cls(identity, dict(classes or {}))

@@ -11,11 +11,11 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 
-FloatArray = NDArray[np.float64]
 TWO_PI = 2.0 * math.pi
 
 

@@ -8,14 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.custom_kernel import ADDRESS, CUSTOM, NUMBER, REACH, register
 from maasi_filter.models.detection import PARAMETERS, DetectionModel
 from maasi_filter.plugins import PluginError
-
-FloatArray = NDArray[np.float64]
 
 # Cells from the robot to the reach, on each axis, by dimension.
 _CELLS = {2: 256, 3: 48}

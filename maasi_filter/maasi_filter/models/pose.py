@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray
 
 
 def finite_vector(name: str, value: ArrayLike, length: int) -> FloatArray:

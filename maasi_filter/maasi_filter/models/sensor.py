@@ -6,12 +6,10 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.measurement import MeasurementModel, RangeBearing, RangeBearingElevation
-
-FloatArray = NDArray[np.float64]
 
 
 def check_covariance(name: str, covariance: FloatArray, dimension: int) -> None:

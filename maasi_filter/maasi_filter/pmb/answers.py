@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray
 
 # Shares of the believed pi with which a place may answer.
 RATES = np.array([1.0, 0.7, 0.5, 0.35, 0.2])

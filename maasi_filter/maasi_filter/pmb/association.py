@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray
 
 ITERATIONS = 500
 TOLERANCE = 1e-9

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.pmb.density import Density, fill_moments
 from maasi_filter.pmb.factors import (
     FIRST,
@@ -20,8 +20,6 @@ from maasi_filter.pmb.factors import (
 )
 from maasi_filter.pmb.scan import Scan
 from maasi_filter.unexplored_map import UnexploredMap
-
-FloatArray = NDArray[np.float64]
 
 # Fewest effective draws that stand for a density.
 LEAST_SUPPORT = 10.0
@@ -132,7 +130,7 @@ def draw_births(
 
 
 def born(
-    scan: Scan, births: Births, wanted: NDArray[np.bool_], grid: FloatArray, frame: FloatArray
+    scan: Scan, births: Births, wanted: BoolArray, grid: FloatArray, frame: FloatArray
 ) -> list[tuple[int, Density]]:
     """Return the density e pi g_j of each detection that is wanted, by its number.
 

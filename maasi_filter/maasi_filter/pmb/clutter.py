@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 from maasi_filter.clutter import LEAST_PER_SCAN
 
 # Weight of the prior, in scans.
 PRIOR_SCANS = 10.0
 
 
+@dataclass
 class ClutterEstimate:
     """Mean number of false detections in a scan, with a gamma prior, for each robot.
 
@@ -20,9 +23,8 @@ class ClutterEstimate:
         By robot: scans, and expected number of false detections in them.
     """
 
-    def __init__(self) -> None:
-        self.scans: dict[str, int] = {}
-        self.counts: dict[str, float] = {}
+    scans: dict[str, int] = field(default_factory=dict)
+    counts: dict[str, float] = field(default_factory=dict)
 
     def per_scan(self, robot: str, told: float) -> float:
         """Return the posterior mean for a robot with a configured rate of `told` per scan."""

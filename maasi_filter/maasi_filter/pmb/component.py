@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb.answers import RATES, add_look
 from maasi_filter.pmb.births import LEAST_SUPPORT, Births
@@ -16,9 +16,6 @@ from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
 from maasi_filter.pmb.scan import Scan
 from maasi_filter.records import FoundTarget
 from maasi_filter.vector_math import squared_distance
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Gate of a detection, in standard deviations and root mean square radii.
 GATE = 6.0

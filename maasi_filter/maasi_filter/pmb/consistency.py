@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray
 
 # Share of the weight of earlier detections that each new one leaves.
 MEMORY = 1.0 - 1.0 / 50.0
@@ -20,6 +20,7 @@ BOUND = 4.0
 NOTHING = np.zeros(3)
 
 
+@dataclass
 class Consistency:
     """Forgetting sums of the squared normalised innovations of each robot.
 
@@ -32,8 +33,7 @@ class Consistency:
         By robot: sums of w e' S^-1 e, of d w, and of d w^2.
     """
 
-    def __init__(self) -> None:
-        self.sums: dict[str, FloatArray] = {}
+    sums: dict[str, FloatArray] = field(default_factory=dict)
 
     def count(self, robot: str, square: float, dimension: int) -> None:
         """Count a detection that a found target caused."""

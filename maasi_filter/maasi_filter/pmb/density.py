@@ -8,23 +8,26 @@ invariant, so that no number of measurements lets the particles collapse.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
+from maasi_filter.models.custom_kernel import renew_addresses
 from maasi_filter.pmb.factors import (
     CARTESIAN,
     CENTRE,
     FIRST,
+    HEAD,
+    KIND,
+    MODEL,
     SENSOR,
+    TERM,
     TERMS,
     gaussian_factor,
     log_products,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Below this share of effective particles they are resampled and moved.
 LEAST_EFFECTIVE = 0.4
@@ -164,6 +167,7 @@ def fill_moments(particles, weights, mean, covariance):  # type: ignore[no-untyp
     return math.sqrt(trace + d * least)
 
 
+@dataclass(eq=False)
 class Density:
     """Density of one target's position.
 
@@ -188,25 +192,19 @@ class Density:
         Root mean square distance from the mean, metres.
     """
 
-    def __init__(
-        self,
-        particles: FloatArray,
-        weights: FloatArray,
-        heads: FloatArray,
-        terms: FloatArray,
-        grid: FloatArray,
-        frame: FloatArray,
-    ) -> None:
-        self.particles = particles
-        self.weights = weights
-        self.heads = heads
-        self.terms = terms
-        self.grid = grid
-        self.frame = frame
-        d = particles.shape[1]
-        self.mean: FloatArray = np.empty(d)
-        self.covariance: FloatArray = np.empty((d, d))
-        self.radius = 0.0
+    particles: FloatArray
+    weights: FloatArray
+    heads: FloatArray
+    terms: FloatArray
+    grid: FloatArray
+    frame: FloatArray
+    mean: FloatArray = field(init=False)
+    covariance: FloatArray = field(init=False)
+    radius: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        d = self.particles.shape[1]
+        self.mean, self.covariance = np.empty(d), np.empty((d, d))
         self._update_moments()
 
     @classmethod
@@ -278,6 +276,35 @@ class Density:
         head, self.terms = gaussian_factor(self.mean, self.covariance)
         self.heads = head[None]
         self.grid = np.empty((0, 0, 0))
+
+    def restore(self, frame: FloatArray, grid: tuple[int, ...]) -> None:
+        """Check a saved density, whose grid has this shape if any, and let it share the frame.
+
+        Raises
+        ------
+        ValueError
+            If a shape or number is wrong.
+        """
+        n, d = len(self.weights), int((frame[1] > frame[0]).sum())
+        shapes = {
+            'particles': (self.particles.shape, (n, d)),
+            'heads': (self.heads.shape, (max(len(self.heads), 1), HEAD)),
+            'terms': (self.terms.shape, (len(self.terms), TERM)),
+            'grid': (self.grid.shape, grid if self.grid.size else (0, 0, 0)),
+        }
+        for name, (shape, allowed) in shapes.items():
+            if shape != allowed:
+                raise ValueError(f'{name}: got shape {shape}, allowed is {allowed}')
+        for name, array in {'particles': self.particles, 'terms': self.terms}.items():
+            if not np.isfinite(array).all():
+                raise ValueError(f'{name}: got a number that is not finite')
+        if n < 1 or ((self.weights < 0.0) | (self.weights > 1.0)).any():
+            raise ValueError('weights: got a number that is not from 0 to 1')
+        first, number = self.heads[:, FIRST], self.heads[:, TERMS]
+        if ((first < 0) | (number < 0) | (first + number > len(self.terms))).any():
+            raise ValueError('heads: got terms that are not there')
+        renew_addresses(self.heads[:, KIND], self.heads[:, MODEL:])
+        self.frame = frame
 
     def _append(self, head: FloatArray, terms: FloatArray) -> None:
         head[FIRST], head[TERMS] = len(self.terms), len(terms)

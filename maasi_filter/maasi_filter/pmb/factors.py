@@ -14,14 +14,12 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.detection import PARAMETERS, fill_probabilities
 from maasi_filter.models.measurement import TWO_PI
 from maasi_filter.unexplored_map import interpolate_at
 from maasi_filter.vector_math import arctan2, exponential, use_wide_vectors
-
-FloatArray = NDArray[np.float64]
 
 # Kind of pi of a factor that is no scan's: 1 everywhere.
 ALWAYS = -1
@@ -41,7 +39,7 @@ TERM = INFORMATION + 9
 
 
 def gaussian_terms(
-    centres: FloatArray, covariances: FloatArray, cartesian: NDArray[np.bool_]
+    centres: FloatArray, covariances: FloatArray, cartesian: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return normal densities as terms (m, TERM), and Cholesky factors of their covariances.
 

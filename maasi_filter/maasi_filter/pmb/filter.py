@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.clutter import measurement_space
 from maasi_filter.dropped import count_unexplained, within_range, without_repeats
 from maasi_filter.found_targets import FoundTargets
@@ -27,8 +28,7 @@ from maasi_filter.measurement_check import (
 )
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.label import LabelTally
-from maasi_filter.pmb import state as pmb_state
-from maasi_filter.pmb.answers import PRIOR, rate_of_targets, reflects
+from maasi_filter.pmb.answers import PRIOR, RATES, rate_of_targets, reflects
 from maasi_filter.pmb.association import Marginals, associate
 from maasi_filter.pmb.births import Births, born, draw_births
 from maasi_filter.pmb.component import Component, View, merge, views
@@ -36,24 +36,14 @@ from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest
 from maasi_filter.pmb.identity import associate_by_identity, learn_labels, new_label
 from maasi_filter.pmb.learnt import Learnt
-from maasi_filter.pmb.offset_state import offset_arrays, restore_offsets
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
+from maasi_filter.search_filter import FilterState
 from maasi_filter.settings import FilterSettings
-from maasi_filter.state_check import (
-    cluster_arrays,
-    clusters_of,
-    common_arrays,
-    construction,
-    exploration_of,
-    naming,
-)
 from maasi_filter.state_file import write_state
 from maasi_filter.unexplored_map import UnexploredMap
-
-FloatArray = NDArray[np.float64]
 
 LEAST_EXISTENCE = 1e-4
 # Least existence probability of a cluster that is published.
@@ -68,6 +58,19 @@ SURELY_REFLECTING = 0.5
 SAME_PLACE = 6.0
 # Existence probability of targets that other filters found.
 CERTAIN = 0.999
+
+
+@dataclass
+class PmbState(FilterState):
+    """The whole state of the filter."""
+
+    components: list[Component]
+    learnt: Learnt
+    offsets: Offsets
+    scans: int
+    last_id: int
+    last_time: float | None
+    method: ClassVar[str] = 'pmb'
 
 
 class PmbFilter:
@@ -437,48 +440,46 @@ class PmbFilter:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the whole state, random generator included, to one file."""
-        write_state(path, self.state())
+        write_state(path, {PmbState.method: self.state()})
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Return the whole state, random generator included, as arrays for a file."""
-        grid = self.exploration.kernel()[0].shape
-        number = self._numbers.pmb.particles
-        return {
-            **common_arrays(self.settings, self.generator, self.exploration),
-            **cluster_arrays(self.clusters, self.dimension),
-            'counters': np.array([self._scans, self._last_id]),
-            'last_time': np.array(np.nan if self._last_time is None else self._last_time),
-            **offset_arrays(self._offsets),
-            **pmb_state.to_arrays(self.components, self._learnt, (number, self.dimension), grid),
-        }
+    def state(self) -> PmbState:
+        """Return the whole state, random generator included, for `write_state`."""
+        return PmbState(
+            self.settings,
+            self.bounds,
+            self.generator,
+            self.exploration.values,
+            self.clusters,
+            self.components,
+            self._learnt,
+            self._offsets,
+            self._scans,
+            self._last_id,
+            self._last_time,
+        )
 
     @classmethod
-    def from_state(
-        cls, state: Mapping[str, NDArray[Any]], path: str | os.PathLike[str]
-    ) -> PmbFilter:
+    def from_state(cls, state: PmbState) -> PmbFilter:
         """Return the filter of a state; it continues bit for bit as the saved one would have.
 
         Raises
         ------
-        StateFileError
-            If an array is missing, or has a wrong shape or number; `path` is named.
+        ValueError
+            If a shape or number is wrong.
         """
-        with naming(path):
-            return cls._restored(state)
-
-    @classmethod
-    def _restored(cls, state: Mapping[str, NDArray[Any]]) -> PmbFilter:
-        pmb_state.check(state)
-        search = cls(*construction(state))
-        search.exploration = exploration_of(state)
-        search._frame[2] = search.exploration.kernel()[2]
-        search._scans, search._last_id = (int(number) for number in state['counters'])
-        last = float(state['last_time'])
-        search._last_time = None if np.isnan(last) else last
-        grid = search.exploration.kernel()[0].shape
-        number = search._numbers.pmb.particles
-        search.components = pmb_state.components_of(state, number, grid, search._frame)
-        search.clusters = clusters_of(state)
-        search._learnt = pmb_state.learnt_of(state)
-        restore_offsets(search._offsets, state)
+        search = cls(state.settings, state.bounds, state.generator)
+        search.exploration.restore(state.exploration)
+        for item in state.components:
+            item.density.restore(search._frame, search.exploration.kernel()[0].shape)
+            if not 0.0 <= item.existence <= 1.0 or item.answers.shape != (len(RATES),):
+                raise ValueError(
+                    f'component: got existence {item.existence} and {len(item.answers)} answers, '
+                    f'allowed are 0 to 1 and {len(RATES)}'
+                )
+        search.components, search.clusters = state.components, state.clusters
+        state.check(search.found_targets)
+        search._learnt, search._offsets = state.learnt, state.offsets
+        search._offsets.check()
+        search._scans, search._last_id = state.scans, state.last_id
+        search._last_time = state.last_time
         return search

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from maasi_filter.arrays import FloatArray
 from maasi_filter.found_targets import SAME_TARGET, distance
 from maasi_filter.pmb.component import Component
 from maasi_filter.records import FoundTarget
@@ -34,7 +32,7 @@ def can_be_found(item: Component, probability: float) -> bool:
     )
 
 
-def is_known(i: int, components: Sequence[Component], caused: NDArray[np.float64]) -> bool:
+def is_known(i: int, components: Sequence[Component], caused: FloatArray) -> bool:
     """Return whether component i may be the same target as a found component.
 
     A target causes at most one detection per scan, so two components that together caused more than

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.label import Label, LabelTally
 from maasi_filter.pmb.component import Component
-
-FloatArray = NDArray[np.float64]
 
 # Odds of clutter against the target that a detection names.
 MISREAD = 1e-6
@@ -20,7 +18,7 @@ LEAST_SHARE = 0.5
 
 def associate_by_identity(
     labels: Sequence[Label], components: Sequence[Component], odds: FloatArray, other: FloatArray
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Leave each detection with an identity only the component of that identity, in place.
 
     Where no component has the identity yet, those without any remain.

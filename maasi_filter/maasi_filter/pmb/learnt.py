@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.pmb.clutter import ClutterEstimate
 from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.consistency import Consistency
 from maasi_filter.pmb.noise_scale import NoiseScale, innovations
 from maasi_filter.pmb.position_error import PositionErrors
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
-
-FloatArray = NDArray[np.float64]
 
 # Detections that the belief is worth.
 PRIOR_DETECTIONS = 6.0
@@ -53,6 +52,7 @@ def innovations(
     return Innovations(errors, jacobians, totals, (errors * solved).sum(axis=2))
 
 
+@dataclass
 class NoiseScale:
     """Factor of the variances of each robot's detections, with a prior of mean 1.
 
@@ -66,9 +66,8 @@ class NoiseScale:
         normalised innovations, each divided by the dimension.
     """
 
-    def __init__(self) -> None:
-        self.detections: dict[str, float] = {}
-        self.squares: dict[str, float] = {}
+    detections: dict[str, float] = field(default_factory=dict)
+    squares: dict[str, float] = field(default_factory=dict)
 
     def factor(self, robot: str) -> float:
         """Return the posterior mean of a robot's factor."""

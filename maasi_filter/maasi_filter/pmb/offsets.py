@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.association import associate
@@ -22,8 +22,6 @@ from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.factors import MOST_PROBABLE
 from maasi_filter.pmb.noise_scale import innovations
 from maasi_filter.pmb.settings import OffsetSettings
-
-FloatArray = NDArray[np.float64]
 
 # Components below this r are not considered, nor associations below this probability.
 LEAST_EXISTENCE = 0.1
@@ -34,6 +32,7 @@ GATE = 25.0
 LEAST_DIFFERENCE = 1e-3
 
 
+@dataclass(eq=False)
 class Offsets:
     """Joint normal density of the errors of robots and of found targets.
 
@@ -49,14 +48,29 @@ class Offsets:
         Way of each robot on the level since its first scan, metres.
     """
 
-    def __init__(self, settings: OffsetSettings, dimension: int) -> None:
-        self.settings = settings
-        self.dimension = dimension
-        self.keys: list[str | int] = []
-        self.mean: FloatArray = np.empty(0)
-        self.covariance: FloatArray = np.empty((0, 0))
-        self.last: dict[str, FloatArray] = {}
-        self.way: dict[str, float] = {}
+    settings: OffsetSettings
+    dimension: int
+    keys: list[str | int] = field(default_factory=list)
+    mean: FloatArray = field(default_factory=lambda: np.empty(0))
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    last: dict[str, FloatArray] = field(default_factory=dict)
+    way: dict[str, float] = field(default_factory=dict)
+
+    def check(self) -> None:
+        """Refuse saved offsets that do not fit each other.
+
+        Raises
+        ------
+        ValueError
+            Naming what was read and what is allowed.
+        """
+        size = self.dimension * len(self.keys)
+        shapes = self.mean.shape, self.covariance.shape
+        if shapes != ((size,), (size, size)) or len(set(self.keys)) < len(self.keys):
+            raise ValueError(f'offsets: got {str(self.keys)[:100]}, allowed is one for each offset')
+        robots = [key for key in self.keys if isinstance(key, str)]
+        if not robots == list(self.last) == list(self.way):
+            raise ValueError(f'offsets: got ways of {list(self.way)}, allowed are {robots}')
 
     @property
     def active(self) -> bool:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.pmb.association import propagate
 from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.factors import MOST_PROBABLE
-
-FloatArray = NDArray[np.float64]
 
 # Deviations of the error that are compared, in deviations of the range.
 LEVELS = np.array([0.0, 0.5, 1.0, 2.0, 4.0])
@@ -75,6 +74,7 @@ def _near(member: CheckedMeasurement, items: Sequence[Component], reach: float) 
     return [item for item, kept in zip(items, near.tolist()) if kept]
 
 
+@dataclass
 class PositionErrors:
     """Probabilities of the errors in LEVELS, for each robot.
 
@@ -84,8 +84,7 @@ class PositionErrors:
         By robot: (k,).
     """
 
-    def __init__(self) -> None:
-        self.probabilities: dict[str, FloatArray] = {}
+    probabilities: dict[str, FloatArray] = field(default_factory=dict)
 
     def learn(
         self,

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
@@ -23,8 +23,6 @@ from maasi_filter.pmb.factors import (
     TERMS,
     gaussian_terms,
 )
-
-FloatArray = NDArray[np.float64]
 
 # Closer than this many deviations of the range, bearings say nothing and noise is Cartesian.
 POLE_DEVIATIONS = 3.0
@@ -67,7 +65,7 @@ class Scan:
     detection: DetectionModel
     ranges: FloatArray
     deviations: FloatArray
-    cartesian: NDArray[np.bool_]
+    cartesian: BoolArray
     origins: FloatArray
     centres: FloatArray
     roots: FloatArray

@@ -11,11 +11,11 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Quaternion
 from geometry_msgs.msg import Pose as PoseMessage
-from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
@@ -23,8 +23,6 @@ from maasi_filter.records import AgentMeasurement, Cluster, FoundTarget
 from maasi_msgs.msg import Cluster as ClusterMessage
 from maasi_msgs.msg import Detection, DetectionArray, RangeMeasurement
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage
-
-FloatArray = NDArray[np.float64]
 
 #: Largest number of detections used of one message, against unbounded computation times; no sensor
 #: of a search sees so many targets at once.
