@@ -224,7 +224,7 @@ def test_parameters_of_a_plugin(folder):
         'planner.settings.stride': 2,
     }
     fields = {item.name: item for item in parameter_fields(PlannerNodeSettings, given)}
-    assert fields['planner.settings.stride'].lowest == 1
+    assert fields['planner.settings.stride'].bound('ge') == 1
     settings = PlannerNodeSettings.model_validate(unflatten(PlannerNodeSettings, given))
     assert settings.planner.settings.stride == 2
     assert flatten(settings)['planner.settings.stride'] == 2

@@ -18,8 +18,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from maasi_filter.ros.node_help import parameters_of, settings_of
-from maasi_filter.ros.parameters import choices, constraints
+from maasi_filter.ros.parameters import choices, constraints, parameters_of, settings_of
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.run.launch_arguments import ending
 from maasi_sim.scenario.schema import Scenario

@@ -17,8 +17,7 @@ from maasi_filter.dropped import FOUND, REPEATED
 from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch
 from maasi_filter.node.filter_memory import FilterMemory, Progress
-from maasi_filter.node.kept_found_targets import KeptFoundTargets, checked_found
-from maasi_filter.node.shared_found_targets import SharedFoundTargets
+from maasi_filter.node.found_target_exchange import KeptFoundTargets, SharedFoundTargets
 from maasi_filter.node.views import FilterViews
 from maasi_filter.ros.conversions import (
     cluster_to_ros,
@@ -374,13 +373,13 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         try:
             if message.header.frame_id != self.settings.frame and message.targets:
                 raise ValueError(
-                    f'header.frame_id: read {message.header.frame_id!r}, allowed is '
+                    f'kept.header.frame_id: read {message.header.frame_id!r}, allowed is '
                     f'{self.settings.frame!r}'
                 )
             targets = [found_target_from_ros(item, self._dimension) for item in message.targets]
-            new = self.filter.keep_found(checked_found(targets))
+            new = self.filter.keep_found(targets)
         except ValueError as error:
-            self.drop('bad found targets', f'found_targets/kept.{error}')
+            self.drop('bad found targets', f'found_targets/{error}')
             new = []
         if new:
             known = {item.id: int(item.batch_id) for item in message.targets}

@@ -158,13 +158,16 @@ def _reported_error(name: str, reported: FloatArray, d: int) -> float:
 
 
 def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> None:
-    """Refuse targets with non-finite numbers or of another dimension.
+    """Refuse targets with non-finite numbers, of another dimension, or of equal ids.
 
     Raises
     ------
     ValueError
         Naming the robot, the target and what is allowed.
     """
+    ids = [target.id for target in targets]
+    if min(ids, default=1) < 1 or len(set(ids)) < len(ids):
+        raise ValueError(f'{robot}: target ids: got {ids}, allowed are different ones from 1')
     for target in targets:
         shapes = target.position.shape, target.covariance.shape
         if shapes != ((dimension,), (dimension, dimension)):

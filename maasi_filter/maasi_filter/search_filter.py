@@ -133,10 +133,10 @@ class SearchFilter(Protocol):
 
         They keep their ids, except that an id in use is replaced by the next free one.
 
-        Parameters
-        ----------
-        targets : sequence of FoundTarget
-            With finite positions and covariances of this dimension.
+        Raises
+        ------
+        ValueError
+            As of `take_over`.
         """
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -11,12 +11,11 @@ from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
+from maasi_filter.ros.clocks import Silence, StampGate
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.run_node import run
-from maasi_filter.ros.silence import Silence
-from maasi_filter.ros.stamps import StampGate
 from maasi_msgs.action import SearchTargets
 from maasi_msgs.msg import AgentState, LockstepStep, PlanDecision
 from maasi_planner import warm_up

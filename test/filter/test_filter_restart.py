@@ -1,12 +1,10 @@
 """A filter node that died goes on after its last batch, or at least with what was found."""
 
-import numpy as np
 import pytest
 from test_filter_node import running, seen_from_a
 
 from maasi_filter.node.filter_memory import FilterMemory
-from maasi_filter.node.kept_found_targets import KeptFoundTargets, checked_found
-from maasi_filter.records import FoundTarget
+from maasi_filter.node.found_target_exchange import KeptFoundTargets
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTargetArray
 
@@ -145,10 +143,3 @@ def test_the_wait_for_kept_targets_has_a_bound():
     assert kept.take()
     assert not kept.take()
     assert not kept.is_awaited(1, 100.0)
-
-
-def test_kept_targets_are_checked():
-    target = FoundTarget(1, np.zeros(2), np.eye(2), 'a', 1, 0.0)
-    assert checked_found([target]) == [target]
-    with pytest.raises(ValueError, match='id 1'):
-        checked_found([FoundTarget(1, np.zeros(2), np.zeros((2, 2)), 'a', 1, 0.0)])

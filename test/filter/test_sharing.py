@@ -109,6 +109,8 @@ def test_bad_targets_are_refused_and_change_nothing(new_filter):
             search.take_over('other', [target([0.0, 0.0], number=2), item])
     with pytest.raises(ValueError, match='dimensions'):
         search.take_over('other', [target([1.0, 1.0, 1.0])])
+    with pytest.raises(ValueError, match='different ones from 1'):
+        search.keep_found([target(), target()])
     assert search.found_targets == []
 
 

@@ -5,7 +5,7 @@ from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from std_msgs.msg import String
 
-from maasi_filter.ros.stamps import StampGate, batch_id_limit, stamp_problem
+from maasi_filter.ros.clocks import StampGate, batch_id_limit, stamp_problem
 from maasi_msgs.msg import MeasurementBatch
 
 SECOND = 10**9

@@ -12,7 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maasi_filter.ros.marker_board import MarkerBoard
+from maasi_filter.ros.conversions import MarkerBoard
 from maasi_sim.missions import load_mission
 from maasi_sim.run.processes import Domain
 from maasi_sim.run.rviz_view import view_text

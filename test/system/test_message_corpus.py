@@ -25,8 +25,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from waiting import wait_until
 
+from maasi_filter.ros.clocks import stamp_problem
 from maasi_filter.ros.qos import RELIABLE, SENSOR_READER, UPDATES
-from maasi_filter.ros.stamps import stamp_problem
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,

@@ -11,6 +11,7 @@ from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.sensor_reading import SensorReading
 from maasi_drivers.agent.watchdog import Watchdog
+from maasi_filter.ros.clocks import JUMP, batch_id_limit
 from maasi_filter.ros.conversions import (
     MOST_DETECTIONS,
     detections_to_ros,
@@ -19,7 +20,6 @@ from maasi_filter.ros.conversions import (
     stamp_to_ros,
 )
 from maasi_filter.ros.qos import RELIABLE
-from maasi_filter.ros.stamps import JUMP, batch_id_limit
 from maasi_msgs.msg import DetectionArray, MeasurementBatch
 
 # How far stamps of images or batches may be ahead of the odometry [ns].

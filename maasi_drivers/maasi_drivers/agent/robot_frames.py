@@ -16,6 +16,7 @@ from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_model import base_frame, robot_description, sensor_frames
 from maasi_drivers.agent.transform_buffer import TransformBuffer, TransformError
 from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.ros.clocks import stamp_problem
 from maasi_filter.ros.conversions import (
     FARTHEST,
     bounded,
@@ -25,7 +26,6 @@ from maasi_filter.ros.conversions import (
 )
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, TRANSFORMS
-from maasi_filter.ros.stamps import stamp_problem
 
 _NO_TYPE = (
     'the package tf2_msgs is not installed (sudo apt install ros-$ROS_DISTRO-tf2-msgs): nothing is '

@@ -12,9 +12,8 @@ from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_drivers.vision.measurement_feed import FeedPeer
 from maasi_filter.models.pose import Pose
+from maasi_filter.ros.clocks import JUMP, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
-from maasi_filter.ros.silence import Silence
-from maasi_filter.ros.stamps import JUMP, StampGate
 
 _POSE_NAMES = {'odometry': 'odometry', 'tf': 'pose on tf', 'pose': 'pose'}
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from maasi_drivers.agent.odometry import StampedPose, interpolate
 from maasi_filter.models.pose import Pose, compose, inverse
-from maasi_filter.ros.stamps import StampGate
+from maasi_filter.ros.clocks import StampGate
 
 # Upper bound on frames, against floods.
 _MOST_FRAMES = 2000

@@ -11,9 +11,9 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.action.client import ActionClient
 
 from maasi_drivers.agent.waypoint_follower import Goal
+from maasi_filter.ros.clocks import Silence
 from maasi_filter.ros.conversions import point_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
-from maasi_filter.ros.silence import Silence
 
 
 class Nav2Navigation:

@@ -306,6 +306,7 @@ class IcPhdFilter:
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets that were found before this filter was created; return the new ones."""
+        check_taken('kept', targets, self.dimension)
         added = self._found.keep(targets)
         self._forget(added)
         return added

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import AgentMeasurement
+from maasi_filter.ros.clocks import Silence, batch_id_limit
 from maasi_filter.ros.conversions import measurement_from_ros, stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
-from maasi_filter.ros.silence import Silence
-from maasi_filter.ros.stamps import batch_id_limit
 from maasi_msgs.msg import BatchMember, DetectionArray, MeasurementBatch
 
 # Largest lead of the stamp of a measurement over that of its batch [ns].

@@ -8,9 +8,8 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from maasi_filter.ros.conversions import filter_markers, particles_to_ros
+from maasi_filter.ros.conversions import MarkerBoard, filter_markers, particles_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
-from maasi_filter.ros.marker_board import MarkerBoard
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.search_filter import SearchFilter
 

@@ -411,6 +411,7 @@ class PmbFilter:
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets that were found before this filter was created; return the new ones."""
+        check_taken('kept', targets, self.dimension)
         found = FoundTargets(self.found_targets, self._last_id)
         added = found.keep(targets)
         self._place(added, found.last_id)

@@ -1,1 +1,5 @@
-"""Runtime shared by all nodes: life cycle, lockstep, parameters, QoS, conversions."""
+"""Runtime shared by all nodes: life cycle, lockstep, parameters, QoS, conversions.
+
+It stands in the first package with nodes, so that all others can import it: packages import one
+way.
+"""

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, Generic, TypeVar
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -20,15 +20,12 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from maasi_filter.ros.bad_requests import survive_bad_requests
-from maasi_filter.ros.clock_watch import ClockWatch
-from maasi_filter.ros.diagnostics import key_values, level_of
+from maasi_filter.ros.clocks import ClockWatch, stamp_problem
+from maasi_filter.ros.executor import NodeEntities, survive_bad_requests
 from maasi_filter.ros.loopback import loopback_fault
-from maasi_filter.ros.node_entities import NodeEntities
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.ros.qos import LATCHED, RELIABLE
 from maasi_filter.ros.readiness import Unconnected, subscribers_connected, unpublished_topics
-from maasi_filter.ros.stamps import stamp_problem
 from maasi_msgs.msg import LockstepDone, LockstepStep
 
 __all__ = ['LockstepLifecycleNode', 'SettingsError']
@@ -480,12 +477,16 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         if sum(self.dropped.values()):
             counts = (f'{reason} {number}' for reason, number in sorted(self.dropped.items()))
             warnings = [*warnings, f'dropped: {", ".join(counts)}']
+        level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
+        level = DiagnosticStatus.ERROR if fault else level
+        values = dict(self.status()) if self.configured else {}
+        values |= {f'dropped: {name}': number for name, number in sorted(self.dropped.items())}
         status = DiagnosticStatus(
-            level=level_of(fault, bool(warnings)),
+            level=level,
             name=self.get_fully_qualified_name(),
             message='; '.join([fault or ('active' if self.active else 'not active'), *warnings]),
             hardware_id='',
-            values=key_values(self.status() if self.configured else {}, self.dropped),
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.stamp_of_diagnostics()

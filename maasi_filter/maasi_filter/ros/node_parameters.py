@@ -30,9 +30,6 @@ from maasi_filter.ros.parameters import (
 SettingsT = TypeVar('SettingsT', bound=NodeSettings)
 
 
-_MOST = 2**63 - 1
-
-
 class SettingsError(Exception):
     """Invalid parameters; the text says which and why."""
 
@@ -77,8 +74,6 @@ class NodeParameters(Generic[SettingsT]):
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._note)
 
-    # ---- reading by the node -----------------------------------------------------------------
-
     def read(self) -> SettingsT:
         """Return the settings, and lock them until `release`.
 
@@ -116,8 +111,6 @@ class NodeParameters(Generic[SettingsT]):
                 self._node.set_parameters_atomically(changes)
             finally:
                 self._own_change = False
-
-    # ---- setting by clients ------------------------------------------------------------------
 
     def _is_foreign(self, name: str) -> bool:
         return name in self._foreign or name.startswith('qos_overrides.')
@@ -194,15 +187,7 @@ class NodeParameters(Generic[SettingsT]):
 def check(
     model: type[SettingsT], values: Mapping[str, Any]
 ) -> tuple[SettingsT | None, dict[str, str]]:
-    """Return the settings of flat parameters, or None and the errors by name.
-
-    Parameters
-    ----------
-    model : type
-        The settings.
-    values : mapping
-        Flat parameters.
-    """
+    """Return the settings of flat parameters, or None and the errors by name."""
     try:
         return model.model_validate(unflatten(model, values)), {}
     except ValidationError as error:
@@ -212,7 +197,7 @@ def check(
     problems: dict[str, str] = {}
     missing = []
     for item in items:
-        name = parameter_name(model, item['loc'])
+        name = parameter_name(model, item['loc'], values)
         if item['type'] == 'missing' or not values:
             missing.append(name)
         else:
@@ -233,18 +218,22 @@ def _refused(reason: str) -> SetParametersResult:
 
 def _descriptor(item: ParameterField, ranged: bool) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
-        description=item.description,
-        additional_constraints=item.constraints,
-        dynamic_typing=True,
+        description=item.description, additional_constraints=item.constraints, dynamic_typing=True
     )
-    if not ranged or item.number is None or item.lowest is item.highest is None:
+    low, high = item.bound('ge', 'gt'), item.bound('le', 'lt')
+    if not ranged or low is high is None:
         return descriptor
     if item.number is float:
-        low = -sys.float_info.max if item.lowest is None else item.lowest
-        high = sys.float_info.max if item.highest is None else item.highest
-        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        most = sys.float_info.max
+        ends = {'from_value': -most, 'to_value': most}
+        kind, name = FloatingPointRange, 'floating_point_range'
+    elif item.number is int:
+        ends = {'from_value': -(2**63), 'to_value': 2**63 - 1}
+        kind, name = IntegerRange, 'integer_range'
     else:
-        lowest = -_MOST - 1 if item.lowest is None else int(item.lowest)
-        highest = _MOST if item.highest is None else int(item.highest)
-        descriptor.integer_range = [IntegerRange(from_value=lowest, to_value=highest)]
+        return descriptor
+    for end, value in (('from_value', low), ('to_value', high)):
+        if value is not None:
+            ends[end] = item.number(value)
+    setattr(descriptor, name, [kind(**ends)])
     return descriptor

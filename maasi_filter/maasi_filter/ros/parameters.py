@@ -1,4 +1,4 @@
-"""Conversion between settings and flat ROS parameters. Without ROS.
+"""Conversion between settings and flat ROS parameters, and their help. Without ROS.
 
 Nested settings become names with dots, and `None` is omitted. Lists of lists of fixed length
 become one list, `bounds: [-0.3, 2.4, -0.3, 2.4]`; other lists of lists, and of small settings,
@@ -9,6 +9,9 @@ Settings by name, `robots`, become the list `robots` and `robot.<name>.<key>`.
 
 from __future__ import annotations
 
+import inspect
+import re
+import textwrap
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,46 +24,82 @@ from maasi_filter.plugins import PluginGroup, own_settings
 
 ParameterValue = bool | int | float | str | list[Any]
 
+_WIDTH = 96
+
 
 @dataclass(frozen=True)
 class ParameterField:
-    """One parameter of a node.
-
-    Attributes
-    ----------
-    name : str
-        With dots.
-    default : bool, int, float, str, list or None
-        None: no default.
-    description : str
-        Meaning and unit.
-    constraints : str
-        What is allowed, in words.
-    number : type or None
-        float or int for a single number.
-    lowest, highest : float or None
-        Its bounds; `constraints` says whether they are included.
-    """
+    """One parameter of a node: its name with dots, its keys in nested settings, its field."""
 
     name: str
-    default: ParameterValue | None
-    description: str
-    constraints: str
-    number: type | None = None
-    lowest: float | None = None
-    highest: float | None = None
+    keys: tuple[str, ...]
+    info: FieldInfo
+    #: Whether it stands for a part of the settings, and is no parameter itself.
+    part: bool = False
+
+    @property
+    def default(self) -> ParameterValue | None:
+        """Default value; None: there is none."""
+        if self.info.is_required() or _model_by_name(self.info.annotation) is not None:
+            return None
+        value = self.info.get_default(call_default_factory=True)
+        if isinstance(value, (list, tuple)):
+            return _as_list(value, self.info.annotation) or None
+        return value
+
+    @property
+    def description(self) -> str:
+        """Meaning and unit."""
+        return self.info.description or ''
+
+    @property
+    def constraints(self) -> str:
+        """What is allowed, in words."""
+        return constraints(self.info)
+
+    @property
+    def number(self) -> type | None:
+        """Type of a single number: float or int."""
+        kinds = [item for item in choices(self.info.annotation) if item is not type(None)]
+        return kinds[0] if len(kinds) == 1 and kinds[0] in (int, float) else None
+
+    def bound(self, *kinds: str) -> float | None:
+        """Return the first bound of these kinds, such as 'ge'."""
+        found = (getattr(item, kind, None) for item in self.info.metadata for kind in kinds)
+        return next((float(value) for value in found if value is not None), None)
+
+
+def parameter_fields(model: type[BaseModel], given: Mapping[str, Any]) -> Iterator[ParameterField]:
+    """Yield the parameters of settings; the `given` ones determine which robots and parts exist."""
+    return (item for item in _walk(model, given) if not item.part)
+
+
+def _walk(
+    model: type[BaseModel], given: Mapping[str, Any], prefix: str = '', keys: tuple[str, ...] = ()
+) -> Iterator[ParameterField]:
+    """Yield parameters, and before them the parts of the settings that they belong to."""
+    for name, info in model.model_fields.items():
+        key = info.alias or name
+        full, place = prefix + key, (*keys, key)
+        by_name = _model_by_name(info.annotation)
+        nested = _nested(info.annotation) or own_settings(info, given, prefix)
+        if by_name is not None:
+            yield ParameterField(full, place, info)
+            for item in given.get(full) or []:
+                inner = f'{prefix}{_singular(name)}.{item}'
+                yield ParameterField(inner, (*place, item), info, part=True)
+                yield from _walk(by_name, given, f'{inner}.', (*place, item))
+        elif nested is None:
+            yield ParameterField(full, place, info)
+        elif type(None) not in get_args(info.annotation) or any(
+            item.startswith(f'{full}.') for item in given
+        ):
+            yield ParameterField(full, place, info, part=True)
+            yield from _walk(nested, given, f'{full}.', place)
 
 
 def flatten(settings: BaseModel, prefix: str = '') -> dict[str, ParameterValue]:
-    """Return settings as flat parameters.
-
-    Parameters
-    ----------
-    settings : BaseModel
-        Any settings of the suite.
-    prefix : str
-        Of all names.
-    """
+    """Return settings as flat parameters, with a prefix of all names."""
     flat: dict[str, ParameterValue] = {}
     for name, info in type(settings).model_fields.items():
         value = getattr(settings, name)
@@ -89,104 +128,28 @@ def unflatten(model: type[BaseModel], flat: Mapping[str, Any]) -> dict[str, Any]
     ValueError
         If a list of numbers is not one; the message names the parameter.
     """
-    return _nest(model, flat, '')
+    nested: dict[str, Any] = {}
+    for item in _walk(model, flat):
+        owner = nested
+        for key in item.keys[:-1]:
+            owner = owner[key]
+        value = flat.get(item.name)
+        if item.part or _model_by_name(item.info.annotation) is not None:
+            owner[item.keys[-1]] = {}
+        elif isinstance(value, (str, bool, int, float)):
+            owner[item.keys[-1]] = value
+        elif value is not None:
+            owner[item.keys[-1]] = _from_list(item.name, value, item.info.annotation)
+    return nested
 
 
-def parameter_fields(
-    model: type[BaseModel], given: Mapping[str, Any], prefix: str = ''
-) -> Iterator[ParameterField]:
-    """Yield the parameters of settings.
-
-    Parameters
-    ----------
-    model : type
-        The settings.
-    given : mapping
-        Flat parameters that are set; they determine which robots and optional parts exist.
-    prefix : str
-        Of all names.
-    """
-    for name, info in model.model_fields.items():
-        key = prefix + (info.alias or name)
-        by_name = _model_by_name(info.annotation)
-        nested = _nested(info.annotation) or own_settings(info, given, prefix)
-        if by_name is not None:
-            yield ParameterField(key, None, info.description or '', '')
-            for item in given.get(key) or []:
-                yield from parameter_fields(by_name, given, f'{prefix}{_singular(name)}.{item}.')
-        elif nested is not None:
-            optional = type(None) in get_args(info.annotation)
-            if not optional or any(item.startswith(f'{key}.') for item in given):
-                yield from parameter_fields(nested, given, f'{key}.')
-        else:
-            yield ParameterField(
-                key,
-                _default(info),
-                info.description or '',
-                constraints(info),
-                _number(info.annotation),
-                _bound(info, 'ge', 'gt'),
-                _bound(info, 'le', 'lt'),
-            )
-
-
-def parameter_name(model: type[BaseModel], location: Iterable[int | str]) -> str:
-    """Return the parameter of a location in nested values.
-
-    Parameters
-    ----------
-    model : type
-        The settings.
-    location : iterable of str or int
-        Keys and indices of the location, as in errors of pydantic.
-    """
-    parts: list[str] = []
-    current: type[BaseModel] | None = model
-    keys = iter(location)
-    for key in keys:
-        info = None
-        if current is not None:
-            info = next(
-                (item for name, item in current.model_fields.items() if key in (name, item.alias)),
-                None,
-            )
-        if info is None:
-            # An index, or a part of a single parameter.
-            break
-        by_name = _model_by_name(info.annotation)
-        if by_name is None:
-            parts.append(str(key))
-            current = _nested(info.annotation)
-            if info.annotation is Any:
-                # Settings of a plugin.
-                parts += [str(inner) for inner in keys if isinstance(inner, str)]
-            continue
-        name = next(keys, None)
-        parts += [str(key)] if name is None else [_singular(str(key)), str(name)]
-        current = by_name
-    return '.'.join(parts)
-
-
-def _default(info: FieldInfo) -> ParameterValue | None:
-    if info.is_required():
-        return None
-    value = info.get_default(call_default_factory=True)
-    if isinstance(value, (list, tuple)):
-        return _as_list(value, info.annotation) or None
-    return value
-
-
-def _bound(info: FieldInfo, *kinds: str) -> float | None:
-    for item in info.metadata:
-        for kind in kinds:
-            if getattr(item, kind, None) is not None:
-                return float(getattr(item, kind))
-    return None
-
-
-def _number(annotation: Any) -> type | None:
-    kinds = [item for item in choices(annotation) if item is not type(None)]
-    return kinds[0] if len(kinds) == 1 and kinds[0] in (int, float) else None
+def parameter_name(
+    model: type[BaseModel], location: Iterable[int | str], given: Mapping[str, Any]
+) -> str:
+    """Return the parameter of a location in nested values, as in errors of pydantic."""
+    keys = tuple(map(str, location))
+    found = [item for item in _walk(model, given) if item.keys == keys[: len(item.keys)]]
+    return max(found, key=lambda item: len(item.keys)).name if found else '.'.join(keys)
 
 
 def constraints(info: FieldInfo) -> str:
@@ -207,34 +170,23 @@ def constraints(info: FieldInfo) -> str:
     return ' and '.join(parts)
 
 
-def _nest(model: type[BaseModel], flat: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    nested: dict[str, Any] = {}
-    for name, info in model.model_fields.items():
-        key = prefix + (info.alias or name)
-        target = info.alias or name
-        by_name = _model_by_name(info.annotation)
-        inner = _nested(info.annotation) or own_settings(info, flat, prefix)
-        if by_name is not None:
-            nested[target] = {
-                item: _nest(by_name, flat, f'{prefix}{_singular(name)}.{item}.')
-                for item in flat.get(key) or []
-            }
-        elif inner is not None:
-            optional = type(None) in get_args(info.annotation)
-            if not optional or any(item.startswith(f'{key}.') for item in flat):
-                nested[target] = _nest(inner, flat, f'{key}.')
-        elif flat.get(key) is not None:
-            value = flat[key]
-            if not isinstance(value, (str, bool, int, float)):
-                value = _from_list(key, value, info.annotation)
-            nested[target] = value
-    return nested
+# Lists.
 
 
 def _as_list(value: Sequence[Any], annotation: Any) -> list[Any]:
     if _width(annotation) is not None:
         return [float(number) for item in value for number in item]
     return [_as_text(item) for item in value]
+
+
+def _as_text(item: Any) -> Any:
+    """Return an item of a list; a list or settings become a string of numbers."""
+    if isinstance(item, BaseModel):
+        item = [item[1] for item in item]
+        item = [number for part in item for number in (part if isinstance(part, list) else [part])]
+    if isinstance(item, (list, tuple)):
+        return ' '.join(repr(float(number)) for number in item)
+    return item
 
 
 def _from_list(key: str, value: Sequence[Any], annotation: Any) -> list[Any]:
@@ -249,24 +201,10 @@ def _from_list(key: str, value: Sequence[Any], annotation: Any) -> list[Any]:
     return [list(value[first : first + width]) for first in range(0, len(value), width)]
 
 
-def _as_text(item: Any) -> Any:
-    """Return an item of a list; a list or settings become a string of numbers."""
-    if isinstance(item, BaseModel):
-        numbers: list[float] = []
-        for name in type(item).model_fields:
-            value = getattr(item, name)
-            numbers += value if isinstance(value, list) else [value]
-        return ' '.join(repr(float(number)) for number in numbers)
-    if isinstance(item, (list, tuple)):
-        return ' '.join(repr(float(number)) for number in item)
-    return item
-
-
 def _from_text(key: str, item: Any, annotation: Any) -> Any:
-    element = _element(annotation)
-    if not isinstance(item, str) or element is str or element is None:
-        return item
-    if get_origin(element) is Literal:
+    elements = [get_args(kind)[0] for kind in choices(annotation) if get_origin(kind) is list]
+    element = _bare(elements[0]) if elements else str
+    if not isinstance(item, str) or element is str or get_origin(element) is Literal:
         return item
     try:
         numbers = [float(word) for word in item.split()]
@@ -277,6 +215,9 @@ def _from_text(key: str, item: Any, annotation: Any) -> Any:
         names = list(element.model_fields)
         return {names[0]: numbers[:-1], names[1]: numbers[-1] if numbers else None}
     return numbers
+
+
+# Types of fields.
 
 
 def _bare(annotation: Any) -> Any:
@@ -293,29 +234,20 @@ def choices(annotation: Any) -> list[Any]:
     return [annotation]
 
 
-def _element(annotation: Any) -> Any:
-    for choice in choices(annotation):
-        if get_origin(choice) is list:
-            return _bare(get_args(choice)[0])
-    return None
-
-
 def _width(annotation: Any) -> int | None:
     """Return the length of the lists in a list, if it is fixed."""
     for choice in choices(annotation):
-        if get_origin(choice) is list and get_origin(get_args(choice)[0]) is Annotated:
-            element, *metadata = get_args(get_args(choice)[0])
-            limits = [item for item in metadata if isinstance(item, FieldInfo)]
-            lengths = {
-                getattr(part, kind)
-                for item in limits
-                for part in item.metadata
-                for kind in ('min_length', 'max_length')
-                if hasattr(part, kind)
-            }
-            parts = [part for item in limits for part in item.metadata]
-            if get_origin(element) is list and len(lengths) == 1 and len(parts) == 2:
-                return int(lengths.pop())
+        element = get_args(choice)[0] if get_origin(choice) is list else None
+        limits = [item for item in get_args(element)[1:] if isinstance(item, FieldInfo)]
+        lengths = [
+            getattr(part, kind)
+            for item in limits
+            for part in item.metadata
+            for kind in ('min_length', 'max_length')
+            if hasattr(part, kind)
+        ]
+        if get_origin(_bare(element)) is list and len(lengths) == 2 and lengths[0] == lengths[1]:
+            return int(lengths[0])
     return None
 
 
@@ -333,14 +265,54 @@ def _model_by_name(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-def settings_by_name(model: type[BaseModel]) -> list[str]:
-    """Return the keys of settings that hold other settings by name, as `robots`."""
-    return [
-        info.alias or name
-        for name, info in model.model_fields.items()
-        if _model_by_name(info.annotation) is not None
-    ]
-
-
 def _singular(name: str) -> str:
     return name.removesuffix('s')
+
+
+# Help.
+
+
+def parameters_of(model: type[BaseModel]) -> Iterator[ParameterField]:
+    """Yield the parameters of a node's settings; those of each robot as of one named NAME."""
+    tables = [item for item in _walk(model, {}) if _model_by_name(item.info.annotation) is not None]
+    return parameter_fields(model, {item.name: ['NAME'] for item in tables})
+
+
+def settings_of(node: type) -> type[BaseModel]:
+    """Return the settings of a class of nodes: the type argument of their base."""
+    for kind in node.__mro__:
+        for base in kind.__dict__.get('__orig_bases__', ()):
+            for argument in get_args(base):
+                if inspect.isclass(argument) and issubclass(argument, BaseModel):
+                    return argument
+    raise TypeError(f'{node.__name__}: has no settings')
+
+
+def node_help(node: type, name: str, base: type) -> str:
+    """Return the help of a class of nodes, whose executable has this name.
+
+    Topics are from the docstrings, up to that of `base`.
+    """
+    text = [
+        f'usage: {name} [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r __ns:=/TEAM] ...]'
+    ]
+    for kind in node.__mro__[: node.__mro__.index(base) + 1]:
+        doc = inspect.cleandoc(kind.__dict__.get('__doc__') or '')
+        # Without the sections for who writes code.
+        text.append(re.split(r'\n(?:Parameters|Attributes)\n-+\n', doc)[0].strip())
+    rows = [_row(item) for item in parameters_of(settings_of(node))]
+    text.append('\n'.join(['ROS parameters', '--------------', *rows]))
+    text.append('Exit codes: 0 ended, 1 failed, 2 wrong parameters.')
+    return '\n\n'.join(filter(None, text))
+
+
+def _row(item: ParameterField) -> str:
+    default: Any = item.default
+    said = [item.description]
+    if item.constraints:
+        said.append(f'allowed: {item.constraints}')
+    if default is not None:
+        said.append(f'default: {str(default).lower() if isinstance(default, bool) else default}')
+    indent = ' ' * 6
+    words = textwrap.fill('; '.join(said), _WIDTH, initial_indent=indent, subsequent_indent=indent)
+    return f'  {item.name}\n{words}'

@@ -18,7 +18,7 @@ from rclpy.utilities import get_default_context
 
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
-from maasi_filter.ros.node_help import node_help
+from maasi_filter.ros.parameters import node_help
 
 # Period of the check for signals [s].
 _SIGNAL_PERIOD = 0.1

@@ -13,8 +13,10 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from maasi_filter.models.pose import Pose, compose
+from maasi_filter.ros.clocks import JUMP, StampGate
 from maasi_filter.ros.conversions import (
     FASTEST,
+    MarkerBoard,
     point_to_ros,
     pose_from_ros,
     stamp_from_ros,
@@ -22,10 +24,8 @@ from maasi_filter.ros.conversions import (
     stamp_to_ros,
 )
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
-from maasi_filter.ros.marker_board import MarkerBoard
 from maasi_filter.ros.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
 from maasi_filter.ros.run_node import run
-from maasi_filter.ros.stamps import JUMP, StampGate
 from maasi_msgs.msg import AgentState, CuboidDecision, LockstepStep, SearchLink, SearchLinkArray
 from maasi_planner.buildings.agent import Activity, Broadcast, SearchAgent, decision_stream
 from maasi_planner.buildings.conversions import (

@@ -11,8 +11,8 @@ from std_msgs.msg import Header
 
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import Cluster
+from maasi_filter.ros.clocks import LAST_STAMP, batch_id_limit
 from maasi_filter.ros.conversions import cluster_from_ros, pose_from_ros
-from maasi_filter.ros.stamps import LAST_STAMP, batch_id_limit
 from maasi_msgs.msg import AgentState, FilterUpdate
 from maasi_planner.conversions import robot_state_from_ros
 from maasi_planner.motion import RobotState

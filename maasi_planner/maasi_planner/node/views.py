@@ -10,9 +10,8 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from maasi_filter.ros.conversions import particles_to_ros
+from maasi_filter.ros.conversions import MarkerBoard, particles_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
-from maasi_filter.ros.marker_board import MarkerBoard
 from maasi_filter.ros.qos import LATCHED
 from maasi_planner.conversions import exploration_to_ros, planner_markers
 from maasi_planner.coordinator import Coordinator, PresentRobot

@@ -13,8 +13,8 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 
+from maasi_filter.ros.clocks import Silence
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
-from maasi_filter.ros.silence import Silence
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 from maasi_planner.motion import RobotState

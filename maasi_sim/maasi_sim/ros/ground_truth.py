@@ -9,8 +9,13 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.conversions import colour, point_to_ros, pose_to_ros, sphere_marker
-from maasi_filter.ros.marker_board import MarkerBoard
+from maasi_filter.ros.conversions import (
+    MarkerBoard,
+    colour,
+    point_to_ros,
+    pose_to_ros,
+    sphere_marker,
+)
 from maasi_filter.ros.qos import LATCHED
 from maasi_sim.world.world import World
 

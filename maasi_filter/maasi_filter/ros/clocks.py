@@ -1,0 +1,216 @@
+"""Time of a node: stamps of messages, silence of sources, jumps of a simulated clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.clock import JumpThreshold, ROSClock, TimeJump
+from rclpy.duration import Duration
+from rclpy.node import Node
+
+_NANOSECONDS = 1_000_000_000
+
+#: Smallest difference of consecutive stamps that counts as a jump [ns].
+JUMP = _NANOSECONDS
+
+#: Largest valid stamp [s].
+LAST_STAMP = 2**31 - 1
+
+# Limit of the first batch id, and of the lead of later ids over the last one.
+_FIRST_IDS = 2**62
+_IDS_AHEAD = 10**6
+
+# Time without /clock before a warning [s].
+_PATIENCE = 3.0
+# With several publishers of /clock: a jump counts if time stays back this long [s].
+_CONFIRMATION = 1.0
+_LEAST_BACKWARD, _LEAST_FORWARD = 1_000_000, 200_000_000
+
+
+def stamp_problem(message: Any) -> str | None:
+    """Return the error of the stamp of a message: field, what was read, what is allowed.
+
+    A message with neither `header.stamp` nor `stamp` has none.
+    """
+    name, owner = 'header.stamp', getattr(message, 'header', None)
+    if owner is None:
+        name, owner = 'stamp', message
+    stamp = getattr(owner, 'stamp', None)
+    if stamp is None:
+        return None
+    if stamp.sec < 0:
+        return f'{name}.sec: read {stamp.sec}, allowed is from 0 [s]'
+    if stamp.nanosec >= _NANOSECONDS:
+        return f'{name}.nanosec: read {stamp.nanosec}, allowed is below {_NANOSECONDS} [ns]'
+    return None
+
+
+def batch_id_limit(last: int) -> int:
+    """Return the highest batch id that is accepted after `last`.
+
+    Ids increase, and uint64 is bounded: a node that accepted an id near the bound could not
+    continue from it. Ids below the limit are accepted, so that filter and planner agree again.
+    """
+    return max(last, _FIRST_IDS) + _IDS_AHEAD
+
+
+class StampGate:
+    """Distinguishes a jump of a stream of stamps from a single wrong stamp.
+
+    A stamp that jumps is refused; if the next one follows it, the stream has really jumped (its
+    source was restarted, messages were lost), and is accepted from there.
+    `jump` is the largest difference of two stamps that is none, in their unit.
+    """
+
+    def __init__(self, jump: int = JUMP) -> None:
+        self.jump = jump
+        self._last: int | None = None
+        self._suspect: int | None = None
+
+    def accepts(self, stamp: int) -> bool:
+        """Return whether a stamp is accepted."""
+        last, suspect = self._last, self._suspect
+        self._suspect = None
+        if last is not None and abs(stamp - last) > self.jump:
+            if suspect is None or not 0 < stamp - suspect <= self.jump:
+                self._suspect = stamp
+                return False
+        elif last is not None and stamp < last:
+            # A late message, not a jump: the reference stays at the last stamp.
+            return True
+        self._last = stamp
+        return True
+
+    def clear(self) -> None:
+        """Reset: the next stamp is accepted."""
+        self._last = self._suspect = None
+
+
+class Silence:
+    """Time since the last message of a source: simulated if the node uses simulated time.
+
+    On a busy machine simulated time slows down with everything else, while timeouts of wall time
+    would expire without a fault. Otherwise the clock is the steady one.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._clock = node.get_clock()
+        self.end()
+
+    def end(self) -> None:
+        """Note that a message was received."""
+        self._wall = time.monotonic()
+        self._simulated = self._time()
+
+    def _time(self) -> int | None:
+        """Return the simulated time [ns]; 0 before it begins, None where it is not used."""
+        if isinstance(self._clock, ROSClock) and self._clock.ros_time_is_active:
+            return int(self._clock.now().nanoseconds)
+        return None
+
+    @property
+    def wall(self) -> float:
+        """Wall time since then [s]."""
+        return time.monotonic() - self._wall
+
+    @property
+    def length(self) -> float:
+        """Time since then [s]; 0 if simulated time had not begun then, or has jumped back."""
+        now = self._time()
+        if now is None:
+            return self.wall
+        if not self._simulated or now < self._simulated:
+            self._simulated = now
+        return 1e-9 * (now - self._simulated)
+
+
+class ClockWatch:
+    """Informs a node that its time starts again.
+
+    A looped recording or a restarted simulation has one publisher of `/clock`: a backward jump
+    counts at once. With several publishers the time may alternate between theirs: then a jump
+    counts only after the time has stayed back.
+    `warn` is called with a key and a text; `on_restart`, from the executor, with the size of the
+    jump [s].
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        warn: Callable[[str, str], None],
+        on_restart: Callable[[float], None],
+    ) -> None:
+        self._node = node
+        self._warn = warn
+        self._on_restart = on_restart
+        # Unconfirmed jump: time before it [ns], and steady time at which it happened [s].
+        self._pending: tuple[int, float] | None = None
+        self._silent_since: float | None = None
+        self._patience = _PATIENCE
+        # rclpy only borrows the pointer: without this reference a jump segfaults.
+        self._handle: Any = node.get_clock().create_jump_callback(
+            JumpThreshold(
+                min_forward=Duration(nanoseconds=_LEAST_FORWARD),
+                min_backward=Duration(nanoseconds=-_LEAST_BACKWARD),
+                on_clock_change=False,
+            ),
+            post_callback=self._on_jump,
+        )
+
+    def _on_jump(self, jump: TimeJump) -> None:
+        # An exception must not pass through the C code that calls this.
+        executor, delta = self._node.executor, jump.delta.nanoseconds
+        if executor is not None:
+            executor.create_task(self._judge, delta)
+
+    def _judge(self, delta: int) -> None:
+        now = self._node.get_clock().now().nanoseconds
+        if delta > 0:
+            if self._pending is not None and now >= self._pending[0]:
+                self._pending = None
+            return
+        publishers = self._node.get_publishers_info_by_topic('/clock')
+        if len(publishers) <= 1:
+            self._pending = None
+            self._on_restart(-1e-9 * delta)
+            return
+        names = ', '.join(sorted({info.node_name for info in publishers}))
+        self._warn(
+            'clock',
+            f'/clock jumped back by {-1e-9 * delta:.3f} s; it has {len(publishers)} publishers '
+            f'({names}), allowed is one',
+        )
+        if self._pending is None:
+            self._pending = (now - delta, time.monotonic())
+
+    def look(self) -> None:
+        """Confirm pending jumps and check for silence; call about once per second."""
+        now, time_now = time.monotonic(), self._node.get_clock().now().nanoseconds
+        if self._pending is not None and now - self._pending[1] >= _CONFIRMATION:
+            before, self._pending = self._pending[0], None
+            if time_now < before:
+                self._on_restart(1e-9 * (before - time_now))
+        self._look_for_clock(now, time_now)
+
+    def _look_for_clock(self, now: float, time_now: int) -> None:
+        simulated = self._node.get_parameter('use_sim_time').value
+        if not simulated or time_now or self._node.count_publishers('/clock'):
+            self._silent_since, self._patience = None, _PATIENCE
+            return
+        if self._silent_since is None:
+            self._silent_since = now
+        waited = now - self._silent_since
+        if waited >= self._patience:
+            # Exponential back-off.
+            self._patience = 2.0 * waited
+            self._node.get_logger().warning(
+                f'no publisher of /clock for {waited:.0f} s (use_sim_time is true): waiting'
+            )
+
+    def stop(self) -> None:
+        """Remove the callback from the clock."""
+        if self._handle is not None:
+            self._handle.unregister()
+            self._handle = None
