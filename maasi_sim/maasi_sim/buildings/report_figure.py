@@ -15,7 +15,7 @@ from maasi_sim.buildings.report import build_cuboid_report
 from maasi_sim.run.report_files import END_REASONS
 from maasi_sim.run.report_panels import (
     MARGIN,
-    View,
+    MapView,
     add_legend,
     draw_start_and_end,
     draw_way,
@@ -54,7 +54,7 @@ def _area(record: CuboidRecord) -> FloatArray:
     return area
 
 
-def _draw_mission(view: View, record: CuboidRecord, visited: set[int]) -> None:
+def _draw_mission(view: MapView, record: CuboidRecord, visited: set[int]) -> None:
     mission = record.mission
     done = [box for number, box in enumerate(mission.boxes) if number in visited]
     missed = [box for number, box in enumerate(mission.boxes) if number not in visited]

@@ -61,22 +61,10 @@ def execute(task: Task) -> Run | str:
 
 @dataclass
 class Campaign:
-    """The runs of one experiment, those that are there and those to be made.
+    """The runs of one experiment: those that are there, by case and map, and those to be made.
 
-    Attributes
-    ----------
-    experiment : Experiment
-        Which.
-    cases : dict of Case
-        By name.
-    folder : RunFolder
-        Folder of the runs.
-    done : dict of Run
-        Stored runs, by case and map.
-    tasks : list of Task
-        Missing runs, map by map: an interrupted campaign has all cases on the first maps.
-    complaints : dict of str
-        By damaged file.
+    Tasks go map by map: an interrupted campaign has all cases on the first maps. Complaints are by
+    damaged file.
     """
 
     experiment: Experiment
@@ -132,13 +120,7 @@ def plan(
 
 
 def one_machine(workers: Workers, campaigns: Sequence[Campaign]) -> dict[str, str]:
-    """Return the machine that all workers and stored runs have in common.
-
-    Raises
-    ------
-    MixedWorkers
-        If there is none; names the difference.
-    """
+    """Return the machine that all workers and stored runs have in common; raise MixedWorkers."""
     first, machine = next(iter(workers.machines.items()))
     for name, other in workers.machines.items():
         difference = machine_difference(machine, other)

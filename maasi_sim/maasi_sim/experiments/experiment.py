@@ -29,16 +29,8 @@ class OpenPoint:
 class Case:
     """One configuration of an experiment, such as a method, that is run on every map.
 
-    Attributes
-    ----------
-    name : str
-        Unique within the experiment, such as 'ASI' or 'ASI, alpha 0.5, beta 5'.
-    settings : dict
-        Everything that a run needs, as plain values for YAML and JSON.
-    preset : str
-        'paper': the best reading of the paper; 'recommended': our own choice.
-    runs : int, optional
-        Number of maps at most; none: as many as asked for.
+    `name` is unique within the experiment, `settings` is all that a run needs, as plain values. The
+    preset is the best reading of the paper, or our own choice; `runs` is the most maps.
     """
 
     name: str
@@ -103,18 +95,10 @@ class Comparison:
 
 @dataclass
 class Outcome:
-    """Results of one run.
+    """Results of one run: numbers, texts or None by quantity, and columns with a row for each step.
 
-    Attributes
-    ----------
-    summary : dict
-        A number, text or None by quantity.
-    columns : dict of arrays
-        One row per step, all columns of the same length.
-    details : dict
-        Other data of figures, such as true positions: lists and numbers.
-    timing : dict
-        Wall times; the one part that differs when a run is repeated.
+    Details are other data of figures, such as true positions; timing is wall times, which differ
+    when a run is repeated.
     """
 
     summary: dict[str, float | int | str | bool | None]
@@ -165,10 +149,8 @@ class Experiment:
 
     Attributes
     ----------
-    name : str
-        Such as '000-fig4'.
-    title : str
-        One line.
+    name, title : str
+        Such as '000-fig4', and one line.
     cases : function of bool
         Returns the cases; with True small ones that take a second, for tests and a first look.
     run : function of settings and seed
@@ -179,16 +161,12 @@ class Experiment:
         Draws a figure in the form of the paper's.
     published, comparisons, choices : sequences
         The paper's numbers, paired differences to report, and open points of the paper.
-    causes, tested : str
-        Causes of differences from the paper: likely ones, and those that were tested by runs.
-    runs : int
-        Number of maps in the paper.
-    seconds : float
-        Approximate time of a run on one core; for --list.
+    causes, tested, note : str
+        Causes of differences from the paper, likely ones and those that were tested; more to read.
+    runs, seconds : int, float
+        Maps in the paper, and the approximate time of a run on one core, for --list.
     maps : str, optional
         Experiments with the same value have the same maps; none: maps of its own.
-    note : str
-        Further information for readers.
     compared : bool
         Whether searches are compared: the seed is the number of the map, and workers are sent the
         settings, as they do not know the experiment.

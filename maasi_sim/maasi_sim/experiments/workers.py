@@ -37,20 +37,10 @@ class InThisProcess(Executor):
 
 @dataclass
 class Workers:
-    """An executor of runs.
+    """An executor of runs, so many at a time.
 
-    Attributes
-    ----------
-    executor : Executor
-        Makes them.
-    number : int
-        How many at a time.
-    ahead : int, optional
-        How many are submitted at a time; none: all, for workers that join later.
-    machines : dict
-        Machine of each worker by its name, as `this_machine` has it.
-    close : function
-        Shuts them down; pending runs are abandoned.
+    So many are submitted `ahead`; none: all, for workers that join later. `machines` has that of
+    each worker by its name, and `close` abandons pending runs.
     """
 
     executor: Executor = field(default_factory=InThisProcess)

@@ -14,24 +14,10 @@ FILTER = 'filter_node'
 
 @dataclass
 class Batch:
-    """One recorded update: its inputs in their order, and its output.
+    """One recorded update of a filter, in a namespace: its inputs in their order, and its output.
 
-    Attributes
-    ----------
-    id, step : int
-        Of the batch.
-    stamp : (int, int)
-        Seconds and nanoseconds.
-    members : list of (robot, decision, measurement)
-        Processed ones, in their order.
-    detections : list of bytes
-        Serialised DetectionArray of each member.
-    update : dict
-        Published by the filter.
-    late : bool
-        Whether it is a measurement that arrived after its batch, or without a request.
-    namespace : str
-        Of the filter; empty for the root.
+    Members are robot, decision and measurement, the stamp seconds and nanoseconds. `late` is a
+    measurement that arrived after its batch, or without a request.
     """
 
     id: int
@@ -48,16 +34,9 @@ class Batch:
 class Recording:
     """Contents of a recording for a replay.
 
-    Attributes
-    ----------
-    facts : dict
-        Scenario, seed and parameters of each node.
-    batches : list of Batch
-        In order; those of several filters in the order of steps and names.
-    found : dict
-        By the namespace of the filter: found targets at the end, a list of dict.
-    found_batch : dict
-        By the namespace: the batch after which they were published.
+    `facts` are scenario, seed and parameters of each node; batches of several filters are in the
+    order of steps and names. By namespace of the filter: found targets at the end, and the batch
+    after which they were published.
     """
 
     facts: dict[str, Any]

@@ -52,16 +52,8 @@ def replay(
 ) -> int:
     """Replay a recording, print whether the found targets are equal, and return the exit code.
 
-    Parameters
-    ----------
-    path : Path
-        Recording, or folder of the run that holds it.
-    out : Path, optional
-        Folder for the node's log and parameters.
-    domain_id : int, optional
-        ROS domain; a free one if not given.
-    interrupted : callable
-        Returns true after an interruption.
+    Logs and parameters of the nodes are written to a folder, `interrupted` returns true after an
+    interruption.
 
     Raises
     ------

@@ -27,8 +27,7 @@ from maasi_sim.run.topics import BATCH, FOUND, UPDATE, within
 
 
 class ReplayNode:
-    """
-    The peer of one or several filter nodes.
+    """The peer of one or several filter nodes, in namespaces of which an empty one is the root.
 
     Publishes
     ---------
@@ -39,15 +38,6 @@ class ReplayNode:
     ----------
     `filter_update` (maasi_msgs/FilterUpdate), `found_targets` (maasi_msgs/FoundTargetArray),
     `lockstep/ready` (maasi_msgs/LockstepDone)
-
-    Parameters
-    ----------
-    domain : int
-        ROS domain.
-    robots : list of str
-        Names.
-    namespaces : list of str
-        Of the filters; an empty one is the root.
     """
 
     def __init__(

@@ -33,18 +33,9 @@ END_REASONS = {
 
 @dataclass(frozen=True)
 class StoredReport:
-    """A report, its summary, and its folder.
+    """A report, its summary, and the folder of its files; None: they could not be written.
 
-    Attributes
-    ----------
-    report : dict
-        Content of `report.json`.
-    words : str
-        Its summary.
-    folder : Path or None
-        Of the files; None: it could not be written.
-    problem : str
-        Why it is not in the folder of the run; else empty.
+    `problem` says why they are not in the folder of the run, else it is empty.
     """
 
     report: dict[str, Any]

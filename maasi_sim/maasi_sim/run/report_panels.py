@@ -36,16 +36,8 @@ _CORNER_WIDTH, _CORNER_ROWS = 3.2, 15
 
 
 @dataclass(frozen=True)
-class View:
-    """Axes that show two of the map's axes.
-
-    Attributes
-    ----------
-    axes : Axes
-        Where.
-    plane : (int, int)
-        Which map axes lie to the right and upwards: 0, 1, 2 for x, y, z.
-    """
+class MapView:
+    """Axes that show two of the map's axes: those to the right and upwards, 0, 1, 2 for x, y, z."""
 
     axes: Axes
     plane: tuple[int, int]
@@ -60,22 +52,13 @@ class View:
 class Panels:
     """The axes of a figure.
 
-    Attributes
-    ----------
-    figure : Figure
-        That holds them.
-    views : list of View
-        The map in 2D; in 3D from above, from the south, and from the east.
-    plots : list of Axes
-        Beside them, from top to bottom.
-    grid : GridSpec
-        Of two rows; the second one, of no height yet, is for a legend.
-    corner : SubplotSpec or None
-        Between the views, if there is room for a legend.
+    Views are the map in 2D; in 3D from above, from the south, and from the east. Plots are beside
+    them, from top to bottom. The second row of the grid, of no height yet, is for a legend, and so
+    is the corner between the views, if there is room.
     """
 
     figure: Figure
-    views: list[View]
+    views: list[MapView]
     plots: list[Axes]
     grid: GridSpec
     corner: SubplotSpec | None
@@ -84,14 +67,8 @@ class Panels:
 def make_panels(area: FloatArray, robots: int, heights: Sequence[float]) -> Panels:
     """Return the axes of a new figure.
 
-    Parameters
-    ----------
-    area : (d, 2) array
-        That the views show [m, map].
-    robots : int
-        Number of bands of the second plot.
-    heights : sequence of float
-        Relative heights of the plots beside the views, after the first two.
+    The views show an area, (d, 2) [m, map]; the second plot has a band for each robot, and those
+    after it have relative heights.
     """
     figure = Figure(figsize=(13.0, 8.0), layout='constrained')
     FigureCanvasAgg(figure)
@@ -101,7 +78,7 @@ def make_panels(area: FloatArray, robots: int, heights: Sequence[float]) -> Pane
     views = []
     corner = None
     if len(area) == 2:
-        views.append(View(figure.add_subplot(outer[0, 0]), (0, 1)))
+        views.append(MapView(figure.add_subplot(outer[0, 0]), (0, 1)))
     else:
         deep = max(float(size[2]), _THINNEST * float(size[:2].max()))
         inner = outer[0, 0].subgridspec(
@@ -109,9 +86,9 @@ def make_panels(area: FloatArray, robots: int, heights: Sequence[float]) -> Pane
         )
         above = figure.add_subplot(inner[0, 0])
         views = [
-            View(above, (0, 1)),
-            View(figure.add_subplot(inner[1, 0], sharex=above), (0, 2)),
-            View(figure.add_subplot(inner[0, 1], sharey=above), (2, 1)),
+            MapView(above, (0, 1)),
+            MapView(figure.add_subplot(inner[1, 0], sharex=above), (0, 2)),
+            MapView(figure.add_subplot(inner[0, 1], sharey=above), (2, 1)),
         ]
         # Unless the side views are thin.
         corner = inner[1, 1] if deep > _CORNER * float(size[:2].max()) else None
@@ -170,7 +147,7 @@ def fade(colour: str) -> LinearSegmentedColormap:
     )
 
 
-def draw_way(view: View, path: FloatArray, colour: str, end: float, label: str) -> None:
+def draw_way(view: MapView, path: FloatArray, colour: str, end: float, label: str) -> None:
     """Draw a way of rows time [s], x, y, z [m], darker with time up to `end` [s]."""
     if len(path):
         places = view.points(path[:, 1:]).T
@@ -189,7 +166,7 @@ def draw_way(view: View, path: FloatArray, colour: str, end: float, label: str) 
     view.axes.plot([], [], '-', color=colour, lw=2.0, label=label)
 
 
-def draw_start_and_end(view: View) -> None:
+def draw_start_and_end(view: MapView) -> None:
     """Add start and end of ways to the legend."""
     view.axes.plot([], [], 's', color=PALE, ms=7, label='start')
     view.axes.plot([], [], 'o', color=PALE, ms=7, label='end')

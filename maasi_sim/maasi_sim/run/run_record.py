@@ -19,16 +19,8 @@ FloatArray = NDArray[np.float64]
 class RunEnd:
     """How a run ended.
 
-    Attributes
-    ----------
-    reason : str
-        Key of `END_REASONS`.
-    time : float
-        Simulated time since the first step [s].
-    wall_time : float
-        From the first step to the end [s].
-    events : list of dict
-        Nodes that died, hung or were restarted.
+    `reason` is a key of `END_REASONS`, `time` simulated, `wall_time` from the first step [s].
+    Events are nodes that died, hung or were restarted.
     """
 
     reason: str
@@ -41,20 +33,8 @@ class RunEnd:
 class RunRecord:
     """Data of the reports of all kinds of runs.
 
-    Attributes
-    ----------
-    name : str
-        Of the scenario.
-    seed : int
-        Of the run.
-    trajectories : dict
-        By robot: time [s], x, y, z [m], (n, 4).
-    events : list of dict
-        Robots lost and back, nodes restarted or dead; in order of time.
-    end_reason : str
-        Why the run ended.
-    end_time, wall_time : float
-        Simulated time at the end, wall time from the first step [s].
+    Trajectories are time [s], x, y, z [m] by robot, (n, 4). Events are robots lost and back, nodes
+    restarted or dead, in order of time.
     """
 
     name: str

@@ -25,11 +25,11 @@ from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.report_files import StoredReport, store_report
 from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
 from maasi_sim.run.run_options import Options, ViewOptions
-from maasi_sim.run.run_page import RunPage
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning
+from maasi_sim.view.live_view import RunPage
 from maasi_sim.view.messages import read_events
 from maasi_sim.view.page_file import REPLAY, write_replay
 

@@ -19,7 +19,7 @@ from maasi_sim.run.report_panels import (
     MARGIN,
     PALE,
     UNSEEN,
-    View,
+    MapView,
     add_legend,
     draw_start_and_end,
     draw_way,
@@ -81,7 +81,7 @@ def _explored(record: TargetRecord) -> UnexploredMap:
     return explored
 
 
-def _draw_explored(view: View, explored: UnexploredMap, bounds: FloatArray) -> None:
+def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -> None:
     """Shade unexplored places: e, in 3D its mean along the line of sight."""
     hidden = tuple(axis for axis in range(explored.dimension) if axis not in view.plane)
     values = explored.values.mean(axis=hidden) if hidden else explored.values
@@ -97,7 +97,7 @@ def _draw_explored(view: View, explored: UnexploredMap, bounds: FloatArray) -> N
     view.axes.plot([], [], 's', color=UNSEEN, ms=9, label='not explored')
 
 
-def _draw_obstacles(view: View, record: TargetRecord, bounds: FloatArray) -> None:
+def _draw_obstacles(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
     style: dict[str, Any] = {'fc': '#C9C3B8', 'ec': '#8A8478', 'zorder': 1, 'label': 'obstacle'}
     for obstacle in record.scenario.environment.obstacles:
         centre, radius = obstacle.centre, obstacle.radius
@@ -115,7 +115,7 @@ def _draw_obstacles(view: View, record: TargetRecord, bounds: FloatArray) -> Non
 
 
 def _draw_field(
-    view: View, record: TargetRecord, name: str, colour: str, bounds: FloatArray
+    view: MapView, record: TargetRecord, name: str, colour: str, bounds: FloatArray
 ) -> None:
     """Draw where a robot's probability of detection is half its largest, from its last pose."""
     if not record.measured_from.get(name):
@@ -141,7 +141,7 @@ def _draw_field(
         )
 
 
-def _draw_targets(view: View, record: TargetRecord, bounds: FloatArray) -> None:
+def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
     axes, width = view.axes, record.scenario.dimension
     positions = np.array([item.position for item in record.found], float).reshape(-1, width)
     pairs = record.scores().match.pairs

@@ -8,6 +8,9 @@ from typing import Any
 
 from rosbags.typesys.store import Typestore
 
+from maasi_sim.run.bag import load_types
+from maasi_sim.run.mission import Mission
+from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.view.event_log import Scene
 from maasi_sim.view.event_maker import EventMaker
 from maasi_sim.view.hub import Hub, LiveFeed
@@ -102,6 +105,35 @@ class MessageFeed:
 
     def _decode(self, topic: str, type_name: str, data: bytes) -> None:
         self._events.take(topic, type_name, self._types.deserialize_cdr(data, type_name))
+
+
+class RunPage:
+    """Serves the page of a running scenario, with the messages of its recorder."""
+
+    def __init__(
+        self, mission: Mission[Any], options: ViewOptions, domain: int, namespace: str
+    ) -> None:
+        self._control = None
+        if options.control:
+            # rclpy starts threads when it is imported.
+            from maasi_sim.view.control_node import Control
+
+            self._control = Control(domain, namespace)
+        scene = scene_of(mission.name, mission.scenario)
+        self.view = LiveView(scene, options.port, options.host, self._control)
+        self._feed = MessageFeed(self.view, load_types())
+
+    def put(self, topic: str, type_name: str, data: bytes) -> None:
+        """Queue a message; never blocks."""
+        self._feed.put(topic, type_name, data)
+
+    def close(self) -> None:
+        """Show the queued messages, and stop serving."""
+        self._feed.close()
+        self.view.maker.end()
+        self.view.end('the run has ended')
+        if self._control is not None:
+            self._control.close()
 
 
 class TraceFeed:

@@ -94,16 +94,7 @@ class Moments:
 
 
 def write_video(log: EventLog, path: Path, speed: float = 5.0) -> None:
-    """Write a run as FILE.mp4 or FILE.gif.
-
-    Parameters
-    ----------
-    log : EventLog
-        Of the run.
-    path : Path
-        Of the video.
-    speed : float
-        Time of the run over that of the video.
+    """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast.
 
     Raises
     ------

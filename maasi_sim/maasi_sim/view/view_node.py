@@ -29,16 +29,13 @@ _DISCOVERY = 0.5
 
 
 class ViewNode(Node):
-    """Hands messages of topics that show a search to a page.
+    """Hands messages of topics that show a search to a function that never waits.
+
+    It takes topic, type and serialised message.
 
     Subscribes
     ----------
     every topic of a type in `maasi_sim.view.messages.TOPICS`, as its publishers offer it
-
-    Parameters
-    ----------
-    put : callable
-        Takes topic, type and serialised message; never waits.
     """
 
     def __init__(self, put: Callable[[str, str, bytes], None]) -> None:
