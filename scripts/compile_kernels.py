@@ -5,7 +5,10 @@ import subprocess
 import sys
 
 # Side by side; they share few kernels.
-PARTS = (('maasi_filter', 'maasi_planner'), ('maasi_sim.warm_up', 'maasi_drivers.warm_up'))
+PARTS = (
+    ('maasi_filter', 'maasi_planner'),
+    ('maasi_sim.warm_up', 'maasi_drivers.vision.marker_detector'),
+)
 PART = 'import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name).warm_up()'
 
 

@@ -19,7 +19,7 @@ import pytest
 import yaml
 from markdown_it import MarkdownIt
 
-from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import parameter_fields

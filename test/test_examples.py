@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
-from maasi_drivers.agent.driver_settings import DriverSettings, GuardSettings
+from maasi_drivers.settings.driver import DriverSettings, GuardSettings
 from maasi_filter import plugins
 from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings

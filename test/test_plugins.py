@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter import plugins
 from maasi_filter.models.pose import Pose

@@ -13,12 +13,12 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.calibration.bag_reader import BagError, BagReader
 from maasi_drivers.calibration.sensor_calibration import Observation, SensorNoise, sensor_noise
-from maasi_drivers.vision.camera_settings import load_calibration
-from maasi_drivers.vision.image_encoding import decode_image, image_to_array
+from maasi_drivers.settings.camera import load_calibration
+from maasi_drivers.settings.driver import DriverSettings
+from maasi_drivers.vision.images import decode_image, image_to_array
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.parameters import parameter_fields, unflatten

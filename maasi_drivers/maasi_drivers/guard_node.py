@@ -10,8 +10,8 @@ from geometry_msgs.msg import TwistStamped
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 
-from maasi_drivers.agent.driver_settings import LOCKSTEP_LEASE, GuardSettings
-from maasi_drivers.links.command_publisher import CommandPublisher
+from maasi_drivers.links.topic_link import CommandPublisher
+from maasi_drivers.settings.driver import LOCKSTEP_LEASE, GuardSettings
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import liveliness_reader
 from maasi_filter.ros.run_node import run

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from maasi_drivers.agent.agent_driver import AgentDriver
-from maasi_drivers.agent.ranging_input import RangingInput
+from maasi_drivers.agent.sensor_input import RangingInput
 from maasi_drivers.links.mavlink.mavlink_robot_link import MavlinkRobotLink
 from maasi_drivers.links.topic_link import TopicLink
 from maasi_filter.ros.run_node import run

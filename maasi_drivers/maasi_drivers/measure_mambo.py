@@ -1,16 +1,269 @@
-"""A command that measures how fast a Mambo flies at its largest tilt: `mambo.full_speed`."""
+"""A command that measures how fast a Mambo flies at its largest tilt: `mambo.full_speed`.
+
+Each leg is the largest tilt one way and then the other for the same time T, from rest. Without
+drag a leg is g tan(tilt) T^2 long and ends at rest; with drag it is shorter, so that its length is
+bounded in advance for any drone. Then it hovers, and flies back.
+"""
 
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 
-from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
-from maasi_drivers.links.mambo.settings import LEAST_TILT, MOST_TILT
-from maasi_drivers.links.mambo.speed_measurement import MeasurementError, MeasuringFlight, fit_speed
+import numpy as np
+
+from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError, PositionEvent
+from maasi_drivers.links.mambo.reckoning import Course, TiltModel
+from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT
+from maasi_filter.arrays import FloatArray
+
+# Rest before each leg: the first part for the firmware to stop it [s].
+_REST, _STOPPING = 3.0, 1.8
+# Above this multiple of the planned distance it has not followed the command.
+_EXCESS = 1.5
+# Longest silence, and longest waits for take-off and connection [s].
+_SILENCE, _PATIENCE = 1.5, 15.0
+_LEAST_BATTERY = 0.2
+# Largest residual of a fit [m], and relative uncertainty of the speed [1].
+_MOST_MISFIT, _MOST_DOUBT = 0.05, 0.35
+# Drag [1/s] and delay [s] that are searched.
+_LEAST, _MOST = (0.05, 0.0), (20.0, 0.9)
+
+
+class MeasurementError(RuntimeError):
+    """The measurement failed; the text has the cause."""
+
+
+@dataclass(frozen=True)
+class MeasuredSpeed:
+    """Result of a measuring flight.
+
+    Attributes
+    ----------
+    full_speed : float
+        Steady speed at the largest tilt [m/s].
+    delay : float
+        From a command until the position shows it [s].
+    doubt : float
+        Standard deviation of `full_speed`, as a share of it [1].
+    misfit : float
+        Root mean square of what the fit leaves [m].
+    """
+
+    full_speed: float
+    delay: float
+    doubt: float
+    misfit: float
+
+
+@dataclass
+class Leg:
+    """One leg: from rest, one way and back.
+
+    Attributes
+    ----------
+    begin : float
+        Monotonic clock [s].
+    origin : float
+        Where it rested, forward of the take-off point [m].
+    tilts : list of (float, float)
+        Time of the command since `begin` [s], share of the largest tilt forward [1].
+    events : list of (float, float)
+        Time since `begin` [s], place forward of the take-off point [m].
+    """
+
+    begin: float
+    origin: float
+    tilts: list[tuple[float, float]] = field(default_factory=list)
+    events: list[tuple[float, float]] = field(default_factory=list)
+
+
+class MeasuringFlight:
+    """Flies the legs.
+
+    Parameters
+    ----------
+    link : MamboLink
+        To the drone, which stands on the floor.
+    way : float
+        That a leg may take at most [m].
+    legs : int
+        How many.
+    clock : callable
+        Monotonic clock [s].
+
+    Attributes
+    ----------
+    legs : list of Leg
+        Those flown.
+    """
+
+    def __init__(self, link: MamboLink, way: float, legs: int, clock: Callable[[], float]) -> None:
+        self.link = link
+        self.way = way
+        self.number = legs
+        self.clock = clock
+        self.legs: list[Leg] = []
+        #: Of one tilt [s].
+        self.time = math.sqrt(way / (9.81 * math.tan(link.tilt)))
+        self._event: PositionEvent | None = None
+
+    def steps(self) -> Iterator[str]:
+        """Take off and fly; yield, every control period, what it does. Landing is the caller's.
+
+        Raises
+        ------
+        MeasurementError
+            If the flight has to be aborted.
+        """
+        link = self.link
+        yield from self._await('connecting', lambda: link.connected)
+        yield from self._await(
+            'waiting for its state',
+            lambda: (
+                link.flying_state == 'landed' and link.battery >= 0.0 and link.position is not None
+            ),
+        )
+        self._check_battery()
+        link.take_off()
+        yield from self._await('taking off', lambda: link.flying_state in ('hovering', 'flying'))
+        for number in range(self.number):
+            yield from self._fly_leg(1.0 if number % 2 == 0 else -1.0)
+
+    def _check_battery(self) -> None:
+        if self.link.battery < _LEAST_BATTERY:
+            raise MeasurementError(
+                f'battery: read {self.link.battery:.2f}, allowed is {_LEAST_BATTERY} or more'
+            )
+
+    def _await(self, what: str, condition: Callable[[], bool]) -> Iterator[str]:
+        end = self.clock() + _PATIENCE
+        while not condition():
+            if self.clock() > end:
+                raise MeasurementError(
+                    f'{what}: {self.link.error or self.link.flying_state or "nothing heard"} after '
+                    f'{_PATIENCE:g} s'
+                )
+            self.link.keep_alive()
+            yield what
+
+    def _fly_leg(self, sign: float) -> Iterator[str]:
+        begin = self.clock()
+        rests: list[float] = []
+        while (passed := self.clock() - begin) < _REST or not rests:
+            event = self._look()
+            if event is not None and passed > _STOPPING:
+                rests.append(float(event.position[0]))
+            self.link.steer(0.0, 0.0, 0.0, 0.0)
+            yield 'hovering'
+        leg = Leg(self.clock(), float(np.mean(rests)))
+        while (passed := self.clock() - leg.begin) < 2.0 * self.time:
+            share = sign if passed < self.time else -sign
+            if not leg.tilts or leg.tilts[-1][1] != share:
+                leg.tilts.append((passed, share))
+            event = self._look()
+            if event is not None:
+                leg.events.append((event.received - leg.begin, float(event.position[0])))
+            self.link.steer(share, 0.0, 0.0, 0.0)
+            yield f'leg {len(self.legs) + 1} of {self.number}'
+        self.legs.append(leg)
+        self.link.steer(0.0, 0.0, 0.0, 0.0)
+
+    def _look(self) -> PositionEvent | None:
+        """Check the link; return a new position event, or None."""
+        link, now = self.link, self.clock()
+        link.keep_alive()
+        event = link.position
+        if event is None or now - event.received > _SILENCE or now - link.heard_at > _SILENCE:
+            raise MeasurementError(f'link: no position for {_SILENCE} s')
+        if link.error:
+            raise MeasurementError(link.error)
+        self._check_battery()
+        if link.flying_state not in ('hovering', 'flying'):
+            raise MeasurementError(f'the drone is {link.flying_state}, allowed is that it flies')
+        if event is self._event:
+            return None
+        self._event = event
+        far = float(np.hypot(*event.position[:2]))
+        if far > _EXCESS * self.way:
+            raise MeasurementError(
+                f'position: read {far:.2f} m from where it took off, allowed are '
+                f'{_EXCESS * self.way:.2f} m'
+            )
+        return event
+
+
+def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
+    """Return speed and delay that explain the legs best, by least squares.
+
+    Parameters
+    ----------
+    legs : list of Leg
+        Those flown.
+    tilt : float
+        The largest [rad].
+
+    Raises
+    ------
+    MeasurementError
+        If the events are too few, or do not fit, or leave the speed open.
+    """
+    from scipy.optimize import least_squares
+
+    if sum(len(leg.events) for leg in legs) < 6:
+        raise MeasurementError('position events: read fewer than 6, allowed are 6 or more')
+
+    def left(parameters: FloatArray) -> FloatArray:
+        drag, delay = parameters.tolist()
+        model = TiltModel(tilt, 9.81 * math.tan(tilt) / drag, 1.0, 1.0)
+        return np.array(
+            [
+                place - leg.origin - _way(model, leg.tilts, passed - delay)
+                for leg in legs
+                for passed, place in leg.events
+            ]
+        )
+
+    fit = min(
+        (
+            least_squares(left, [drag, 0.2], bounds=(_LEAST, _MOST), x_scale=(drag, 0.1))
+            for drag in (0.3, 3.0)
+        ),
+        key=lambda fit: float(fit.cost),
+    )
+    drag, delay = fit.x.tolist()
+    misfit = math.sqrt(2.0 * fit.cost / len(fit.fun))
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * 2.0 * fit.cost / max(len(fit.fun) - 2, 1)
+    doubt = math.sqrt(covariance[0, 0]) / drag
+    if misfit > _MOST_MISFIT:
+        raise MeasurementError(
+            f'misfit: read {misfit:.3f} m, allowed is {_MOST_MISFIT} m: it does not fly as one '
+            'that is told tilts (draught? a floor without texture?)'
+        )
+    if doubt > _MOST_DOUBT or not _LEAST[0] * 1.01 < drag < _MOST[0] / 1.01:
+        raise MeasurementError(
+            f'speed: known to {100.0 * doubt:.0f} per cent, allowed are {100.0 * _MOST_DOUBT:.0f}: '
+            'fly more legs or a longer way'
+        )
+    return MeasuredSpeed(9.81 * math.tan(tilt) / drag, delay, doubt, misfit)
+
+
+def _way(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> float:
+    """Return the way forward at a time of a leg, by tilts that act at once [m]."""
+    course = Course(np.zeros(3), np.zeros(3), 0.0)
+    ends = [begin for begin, _ in tilts[1:]] + [math.inf]
+    for (begin, share), end in zip(tilts, ends, strict=True):
+        h = min(passed, end) - begin
+        if h > 0.0:
+            course = model.advance(course, np.array([share, 0.0, 0.0, 0.0]), h)
+    return float(course.position[0])
+
 
 _PERIOD = 0.05
 # Longest wait for it to land [s].

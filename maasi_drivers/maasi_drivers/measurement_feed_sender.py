@@ -11,8 +11,8 @@ import time
 
 from pydantic import ValidationError
 
-from maasi_drivers.vision.camera_settings import SegmentationSettings
-from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
+from maasi_drivers.settings.camera import SegmentationSettings
+from maasi_drivers.vision.images import ImageSourceError, VideoSource
 from maasi_drivers.vision.measurement_feed import MOST, FeedPacket, encode
 from maasi_drivers.vision.segmentation import segment
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from maasi_drivers.agent.driver_settings import DRIVERS
+from maasi_drivers.settings.driver import DRIVERS
 from maasi_filter.plugins import PluginError, add_folders
 
 _USAGE = """usage: plugin_driver [--check] NAME [FOLDER ...] [--ros-args ...]

@@ -2,7 +2,7 @@
 
 import itertools
 
-from maasi_drivers.agent.arrival_clock import ArrivalClock
+from maasi_drivers.agent.robot_node import ArrivalClock
 
 
 def test_before_the_time_begins_there_is_no_stamp():

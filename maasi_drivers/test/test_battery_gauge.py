@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from maasi_drivers.agent.battery_gauge import BatteryReadings, charge_of
+from maasi_drivers.agent.battery import BatteryReadings, charge_of
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ import pytest
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
+from maasi_drivers.settings.camera import CameraSettings, load_calibration
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import CameraSettings, load_calibration
 
 K = [250.0, 0.0, 81.0, 0.0, 251.0, 62.0, 0.0, 0.0, 1.0]
 D = [-0.2, 0.05, 0.001, -0.002, 0.0]

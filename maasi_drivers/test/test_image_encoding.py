@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from maasi_drivers.vision.image_encoding import COLOUR_ENCODINGS, image_to_array
+from maasi_drivers.vision.images import COLOUR_ENCODINGS, image_to_array
 
 CHANNELS = {'rgb8': 'RGB', 'bgr8': 'BGR', 'rgba8': 'RGBA', 'bgra8': 'BGRA'}
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from maasi_drivers.agent.measurement_queue import Frame, MeasurementQueue, MeasurementRequest
+from maasi_drivers.agent.measurement_responder import Frame, MeasurementQueue, MeasurementRequest
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_filter.models.pose import Pose
 

@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.ranging_mount import RangingMount, RangingSettings
+from maasi_drivers.agent.sensor_input import RangingMount
+from maasi_drivers.settings.driver import RangingSettings
 from maasi_drivers.vision.camera_model import rotation_from_rpy
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings

@@ -11,8 +11,7 @@ from pydantic import ValidationError
 from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.agent.sensor_reading import SensorReading
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
-from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_drivers.vision.marker_reading import read_markers
+from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers
 from maasi_filter.arrays import FloatArray
 from maasi_filter.make_filter import make_filter
 from maasi_filter.metrics import match_targets

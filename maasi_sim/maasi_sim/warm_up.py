@@ -11,7 +11,7 @@ from typing import Any
 
 import maasi_filter
 import maasi_planner
-from maasi_drivers.warm_up import warm_up as warm_up_drivers
+from maasi_drivers.vision.marker_detector import warm_up as warm_up_drivers
 from maasi_planner.settings import PLANNERS
 from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.scenario.loading import load_scenario

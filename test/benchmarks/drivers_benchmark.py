@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import CameraSettings
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings

@@ -17,9 +17,9 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import KINDS, TURTLEBOT, Team, parameters_of
 
-from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.settings.camera import CameraSettings
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import CameraSettings
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_filter.ros.parameters import flatten

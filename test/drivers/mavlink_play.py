@@ -3,10 +3,9 @@
 import numpy as np
 
 from maasi_drivers.links.mavlink.link import make_sender
-from maasi_drivers.links.mavlink.phase import Phase
 from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
-from maasi_drivers.links.mavlink.vehicle import Vehicle
+from maasi_drivers.links.mavlink.vehicle import Phase, Vehicle
+from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from maasi_drivers.links.mambo.link import PositionEvent
 from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
-from maasi_drivers.links.mambo.settings import MamboSettings
-from maasi_drivers.links.mambo.speed_measurement import MeasuredSpeed, MeasuringFlight, fit_speed
+from maasi_drivers.measure_mambo import MeasuredSpeed, MeasuringFlight, fit_speed
+from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
 from maasi_planner.settings import MotionSettings

@@ -20,7 +20,7 @@ from robot_team import (
 )
 from sensor_msgs.msg import CameraInfo
 
-from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.conversions import pose_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import (

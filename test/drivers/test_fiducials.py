@@ -6,8 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_drivers.vision.marker_reading import read_markers
+from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import SensorSettings
 

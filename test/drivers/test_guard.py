@@ -14,7 +14,7 @@ from action_msgs.srv import CancelGoal
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import KINDS, Team, numbers, start_guard
 
-from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.parameters import flatten
 
 HANGING = Path(__file__).parent / 'hanging_driver.py'

@@ -10,7 +10,7 @@ from waiting import wait_until
 
 from maasi_drivers.links.mambo.link import MamboLink
 from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
-from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
 from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware

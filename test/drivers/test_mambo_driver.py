@@ -19,15 +19,15 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, parameters_of, rendered
 from waiting import wait_until
 
-from maasi_drivers.agent.arm_permission import UNTIL_ARM
-from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.agent.watchdog import PERIOD as WATCH_PERIOD
 from maasi_drivers.links.mambo.mambo_robot_link import _POLL_PERIOD
-from maasi_drivers.links.mambo.settings import MamboSettings
 from maasi_drivers.mambo_driver import MamboDriver
+from maasi_drivers.settings.driver import DriverSettings
+from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
-from maasi_drivers.vision.blobs import Blobs
 from maasi_drivers.vision.camera_model import Camera
+from maasi_drivers.vision.detector import Blobs
 from maasi_drivers.vision.measurement_feed import FeedPacket
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import pose_to_ros, stamp_from_ros, stamp_to_ros

@@ -11,10 +11,10 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import MAMBO, Team, parameters_of
 from waiting import wait_until
 
-from maasi_drivers.agent.arm_permission import UNTIL_ARM
-from maasi_drivers.links.waypoint_orders import Order, OrderError, OrderKind
-from maasi_drivers.links.waypoint_orders import decode as decode_order
-from maasi_drivers.links.waypoint_orders import encode as encode_order
+from maasi_drivers.agent.flight_rules import UNTIL_ARM
+from maasi_drivers.links.mambo.onboard_link import Order, OrderError, OrderKind
+from maasi_drivers.links.mambo.onboard_link import decode as decode_order
+from maasi_drivers.links.mambo.onboard_link import encode as encode_order
 from maasi_drivers.mambo_onboard_driver import MamboOnboardDriver
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.measurement_feed import FeedError, FeedPose, FeedState, decode, encode
@@ -199,7 +199,7 @@ def test_a_driver_that_hangs_is_a_drone_that_hovers_then_lands(fly):
 
 
 def packet(**pose):
-    from maasi_drivers.vision.blobs import Blobs
+    from maasi_drivers.vision.detector import Blobs
     from maasi_drivers.vision.measurement_feed import FeedPacket
 
     none = Blobs(

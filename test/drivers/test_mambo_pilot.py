@@ -7,12 +7,11 @@ import pytest
 from numpy.testing import assert_allclose
 from simulated_mambo import FENCE, HOME, STEP, TILT, Flight, full_speed, measure_and_fly
 
-from maasi_drivers.agent.arm_permission import UNTIL_ARM
+from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.links.mambo.link import PositionEvent
 from maasi_drivers.links.mambo.pilot import MamboPilot, Phase
-from maasi_drivers.links.mambo.reckoning import DeadReckoning
-from maasi_drivers.links.mambo.settings import MamboSettings
-from maasi_drivers.links.mambo.tilt_model import Course, TiltModel
+from maasi_drivers.links.mambo.reckoning import Course, DeadReckoning, TiltModel
+from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_sim.emulators.mambo.firmware import FlyingState
 

@@ -19,14 +19,14 @@ from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
 
-from maasi_drivers.agent import battery_watch
-from maasi_drivers.agent.arm_permission import UNTIL_ARM
-from maasi_drivers.agent.driver_settings import DriverSettings
-from maasi_drivers.agent.robot_stop import STOPPED as STOPPED_BY_SERVICE
+from maasi_drivers.agent import battery
+from maasi_drivers.agent.agent_driver import STOPPED as STOPPED_BY_SERVICE
+from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.links.mavlink.mavlink_robot_link import _POLL_PERIOD
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
 from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
 from maasi_drivers.mavlink_driver import MavlinkDriver
+from maasi_drivers.settings.driver import DriverSettings
+from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.models.pose import Pose, compose
 from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
@@ -499,7 +499,7 @@ def test_the_pilot_takes_over_and_keeps_it(fly, capfd):
 
 
 def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
-    monkeypatch.setattr(battery_watch, '_PATIENCE', 2.5)
+    monkeypatch.setattr(battery, '_PATIENCE', 2.5)
     flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
     # One that stays the same has been heard all the same.
     begin = time.monotonic()

@@ -9,20 +9,20 @@ from mavlink_play import FIRMWARES, HEIGHTS, Play, mavlink
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
-from maasi_drivers.agent.arm_permission import UNTIL_ARM
-from maasi_drivers.links.mavlink import flight_origin
-from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, identify
-from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
-from maasi_drivers.links.mavlink.frames import (
+from maasi_drivers.agent.flight_rules import UNTIL_ARM
+from maasi_drivers.links.mavlink import estimate
+from maasi_drivers.links.mavlink.estimate import (
+    FlightOrigin,
     swap_enu_ned,
     swap_flu_frd,
     swap_orientation,
     swap_yaw,
 )
+from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER, identify
 from maasi_drivers.links.mavlink.link import make_sender
-from maasi_drivers.links.mavlink.phase import Phase
-from maasi_drivers.links.mavlink.report_log import ReportLog
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.links.mavlink.protocol import ReportLog
+from maasi_drivers.links.mavlink.vehicle import Phase
+from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 
 # What the robot may take until it has stopped [s], and what counts as that [m/s].
@@ -480,7 +480,7 @@ def test_an_origin_of_another_time_or_map_is_not_used(tmp_path, change, monkeypa
     elif change == 'ground':
         settings = MavlinkSettings(origin='here', ground=0.5)
     elif change == 'host':
-        monkeypatch.setattr(flight_origin, '_host_boot', lambda: 'another')
+        monkeypatch.setattr(estimate, '_host_boot', lambda: 'another')
     else:
         path.write_text(path.read_text()[:-9])
     assert FlightOrigin(settings, start, path, log).find(here, booted, True) is None

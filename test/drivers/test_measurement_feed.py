@@ -16,9 +16,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from waiting import PATIENCE, wait_until
 
 from maasi_drivers.measurement_feed_sender import main
-from maasi_drivers.vision.blobs import Blobs
-from maasi_drivers.vision.camera_settings import SegmentationSettings
-from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
+from maasi_drivers.settings.camera import SegmentationSettings
+from maasi_drivers.vision.detector import Blobs
+from maasi_drivers.vision.images import ImageSourceError, VideoSource
 from maasi_drivers.vision.measurement_feed import (
     FeedError,
     FeedPacket,

@@ -15,7 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import Team, parameters_of, rendered, stamped
 
 from maasi_drivers.agent.agent_driver import AgentDriver
-from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.camera_input import CameraInput
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_from_ros, stamp_from_ros

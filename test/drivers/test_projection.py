@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 from marker_view import sees_whole
 from numpy.testing import assert_allclose
 
-from maasi_drivers.vision.camera_model import Camera, rotation_from_rpy
-from maasi_drivers.vision.camera_settings import CameraSettings
-from maasi_drivers.vision.camera_view import box_view_margin
-from maasi_drivers.vision.projection import propagate, range_bearing
+from maasi_drivers.settings.camera import CameraSettings
+from maasi_drivers.vision.camera_model import Camera, box_view_margin, rotation_from_rpy
+from maasi_drivers.vision.marker_detector import propagate, range_bearing
 from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
 from maasi_filter.models.pose import Pose
 

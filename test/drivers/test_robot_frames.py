@@ -16,9 +16,9 @@ from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from maasi_drivers.agent.driver_settings import DriverSettings
-from maasi_drivers.agent.pose_speed import PoseSpeed
+from maasi_drivers.agent.odometry import PoseSpeed
 from maasi_drivers.agent.transform_buffer import TransformBuffer
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose, compose, inverse

@@ -5,7 +5,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_array_equal
 
-from maasi_drivers.agent.robot_stop import STOPPED
+from maasi_drivers.agent.agent_driver import STOPPED
 from maasi_msgs.msg import AgentState
 
 

@@ -17,9 +17,9 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, image_message, numbers, start_guard
 from sensor_msgs.msg import BatteryState
 
-from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.agent.watchdog import PERIOD as WATCH_PERIOD
 from maasi_drivers.guard_node import _STOP_PERIOD
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 from maasi_msgs.msg import AgentState, BatchMember, MeasurementBatch
@@ -218,7 +218,7 @@ def test_a_goal_before_any_odometry_is_refused(play, capfd):
 
 
 def test_a_minimum_without_a_charge_is_warned_of(play, monkeypatch):
-    monkeypatch.setattr('maasi_drivers.agent.battery_watch._PATIENCE', 0.3)
+    monkeypatch.setattr('maasi_drivers.agent.battery._PATIENCE', 0.3)
     driver, team = play(battery_minimum=0.2)
     team.until(lambda: team.move() or 'battery' in driver._warned)
     # An unknown charge does not end what a low one began.

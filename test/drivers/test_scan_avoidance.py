@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from maasi_drivers.agent.driver_settings import ScanSettings
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.scan_avoidance import ScanUnicycle, scan_points
+from maasi_drivers.agent.scan_input import ScanUnicycle, scan_points
+from maasi_drivers.settings.driver import ScanSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
 from maasi_planner.obstacles import Obstacles

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pydantic import ValidationError
 from scipy import ndimage
 
-from maasi_drivers.vision.camera_settings import SegmentationSettings
+from maasi_drivers.settings.camera import SegmentationSettings
 from maasi_drivers.vision.segmentation import paper_mask, segment
 
 PAPER = SegmentationSettings(rule='paper')

@@ -8,9 +8,9 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose
 
-from maasi_drivers.agent.driver_settings import DriverSettings
 from maasi_drivers.calibrate_sensor import main
 from maasi_drivers.calibration.sensor_calibration import Observation, sensor_noise
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import SensorSettings

@@ -11,13 +11,13 @@ from numpy.testing import assert_allclose
 from simulated_mambo import TILT, Flight, full_speed, measure
 from waiting import wait_until
 
-from maasi_drivers.links.mambo.speed_measurement import (
+from maasi_drivers.measure_mambo import (
     Leg,
     MeasurementError,
     MeasuringFlight,
     fit_speed,
+    main,
 )
-from maasi_drivers.measure_mambo import main
 from maasi_filter.models.pose import Pose
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
 from maasi_sim.emulators.mambo.firmware import FlyingState, MamboFirmware

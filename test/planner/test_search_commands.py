@@ -6,7 +6,7 @@ import sys
 import pytest
 from driven_team import driven
 
-from maasi_drivers.agent.robot_stop import STOPPED
+from maasi_drivers.agent.agent_driver import STOPPED
 from maasi_msgs.msg import AgentState
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.search_command import wanted

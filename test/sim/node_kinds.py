@@ -6,12 +6,12 @@ from typing import Any
 import yaml
 from rclpy.parameter import Parameter
 
-from maasi_drivers.agent.driver_settings import DriverSettings, GuardSettings
 from maasi_drivers.guard_node import GuardNode
 from maasi_drivers.mambo_driver import MamboDriver
 from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
 from maasi_drivers.mavlink_driver import MavlinkDriver
 from maasi_drivers.ranging_driver import RangingDriver
+from maasi_drivers.settings.driver import DriverSettings, GuardSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings

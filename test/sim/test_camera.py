@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pydantic import ValidationError
 
+from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import CameraSettings
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.world.camera import CameraRenderer

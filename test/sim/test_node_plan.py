@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from maasi_drivers.agent.driver_settings import DriverSettings
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.node_settings import PlannerNodeSettings

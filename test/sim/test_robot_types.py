@@ -2,8 +2,7 @@
 
 import pytest
 
-from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_view import box_view_margin
+from maasi_drivers.vision.camera_model import Camera, box_view_margin
 from maasi_sim.scenario.loading import config_folder, scenario_from_values
 from maasi_sim.search import search
 

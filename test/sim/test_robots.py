@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from maasi_drivers.agent.odometry import MapOdometry
-from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings, SensorSettings

@@ -23,7 +23,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from waiting import wait_until
 
 from maasi_drivers.links.mavlink.link import VehicleLink
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import pose_to_ros
 from maasi_filter.ros.qos import LATCHED, RELIABLE

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.system
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 SLOW = """
 from maasi_drivers.agent.agent_driver import AgentDriver
-from maasi_drivers.agent.ranging_input import RangingInput
+from maasi_drivers.agent.sensor_input import RangingInput
 from maasi_drivers.links.topic_link import TopicLink
 
 
@@ -28,7 +28,7 @@ class SlowDriver(AgentDriver):
 """
 BLIND = """
 from maasi_drivers.agent.agent_driver import AgentDriver
-from maasi_drivers.agent.ranging_input import RangingInput
+from maasi_drivers.agent.sensor_input import RangingInput
 from maasi_drivers.agent.sensor_reading import Sweep
 from maasi_drivers.links.topic_link import TopicLink
 

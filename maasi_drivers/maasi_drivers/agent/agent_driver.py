@@ -7,25 +7,22 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from std_srvs.srv import Trigger
 
-from maasi_drivers.agent.battery_watch import BatteryWatch
+from maasi_drivers.agent.battery import BatteryWatch
 from maasi_drivers.agent.goal_server import GoalServer
-from maasi_drivers.agent.health import FROZEN_POSE, ODOMETRY, STOP
 from maasi_drivers.agent.measurement_responder import MeasurementResponder
-from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.pose_speed import PoseSpeed
+from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.pose_topic import PoseTopic
 from maasi_drivers.agent.robot_frames import RobotFrames
-from maasi_drivers.agent.robot_node import RobotNode
-from maasi_drivers.agent.robot_stop import STOPPED, RobotStop
+from maasi_drivers.agent.robot_link import RobotLink
+from maasi_drivers.agent.robot_node import FROZEN_POSE, ODOMETRY, STOP, RobotNode
 from maasi_drivers.agent.sensor_input import SensorInput
-from maasi_drivers.agent.state_publisher import StatePublisher
-from maasi_drivers.agent.watchdog import PERIOD, Watchdog
+from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
-from maasi_drivers.links.robot_link import RobotLink
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import stamp_from_ros
-from maasi_filter.ros.lifecycle_node import SettingsError
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.run_node import run as run_node
 from maasi_msgs.msg import LockstepStep
 from maasi_planner.motion import RobotState
@@ -328,3 +325,48 @@ def run(
     """
     links = link if isinstance(link, Mapping) else {'topics': link}
     return run_node(lambda: AgentDriver(links, sensor), arguments, AgentDriver)
+
+
+# Reason in `state` while it is latched.
+STOPPED = 'stopped by the service stop, until the service release is called'
+
+
+class RobotStop:
+    """A latched stop.
+
+    It outlives *cleanup* and *configure* of its node, but not its process.
+
+    Parameters
+    ----------
+    on_stop, on_release : callable
+        Called after the service.
+
+    Attributes
+    ----------
+    latched : bool
+        Whether the stop is in force.
+    """
+
+    def __init__(self, on_stop: Callable[[], None], on_release: Callable[[], None]) -> None:
+        self.latched = False
+        self._on_stop = on_stop
+        self._on_release = on_release
+
+    def offer(self, node: LockstepLifecycleNode[Any]) -> None:
+        """Offer the services `stop` and `release` (std_srvs/Trigger) of a node."""
+        node.offer_service('stop', self._stop)
+        node.offer_service('release', self._release)
+
+    def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.latched = True
+        self._on_stop()
+        response.success = True
+        response.message = 'the robot is stopped; it takes no goals until release'
+        return response
+
+    def _release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        response.message = 'the robot takes goals' if self.latched else 'the robot was not stopped'
+        self.latched = False
+        self._on_release()
+        return response

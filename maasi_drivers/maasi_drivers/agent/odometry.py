@@ -1,16 +1,16 @@
-"""Odometry in the map: a robot's own odometry placed by its initial pose, and poses at a stamp."""
+"""Odometry placed in the map, velocities from poses, and poses at a stamp. Without ROS."""
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class StampedPose:
 
     stamp: int
     pose: Pose
-    covariance: Array
-    velocity: Array
-    angular_velocity: Array
+    covariance: FloatArray
+    velocity: FloatArray
+    angular_velocity: FloatArray
 
 
-def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     array = np.array(value, dtype=float)
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(
@@ -120,7 +120,7 @@ def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedP
         return second
     part = (stamp - first.stamp) / (second.stamp - first.stamp)
 
-    def mix(a: Array, b: Array) -> Array:
+    def mix(a: FloatArray, b: FloatArray) -> FloatArray:
         return (1.0 - part) * a + part * b
 
     a, b = first.pose.orientation, second.pose.orientation
@@ -194,3 +194,40 @@ class PoseHistory:
         if index == 0:
             return None
         return interpolate(self._poses[index - 1], self._poses[index], stamp)
+
+
+# Longest time over which a difference is a velocity [ns].
+_LONGEST = 1_000_000_000
+# Faster than this is a jump of the pose, not a movement [m/s, rad/s].
+_FASTEST = 50.0
+
+
+class PoseSpeed:
+    """Differences of poses over time."""
+
+    def __init__(self) -> None:
+        self._before: tuple[int, Pose] | None = None
+
+    def place(self, stamp: int, pose: Pose) -> StampedPose:
+        """Return a pose with velocities by the difference from the one before; zero at first.
+
+        Parameters
+        ----------
+        stamp : int
+            [ns].
+        pose : Pose
+            In the map.
+        """
+        velocity, turning = np.zeros(3), np.zeros(3)
+        before, self._before = self._before, (stamp, pose)
+        if before is not None and 0 < stamp - before[0] < _LONGEST:
+            period = 1e-9 * (stamp - before[0])
+            velocity = (pose.position - before[1].position) / period
+            change = compose(inverse(before[1]), pose).orientation
+            change = change if change[0] >= 0.0 else -change
+            half = float(np.linalg.norm(change[1:]))
+            angle = 2.0 * math.atan2(half, float(change[0]))
+            turning = change[1:] * (angle / half if half > 0.0 else 2.0) / period
+            if max(np.linalg.norm(velocity), np.linalg.norm(turning)) > _FASTEST:
+                velocity, turning = np.zeros(3), np.zeros(3)
+        return StampedPose(stamp, pose, np.zeros((6, 6)), velocity, turning)

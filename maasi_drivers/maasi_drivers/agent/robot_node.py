@@ -3,23 +3,127 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from maasi_drivers.agent.arrival_clock import ArrivalClock
-from maasi_drivers.agent.driver_settings import DriverSettings
-from maasi_drivers.agent.health import BATTERY, STOP, Health
+from std_srvs.srv import Trigger
+
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
-from maasi_drivers.vision.measurement_feed import FeedPeer
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.clocks import JUMP, Silence, StampGate
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 
+# Length of the window of observations [s].
+_WINDOW = 2.0
+# A lead that falls by more at once is a jump back of the node's time [ns].
+_JUMP = 1_000_000_000
+
+
+class ArrivalClock:
+    """The node's time at any instant of the steady clock.
+
+    Simulated time arrives in steps and late, so that its largest recent lead over the steady clock
+    is the true one. With system time the result is exact.
+    """
+
+    def __init__(self) -> None:
+        # Recent instants [s] and leads of the node's time [ns], with falling leads.
+        self._leads: deque[tuple[float, int]] = deque()
+
+    def observe(self, now: float, time: int) -> None:
+        """Note the node's time [ns] at an instant of the steady clock [s]; 0: it has not begun."""
+        leads = self._leads
+        if time <= 0:
+            leads.clear()
+            return
+        lead = time - round(now * 1e9)
+        if leads and lead < leads[-1][1] - _JUMP:
+            leads.clear()
+        while leads and leads[-1][1] <= lead:
+            leads.pop()
+        leads.append((now, lead))
+        while leads[0][0] < now - _WINDOW:
+            leads.popleft()
+
+    def stamp(self, instant: float) -> int | None:
+        """Return the node's time [ns] at an instant [s]; None while it has not begun."""
+        if not self._leads:
+            return None
+        time = round(instant * 1e9) + self._leads[0][1]
+        return time if time > 0 else None
+
+
+# Kinds of faults that every robot can have.
+ODOMETRY, FROZEN_POSE, SENSOR = 'odometry', 'frozen pose', 'sensor'
+BATTERY, STOP = 'battery', 'stop'
+
+
+class Health:
+    """The present faults of a robot; without any it can follow goals.
+
+    Parameters
+    ----------
+    on_fault : callable
+        Called with the text of each new fault.
+    """
+
+    def __init__(self, on_fault: Callable[[str], None]) -> None:
+        self._on_fault = on_fault
+        self._faults: dict[str, str] = {}
+
+    def __contains__(self, kind: str) -> bool:
+        return kind in self._faults
+
+    @property
+    def text(self) -> str:
+        """All faults; empty without any."""
+        return '; '.join(self._faults.values())
+
+    def get(self, kind: str) -> str:
+        """Return the text of a fault; empty if there is none of this kind."""
+        return self._faults.get(kind, '')
+
+    def begin(self, kind: str, text: str) -> bool:
+        """Set a fault, or the text of one that is set; return whether it is new.
+
+        Parameters
+        ----------
+        kind : str
+            To end it by.
+        text : str
+            The cause, for the planner.
+        """
+        new = kind not in self._faults
+        self._faults[kind] = text
+        if new:
+            self._on_fault(text)
+        return new
+
+    def end(self, kind: str) -> bool:
+        """Clear a fault; return whether it was set."""
+        return self._faults.pop(kind, None) is not None
+
+
 _POSE_NAMES = {'odometry': 'odometry', 'tf': 'pose on tf', 'pose': 'pose'}
 
 
+@dataclass(frozen=True)
+class FeedPeer:
+    """The only sender of a measurement feed that is used: its address, and what takes its poses.
+
+    `on_pose` takes the stamp [ns] and the `FeedPose` of each image.
+    """
+
+    address: str
+    on_pose: Callable[[int, Any], None]
+
+
 class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
-    """The state that link, sensor and the parts of a driver share, and where they report to.
+    """Where link, sensor and parts of a driver meet: the state they share, what they report to.
 
     All of it is made anew in *configure*.
 
@@ -175,6 +279,32 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         if not self.active:
             return 'the driver is not active'
         return self.health.get(STOP) or self.health.get(BATTERY)
+
+    def offer_arm(self, arm: Callable[[], str], in_air: Callable[[], bool] = lambda: False) -> None:
+        """Offer the service `arm` (std_srvs/Trigger) of a robot that takes off.
+
+        Parameters
+        ----------
+        arm : callable
+            Gives the permission, or returns the reason of a refusal; empty where it is given.
+        in_air : callable
+            Whether it flies already, and is taken over.
+        """
+
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            problem = arm() if self.active else 'the driver is not active'
+            response.success = not problem
+            if problem:
+                response.message = problem
+                self.get_logger().warning(f'arm: refused: {problem}')
+                return response
+            response.message = 'it takes off as soon as it is ready'
+            if in_air():
+                response.message = 'it is in the air: it is taken over where it is'
+            self.get_logger().info(f'arm: {response.message}')
+            return response
+
+        self.offer_service('arm', answer)
 
     def _on_fault(self, text: str) -> None:
         self.end_goal(GoalStatus.ABORTED, text)

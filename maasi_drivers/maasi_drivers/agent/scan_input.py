@@ -1,18 +1,220 @@
-"""A ground robot's laser scan: placed in the map for its controller, and watched."""
+"""A ground robot's laser scan: placed in the map, avoided by a dynamic window, and watched."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
 from sensor_msgs.msg import LaserScan
 
-from maasi_drivers.agent.driver_settings import ScanSettings
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
-from maasi_drivers.agent.scan_avoidance import ScanUnicycle, scan_points
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
+from maasi_drivers.settings.driver import ScanSettings
+from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.qos import sensor_reader
 from maasi_planner.motion import RobotState
+from maasi_planner.motion.base import check_waypoints
+from maasi_planner.motion.dynamic_window import window_command
+from maasi_planner.motion.unicycle import Unicycle, as_tuple, five_states
+from maasi_planner.obstacles import Obstacles, is_clear, next_point
+from maasi_planner.settings import MotionSettings
+
+# Size of the cells in which points count as one [m].
+_CELL = 0.03
+# Number of headings that are tried where the straight way is blocked.
+_HEADINGS = 72
+# Cost of a change of the last heading, relative to that of a detour [1/rad].
+_STEADINESS = 0.3
+# Below this distance the robot touches the point, and may still leave it [m].
+_SKIN = 1e-3
+
+
+def scan_points(
+    ranges: ArrayLike,
+    angles: tuple[float, float],
+    limits: tuple[float, float],
+    seconds_per_beam: float,
+    placed: StampedPose,
+    mount: ArrayLike,
+) -> FloatArray:
+    """Return where the beams of a scan ended, (n, 2) in the map [m].
+
+    Parameters
+    ----------
+    ranges : array_like, shape (m,)
+        Infinite: nothing hit; not a number: no measurement [m].
+    angles : tuple of float
+        Of the first beam, and from one to the next, in the scanner's frame [rad].
+    limits : tuple of float
+        Smallest and largest range that is a measurement [m].
+    seconds_per_beam : float
+        From one beam to the next: the robot moves on meanwhile [s].
+    placed : StampedPose
+        Of the robot at the first beam.
+    mount : array_like, shape (3,)
+        x, y and heading of the scanner in the robot's frame [m, rad].
+
+    Raises
+    ------
+    ValueError
+        If the angles, limits or the time are not finite, or there is no beam.
+    """
+    distances = np.asarray(ranges, dtype=float)
+    fields = {
+        'angle_min': angles[0],
+        'angle_increment': angles[1],
+        'range_min': limits[0],
+        'range_max': limits[1],
+        'time_increment': seconds_per_beam,
+    }
+    for name, value in fields.items():
+        if not math.isfinite(value):
+            raise ValueError(f'{name}: read {value}, allowed are finite numbers')
+    if not len(distances):
+        raise ValueError('ranges: read none, allowed is at least one')
+    beams = np.flatnonzero(
+        np.isfinite(distances) & (distances >= limits[0]) & (distances <= limits[1])
+    )
+    x, y, turned = (float(value) for value in np.asarray(mount, dtype=float))
+    times = seconds_per_beam * beams
+    heading = placed.pose.yaw + placed.angular_velocity[2] * times
+    cosine, sine = np.cos(heading), np.sin(heading)
+    bearing = heading + turned + angles[0] + angles[1] * beams
+    hit = distances[beams]
+    origin, velocity = placed.pose.position, placed.velocity
+    return np.stack(
+        [
+            origin[0] + velocity[0] * times + cosine * x - sine * y + hit * np.cos(bearing),
+            origin[1] + velocity[1] * times + sine * x + cosine * y + hit * np.sin(bearing),
+        ],
+        axis=1,
+    )
+
+
+@njit(cache=True)
+def _is_free(x: float, y: float, heading: float, reach: float, circles: FloatArray) -> bool:
+    """Return whether a heading is free of circles for `reach` metres."""
+    end_x = x + reach * math.cos(heading)
+    end_y = y + reach * math.sin(heading)
+    return is_clear(x, y, 0.0, end_x, end_y, 0.0, circles, 0.0, False)
+
+
+@njit(cache=True)
+def way_around(
+    x: float,
+    y: float,
+    target_x: float,
+    target_y: float,
+    circles: FloatArray,
+    reach: float,
+    before: float,
+) -> tuple[float, float, float]:
+    """
+    Return a point to head for that is free for `reach` metres or up to the target, and its heading.
+
+    The target itself where the straight way is free, else the free heading that is nearest to it
+    and to the one chosen before (not a number: none was); the target where no heading is free.
+    """
+    dx = target_x - x
+    dy = target_y - y
+    away = math.hypot(dx, dy)
+    straight = math.atan2(dy, dx)
+    for part in (1.0, 0.5):
+        if _is_free(x, y, straight, part * min(away, reach), circles):
+            return target_x, target_y, straight
+        # Other headings, for the whole distance even if the target is nearer.
+        look = part * reach
+        best = np.inf
+        chosen = np.nan
+        for i in range(1, _HEADINGS):
+            turn = 2.0 * math.pi * i / _HEADINGS
+            if turn > math.pi:
+                turn -= 2.0 * math.pi
+            heading = straight + turn
+            cost = abs(turn)
+            if before == before:
+                change = heading - before
+                change -= 2.0 * math.pi * math.floor((change + math.pi) / (2.0 * math.pi))
+                cost += _STEADINESS * abs(change)
+            if cost < best and _is_free(x, y, heading, look, circles):
+                best = cost
+                chosen = heading
+        if best < np.inf:
+            return x + look * math.cos(chosen), y + look * math.sin(chosen), chosen
+    return target_x, target_y, np.nan
+
+
+class ScanUnicycle(Unicycle):
+    """A ground robot that keeps clear of known obstacles and of what its scanner sees.
+
+    Ways around known obstacles are planned; what is seen beside them is avoided locally, so that
+    the robot can get stuck in a pocket: the driver gives up a waypoint that gets no nearer.
+
+    Parameters
+    ----------
+    settings : MotionSettings
+        Limits of the robot.
+    obstacles : Obstacles
+        Known ones.
+    radius : float
+        Of the robot [m].
+    scan : ScanSettings
+        Distance of avoidance.
+    """
+
+    def __init__(
+        self, settings: MotionSettings, obstacles: Obstacles, radius: float, scan: ScanSettings
+    ) -> None:
+        super().__init__(settings, obstacles, radius)
+        self.scan = scan
+        self.points = np.zeros((0, 2))
+        self._heading = math.nan
+
+    def see(self, points: ArrayLike) -> None:
+        """Take the points (n, 2) of a scan in the map [m]; they replace those before."""
+        array = np.asarray(points, dtype=float).reshape(-1, 2)
+        _, first = np.unique(np.floor(array / _CELL), axis=0, return_index=True)
+        self.points = array[np.sort(first)]
+
+    def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
+        """See `MotionModel.command`."""
+        here = as_tuple(five_states(state))
+        x, y = here[:2]
+        away = np.hypot(self.points[:, 0] - x, self.points[:, 1] - y)
+        near = away <= self.scan.reach + self.keep_out.radius
+        if not near.any():
+            self._heading = math.nan
+            return super().command(state, waypoint)
+        goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
+        position, target = np.array([x, y, goal[2]]), np.empty(3)
+        left = next_point(
+            position,
+            goal,
+            self.keep_out.circles,
+            self.keep_out.vertices,
+            self._table(goal),
+            self.keep_out.clearance,
+            target,
+        )
+        seen = np.zeros((int(near.sum()), 5))
+        seen[:, :2] = self.points[near]
+        seen[:, 3] = np.minimum(
+            self.keep_out.radius + 0.5 * self.keep_out.clearance, away[near] - _SKIN
+        )
+        circles = np.concatenate([self.keep_out.circles, seen])
+        target_x, target_y, self._heading = way_around(
+            x, y, target[0], target[1], circles, self.scan.reach, self._heading
+        )
+        out = np.zeros(4)
+        out[0], out[3] = window_command(
+            here, target_x, target_y, left, self.limits, circles, self.keep_out.clearance
+        )
+        return out
+
 
 # Kind of fault.
 _SCAN = 'scan'

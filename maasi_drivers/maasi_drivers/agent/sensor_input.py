@@ -1,13 +1,23 @@
-"""A robot's sensor as its driver uses it, and what it reads at one instant."""
+"""A robot's sensor as its driver uses it, and a sensor of range, bearing and elevation."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import Generic, TypeVar
 
+import numpy as np
+
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
-from maasi_drivers.agent.sensor_reading import SensorReading
+from maasi_drivers.agent.sensor_reading import SensorReading, Sweep
+from maasi_drivers.settings.driver import RangingSettings
+from maasi_filter.arrays import FloatArray
+from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
+from maasi_filter.ros.conversions import label_problem, labels_of, stamp_from_ros
+from maasi_filter.ros.qos import sensor_reader
+from maasi_msgs.msg import RangeArray
 
 DataT = TypeVar('DataT')
 
@@ -55,3 +65,145 @@ class SensorInput(ABC, Generic[DataT]):
 
     def close(self) -> None:
         """Release what is no ROS entity; may be called more than once."""
+
+
+# Variance of an angle of which nothing is known, as of the bearing of what is straight below.
+_ANY_ANGLE = np.pi**2 / 3.0
+
+
+class RangingMount:
+    """Turns sweeps of a mounted sensor into measurements from the robot's position.
+
+    Parameters
+    ----------
+    settings : RangingSettings
+        Where it sits.
+    sensor : Sensor
+        Its measurement model and noise R; R is that of range, bearing and elevation in the
+        sensor's frame. In a planar search the elevation has the noise of the bearing.
+    """
+
+    def __init__(self, settings: RangingSettings, sensor: Sensor) -> None:
+        self._model = sensor.measurement
+        self._position = np.array(settings.position)
+        self._rotation = Pose.from_rpy([0.0, 0.0, 0.0], settings.rpy).rotation()
+        self._noise = np.zeros((3, 3))
+        d = sensor.dimension
+        self._noise[:d, :d] = sensor.covariance
+        if d == 2:
+            self._noise[2, 2] = sensor.covariance[1, 1]
+
+    def measurements(
+        self, sweep: FloatArray, pose: StampedPose
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what the robot measured.
+
+        Parameters
+        ----------
+        sweep : ndarray, shape (m, 3)
+            Slant range [m], bearing and elevation [rad] in the sensor's frame: x forward, y left.
+        pose : StampedPose
+            Of the robot at the sweep; the covariance of its orientation counts.
+
+        Returns
+        -------
+        values : ndarray, shape (m, d)
+            Range, bearing and, in 3D, elevation, axes of the map [m, rad].
+        covariances : ndarray, shape (m, d, d)
+            Of the values; the error of the robot's position is left to the filter.
+        positions : ndarray, shape (m, d)
+            Where that is [m, map].
+        """
+        d = self._model.dimension
+        if not len(sweep):
+            return np.zeros((0, d)), np.zeros((0, d, d)), np.zeros((0, d))
+        body = pose.pose.rotation()
+        ranges, bearings, elevations = sweep.T
+        cb, sb = np.cos(bearings), np.sin(bearings)
+        ce, se = np.cos(elevations), np.sin(elevations)
+        unit = np.stack([ce * cb, ce * sb, se], axis=1)
+        # Columns: by range, by bearing, by elevation.
+        slopes = np.stack(
+            [
+                unit,
+                ranges[:, None] * np.stack([-ce * sb, ce * cb, np.zeros_like(sb)], axis=1),
+                ranges[:, None] * np.stack([-se * cb, -se * sb, ce], axis=1),
+            ],
+            axis=2,
+        )
+        turn = body @ self._rotation
+        arms = self._position @ body.T + (ranges[:, None] * unit) @ turn.T
+        by_sweep = turn @ slopes
+        spread = by_sweep @ self._noise @ by_sweep.transpose(0, 2, 1)
+        # A small rotation about the map's axes moves a target by its cross product with the arm.
+        by_turn = _cross(-arms)
+        spread = spread + by_turn @ pose.covariance[3:, 3:] @ by_turn.transpose(0, 2, 1)
+        positions = (pose.pose.position + arms)[:, :d]
+        values = self._model.measure(positions, pose.pose)
+        slope = self._model.jacobian(positions, pose.pose)
+        covariances = slope @ spread[:, :d, :d] @ slope.transpose(0, 2, 1)
+        unknown = np.logical_not(np.any(slope, axis=2))
+        unknown[:, 0] = False
+        index = np.nonzero(unknown)
+        covariances[index[0], index[1], index[1]] = _ANY_ANGLE
+        return values, covariances, positions
+
+
+def _cross(vectors: FloatArray) -> FloatArray:
+    """Return the matrices (n, 3, 3) with which vectors (n, 3) take cross products."""
+    out = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    out[:, 0, 1], out[:, 0, 2] = -z, y
+    out[:, 1, 0], out[:, 1, 2] = z, -x
+    out[:, 2, 0], out[:, 2, 1] = -y, x
+    return out
+
+
+class RangingInput(SensorInput[Sweep]):
+    """A sensor that measures range and direction of what is near.
+
+    Subscribes
+    ----------
+    `ranges` (maasi_msgs/RangeArray); what its angles are relative to: `ranging.frame`
+    """
+
+    def set_up(self) -> None:
+        """Subscribe."""
+        driver, ranging = self.driver, self.driver.settings.ranging
+        self._mount = RangingMount(ranging, driver.sensor) if ranging.frame == 'body' else None
+        quality = sensor_reader(driver.settings.lockstep)
+        driver.create_subscription(RangeArray, 'ranges', self._on_ranges, quality)
+
+    def _on_ranges(self, message: RangeArray) -> None:
+        values = np.array(
+            [(item.range, item.bearing, item.elevation) for item in message.ranges], dtype=float
+        ).reshape(-1, 3)
+        if self._mount is None:
+            values = values[:, : self.driver.dimension]
+        limits = np.array([math.inf, math.pi, 0.5 * math.pi][: values.shape[1]]) + 1e-6
+        good = np.isfinite(values).all(axis=1) & (values[:, 0] >= 0.0)
+        good &= (np.abs(values) <= limits).all(axis=1)
+        if not good.all():
+            first = values[np.flatnonzero(~good)[0]].tolist()
+            self.driver.drop(
+                'range',
+                f'ranges: read {first}, allowed are a finite range from 0 [m], a bearing within pi '
+                'and an elevation within pi/2 [rad]',
+                int(np.count_nonzero(~good)),
+            )
+        labelled = np.array([label_problem(item) is None for item in message.ranges], dtype=bool)
+        if not labelled[good].all():
+            first = next(text for item in message.ranges if (text := label_problem(item)))
+            self.driver.drop('range', f'ranges: {first}', int(np.count_nonzero(~labelled[good])))
+            good &= labelled
+        labels = labels_of([item for item, kept in zip(message.ranges, good.tolist()) if kept])
+        sweep = Sweep(values[good], labels)
+        self.driver.take_frame('ranges', stamp_from_ros(message.header.stamp), sweep)
+
+    def detect(self, data: Sweep, pose: StampedPose) -> SensorReading:
+        """Return the measurements of one sweep, relative to the robot's position in the map."""
+        sensor = self.driver.sensor
+        if self._mount is None:
+            return SensorReading.of_sweep(data, sensor, pose.pose)
+        reading = SensorReading(*self._mount.measurements(data.values, pose), {}, data.labels)
+        return reading.in_field_of_view(sensor, pose.pose)

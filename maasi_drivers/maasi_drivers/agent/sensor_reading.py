@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -29,12 +27,12 @@ class Sweep:
     values: FloatArray
     labels: tuple[Label, ...] = ()
 
-    def only(self, keep: NDArray[np.bool_]) -> Sweep:
+    def only(self, keep: BoolArray) -> Sweep:
         """Return a copy with some of the returns."""
         return Sweep(self.values[keep], selected(self.labels, keep))
 
 
-def selected(labels: tuple[Label, ...], keep: NDArray[np.bool_]) -> tuple[Label, ...]:
+def selected(labels: tuple[Label, ...], keep: BoolArray) -> tuple[Label, ...]:
     """Return the labels where `keep` (m,) is true."""
     return tuple(label for label, kept in zip(labels, keep.tolist()) if kept)
 

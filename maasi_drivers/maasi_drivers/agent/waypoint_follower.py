@@ -8,11 +8,9 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import MotionModel, RobotState
-
-FloatArray = NDArray[np.float64]
 
 
 class GoalStatus(IntEnum):

@@ -10,29 +10,25 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.sensor_reading import SensorReading
-from maasi_drivers.vision.blobs import Blobs
-from maasi_drivers.vision.camera_settings import CameraSettings, load_calibration
-from maasi_drivers.vision.camera_view import box_view_margin
-from maasi_drivers.vision.image_encoding import decode_image, image_to_array
-from maasi_drivers.vision.image_source import ImageSourceError, VideoSource
-from maasi_drivers.vision.marker_detector import MarkerDetector
-from maasi_drivers.vision.marker_reading import read_markers
+from maasi_drivers.settings.camera import CameraSettings, load_calibration
+from maasi_drivers.vision.camera_model import box_view_margin
+from maasi_drivers.vision.detector import Blobs
+from maasi_drivers.vision.images import ImageSourceError, VideoSource, decode_image, image_to_array
+from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers, warm_up
 from maasi_drivers.vision.measurement_feed import FeedReceiver
-from maasi_drivers.warm_up import warm_up
+from maasi_filter.arrays import ImageArray
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.qos import RELIABLE, SENSOR, sensor_reader
 
-ImageArray = NDArray[np.uint8]
 # Decodes an image, or returns the blobs found on board; called only for images that answer a batch.
 Picture = Callable[[], ImageArray | Blobs]
 

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.settings.camera import CameraSettings
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-
-Array = NDArray[np.float64]
-
 
 # From optical axes (x right, y down, z forward) to REP-103 axes (x forward, y left, z up).
 _OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -20,7 +18,7 @@ _OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]
 _NEWTON_STEPS = 12
 
 
-def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:
     """Return the (3, 3) rotation Rz(yaw) Ry(pitch) Rx(roll); angles about fixed axes [rad]."""
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
     return np.array(
@@ -138,7 +136,7 @@ def _to_floor(points, by_pixel, centre, turn, origin, height):
     return positions, jacobian_pixel, jacobian_pose
 
 
-def _largest_radius(k: Array) -> float:
+def _largest_radius(k: FloatArray) -> float:
     """Normalised radius up to which the radial model grows, so that it can be inverted."""
     k1, k2, _, _, k3 = k
     roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0]) if np.any(k[[0, 1, 4]]) else np.empty(0)
@@ -146,7 +144,7 @@ def _largest_radius(k: Array) -> float:
     return float(np.sqrt(real.min())) if real.size else np.inf
 
 
-def _points(name: str, values: ArrayLike, columns: int) -> Array:
+def _points(name: str, values: ArrayLike, columns: int) -> FloatArray:
     points = np.atleast_2d(np.asarray(values, dtype=np.float64))
     if points.size == 0:
         return np.empty((0, columns))
@@ -175,10 +173,10 @@ class Camera:
 
     width: int
     height: int
-    matrix: Array
-    distortion: Array
-    position: Array
-    rotation: Array
+    matrix: FloatArray
+    distortion: FloatArray
+    position: FloatArray
+    rotation: FloatArray
     largest_radius: float = np.inf
 
     @classmethod
@@ -201,11 +199,11 @@ class Camera:
             largest_radius=_largest_radius(distortion),
         )
 
-    def centre(self, pose: Pose) -> Array:
+    def centre(self, pose: Pose) -> FloatArray:
         """Return the optical centre in the map frame, shape (3,) [m]."""
         return np.asarray(pose.position) + pose.rotation() @ self.position
 
-    def project(self, positions: ArrayLike, pose: Pose) -> Array:
+    def project(self, positions: ArrayLike, pose: Pose) -> FloatArray:
         """Project positions in the map frame to pixels (001, eq. (17)).
 
         Parameters
@@ -232,7 +230,7 @@ class Camera:
             )
         )
 
-    def undistort(self, pixels: ArrayLike) -> tuple[Array, Array]:
+    def undistort(self, pixels: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Invert intrinsics and distortion.
 
         Returns
@@ -249,7 +247,7 @@ class Camera:
 
     def back_project(
         self, pixels: ArrayLike, pose: Pose, height: float = 0.0
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Back-project pixels to the plane z = height (001, eq. (17) with z_w known).
 
         Parameters
@@ -282,7 +280,7 @@ class Camera:
         )
         return positions, jacobian_pixel, jacobian_pose
 
-    def margin(self, positions: ArrayLike, pose: Pose) -> Array:
+    def margin(self, positions: ArrayLike, pose: Pose) -> FloatArray:
         """Return how far inside the image positions (n, 3) are seen, shape (n,) [px].
 
         Negative outside, minus infinity where the camera cannot see at all.
@@ -301,3 +299,57 @@ class Camera:
             [[(self.width - 1) / 2.0, (self.height - 1) / 2.0]], pose, 0.0
         )
         return float(1.0 / np.sqrt(np.abs(np.linalg.det(by_pixel[0]))))
+
+
+# Points on the rim of a marker.
+_RIM_POINTS = 24
+
+
+def box_view_margin(
+    camera: Camera,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    robot_height: float,
+    marker_radius: float = 0.0,
+) -> float:
+    """Return how far inside the image a box field of view lies, markers at its rim included.
+
+    Parameters
+    ----------
+    camera : Camera
+        On the robot.
+    lower, upper : array_like, at least 2 values
+        Offsets of the box from the robot, in its frame, of which x and y are used [m].
+    robot_height : float
+        Height of the robot's origin over the floor [m].
+    marker_radius : float
+        Markers whose centre lies in the box must be seen as a whole [m].
+
+    Returns
+    -------
+    float
+        Smallest distance of the box to the image's border [px]; negative where a
+        part of the box is not seen, minus infinity where it lies behind the camera.
+
+    Raises
+    ------
+    ValueError
+        Where a bound is not finite, or a lower one is not below its upper one.
+    """
+    low = np.asarray(lower, dtype=np.float64)[:2]
+    high = np.asarray(upper, dtype=np.float64)[:2]
+    if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high)):
+        raise ValueError(
+            f'box field of view: got lower {low.tolist()}, upper {high.tolist()}, '
+            'allowed finite offsets with lower below upper'
+        )
+    along = np.linspace(0.0, 1.0, 33)[:, None]
+    corners = np.array([[low[0], low[1]], [high[0], low[1]], high, [low[0], high[1]]])
+    rim = np.concatenate(
+        [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0))]
+    )
+    angles = np.arange(_RIM_POINTS) * (2.0 * np.pi / _RIM_POINTS)
+    circle = marker_radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    outline = (rim[:, None, :] + circle).reshape(-1, 2)
+    outline = np.concatenate([outline, np.zeros((len(outline), 1))], axis=1)
+    return float(camera.margin(outline, Pose.from_yaw([0.0, 0.0, robot_height], 0.0)).min())

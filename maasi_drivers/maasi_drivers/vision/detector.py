@@ -3,13 +3,57 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
-from maasi_drivers.vision.blobs import Blobs
+from maasi_filter.arrays import BoolArray, FloatArray, ImageArray
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """Connected marker pixels, in the order of their topmost and then leftmost pixel.
+
+    Attributes
+    ----------
+    centroids : ndarray, shape (n, 2)
+        (column, row), pixel centres at whole numbers [px].
+    areas : ndarray, shape (n,)
+        [px].
+    extents : ndarray, shape (n, 2)
+        Width and height of the bounding box [px].
+    border_cut : ndarray of bool, shape (n,)
+        True where the blob touches the image's border, so that its centroid is biased inwards.
+    covariances : ndarray, shape (n, 2, 2)
+        Of the centroids, as far as image noise explains them; zero where the rule does not tell
+        [px^2].
+    identities : tuple of str
+        Ids of fiducial markers; empty: the rule does not tell.
+    """
+
+    centroids: FloatArray
+    areas: FloatArray
+    extents: FloatArray
+    border_cut: BoolArray
+    covariances: FloatArray
+    identities: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.areas)
+
+    def select(self, mask: BoolArray) -> Blobs:
+        """Return the blobs where ``mask`` (n,) is true."""
+        return Blobs(
+            self.centroids[mask],
+            self.areas[mask],
+            self.extents[mask],
+            self.border_cut[mask],
+            self.covariances[mask],
+            tuple(name for name, kept in zip(self.identities, mask.tolist()) if kept),
+        )
 
 
 class Detector(ABC):
@@ -32,7 +76,7 @@ class Detector(ABC):
         self.own = settings
 
     @abstractmethod
-    def detect(self, image: NDArray[np.uint8]) -> Blobs:
+    def detect(self, image: ImageArray) -> Blobs:
         """Return the targets in an image.
 
         Parameters

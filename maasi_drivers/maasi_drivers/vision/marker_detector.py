@@ -1,21 +1,142 @@
-"""From a camera image and the robot's pose to detections: segmentation and projection in one."""
+"""From a camera image and the robot's pose to detections: segmentation and projection."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numba import njit
+from numpy.typing import ArrayLike
 
-from maasi_drivers.vision.blobs import Blobs
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.sensor_reading import SensorReading
+from maasi_drivers.settings.camera import DETECTORS, CameraSettings, SegmentationSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import DETECTORS, CameraSettings
-from maasi_drivers.vision.detector import Detector
-from maasi_drivers.vision.projection import propagate, range_bearing
+from maasi_drivers.vision.detector import Blobs, Detector
 from maasi_drivers.vision.segmentation import segment
+from maasi_filter.arrays import FloatArray, ImageArray
+from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
 
-Array = NDArray[np.float64]
+# A bearing that says nothing is uniform over the circle: variance pi^2 / 3.
+_BEARING_VARIANCE_LIMIT = np.pi**2 / 3.0
+
+
+def propagate(
+    by_pixel: FloatArray,
+    pixel_covariances: ArrayLike,
+    by_pose: FloatArray,
+    pose_covariance: ArrayLike | None = None,
+) -> FloatArray:
+    """Return the covariances (n, 2, 2) of floor positions, from those of pixels and pose [m^2].
+
+    Parameters
+    ----------
+    by_pixel, by_pose : ndarray, shapes (n, 2, 2) and (n, 2, 6)
+        Derivatives, from `Camera.back_project`.
+    pixel_covariances : array_like, shape (n, 2, 2) or (2, 2)
+        [px^2].
+    pose_covariance : array_like, shape (6, 6), optional
+        Of x, y, z [m] and of rotations about the map's axes [rad].
+
+    Raises
+    ------
+    ValueError
+        If the pose's covariance has another shape or is not finite.
+    """
+    pixel = np.asarray(pixel_covariances, dtype=np.float64)
+    covariances = by_pixel @ pixel @ by_pixel.transpose(0, 2, 1)
+    if pose_covariance is not None:
+        matrix = np.asarray(pose_covariance, dtype=np.float64)
+        if matrix.shape != (6, 6):
+            raise ValueError(f'pose_covariance: got shape {matrix.shape}, allowed is (6, 6)')
+        if not np.isfinite(matrix).all():
+            raise ValueError('pose_covariance: got a number that is not finite')
+        covariances = covariances + by_pose @ matrix @ by_pose.transpose(0, 2, 1)
+    return np.asarray(covariances)
+
+
+def range_bearing(
+    positions: FloatArray,
+    covariances: FloatArray,
+    pose: Pose,
+    dimension: int = 2,
+    floor_height: float = 0.0,
+    floor_deviation: float = 0.005,
+) -> tuple[FloatArray, FloatArray]:
+    """
+    Turn floor positions into range, bearing (and elevation) from the robot (000, eq. (6) to (9)).
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, 2)
+        On the floor, map frame [m].
+    covariances : ndarray, shape (n, 2, 2)
+        Of the positions [m^2].
+    pose : Pose
+        Of the robot; the bearing counts from the map's x axis, whatever the yaw.
+    dimension : {2, 3}
+        2: horizontal range and bearing; 3: range in space, bearing, elevation.
+    floor_height : float
+        Of the positions [m].
+    floor_deviation : float
+        How well that height is known [m]; keeps the covariance regular in 3D.
+
+    Returns
+    -------
+    values : ndarray, shape (n, dimension)
+        [m, rad(, rad)].
+    covariances : ndarray, shape (n, dimension, dimension)
+        To first order. Right over a target the bearing says nothing: its variance is bounded by
+        that of a uniform angle.
+    """
+    if dimension not in (2, 3):
+        raise ValueError(f'dimension: got {dimension}, allowed 2 or 3')
+    values = np.empty((len(positions), dimension))
+    result = np.empty((len(positions), dimension, dimension))
+    _range_bearing(
+        positions, covariances, pose.position, floor_height, floor_deviation, values, result
+    )
+    return values, result
+
+
+@njit(cache=True)
+def _range_bearing(positions, covariances, origin, height, deviation, values, result):
+    dimension = values.shape[1]
+    for i in range(positions.shape[0]):
+        dx, dy = positions[i, 0] - origin[0], positions[i, 1] - origin[1]
+        horizontal = np.sqrt(dx * dx + dy * dy)
+        bearing = np.arctan2(dy, dx)
+        cosine, sine = np.cos(bearing), np.sin(bearing)
+        xx, yy = covariances[i, 0, 0], covariances[i, 1, 1]
+        xy = 0.5 * (covariances[i, 0, 1] + covariances[i, 1, 0])
+        # Variances along the line of sight and across it.
+        along = cosine * cosine * xx + 2.0 * cosine * sine * xy + sine * sine * yy
+        across = sine * sine * xx - 2.0 * cosine * sine * xy + cosine * cosine * yy
+        both = cosine * sine * (yy - xx) + (cosine * cosine - sine * sine) * xy
+        limit = np.sqrt(_BEARING_VARIANCE_LIMIT / across) if across > 0.0 else np.inf
+        per_metre = min(1.0 / horizontal, limit) if horizontal > 0.0 else min(limit, 1e9)
+        values[i, 1] = bearing
+        result[i, 1, 1] = across * per_metre * per_metre
+        if dimension == 2:
+            values[i, 0] = horizontal
+            result[i, 0, 0] = along
+            result[i, 0, 1] = result[i, 1, 0] = both * per_metre
+            continue
+        rise = height - origin[2]
+        distance = max(np.sqrt(horizontal * horizontal + rise * rise), 1e-12)
+        # Derivatives of range and elevation along the horizontal line of sight, and upwards.
+        by_along, by_up = horizontal / distance, rise / distance
+        up = deviation * deviation
+        values[i, 0] = distance
+        values[i, 2] = np.arcsin(min(max(rise / distance, -1.0), 1.0))
+        result[i, 0, 0] = by_along * by_along * along + by_up * by_up * up
+        result[i, 2, 2] = (by_up * by_up * along + by_along * by_along * up) / distance**2
+        result[i, 0, 2] = result[i, 2, 0] = by_along * by_up * (up - along) / distance
+        result[i, 0, 1] = result[i, 1, 0] = by_along * both * per_metre
+        result[i, 1, 2] = result[i, 2, 1] = -by_up / distance * both * per_metre
+
 
 # Part of a marker's area that must be seen where the image's border cuts it.
 _LEAST_CUT = 0.4
@@ -41,10 +162,10 @@ class MarkerDetections:
         Blobs left out: reason to count.
     """
 
-    values: Array
-    covariances: Array
-    positions: Array
-    position_covariances: Array
+    values: FloatArray
+    covariances: FloatArray
+    positions: FloatArray
+    position_covariances: FloatArray
     blobs: Blobs
     dropped: dict[str, int]
 
@@ -78,14 +199,14 @@ class MarkerDetector:
         self._own: Detector | None = None
         if rule not in DETECTORS.own:
             self._own = DETECTORS.load(rule)(settings.segmentation.settings)
-        self._pose_covariance: Array | None = None
+        self._pose_covariance: FloatArray | None = None
         if settings.position_noise > 0 or settings.orientation_noise > 0:
             self._pose_covariance = np.diag(
                 [settings.position_noise**2] * 3 + [settings.orientation_noise**2] * 3
             )
 
     def detect(
-        self, image: NDArray[np.uint8], pose: Pose, pose_covariance: ArrayLike | None = None
+        self, image: ImageArray, pose: Pose, pose_covariance: ArrayLike | None = None
     ) -> MarkerDetections:
         """Find the markers in an image.
 
@@ -109,7 +230,7 @@ class MarkerDetector:
         """
         return self.locate(self.segment(image), pose, pose_covariance)
 
-    def segment(self, image: NDArray[np.uint8]) -> Blobs:
+    def segment(self, image: ImageArray) -> Blobs:
         """Return where markers are in an image, by the rule of the settings.
 
         Raises
@@ -122,7 +243,7 @@ class MarkerDetector:
             return self._own.detect(image)
         return segment(image, self.settings.segmentation)
 
-    def check_size(self, image: NDArray[np.uint8]) -> None:
+    def check_size(self, image: ImageArray) -> None:
         """Raise `ValueError` for an image of another size than the calibrated one."""
         camera = self.camera
         if image.shape[:2] != (camera.height, camera.width):
@@ -181,3 +302,52 @@ class MarkerDetector:
             positions, covariances, pose, self.dimension, self.floor_height
         )
         return MarkerDetections(values, value_covariances, positions, covariances, blobs, dropped)
+
+
+def read_markers(
+    picture: ImageArray | Blobs, pose: StampedPose, detector: MarkerDetector, sensor: Sensor
+) -> SensorReading:
+    """Return the markers in a decoded image: segmentation, projection, field of view.
+
+    Driver and in-process search call this same function.
+
+    Parameters
+    ----------
+    picture : ndarray, shape (h, w, 3), uint8, or Blobs
+        R, G, B; or what was segmented on board.
+    pose : StampedPose
+        Of the robot when the image was taken; an all-zero covariance is unknown.
+    detector : MarkerDetector
+        Camera and segmentation.
+    sensor : Sensor
+        Field of view and maximum range.
+
+    Raises
+    ------
+    ValueError
+        If the image has another size than the calibrated one.
+    """
+    if not isinstance(picture, Blobs):
+        picture = detector.segment(picture)
+    covariance = pose.covariance if pose.covariance.any() else None
+    markers = detector.locate(picture, pose.pose, covariance)
+    # On the floor, z = 0.
+    positions = np.pad(markers.positions, ((0, 0), (0, sensor.dimension - 2)))
+    labels = tuple(Label(identity=name) for name in markers.blobs.identities)
+    reading = SensorReading(markers.values, markers.covariances, positions, markers.dropped, labels)
+    return reading.in_field_of_view(sensor, pose.pose)
+
+
+def warm_up() -> None:
+    """Run segmentation and projection once, so that the first image is not late."""
+    image = np.full((120, 160, 3), 120, dtype=np.uint8)
+    image[58:63, 78:83] = (20, 40, 160)
+    # Images come as read-only views of messages too: another type to the compiler.
+    view = np.frombuffer(image.tobytes(), dtype=np.uint8).reshape(image.shape)
+    pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
+    for rule in ('paper', 'robust'):
+        segmentation = SegmentationSettings.model_validate({'rule': rule})
+        detector = MarkerDetector(CameraSettings(segmentation=segmentation))
+        for picture in (image, view):
+            detector.detect(picture, pose)
+        detector.camera.project([[0.0, 0.0, 0.0]], pose)

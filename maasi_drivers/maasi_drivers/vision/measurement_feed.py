@@ -11,13 +11,12 @@ import struct
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
-from maasi_drivers.vision.blobs import Blobs
+from maasi_drivers.vision.detector import Blobs
 
 MAGIC = b'MSMF'
 VERSION = 1
@@ -239,22 +238,6 @@ class ReceivedPacket:
 
     packet: FeedPacket
     taken: float
-
-
-@dataclass(frozen=True)
-class FeedPeer:
-    """The robot that sends a feed.
-
-    Attributes
-    ----------
-    address : str
-        Of the only sender that is used.
-    on_pose : callable
-        Takes stamp [ns] and pose of each of its images.
-    """
-
-    address: str
-    on_pose: Callable[[int, FeedPose], None]
 
 
 class FeedReceiver:

@@ -1,4 +1,4 @@
-"""Blue markers in an image: the papers' rule, and one that adapts to the light.
+"""Markers in an image: the papers' rule, one that adapts to the light, and fiducial markers.
 
 All rules take an RGB image and return `Blobs`; `segment` chooses by name.
 """
@@ -6,6 +6,7 @@ All rules take an RGB image and return `Blobs`; `segment` chooses by name.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -13,12 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from maasi_drivers.vision.blobs import Blobs
-from maasi_drivers.vision.camera_settings import SegmentationSettings
-from maasi_drivers.vision.fiducials import segment_fiducials
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from maasi_drivers.settings.camera import SegmentationSettings
+from maasi_drivers.vision.detector import Blobs
+from maasi_filter.arrays import BoolArray, FloatArray, ImageArray, IntArray
 
 # Labels of pixels that are no marker, and of those not yet reached.
 _BACKGROUND, _UNLABELLED = -1, -2
@@ -28,7 +26,7 @@ _FLOOR_SAMPLES = 4096
 _DARK = 6.0
 
 
-def check_image(image: NDArray[np.generic]) -> Image:
+def check_image(image: NDArray[np.generic]) -> ImageArray:
     """Return an image fit for segmentation.
 
     Raises
@@ -57,7 +55,7 @@ def _paper_mask(red, green, blue, limit, mask):
             mask[row, column] = np.uint8(excess > limit)
 
 
-def paper_mask(image: Image, threshold: float = 35.0) -> NDArray[np.uint8]:
+def paper_mask(image: ImageArray, threshold: float = 35.0) -> ImageArray:
     """Return 1 where B - R/2 - G/2 > threshold, else 0 (001, eq. (16)).
 
     Computed in whole numbers of half grey levels, so nothing is rounded or clipped.
@@ -68,7 +66,7 @@ def paper_mask(image: Image, threshold: float = 35.0) -> NDArray[np.uint8]:
     return mask
 
 
-def _planes(image: Image) -> list[Image]:
+def _planes(image: ImageArray) -> list[ImageArray]:
     # Masks are computed plane by plane, which compilers vectorise.
     return [np.asarray(plane, dtype=np.uint8) for plane in cv2.split(image)]
 
@@ -122,12 +120,12 @@ class _Components(NamedTuple):
     """
 
     labels: NDArray[np.int32]
-    members: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    boxes: NDArray[np.int64]
+    members: IntArray
+    starts: IntArray
+    boxes: IntArray
 
 
-def _components(mask: NDArray[np.uint8]) -> _Components:
+def _components(mask: ImageArray) -> _Components:
     """Return the components of a mask.
 
     Markers are few pixels of an image: a fill from the first pixel of each is faster than the
@@ -143,12 +141,12 @@ def _components(mask: NDArray[np.uint8]) -> _Components:
     return _Components(labels, members, starts[: count + 1], boxes[:count])
 
 
-def _border_cut(boxes: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _border_cut(boxes: IntArray, shape: tuple[int, ...]) -> BoolArray:
     low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
     return np.asarray(((low <= 0) | (high >= np.array([shape[1], shape[0]]))).any(axis=1))
 
 
-def segment_paper(image: Image, settings: SegmentationSettings) -> Blobs:
+def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     """
     Find blobs of a fixed blue excess, with the plain centroid of their pixels (001, section 6.1).
 
@@ -359,10 +357,10 @@ class _Measures(NamedTuple):
         Of the centroids, from the noise of the surroundings.
     """
 
-    keep: NDArray[np.bool_]
-    centroids: NDArray[np.float64]
-    areas: NDArray[np.float64]
-    variances: NDArray[np.float64]
+    keep: BoolArray
+    centroids: FloatArray
+    areas: FloatArray
+    variances: FloatArray
 
 
 @njit(cache=True)
@@ -397,7 +395,7 @@ def _measure_blobs(image, components, gains, gates, measures):
         measures.variances[blob, 1] = scale * spread_y
 
 
-def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
+def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     """Find compact blobs that are bluer than the floor, in any light.
 
     White balance from the median of the image (the floor); blueness (B - max(R, G)) over the mean
@@ -445,14 +443,63 @@ def segment_robust(image: Image, settings: SegmentationSettings) -> Blobs:
     return blobs.select(measures.keep)
 
 
-RULES: dict[str, Callable[[Image, SegmentationSettings], Blobs]] = {
+def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blobs:
+    """Find ArUco markers; their ids are the identities of the targets.
+
+    The detector finds whole markers only, so none is cut by the border. The centre is where the
+    diagonals intersect, which perspective does not shift.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w, 3), uint8
+        R, G, B.
+    settings : SegmentationSettings
+        ``dictionary`` is used.
+    """
+    grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    found, ids, _ = _detector(settings.dictionary).detectMarkers(grey)
+    corners = np.array(found, dtype=float).reshape(-1, 4, 2)
+    count = len(corners)
+    names = [] if ids is None else [f'{settings.dictionary}:{number}' for number in ids.ravel()]
+    following = np.roll(corners, -1, axis=1)
+    products = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
+    return Blobs(
+        _intersections(corners),
+        0.5 * np.abs(products.sum(axis=1)),
+        np.ptp(corners, axis=1) if count else np.zeros((0, 2)),
+        np.zeros(count, np.bool_),
+        np.zeros((count, 2, 2)),
+        tuple(names),
+    )
+
+
+def _intersections(corners: FloatArray) -> FloatArray:
+    """Return where the diagonals of quadrilaterals (n, 4, 2) intersect, (n, 2)."""
+    one, two = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    gap = corners[:, 1] - corners[:, 0]
+    share = (gap[:, 0] * two[:, 1] - gap[:, 1] * two[:, 0]) / (
+        one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
+    )
+    centres: FloatArray = corners[:, 0] + share[:, None] * one
+    return centres
+
+
+@cache
+def _detector(name: str) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f'DICT_{name}'))
+    return cv2.aruco.ArucoDetector(dictionary, parameters)
+
+
+RULES: dict[str, Callable[[ImageArray, SegmentationSettings], Blobs]] = {
     'paper': segment_paper,
     'robust': segment_robust,
     'aruco': segment_fiducials,
 }
 
 
-def segment(image: Image, settings: SegmentationSettings) -> Blobs:
+def segment(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     """Find marker blobs by the rule that the settings name.
 
     Parameters

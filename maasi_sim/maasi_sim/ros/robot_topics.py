@@ -14,8 +14,8 @@ from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from std_msgs.msg import Header
 
 from maasi_drivers.agent.sensor_reading import Sweep
+from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import CameraSettings
 from maasi_filter.models.label import UNLABELLED
 from maasi_msgs.msg import RangeArray, RangeMeasurement
 from maasi_sim.scenario.schema import steps_of

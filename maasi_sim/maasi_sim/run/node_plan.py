@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from maasi_drivers.agent.driver_settings import GuardSettings
+from maasi_drivers.settings.driver import GuardSettings
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 from maasi_filter.ros.parameters import flatten
 from maasi_sim.run.topics import CLOCK, STEP, within

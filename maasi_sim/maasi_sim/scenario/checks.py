@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from maasi_drivers.agent.driver_settings import DRIVERS
+from maasi_drivers.settings.driver import DRIVERS
 from maasi_filter.settings import DETECTIONS
 from maasi_sim.scenario.base import BaseScenario, EventSettings
 from maasi_sim.scenario.layering import Key, unknown

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
-from maasi_drivers.agent.battery_gauge import BatteryUnit
-from maasi_drivers.agent.driver_settings import DRIVERS
-from maasi_drivers.links.mambo.settings import MamboSettings
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
-from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.settings.camera import CameraSettings
+from maasi_drivers.settings.driver import DRIVERS, BatteryUnit
+from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import (
     FilterSettings,

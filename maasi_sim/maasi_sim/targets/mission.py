@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
 
-from maasi_drivers.agent.driver_settings import DRIVERS, DriverSettings
+from maasi_drivers.settings.driver import DRIVERS, DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import unsuitable_lengths, unused_settings

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_drivers.agent.geofence import make_fence, make_vehicle_fence
-from maasi_drivers.links.mambo.settings import MamboSettings
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.agent.flight_rules import make_fence, make_vehicle_fence
+from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.settings import DETECTIONS
 from maasi_planner.objective.weights import resolve
 from maasi_planner.settings import PlannerSettings

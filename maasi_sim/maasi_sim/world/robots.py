@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from maasi_drivers.agent.sensor_reading import Sweep
+from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.camera_settings import CameraSettings
 from maasi_filter.models.label import UNLABELLED
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor

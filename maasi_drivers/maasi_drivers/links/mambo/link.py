@@ -21,12 +21,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maasi_drivers.links.mambo.bluetooth import ask_for_answer, mend
-from maasi_drivers.links.mambo.guarded_socket import DroneSocket, guard, revive
-
-FloatArray = NDArray[np.float64]
+from maasi_drivers.links.mambo.pyparrot import DroneSocket, ask_for_answer, guard, mend, revive
+from maasi_filter.arrays import FloatArray
 
 HANDSHAKE_PORT = 44444
 AIRBORNE = ('takingoff', 'hovering', 'flying', 'landing')

@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent import geofence
-from maasi_drivers.agent.arm_permission import offer_arm
+from maasi_drivers.agent.flight_rules import fence_problem, make_fence
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.odometry_topic import OdometryTopic
-from maasi_drivers.agent.pose_topic import PoseTopic
+from maasi_drivers.agent.pose_topic import OdometryTopic, PoseTopic
+from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_drivers.links.mambo.pilot import MamboPilot, Phase, tilt_limit
-from maasi_drivers.links.mambo.settings import MamboSettings
-from maasi_drivers.links.robot_link import FloatArray, RobotLink
+from maasi_drivers.settings.vehicles import MamboSettings
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_planner.motion import MotionModel, RobotState
@@ -60,7 +59,7 @@ class MamboRobotLink(RobotLink):
     def prepare(self) -> None:
         """Make the geofence; check that a connection is possible."""
         settings = self.driver.settings
-        self._fence = geofence.make_fence(
+        self._fence = make_fence(
             self._mambo.geofence,
             self.driver.bounds,
             settings.radius,
@@ -96,7 +95,7 @@ class MamboRobotLink(RobotLink):
         self._link = link = self._make_link()
         link.connect()
         driver.create_wall_timer(min(driver.settings.step, _POLL_PERIOD), self._update)
-        offer_arm(driver, self._arm, lambda: link.airborne)
+        driver.offer_arm(self._arm, lambda: link.airborne)
         if self._mambo.pose == 'odometry':
             OdometryTopic(driver)
         elif self._mambo.pose == 'pose':
@@ -266,7 +265,7 @@ class MamboRobotLink(RobotLink):
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Refuse waypoints outside the geofence."""
-        return geofence.goal_problem(self._fence, position)
+        return fence_problem(self._fence, position)
 
     def goal_taken(self, goal: Goal) -> None:
         """Keep the drone in the air."""

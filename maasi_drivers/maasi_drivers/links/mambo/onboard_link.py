@@ -1,23 +1,147 @@
-"""A Mambo with a program of its own as a driver's robot: poses by the feed, orders by UDP (001)."""
+"""A Mambo with a program of its own as a driver's robot: poses by the feed, orders by UDP (001).
+
+The layout of the orders is in docs/measurement_feed.md; everything is little-endian.
+"""
 
 from __future__ import annotations
 
+import math
+import socket
+import struct
 import time
+import zlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Any
 
-from maasi_drivers.agent import geofence
-from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission, offer_arm
-from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.pose_speed import PoseSpeed
-from maasi_drivers.agent.robot_node import RobotNode
-from maasi_drivers.links.mambo.settings import MamboSettings
-from maasi_drivers.links.robot_link import RobotLink
-from maasi_drivers.links.waypoint_orders import OrderKind, OrderSender
-from maasi_drivers.vision.measurement_feed import FeedPeer, FeedPose, FeedState
+import numpy as np
+
+from maasi_drivers.agent.flight_rules import (
+    UNTIL_ARM,
+    ArmPermission,
+    fence_problem,
+    make_fence,
+    outside_fence,
+)
+from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
+from maasi_drivers.agent.robot_link import RobotLink
+from maasi_drivers.agent.robot_node import FeedPeer, RobotNode
+from maasi_drivers.settings.vehicles import MamboSettings
+from maasi_drivers.vision.measurement_feed import FeedPose, FeedState
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.lifecycle_node import SettingsError
+
+MAGIC = b'MSWO'
+VERSION = 1
+_ORDER = struct.Struct('<4sBBHI4f')
+_CHECKSUM = struct.Struct('<I')
+_FARTHEST = 1000.0
+
+
+class OrderError(ValueError):
+    """An invalid order; the text has field, value read, values allowed."""
+
+
+class OrderKind(IntEnum):
+    """What the robot is to do."""
+
+    LAND = 0
+    HOLD = 1
+    GO = 2
+
+
+@dataclass(frozen=True)
+class Order:
+    """An order.
+
+    Attributes
+    ----------
+    sequence : int
+        Counted up by the sender, 0 to 2^32 - 1.
+    kind : OrderKind
+        What to do: be on the ground, hover where it is, or fly to the position.
+    position : ndarray, shape (3,)
+        From where it took off: forward, left, up, axes of the heading then [m].
+    yaw : float
+        From the heading at take-off, anticlockwise [rad].
+    """
+
+    sequence: int
+    kind: OrderKind
+    position: np.ndarray
+    yaw: float = 0.0
+
+
+def encode(order: Order) -> bytes:
+    """Return an order as a datagram; `OrderError` for numbers that are not allowed."""
+    data = _ORDER.pack(
+        MAGIC, VERSION, order.kind, 0, order.sequence % 2**32, *order.position, order.yaw
+    )
+    data += _CHECKSUM.pack(zlib.crc32(data))
+    decode(data)
+    return data
+
+
+def decode(data: bytes) -> Order:
+    """Return the order of a datagram.
+
+    Raises
+    ------
+    OrderError
+        If it is damaged, of another version, or holds values that are not allowed.
+    """
+    size = _ORDER.size + _CHECKSUM.size
+    if len(data) != size:
+        raise OrderError(f'length: read {len(data)} bytes, allowed are {size}')
+    magic, version, kind, reserved, sequence, *numbers = _ORDER.unpack_from(data)
+    (checksum,) = _CHECKSUM.unpack_from(data, _ORDER.size)
+    expected = zlib.crc32(data[: _ORDER.size])
+    for good, what in (
+        (magic == MAGIC, f'magic: read {magic!r}, allowed is {MAGIC!r}'),
+        (version == VERSION, f'version: read {version}, allowed is {VERSION}'),
+        (checksum == expected, f'checksum: read {checksum:#010x}, allowed is {expected:#010x}'),
+        (kind in list(OrderKind), f'kind: read {kind}, allowed are 0 to 2'),
+        (reserved == 0, f'reserved: read {reserved}, allowed is 0'),
+        (
+            all(math.isfinite(value) and abs(value) <= _FARTHEST for value in numbers),
+            f'position, yaw: read {numbers}, allowed are finite numbers within {_FARTHEST:g}',
+        ),
+    ):
+        if not good:
+            raise OrderError(what)
+    return Order(sequence, OrderKind(kind), np.array(numbers[:3]), numbers[3])
+
+
+class OrderSender:
+    """Sends orders to one robot.
+
+    Parameters
+    ----------
+    address : str
+        Of the robot.
+    port : int
+        UDP, on which it receives them.
+    """
+
+    def __init__(self, address: str, port: int) -> None:
+        self._to = (address, port)
+        self._sequence = 0
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    def send(self, kind: OrderKind, position: np.ndarray, yaw: float = 0.0) -> str:
+        """Send an order; return why it could not be sent, or nothing."""
+        self._sequence += 1
+        try:
+            self._socket.sendto(encode(Order(self._sequence, kind, position, yaw)), self._to)
+        except OSError as error:
+            return f'orders to {self._to[0]}: {error.strerror or error}'
+        return ''
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
 
 # Between two orders [s]; without them the program on board hovers, then lands.
 _PERIOD = 0.1
@@ -64,7 +188,7 @@ class OnboardLink(RobotLink):
                 'mambo_feed is feed'
             )
         driver.feed_peer = FeedPeer(self._mambo.address, self._take_feed_pose)
-        self._fence = geofence.make_fence(
+        self._fence = make_fence(
             self._mambo.geofence,
             driver.bounds,
             settings.radius,
@@ -82,7 +206,7 @@ class OnboardLink(RobotLink):
         self._sender = OrderSender(self._mambo.address, self._mambo.order_port)
         self.driver.create_wall_timer(_PERIOD, self._send_order)
         self.driver.expect(lambda: self._up)
-        offer_arm(self.driver, self._arm)
+        self.driver.offer_arm(self._arm)
 
     def close(self) -> None:
         """Leave the drone to its program."""
@@ -148,7 +272,7 @@ class OnboardLink(RobotLink):
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Refuse waypoints outside the geofence."""
-        return geofence.goal_problem(self._fence, position)
+        return fence_problem(self._fence, position)
 
     def status(self) -> dict[str, Any]:
         """Return the present order."""
@@ -192,7 +316,7 @@ class OnboardLink(RobotLink):
             return 'on the ground: it may not take off (parameter mambo.arm)'
         if 0.0 <= pose.battery < mambo.battery_minimum:
             return self._land(f'battery at {pose.battery:.2f}, below {mambo.battery_minimum:.2f}')
-        too_far = geofence.outside(self._fence, place.position)
+        too_far = outside_fence(self._fence, place.position)
         if too_far:
             return self._land(too_far)
         if self._up:

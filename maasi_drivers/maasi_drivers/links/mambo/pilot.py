@@ -6,19 +6,15 @@ import math
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from maasi_drivers.agent import geofence
-from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission
+from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission, outside_fence
 from maasi_drivers.links.mambo.link import MamboLink, PositionEvent
-from maasi_drivers.links.mambo.reckoning import DeadReckoning
-from maasi_drivers.links.mambo.settings import LEAST_TILT, MOST_TILT, MamboSettings
-from maasi_drivers.links.mambo.tilt_model import Course, TiltModel
+from maasi_drivers.links.mambo.reckoning import Course, DeadReckoning, TiltModel
+from maasi_drivers.settings.vehicles import LEAST_TILT, MOST_TILT, MamboSettings
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import MotionModel, RobotState
 from maasi_planner.settings import MotionSettings
-
-FloatArray = NDArray[np.float64]
 
 # Acceleration per speed error [1/s].
 _SPEED_GAIN = 2.5
@@ -374,7 +370,7 @@ class MamboPilot:
         state = self.state
         if state is None:
             return 'no position'
-        outside = geofence.outside(self.fence, state.pose.position)
+        outside = outside_fence(self.fence, state.pose.position)
         if outside:
             return self._end_flight(outside)
         if self.phase is Phase.CLIMBING:

@@ -8,14 +8,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from maasi_drivers.links.mavlink.commands import CommandQueue, command_name, result_name
-from maasi_drivers.links.mavlink.estimate import Estimate
-from maasi_drivers.links.mavlink.failsafes import FailsafeCheck
-from maasi_drivers.links.mavlink.firmware import Firmware, identify
-from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
-from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.links.mavlink.report_log import DEBUG, ERROR, INFO, WARNING, ReportLog
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.links.mavlink.estimate import Estimate, FlightOrigin
+from maasi_drivers.links.mavlink.firmware import FailsafeCheck, Firmware, identify
+from maasi_drivers.links.mavlink.protocol import (
+    DEBUG,
+    ERROR,
+    INFO,
+    WARNING,
+    CommandQueue,
+    ReportLog,
+    command_name,
+    mavlink,
+    result_name,
+)
+from maasi_drivers.settings.vehicles import MavlinkSettings
 
 _HEARTBEAT_PERIOD = 1.0
 # Without attitude, position or their status for so long the messages are requested again [s].

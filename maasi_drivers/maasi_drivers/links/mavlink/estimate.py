@@ -2,21 +2,153 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
-from maasi_drivers.links.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation
-from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.links.mavlink.protocol import WARNING, ReportLog, mavlink
+from maasi_drivers.settings.vehicles import MavlinkSettings
+from maasi_filter.arrays import FloatArray
+from maasi_filter.models.pose import quaternion_product
 
-FloatArray = NDArray[np.float64]
+_HALF = math.sqrt(0.5)
+# Turns ENU into NED, and FRD into FLU; w first.
+_NED_TO_ENU = np.array([0.0, _HALF, _HALF, 0.0])
+_FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
+
+
+def swap_enu_ned(vector: ArrayLike) -> FloatArray:
+    """Return a vector (3,) of ENU in NED, or the other way round: it is the same swap."""
+    x, y, z = np.asarray(vector, dtype=float)
+    return np.array([y, x, -z])
+
+
+def swap_flu_frd(vector: ArrayLike) -> FloatArray:
+    """Return a vector (3,) of a body's FLU axes in FRD, or the other way round."""
+    x, y, z = np.asarray(vector, dtype=float)
+    return np.array([x, -y, -z])
+
+
+def swap_yaw(yaw: float) -> float:
+    """Return a yaw [rad] from east, to the left, as one from north, to the right, or back."""
+    turned = 0.5 * math.pi - yaw
+    return math.atan2(math.sin(turned), math.cos(turned))
+
+
+def swap_orientation(quaternion: ArrayLike) -> FloatArray:
+    """Return the orientation (4,) of FLU in ENU from that of FRD in NED, or back; w first."""
+    # Two half turns, each its own inverse but for the sign: the same both ways.
+    given = np.asarray(quaternion, dtype=float)
+    return quaternion_product(quaternion_product(_NED_TO_ENU, given), _FLU_TO_FRD)
+
+
+# Autopilots that were switched on within this time of each other are the same one [s].
+_SAME_BOOT = 5.0
+_HOST_BOOT = Path('/proc/sys/kernel/random/boot_id')
+
+
+class FlightOrigin:
+    """The place in the local frame that stands at the start in the map.
+
+    A local frame lasts as long as its autopilot is on: a file has the place for a driver that is
+    started again meanwhile, in the air or after a landing elsewhere.
+
+    Parameters
+    ----------
+    settings : MavlinkSettings
+        Of the link.
+    start : list of float
+        In the map, x, y, z [m].
+    path : Path or None
+        Of the file; None: nothing is kept.
+    log : ReportLog
+        Takes reports.
+
+    Attributes
+    ----------
+    problem : str
+        Why the place is not known; empty where it is.
+    """
+
+    def __init__(
+        self, settings: MavlinkSettings, start: list[float], path: Path | None, log: ReportLog
+    ) -> None:
+        self.problem = ''
+        self._here = settings.origin == 'here'
+        self._place = [*start[:2], settings.ground]
+        self._path = path
+        self._log = log
+
+    def find(self, position: FloatArray, booted: float, armed: bool) -> FloatArray | None:
+        """Return the place (3,), ENU [m], or None where it cannot be known.
+
+        Parameters
+        ----------
+        position : ndarray, shape (3,)
+            First one of the vehicle that the driver hears, ENU [m].
+        booted : float
+            When the autopilot was switched on, on the steady clock [s].
+        armed : bool
+            Whether its motors are.
+        """
+        kept = self._load(booted)
+        if kept is not None:
+            x, y, z = (position - kept).tolist()
+            self._log.add(
+                WARNING,
+                f'the origin of the flight before is kept: the vehicle is ({x:.1f}, {y:.1f}, '
+                f'{z:.1f}) m east, north and up of it; for a new one restart the autopilot',
+            )
+            return kept
+        if not self._here:
+            return np.zeros(3)
+        if armed or self.problem:
+            self.problem = (
+                'mavlink.origin is here, and it was armed when the driver first heard it: its '
+                'place in the map is not known; land it, put it at start, start the driver again'
+            )
+            return None
+        self.keep(position, booted)
+        return position
+
+    def keep(self, place: FloatArray, booted: float) -> None:
+        """Write the place to the file; `booted` as in `find`."""
+        if self._path is None:
+            return
+        item = {'boot': [_host_boot(), booted], 'map': self._place, 'place': place.tolist()}
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            part = self._path.with_suffix('.part')
+            part.write_text(json.dumps(item))
+            os.replace(part, self._path)
+        except OSError as error:
+            self._log.add(WARNING, f'the origin of the flight cannot be kept: {error}')
+
+    def _load(self, booted: float) -> FloatArray | None:
+        """Return what was kept of this autopilot since it is on, for this place in the map."""
+        try:
+            item = json.loads(self._path.read_text()) if self._path is not None else {}
+            host, before = item['boot']
+            place = np.array(item['place'], dtype=float)
+            same = host == _host_boot() and math.isclose(before, booted, abs_tol=_SAME_BOOT)
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        fits = place.shape == (3,) and np.isfinite(place).all() and item.get('map') == self._place
+        return place if same and fits else None
+
+
+def _host_boot() -> str:
+    """Return what tells one start of this computer from another: the steady clock begins there."""
+    return _HOST_BOOT.read_text().strip()
+
 
 # A time since boot that is smaller by more than this means a restart [ms].
 _RESTART = 1000

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from maasi_drivers.links.mavlink.protocol import mavlink, mavutil
-from maasi_drivers.links.mavlink.settings import Ending, MavlinkSettings
 from maasi_drivers.links.mavlink.vehicle import Vehicle
+from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 
 # Longest time until the next check of what is due [s].
 _PERIOD = 0.02

@@ -11,17 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent import geofence
-from maasi_drivers.agent.arm_permission import offer_arm
-from maasi_drivers.agent.arrival_clock import ArrivalClock
-from maasi_drivers.agent.health import BATTERY, ODOMETRY
+from maasi_drivers.agent.flight_rules import fence_problem, make_vehicle_fence
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
-from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.robot_link import RobotLink
+from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, ArrivalClock, RobotNode
 from maasi_drivers.links.mavlink.estimate import Telemetry
 from maasi_drivers.links.mavlink.link import VehicleLink
-from maasi_drivers.links.mavlink.report_log import ERROR, INFO, WARNING
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
-from maasi_drivers.links.robot_link import FloatArray, RobotLink
+from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING
+from maasi_drivers.settings.vehicles import MavlinkSettings
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose
 
 _POLL_PERIOD = 0.02
@@ -68,7 +66,7 @@ class MavlinkRobotLink(RobotLink):
         self._taken = -1
         self._heading: float | None = None
         self._ending = False
-        self._fence = geofence.make_vehicle_fence(
+        self._fence = make_vehicle_fence(
             self._mavlink.geofence,
             driver.bounds,
             settings.radius,
@@ -91,7 +89,7 @@ class MavlinkRobotLink(RobotLink):
             with link.vehicle() as vehicle:
                 return vehicle.in_air
 
-        offer_arm(driver, self._arm, in_air)
+        driver.offer_arm(self._arm, in_air)
 
         def flying() -> bool:
             with link.vehicle() as vehicle:
@@ -189,7 +187,7 @@ class MavlinkRobotLink(RobotLink):
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Refuse waypoints outside the geofence."""
-        return geofence.goal_problem(self._fence, position)
+        return fence_problem(self._fence, position)
 
     def _send_target(self, position: FloatArray, yaw: float) -> None:
         if self._link is None:

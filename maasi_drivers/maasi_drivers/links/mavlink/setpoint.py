@@ -1,4 +1,4 @@
-"""The set-point of a vehicle: position and yaw, sent periodically."""
+"""The set-point of a vehicle, and its progress on the way to its height."""
 
 from __future__ import annotations
 
@@ -6,11 +6,55 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from maasi_drivers.links.mavlink.frames import swap_enu_ned, swap_yaw
+from maasi_drivers.links.mavlink.estimate import swap_enu_ned, swap_yaw
 from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.settings.vehicles import MavlinkSettings
+from maasi_filter.arrays import FloatArray
+
+# The height is reached within this; a smaller change is no progress [m].
+_REACHED, _PROGRESS = 0.2, 0.1
+
+
+class Climb:
+    """Detects the end or a stall of a climb or dive.
+
+    Parameters
+    ----------
+    timeout : float
+        Time without progress after which it is stalled [s].
+
+    Attributes
+    ----------
+    accepted : bool
+        Whether the autopilot has accepted the take-off: it refuses another one.
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
+        self.begin(-math.inf)
+
+    def begin(self, now: float) -> None:
+        """Begin, at `now` on the steady clock [s]."""
+        self.accepted = False
+        # Smallest distance left so far [m], and its time [s].
+        self._least = math.inf
+        self._progress_at = now
+
+    def update(self, left: float, now: float) -> None:
+        """Update with the distance left [m]."""
+        if left < self._least - _PROGRESS:
+            self._least, self._progress_at = left, now
+
+    def is_over(self, left: float) -> bool:
+        """Return whether the height is reached, with this way left [m]."""
+        return left <= _REACHED
+
+    def is_stalled(self, now: float) -> bool:
+        """Return whether there was no progress for the timeout."""
+        return now - self._progress_at > self.timeout
+
 
 # Position only, and yaw: no velocity, acceleration, yaw rate; and no yaw either.
 _POSITION_AND_YAW, _NO_YAW = 0x9F8, 0x400
@@ -38,10 +82,10 @@ class Setpoint:
         self._settings = settings
         self._sender = sender
         self._sent_at = -math.inf
-        self.position: NDArray[np.float64] | None = None
+        self.position: FloatArray | None = None
         self.yaw: float | None = None
 
-    def hold(self, position: NDArray[np.float64]) -> None:
+    def hold(self, position: FloatArray) -> None:
         """Set a position, with the present yaw."""
         self.position, self.yaw = position, None
 
@@ -67,7 +111,7 @@ class Setpoint:
         )
 
 
-def checked_target(position: ArrayLike, yaw: float) -> NDArray[np.float64]:
+def checked_target(position: ArrayLike, yaw: float) -> FloatArray:
     """Return a position (3,) [m].
 
     Raises

@@ -4,24 +4,42 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from maasi_drivers.agent.arm_permission import UNTIL_ARM, ArmPermission
+from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission
 from maasi_drivers.links.mavlink.autopilot import Autopilot, ModeChange
-from maasi_drivers.links.mavlink.climb import Climb
+from maasi_drivers.links.mavlink.estimate import FlightOrigin
 from maasi_drivers.links.mavlink.firmware import Firmware
-from maasi_drivers.links.mavlink.flight_origin import FlightOrigin
-from maasi_drivers.links.mavlink.phase import COMMANDED, Phase
-from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.links.mavlink.report_log import ERROR, INFO, WARNING, ReportLog
-from maasi_drivers.links.mavlink.setpoint import Setpoint, checked_target
-from maasi_drivers.links.mavlink.settings import Ending, MavlinkSettings
+from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog, mavlink
+from maasi_drivers.links.mavlink.setpoint import Climb, Setpoint, checked_target
+from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
+from maasi_filter.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
+
+class Phase(Enum):
+    """How far the driver is with a vehicle; the value says why it does not continue from there."""
+
+    CONNECTING = 'nothing heard yet'
+    PREPARING = 'no position estimate yet'
+    WAITING = 'not armed'
+    STARTING = 'takes the mode'
+    ARMING = 'is being armed'
+    RISING = 'is on its way to its height'
+    FLYING = ''
+    RELEASED = 'the pilot has taken over'
+    ENDING = 'ends'
+    STOPPED = 'is disarmed'
+    REFUSED = 'is left alone'
+
+
+#: Phases in which the driver commands the vehicle.
+COMMANDED = (Phase.STARTING, Phase.ARMING, Phase.RISING, Phase.FLYING, Phase.ENDING)
+
 
 # Period of requests for the final mode [s].
 _ENDING_PERIOD = 0.3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from maasi_drivers.links.mambo.settings import MamboSettings
+from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo

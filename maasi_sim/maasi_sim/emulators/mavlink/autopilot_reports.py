@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from maasi_drivers.links.mavlink.estimate import swap_enu_ned, swap_flu_frd, swap_orientation
 from maasi_drivers.links.mavlink.firmware import PX4_COPTER, Firmware
-from maasi_drivers.links.mavlink.frames import swap_enu_ned, swap_flu_frd, swap_orientation
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.models.pose import Pose
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER
-from maasi_drivers.links.mavlink.frames import (
+from maasi_drivers.links.mavlink.estimate import (
     swap_enu_ned,
     swap_yaw,
 )
+from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.models.pose import Pose
 from maasi_sim.emulators.mavlink.autopilot_parameters import (

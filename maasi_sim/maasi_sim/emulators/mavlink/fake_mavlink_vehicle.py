@@ -14,7 +14,7 @@ import numpy as np
 
 from maasi_drivers.links.mavlink.link import LinkError, open_connection
 from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
+from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
 from maasi_sim.emulators.mavlink.autopilot_parameters import FIRMWARES

@@ -22,7 +22,7 @@ DETECTORS = PluginGroup(
     {
         'robust': 'maasi_drivers.vision.segmentation:segment_robust',
         'paper': 'maasi_drivers.vision.segmentation:segment_paper',
-        'aruco': 'maasi_drivers.vision.fiducials:segment_fiducials',
+        'aruco': 'maasi_drivers.vision.segmentation:segment_fiducials',
     },
 )
 _DETECTOR = OwnSettings(DETECTORS, 'rule')

@@ -6,16 +6,14 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from maasi_drivers.agent.battery_gauge import BatteryUnit
-from maasi_drivers.agent.ranging_mount import RangingSettings
-from maasi_drivers.links.mambo.settings import MamboSettings
-from maasi_drivers.links.mavlink.settings import MavlinkSettings
-from maasi_drivers.vision.camera_settings import CameraSettings
+from maasi_drivers.settings.camera import CameraSettings
+from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.plugins import PluginGroup
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE, NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
 from maasi_planner.settings import MotionSettings
 
+BatteryUnit = Literal['fraction', 'percent']
 CommandType = Literal['auto', 'stamped', 'twist']
 LinkName = Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink']
 # The same in lockstep, where robots wait for their drivers: a busy machine may delay
@@ -38,6 +36,30 @@ DRIVERS = PluginGroup(
         )
     },
 )
+
+
+class RangingSettings(Settings):
+    """What the angles of `ranges` are relative to, and where the sensor sits."""
+
+    frame: Literal['map', 'body'] = Field(
+        default='map',
+        description="'map': bearings from the map's x axis, elevations from the horizontal plane; "
+        "'body': both in the frame of the sensor on the robot, as real ones give them, with slant "
+        'ranges',
+    )
+    position: list[Finite] = Field(
+        default_factory=lambda: [0.0, 0.0, 0.0],
+        min_length=3,
+        max_length=3,
+        description="Of the sensor in the robot's frame, with frame body [m]",
+    )
+    rpy: list[Finite] = Field(
+        default_factory=lambda: [0.0, 0.0, 0.0],
+        min_length=3,
+        max_length=3,
+        description='Roll, pitch, yaw of the sensor about fixed axes of the robot, with frame body '
+        '[rad]',
+    )
 
 
 class ScanSettings(Settings):

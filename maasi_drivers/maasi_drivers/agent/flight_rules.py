@@ -1,4 +1,4 @@
-"""Where a flying robot may go. Without ROS."""
+"""What a flying robot may do: take off when permitted, and fly inside a geofence. Without ROS."""
 
 from __future__ import annotations
 
@@ -6,9 +6,43 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray
+
+# Reason in `state` while a vehicle waits for it.
+UNTIL_ARM = 'until the service arm is called'
+
+
+class ArmPermission:
+    """Whether a vehicle may take off: one take-off for each call of the service.
+
+    Parameters
+    ----------
+    timeout : float
+        After which an unused permission expires [s].
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
+        self._end = -math.inf
+
+    def give(self, now: float) -> None:
+        """Give it, from `now` on the steady clock [s]."""
+        self._end = now + self.timeout
+
+    def end(self) -> bool:
+        """End it, as after a take-off or a refusal; return whether there was one."""
+        given, self._end = self._end > -math.inf, -math.inf
+        return given
+
+    def holds(self, now: float) -> bool:
+        """Return whether there is one."""
+        return now < self._end
+
+    def expired(self, now: float) -> bool:
+        """Return whether a permission has just expired."""
+        return now >= self._end and self.end()
+
 
 # Between the start's height and the geofence, where none is given [m].
 _HEIGHT = 1.0
@@ -64,7 +98,7 @@ def _fence(
     return fence
 
 
-def goal_problem(fence: FloatArray, point: Sequence[float]) -> str | None:
+def fence_problem(fence: FloatArray, point: Sequence[float]) -> str | None:
     """Return why a waypoint (x, y, z) is not allowed, or nothing."""
     for axis, value in enumerate(point):
         low, high = fence[axis].tolist()
@@ -76,7 +110,7 @@ def goal_problem(fence: FloatArray, point: Sequence[float]) -> str | None:
     return None
 
 
-def outside(fence: FloatArray, position: FloatArray) -> str:
+def outside_fence(fence: FloatArray, position: FloatArray) -> str:
     """Return where a robot is too far outside, or nothing; below the fence it may land."""
     for axis, (low, high) in enumerate(fence.tolist()):
         lowest = -math.inf if axis == 2 else low - MARGIN

@@ -1,0 +1,136 @@
+"""How a driver reaches its robot: the interface that every link implements."""
+
+# Optional hooks do nothing.
+# ruff: noqa: B027
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.waypoint_follower import Goal
+from maasi_filter.arrays import FloatArray
+from maasi_planner.motion import MotionModel, RobotState, make_motion
+from maasi_planner.obstacles import Obstacles
+
+# Commands below these are not expected to change the pose [m/s, rad/s].
+_LEAST_SPEED, _LEAST_TURN = 0.02, 0.05
+
+
+class RobotLink(ABC):
+    """The link to one robot.
+
+    A driver makes it in *configure*. Everything that comes in goes to `driver`: poses to
+    `take_pose`, the charge to `take_charge`, faults to `judge`. No method waits, except `stop`.
+
+    Parameters
+    ----------
+    driver : RobotNode
+        The robot's node.
+    """
+
+    def __init__(self, driver: RobotNode) -> None:
+        self.driver = driver
+
+    # ---- every link --------------------------------------------------------------------------
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Open the link, in *configure*; where this raises, the node stays unconfigured."""
+
+    @abstractmethod
+    def send(self, placed: StampedPose, command: Sequence[float]) -> None:
+        """Send a velocity command, after each pose.
+
+        Parameters
+        ----------
+        placed : StampedPose
+            Pose of the robot.
+        command : sequence of float
+            vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+        """
+
+    @abstractmethod
+    def hold(self) -> None:
+        """Stop the robot now: its goal was cancelled, or its pose is unknown."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop the robot because the driver ends; may wait until that is confirmed."""
+
+    @abstractmethod
+    def poll(self) -> None:
+        """Check the link: ten times a second on wall time while active; not in lockstep."""
+
+    def close(self) -> None:
+        """Undo `connect`; called once. ROS entities are destroyed by the node."""
+
+    def status(self) -> dict[str, Any]:
+        """Return values for the diagnostics."""
+        return {}
+
+    # ---- life cycle and goals, where a robot needs them --------------------------------------
+
+    def prepare(self) -> None:
+        """Check the settings, before `connect`; `SettingsError` for what is not allowed."""
+
+    def activate(self) -> None:
+        """Begin to work, in *activate*: from now on the robot may move."""
+
+    def reset(self) -> None:
+        """Discard what belongs to the time before a jump back of the clock."""
+
+    def latch_stop(self) -> None:
+        """Handle the service `stop`, after `hold`."""
+
+    def expects_pose(self) -> bool:
+        """Return whether a missing first pose is worth a warning."""
+        return True
+
+    def observe(self, placed: StampedPose) -> None:
+        """Take note of a new pose, before it is used."""
+
+    def goal_problem(self, position: Sequence[float]) -> str | None:
+        """Return why a waypoint (x, y, z) [m, map] is refused, or None."""
+        return None
+
+    def goal_taken(self, goal: Goal) -> None:
+        """Take note of a new goal."""
+
+    def goal_ended(self, goal: Goal) -> None:
+        """Take note that a goal has ended, before its result is sent."""
+
+    def goal_cancelled(self) -> None:
+        """Take note that a client cancelled the goal, after `hold`."""
+
+    # ---- control, where a robot differs ------------------------------------------------------
+
+    def make_motion(self) -> MotionModel:
+        """Return the controller."""
+        settings = self.driver.settings
+        obstacles = Obstacles.from_settings(settings.environment.obstacles)
+        return make_motion(settings.motion, obstacles, settings.radius)
+
+    def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
+        """Return the command (4,) and the goal reached; see `WaypointFollower.update`."""
+        return self.driver.follower.update(robot, step)
+
+    def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
+        """Return whether this command must change pose and images."""
+        return bool(math.hypot(*command[:3]) > _LEAST_SPEED or abs(command[3]) > _LEAST_TURN)
+
+    # ---- lockstep ----------------------------------------------------------------------------
+
+    def begin_step(self, stamp: int) -> None:
+        """Take in what is older than the step at `stamp` [ns], before its control step."""
+
+    def hold_step(self, stamp: int) -> None:
+        """Answer the step at `stamp` [ns], whose odometry could not be used, by a stop."""
+        self.hold()
+
+    def repeat(self) -> None:
+        """Send the last command again: a peer that was restarted may have missed it."""

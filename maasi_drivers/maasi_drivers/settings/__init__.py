@@ -1,0 +1,1 @@
+"""Settings of drivers: the node, the camera, and the links to vehicles."""

@@ -1,0 +1,260 @@
+"""Images as arrays: from messages, and from streams, devices and files. Without ROS."""
+
+from __future__ import annotations
+
+import threading
+import time
+from array import array
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from maasi_filter.arrays import ImageArray
+
+# Encoding (sensor_msgs/image_encodings) to bytes per pixel in a row and, if those are not R, G, B,
+# the conversion.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    'rgb8': (3, None),
+    'bgr8': (3, cv2.COLOR_BGR2RGB),
+    'rgba8': (4, cv2.COLOR_RGBA2RGB),
+    'bgra8': (4, cv2.COLOR_BGRA2RGB),
+    # Luminance at each pixel, colour at every other one.
+    'yuv422': (2, cv2.COLOR_YUV2RGB_UYVY),
+    'uyvy': (2, cv2.COLOR_YUV2RGB_UYVY),
+    'yuv422_yuy2': (2, cv2.COLOR_YUV2RGB_YUY2),
+    'yuyv': (2, cv2.COLOR_YUV2RGB_YUY2),
+    # A plane of luminance, then one of colour with half its rows.
+    'nv12': (1, cv2.COLOR_YUV2RGB_NV12),
+    'nv21': (1, cv2.COLOR_YUV2RGB_NV21),
+    # One colour at each pixel; OpenCV names the pattern by its second row.
+    'bayer_rggb8': (1, cv2.COLOR_BayerBG2RGB),
+    'bayer_bggr8': (1, cv2.COLOR_BayerRG2RGB),
+    'bayer_gbrg8': (1, cv2.COLOR_BayerGR2RGB),
+    'bayer_grbg8': (1, cv2.COLOR_BayerGB2RGB),
+}
+_SUBSAMPLED = ('nv12', 'nv21')
+COLOUR_ENCODINGS = tuple(_ENCODINGS)
+_MAXIMUM_SIDE = 16384
+
+
+def image_to_array(
+    height: int,
+    width: int,
+    encoding: str,
+    step: int,
+    data: bytes | bytearray | memoryview | array | ImageArray,
+) -> ImageArray:
+    """Turn the fields of a ``sensor_msgs/Image`` into an RGB array.
+
+    Parameters
+    ----------
+    height, width : int
+        Rows and columns [px].
+    encoding : str
+        One of ``COLOUR_ENCODINGS``.
+    step : int
+        Length of a full row [bytes]; more than what ``width`` pixels take if rows are padded.
+    data : bytes-like
+        ``step * height`` bytes; half as much again for nv12 and nv21.
+
+    Returns
+    -------
+    ndarray, shape (height, width, 3), uint8
+        Channels in the order R, G, B, rows contiguous or strided by ``step``. A read-only view of
+        ``data`` where nothing has to be converted.
+
+    Raises
+    ------
+    ValueError
+        On a size of zero, an encoding without colour or unknown, an odd size where colours are
+        subsampled, a step too short for the width, or data of another length.
+    """
+    for name, value in (('height', height), ('width', width)):
+        if not 0 < value <= _MAXIMUM_SIDE:
+            raise ValueError(f'image {name}: got {value}, allowed 1 to {_MAXIMUM_SIDE} px')
+    if encoding not in _ENCODINGS:
+        raise ValueError(
+            f"image encoding: got '{encoding}', allowed {', '.join(COLOUR_ENCODINGS)} "
+            '(the markers are told by their colour)'
+        )
+    size, conversion = _ENCODINGS[encoding]
+    halved = encoding in _SUBSAMPLED
+    odd = (size == 2 or halved) and width % 2, halved and height % 2
+    if any(odd):
+        raise ValueError(
+            f'image size: got {width} x {height} px, allowed are even numbers with {encoding}'
+        )
+    if step < width * size:
+        raise ValueError(
+            f'image step: got {step} bytes, allowed at least {width * size} '
+            f'({width} px of {encoding})'
+        )
+    flat = np.frombuffer(data, dtype=np.uint8)
+    rows = height * 3 // 2 if halved else height
+    if flat.size != step * rows:
+        raise ValueError(
+            f'image data: got {flat.size} bytes, allowed exactly {step * rows} '
+            f'(step {step} times {rows} rows)'
+        )
+    pixels = flat.reshape(rows, step)[:, : width * size].reshape(rows, width, size)
+    if conversion is None:
+        return pixels
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
+
+
+def decode_image(data: bytes | bytearray | array | ImageArray, kind: str) -> ImageArray:
+    """Decode the data of a ``sensor_msgs/CompressedImage``.
+
+    Parameters
+    ----------
+    data : bytes-like
+        JPEG, PNG, ...
+    kind : str
+        Its format, for messages.
+
+    Returns
+    -------
+    ndarray, shape (height, width, 3), uint8
+        R, G, B.
+
+    Raises
+    ------
+    ValueError
+        If it is nothing that OpenCV decodes.
+    """
+    flat = np.frombuffer(data, np.uint8)
+    image = cv2.imdecode(flat, cv2.IMREAD_COLOR) if flat.size else None
+    if image is None:
+        raise ValueError(
+            f"image: got {flat.size} bytes of '{kind}', allowed is what OpenCV decodes"
+        )
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+# From one try to open a source to the next [s].
+_REOPEN = 1.0
+_OPEN_TIMEOUT, _READ_TIMEOUT = 5000, 2000
+_DEFAULT_RATE = 30.0
+
+
+class ImageSourceError(ValueError):
+    """A source that cannot be opened."""
+
+
+@dataclass(frozen=True)
+class VideoFrame:
+    """One image.
+
+    Attributes
+    ----------
+    image : ndarray, shape (h, w, 3), uint8
+        R, G, B.
+    received : float
+        Time of arrival, monotonic clock [s].
+    number : int
+        Of the frames of this source, from 1.
+    """
+
+    image: ImageArray
+    received: float
+    number: int
+
+
+class VideoSource:
+    """Reads a source in a thread of its own, and keeps the newest frame.
+
+    A stream or device that breaks off is opened again. A file is played at its own rate, once.
+
+    Parameters
+    ----------
+    source : str
+        Address (rtsp://..., udp://...), device (/dev/video0, or its number), or file.
+
+    Raises
+    ------
+    ImageSourceError
+        If it is none of these, or a file that cannot be read.
+    """
+
+    def __init__(self, source: str) -> None:
+        if not source:
+            raise ImageSourceError(
+                "video: got '', allowed are an address (rtsp://...), a device (/dev/video0) or a "
+                'file'
+            )
+        self.source = source
+        self.live = '://' in source or source.startswith('/dev/') or source.isdigit()
+        #: What is wrong; empty while frames come.
+        self.error = ''
+        #: Whether a file has come to its end.
+        self.ended = False
+        self._frame: VideoFrame | None = None
+        self._taken = 0
+        self._count = 0
+        self._closing = threading.Event()
+        self._first = None if self.live else self._open()
+        self._thread = threading.Thread(target=self._read, name='video source', daemon=True)
+        self._thread.start()
+
+    def take(self) -> VideoFrame | None:
+        """Return the newest frame, or None if it was returned before."""
+        frame = self._frame
+        if frame is None or frame.number == self._taken:
+            return None
+        self._taken = frame.number
+        return frame
+
+    def close(self) -> None:
+        """Close the source."""
+        self._closing.set()
+        self._thread.join(0.001 * _READ_TIMEOUT)
+
+    def _open(self) -> cv2.VideoCapture:
+        if self.source.isdigit():
+            capture = cv2.VideoCapture(int(self.source))
+        elif '://' in self.source:
+            limits = [
+                *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_TIMEOUT),
+                *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT),
+            ]
+            capture = cv2.VideoCapture(self.source, cv2.CAP_FFMPEG, limits)
+        else:
+            capture = cv2.VideoCapture(self.source)
+        if not capture.isOpened():
+            capture.release()
+            raise ImageSourceError(f'video: {self.source}: OpenCV cannot open it')
+        return capture
+
+    def _read(self) -> None:
+        capture = self._first
+        while not self._closing.is_set():
+            try:
+                capture = capture or self._open()
+            except ImageSourceError as error:
+                self.error = str(error)
+                self._closing.wait(_REOPEN)
+                continue
+            self._play(capture)
+            capture.release()
+            capture = None
+            if not self.live:
+                self.ended = True
+                return
+            self.error = f'video: {self.source}: no more frames'
+            self._closing.wait(_REOPEN)
+
+    def _play(self, capture: cv2.VideoCapture) -> None:
+        rate = capture.get(cv2.CAP_PROP_FPS) or _DEFAULT_RATE
+        due = time.monotonic()
+        while not self._closing.is_set():
+            there, image = capture.read()
+            if not there:
+                return
+            if not self.live:
+                due += 1.0 / rate
+                self._closing.wait(max(due - time.monotonic(), 0.0))
+            self._count += 1
+            self.error = ''
+            turned = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+            self._frame = VideoFrame(turned, time.monotonic(), self._count)
