@@ -13,8 +13,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 from maasi_filter import warm_up
-from maasi_filter.dropped import FOUND, REPEATED
 from maasi_filter.make_filter import load_filter, make_filter
+from maasi_filter.measurement_check import FOUND, REPEATED
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch
 from maasi_filter.node.filter_memory import FilterMemory, Progress
 from maasi_filter.node.found_target_exchange import KeptFoundTargets, SharedFoundTargets

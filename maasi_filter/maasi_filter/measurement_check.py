@@ -1,4 +1,4 @@
-"""Checks of measurements before a step."""
+"""Checks of measurements before a step, and detections that are not used, by reason."""
 
 from __future__ import annotations
 
@@ -19,32 +19,26 @@ from maasi_filter.settings import FilterSettings
 # Default position error of a robot with a box-shaped field of view, as a share of its half size:
 # the position error blurs the edge.
 POSE_ERROR_OF_BOX = 0.05
+# Reasons that are no faults: a found target took it, or another one of the scan is the same.
+FOUND = 'found'
+REPEATED = 'repeated'
 
 
 @dataclass
 class CheckedMeasurement:
-    """A checked measurement: every detection has a covariance, and their order is fixed.
-
-    Parameters
-    ----------
-    own : bool
-        Whether the covariances are the detections' own.
-    pose_error : float
-        Standard deviation of the robot's position error per axis, as far as the covariances do not
-        include it [m].
-    labels : tuple of Label
-        Of each detection; empty: none has one.
-    """
+    """A checked measurement: every detection has a covariance, and their order is fixed."""
 
     robot: str
     pose: Pose
     sensor: Sensor
     values: FloatArray
     covariances: FloatArray
-    own: bool
+    own: bool  # Whether the covariances are the detections' own
     index: int
+    #: Standard deviation of the robot's position error per axis, as far as the covariances do
+    #: not include it [m].
     pose_error: float
-    labels: tuple[Label, ...] = ()
+    labels: tuple[Label, ...] = ()  # Of each detection; empty: none has one
 
     def only(self, keep: BoolArray) -> CheckedMeasurement:
         """Return a copy with some of the detections."""
@@ -61,14 +55,7 @@ def check_measurements(
     settings: FilterSettings,
     dimension: int,
 ) -> list[CheckedMeasurement]:
-    """Return the measurements of a step in the order of the robots' names.
-
-    Raises
-    ------
-    ValueError
-        If anything is not finite, a covariance is not positive definite, shapes or dimensions do
-        not fit, or a robot appears twice.
-    """
+    """Return the measurements of a step in the order of the robots' names."""
     if isinstance(steps, bool) or int(steps) != steps or steps < 0:
         raise ValueError(f'steps: got {steps!r}, allowed are whole numbers from 0')
     if not math.isfinite(time):
@@ -158,13 +145,7 @@ def _reported_error(name: str, reported: FloatArray, d: int) -> float:
 
 
 def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> None:
-    """Refuse targets with non-finite numbers, of another dimension, or of equal ids.
-
-    Raises
-    ------
-    ValueError
-        Naming the robot, the target and what is allowed.
-    """
+    """Refuse targets with non-finite numbers, of another dimension, or of equal ids."""
     ids = [target.id for target in targets]
     if min(ids, default=1) < 1 or len(set(ids)) < len(ids):
         raise ValueError(f'{robot}: target ids: got {ids}, allowed are different ones from 1')
@@ -181,3 +162,47 @@ def check_taken(robot: str, targets: Sequence[FoundTarget], dimension: int) -> N
                 f'covariance {target.covariance.tolist()}, allowed are finite numbers and a '
                 'positive definite matrix'
             )
+
+
+def count_dropped(dropped: dict[str, int], reason: str, number: int) -> None:
+    """Add a number of detections to those dropped for a reason."""
+    if number:
+        dropped[reason] = dropped.get(reason, 0) + number
+
+
+def within_range(member: CheckedMeasurement, dropped: dict[str, int]) -> CheckedMeasurement:
+    """Return a measurement without detections beyond the range of its sensor."""
+    reach = member.values[:, 0] <= member.sensor.maximum_range
+    if reach.all():
+        return member
+    count_dropped(dropped, 'range', int((~reach).sum()))
+    return member.only(reach)
+
+
+def without_repeats(member: CheckedMeasurement, dropped: dict[str, int]) -> CheckedMeasurement:
+    """Return a measurement with one detection where several are one by the sensor's resolution.
+
+    Detections with different identities are of different targets.
+    """
+    values, gate = member.values, member.sensor.resolution
+    # Detections are sorted by range, which is within the gate first of all.
+    reach = values[:, 0] - gate * np.sqrt(member.covariances[:, 0, 0])
+    first = np.searchsorted(values[:, 0], reach, side='right')
+    keep = np.ones(len(values), np.bool_)
+    for j in np.flatnonzero(first < np.arange(len(values))).tolist():
+        others = first[j] + np.flatnonzero(keep[first[j] : j])
+        errors = member.sensor.measurement.residual(values[others], values[j])
+        solved = np.linalg.solve(member.covariances[j], errors.T).T
+        same = (errors * solved).sum(axis=1) < gate**2
+        if member.labels:
+            same &= [member.labels[i].identity == member.labels[j].identity for i in others]
+        keep[j] = not same.any()
+    count_dropped(dropped, REPEATED, int((~keep).sum()))
+    return member if keep.all() else member.only(keep)
+
+
+def count_unexplained(centres: FloatArray, bounds: FloatArray, dropped: dict[str, int]) -> None:
+    """Count detections that only clutter explains, by the places (m, d) they point at."""
+    inside = ((centres >= bounds[:, 0]) & (centres <= bounds[:, 1])).all(axis=1)
+    count_dropped(dropped, 'outside', int((~inside).sum()))
+    count_dropped(dropped, 'unseen', int(inside.sum()))

@@ -212,6 +212,19 @@ class UnexploredMap:
             self.dimension,
         )
 
+    def diffuse(self, variance: float) -> None:
+        """Diffuse e as for targets in a random walk, `variance` [m^2], with reflecting bounds."""
+        values = self.values
+        for axis in range(self.dimension):
+            rate = 0.5 * variance / float(self.step[axis]) ** 2
+            # The explicit scheme is stable and positive up to a ratio of 1/2.
+            parts = max(1, math.ceil(rate / 0.25))
+            for _ in range(parts):
+                flow = rate / parts * np.diff(values, axis=axis)
+                width = [(0, 0)] * self.dimension
+                width[axis] = (1, 1)
+                values += np.diff(np.pad(flow, width), axis=axis)
+
     def at(self, positions: ArrayLike) -> FloatArray:
         """Return e at positions (n, d) by multilinear interpolation, shape (n,).
 

@@ -39,7 +39,6 @@ from stonesoup.types.update import GaussianStateUpdate
 from stonesoup.updater.kalman import ExtendedKalmanUpdater
 
 from maasi_filter import AgentMeasurement, Pose, Sensor, make_filter
-from maasi_filter.clutter import measurement_space
 from maasi_filter.metrics import gospa
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_sim.scenario.schema import Scenario
@@ -112,7 +111,7 @@ class StoneSoup:
 
     def __init__(self, scan: AgentMeasurement, bounds: FloatArray, walk: float) -> None:
         self.view = View(scan.sensor, scan.pose)
-        space = measurement_space(scan.sensor, bounds)
+        space = scan.sensor.measurement_space(bounds)
         density = max(scan.sensor.clutter, LEAST_CLUTTER / space)
         walks = [RandomWalk(max(walk**2, LEAST_WALK))] * 3
         predictor = ExtendedKalmanPredictor(CombinedLinearGaussianTransitionModel(walks))

@@ -14,7 +14,7 @@ from maasi_filter.ic_phd.births import (
     uniform_births,
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
-from maasi_filter.ic_phd.removal import kept_measurements
+from maasi_filter.ic_phd.filter import kept_measurements
 from maasi_filter.ic_phd.resampling import jittered, resample
 from maasi_filter.records import FoundTarget
 

@@ -8,12 +8,12 @@ from exact_pmbm import ExactPmbm
 from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, plane_sensor
 
 from maasi_filter import FilterSettings, Pose, UnexploredMap, wrap_angle
-from maasi_filter.clutter import LEAST_PER_SCAN, measurement_space
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.models.label import Label
+from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.pmb.births import draw_births
-from maasi_filter.pmb.clutter import PRIOR_SCANS, ClutterEstimate
 from maasi_filter.pmb.filter import PmbFilter
+from maasi_filter.pmb.learnt import PRIOR_SCANS, ClutterEstimate
 
 TARGET = np.array([[60.0, 45.0]])
 # Where the robot measures from, in turn.
@@ -106,7 +106,7 @@ def test_first_detection_exists_with_the_share_of_clutter():
     search.step([measured(sensor, PLACES[0], value)], 1, 0.0)
     probability, likelihood = densities(sensor, PLACES[0], value)
     intensity = 3.0 / SIDE**2 * (probability * likelihood[0]).sum()
-    space = measurement_space(sensor, PLANE)
+    space = sensor.measurement_space(PLANE)
     kappa = max(2e-4, LEAST_PER_SCAN / space)
     assert search.components[0].existence == pytest.approx(
         intensity / (intensity + kappa), rel=0.03
@@ -149,7 +149,7 @@ def test_close_to_the_exact_mixture(targets, tolerance):
             if step == seed % 3 and len(values) < 3:
                 false = [generator.uniform(5.0, 40.0), generator.uniform(-3.0, 3.0)]
                 values = np.concatenate([values, [false]])
-            space = measurement_space(sensor, PLANE)
+            space = sensor.measurement_space(PLANE)
             kappa = search._learnt.clutter.per_scan('robot', sensor.clutter * space) / space
             search.step([measured(sensor, place, values, step)], 1, step)
             exact.update(*densities(sensor, place, values), kappa)

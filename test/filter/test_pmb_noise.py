@@ -7,8 +7,14 @@ from searches import CUBE, DEGREES, RADIANS, cube_sensor, observe
 
 from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose
 from maasi_filter.measurement_check import check_measurements
-from maasi_filter.pmb.consistency import BOUND, Consistency, _excess
-from maasi_filter.pmb.noise_scale import MOST_FACTOR, NoiseScale, innovations
+from maasi_filter.pmb.learnt import (
+    BOUND,
+    MOST_FACTOR,
+    Consistency,
+    NoiseScale,
+    _excess,
+    innovations,
+)
 
 TARGET = np.array([[130.0, 130.0, 130.0]])
 POSE = Pose([112.0, 120.0, 125.0])

@@ -12,7 +12,6 @@ from maasi_filter import (
     Pose,
     wrap_angle,
 )
-from maasi_filter.clutter import measurement_space
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.make_filter import load_filter, make_filter
 from maasi_filter.metrics import match_targets, normalised_error
@@ -209,7 +208,7 @@ def cube_search(seed, number, clutter):
     """Search targets drawn from the prior; return filter, targets and (r, is a target) of steps."""
     generator = np.random.default_rng([seed, 9])
     sensor = cube_sensor()
-    sensor.clutter = clutter / measurement_space(sensor, CUBE)
+    sensor.clutter = clutter / sensor.measurement_space(CUBE)
     targets = generator.uniform(0.0, 260.0, (generator.poisson(12.0), 3))
     search = PmbFilter(FilterSettings(method='pmb'), CUBE, np.random.default_rng([seed, 10]))
     pairs = []

@@ -16,18 +16,11 @@ from maasi_filter.models.sensor import Sensor
 
 @dataclass
 class MeasurementBirths:
-    """Births at each of m measurements, J for each.
+    """Births at each of m measurements, J for each."""
 
-    Parameters
-    ----------
-    particles : (m J, d) array
-        Metres; grouped by measurement.
-    intensity : (m, J) array
-        b, the birth intensity times psi_z over the density of the draw, divided by J, per unit of
-        measurement space. b / C(z) is the posterior weight.
-    """
-
-    particles: FloatArray
+    particles: FloatArray  # (m J, d): Metres; grouped by measurement
+    #: (m, J): b, the birth intensity times psi_z over the density of the draw, divided by J,
+    #: per unit of measurement space. b / C(z) is the posterior weight.
     intensity: FloatArray
 
     @property
@@ -51,17 +44,6 @@ def measurement_births(
     Their intensity is N0 / V. Divided by the density of the draw and multiplied by the probability
     that earlier robots missed them, b = (N0 / V) pi(x, q) |dx/dz| prod(1 - pi_before) / J, where
     |dx/dz| = r in 2D and r^2 cos(elevation) in 3D. A birth counts for its own measurement only.
-
-    Parameters
-    ----------
-    values : (m, d) array
-        Range and angles, m and rad.
-    bounds : (d, 2) array
-        Of E, metres.
-    number : int
-        J.
-    before : sequence of (DetectionModel, Pose)
-        Robots that were processed earlier in the same step, (9).
     """
     count, d = values.shape
     noise = generator.standard_normal((count, number, d)) @ np.linalg.cholesky(sensor.covariance).T
@@ -83,13 +65,7 @@ def measurement_births(
 def uniform_births(
     bounds: FloatArray, expected: float, number: int, generator: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return uniform births: particles (J, d) and weights Y V / J (001, (A1)).
-
-    Parameters
-    ----------
-    expected : float
-        Y V, targets expected to appear in the whole environment.
-    """
+    """Return uniform births: particles (J, d) and weights Y V / J (001, (A1))."""
     size = bounds[:, 1] - bounds[:, 0]
     particles = bounds[:, 0] + size * generator.random((number, len(bounds)))
     return particles, np.full(number, expected / number)
@@ -106,16 +82,8 @@ def gaussian_births(
     """Return births from one Gaussian over all measured positions (003, section 3.3).
 
     Weights are Y / (J p(x)) with p the Gaussian density; draws outside the bounds are left out.
-
-    Parameters
-    ----------
-    centres : (m, d) array
-        g^-1(z), metres.
-    spread : (d, d) array
-        Noise covariance at the measurements, added to the empirical one, which is singular for few
-        measurements. A deviation from the paper.
-    expected : float
-        Y V, targets expected to appear in the whole environment.
+    The covariance of the noise, `spread`, is added to the empirical one, which is singular for few
+    measurements: a deviation from the paper.
     """
     d = len(bounds)
     mean = centres.mean(axis=0)

@@ -108,14 +108,7 @@ def kmeans(
 ) -> tuple[IntArray, FloatArray]:
     """Return labels (n,) and centres (k, d) of weighted K-means.
 
-    Parameters
-    ----------
-    number : int
-        k, at least 1; the papers have the rounded expected number of targets.
-    start : (s, d) array
-        Centres of the step before; K-means++ adds what is missing.
-    iterations : int
-        At most.
+    `start` (s, d) are the centres of the step before; K-means++ adds what is missing of `number`.
     """
     centres = _starting_centres(particles, weights, number, start, generator)
     label = np.full(len(particles), -1, np.int64)

@@ -173,27 +173,8 @@ def phd_correct(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the factor of each particle's weight, and C(z) (000, (13), (16)).
 
-    The factor is 1 - pi + sum over z of psi_z / C(z), with C(z) = background + <psi_z, D>.
-
-    Parameters
-    ----------
-    particles : (n, d) array
-        Metres, frame `map`.
-    weights : (n,) array
-        Of the running intensity D.
-    scan : Scan
-        m detections.
-    background : (m,) array
-        What else explains each detection: the intensities of clutter and of births at it, above
-        0, per unit of measurement space.
-    pool : ThreadPoolExecutor, optional
-        For large sets.
-
-    Returns
-    -------
-    factor : (n,) array
-    normaliser : (m,) array
-        C(z), per unit of measurement space.
+    The factor is 1 - pi + sum over z of psi_z / C(z), with C(z) = background + <psi_z, D>, where
+    `background` (m,) are the intensities of clutter and of births at each detection, above 0.
     """
     number, count = len(weights), len(scan.values)
     chunks = max(1, -(-number // CHUNK))

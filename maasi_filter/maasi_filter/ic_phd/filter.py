@@ -12,9 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_filter.arrays import FloatArray
-from maasi_filter.clutter import least_clutter
-from maasi_filter.dropped import FOUND, count_dropped, count_unexplained, within_range
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
     MeasurementBirths,
@@ -25,9 +23,18 @@ from maasi_filter.ic_phd.births import (
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import make_scan, phd_correct
-from maasi_filter.ic_phd.removal import kept_measurements, nearest_label
 from maasi_filter.ic_phd.resampling import jittered, resample
-from maasi_filter.measurement_check import CheckedMeasurement, check_measurements, check_taken
+from maasi_filter.measurement_check import (
+    FOUND,
+    CheckedMeasurement,
+    check_measurements,
+    check_taken,
+    count_dropped,
+    count_unexplained,
+    within_range,
+)
+from maasi_filter.models.label import UNLABELLED, Label
+from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.search_filter import FilterState
 from maasi_filter.settings import FilterSettings, IcPhdNumbers
@@ -150,7 +157,8 @@ class IcPhdFilter:
         C(z) = kappa(z) + <psi_z, D^{o-1}>, and births are part of D^{o-1}.
         """
         births = self._births(member, before)
-        clutter = max(member.sensor.clutter, least_clutter(member.sensor, self.bounds))
+        space = member.sensor.measurement_space(self.bounds)
+        clutter = max(member.sensor.clutter, LEAST_PER_SCAN / space)
         scan = make_scan(member.values, member.sensor, member.pose)
         factor, normaliser = phd_correct(
             self.particles, self.weights, scan, clutter + births.totals, self._threads()
@@ -340,13 +348,7 @@ class IcPhdFilter:
 
     @classmethod
     def from_state(cls, state: IcPhdState) -> IcPhdFilter:
-        """Return the filter of a state; it continues bit for bit as the saved one would have.
-
-        Raises
-        ------
-        ValueError
-            If a shape or number is wrong.
-        """
+        """Return the filter of a state; it continues bit for bit as the saved one would have."""
         search = cls(state.settings, state.bounds, state.generator)
         search.exploration.restore(state.exploration)
         state.check(state.found_targets)
@@ -374,3 +376,40 @@ def _nearest_member(
         apart.append(float(squares.min()) if len(squares) else math.inf)
     best = int(np.argmin(apart))
     return members[best] if math.isfinite(apart[best]) else members[-1]
+
+
+def kept_measurements(
+    centres: FloatArray, targets: Sequence[FoundTarget], limit: float, every: bool
+) -> BoolArray:
+    """Return which of m detections remain after removing those of found targets.
+
+    That is all within T_z = `limit` of one (`every`: 003, algorithm 1), or only the closest one to
+    each (000, section 3.3; 001, algorithm 1).
+    """
+    keep = np.ones(len(centres), np.bool_)
+    for target in targets:
+        apart = np.sqrt(((centres - target.position) ** 2).sum(axis=1))
+        near = keep & (apart <= limit)
+        if every:
+            keep &= ~near
+        elif near.any():
+            keep[int(np.argmin(np.where(near, apart, np.inf)))] = False
+    return keep
+
+
+def nearest_label(
+    position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
+) -> Label:
+    """Return the label of the detection nearest to a position, within T_z = `limit` metres.
+
+    The PHD filter does not associate detections with targets.
+    """
+    best, least = UNLABELLED, limit
+    for member in members:
+        if not member.labels:
+            continue
+        centres = member.sensor.measurement.inverse(member.values, member.pose)
+        for label, apart in zip(member.labels, np.linalg.norm(centres - position, axis=1).tolist()):
+            if apart <= least:
+                best, least = label, apart
+    return best

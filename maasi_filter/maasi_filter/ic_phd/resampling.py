@@ -19,13 +19,7 @@ def _select(cumulative, points, index):  # type: ignore[no-untyped-def]
 
 
 def resample(weights: FloatArray, number: int, generator: np.random.Generator) -> IntArray:
-    """Return indices (number,) of particles, drawn with replacement by weight; they increase.
-
-    Parameters
-    ----------
-    weights : (n,) array
-        Not negative, with a positive sum.
-    """
+    """Return indices (number,) of particles, drawn with replacement by weight; they increase."""
     # Uniform points in order, from exponential gaps.
     gaps = np.cumsum(generator.standard_exponential(number + 1))
     cumulative = np.cumsum(weights)
@@ -45,17 +39,6 @@ def jittered(
 
     A deviation from the papers: targets stand still, so that without it ever fewer different
     particles are left.
-
-    Parameters
-    ----------
-    particles : (n, d) array
-        Metres.
-    index : (number,) array
-        From `resample`.
-    deviation : float
-        Of Gaussian noise on each axis of the second and further copies, metres.
-    bounds : (d, 2) array
-        Copies stay inside, metres.
     """
     moved = particles[index]
     copies = np.flatnonzero(index[1:] == index[:-1]) + 1

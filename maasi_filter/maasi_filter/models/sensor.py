@@ -8,8 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.detection import DetectionModel
+from maasi_filter.models.detection import BoxDetection, DetectionModel
 from maasi_filter.models.measurement import MeasurementModel, RangeBearing, RangeBearingElevation
+
+# Lower bound of the expected false detections in a scan: without it, a few stray particles
+# suffice to explain a false detection as a target.
+LEAST_PER_SCAN = 0.05
 
 
 def check_covariance(name: str, covariance: FloatArray, dimension: int) -> None:
@@ -107,6 +111,22 @@ class Sensor:
     def dimension(self) -> int:
         """2 or 3."""
         return self.measurement.dimension
+
+    def measurement_space(self, bounds: FloatArray) -> float:
+        """Return the volume of the measurements in an environment [m rad, in 3D m rad^2].
+
+        Ranges up to the sensor's largest, the diagonal of the environment, or the farthest corner
+        of its field of view; all angles.
+        """
+        size = bounds[:, 1] - bounds[:, 0]
+        reach = min(self.maximum_range, math.sqrt(float((size * size).sum())))
+        if isinstance(self.detection, BoxDetection):
+            corner = np.maximum(np.abs(self.detection.lower), np.abs(self.detection.upper))
+            corner = corner[: len(bounds)] + self.detection.edge
+            # A box in two axes does not limit the height.
+            if len(corner) == len(bounds):
+                reach = min(reach, math.sqrt(float((corner * corner).sum())))
+        return reach * 2.0 * math.pi * (math.pi if len(bounds) == 3 else 1.0)
 
     @classmethod
     def ranging(

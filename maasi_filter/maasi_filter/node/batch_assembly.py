@@ -203,17 +203,7 @@ class BatchAssembly:
     def _stamp_problem(
         self, name: str, message: DetectionArray, expected: PendingBatch | None
     ) -> str | None:
-        """Return why the stamp of detections is refused, or None.
-
-        Parameters
-        ----------
-        name : str
-            Of the robot.
-        message : DetectionArray
-            From it.
-        expected : PendingBatch, optional
-            The batch that it answers.
-        """
+        """Return why the stamp of detections is refused, or None."""
         stamp = stamp_from_ros(message.header.stamp)
         last = self.heard[name][2] if name in self.heard else 0
         if expected is not None:

@@ -12,29 +12,16 @@ from maasi_filter.state_file import SavedState, write_state
 
 @dataclass
 class Progress:
-    """Progress of a run after a batch.
+    """Progress of a run after a batch."""
 
-    Attributes
-    ----------
-    batch : int
-        Id of the last batch.
-    stamp : int
-        Of the last batch [ns].
-    step : int
-        Of the last batch.
-    settled_by : dict
-        Id of the batch that completed each found target, by the id of the target.
-    heard : dict
-        Batch, measurement and stamp [ns] of the last detections, by robot.
-    update : bytes
-        The last update, as published and serialised; it may not have been sent yet.
-    """
-
-    batch: int
-    stamp: int
-    step: int
+    batch: int  # Id of the last batch
+    stamp: int  # Of the last batch [ns]
+    step: int  # Of the last batch
+    #: Id of the batch that completed each found target, by the id of the target.
     settled_by: dict[int, int] = field(default_factory=dict)
+    #: Batch, measurement and stamp [ns] of the last detections, by robot.
     heard: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+    #: The last update, as published and serialised; it may not have been sent yet.
     update: bytes = b''
 
 
@@ -54,13 +41,7 @@ class FilterMemory:
         write_state(self.path, {state.method: state, 'progress': progress}, durable=False)
 
     def load(self) -> tuple[SearchFilter, Progress] | None:
-        """Return the saved filter and progress, or None without a file.
-
-        Raises
-        ------
-        StateFileError
-            If the file cannot be used.
-        """
+        """Return the saved filter and progress, or None without a file."""
         if not self.path.exists():
             return None
         saved = SavedState(self.path)

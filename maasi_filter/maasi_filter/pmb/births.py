@@ -66,24 +66,19 @@ class Births:
 
     Parameters
     ----------
-    particles : (m, n, d) array
-        x = g^-1(z + noise), metres.
-    volume : (m, n) array
-        pi(x) |dx/dz|, 0 outside the bounds: with it a mean over the draws is an integral of
-        pi(x) g(z | x).
-    weights : (m, n) array
-        The same times e(x).
     means, covariances : (m, d) and (m, d, d) arrays
         Of the draws.
-    intensity : (m,) array
-        lambda_j = (N0 / V) int e pi g(z_j | x) dx, of detections of targets not seen before.
     """
 
-    particles: FloatArray
+    particles: FloatArray  # (m, n, d): x = g^-1(z + noise), metres
+    #: (m, n): pi(x) |dx/dz|, 0 outside the bounds: with it a mean over the draws is an
+    #: integral of pi(x) g(z | x).
     volume: FloatArray
-    weights: FloatArray
+    weights: FloatArray  # (m, n): The same times e(x)
     means: FloatArray
     covariances: FloatArray
+    #: (m,): lambda_j = (N0 / V) int e pi g(z_j | x) dx, of detections of targets not seen
+    #: before.
     intensity: FloatArray
 
 
@@ -94,15 +89,7 @@ def draw_births(
     number: int,
     generator: np.random.Generator,
 ) -> Births:
-    """Return births of a scan, before e is updated with it (Williams 2015).
-
-    Parameters
-    ----------
-    expected_targets : float
-        N0.
-    number : int
-        Draws for each detection.
-    """
+    """Return births of a scan, before e is updated with it (Williams 2015)."""
     count, d = scan.origins.shape
     particles = generator.standard_normal((count, number, d))
     volume = np.empty((count, number))
@@ -135,13 +122,6 @@ def born(
     """Return the density e pi g_j of each detection that is wanted, by its number.
 
     A detection near or beyond the bounds has few draws inside the environment, and none is made.
-
-    Parameters
-    ----------
-    grid : array
-        e before the scan; it is copied.
-    frame : (3, 3) array
-        As of a density.
     """
     total, squares = births.weights.sum(axis=1), np.square(births.weights).sum(axis=1)
     wanted = wanted & (np.square(total) > LEAST_SUPPORT * squares)

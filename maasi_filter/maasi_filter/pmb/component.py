@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.found_targets import SAME_TARGET, distance
 from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb.answers import RATES, add_look
 from maasi_filter.pmb.births import LEAST_SUPPORT, Births
@@ -31,75 +32,40 @@ LEAST_CHANGE = 1e-3
 MOST_FACTORS_FOUND = 60
 MOST_FACTORS = 150
 
+# Least expected number of detections of a found target: one precise detection is not enough.
+LEAST_HITS = 1.5
+# Expected joint detections in a scan from which two components are different targets.
+SEEN_BOTH = 1.5
+
 
 @dataclass
 class View:
-    """Likelihoods of a component in one scan.
+    """Likelihoods of a component in one scan."""
 
-    Parameters
-    ----------
-    probability : (n,) array
-        pi at its particles.
-    detected : float
-        p_D = sum w pi.
-    gated : (g,) int array
-        Detections within its gate.
-    seen : (g, n) array
-        pi g_j at its particles.
-    likelihood : (g,) array
-        L_j = int f pi g_j dx.
-    drawn : dict
-        Weights of draws from detections with too few particles, by index in `gated`.
-    """
-
-    probability: FloatArray
-    detected: float
-    gated: IntArray
-    seen: FloatArray
-    likelihood: FloatArray
+    probability: FloatArray  # (n,): pi at its particles
+    detected: float  # p_D = sum w pi
+    gated: IntArray  # (g,): Detections within its gate
+    seen: FloatArray  # (g, n): pi g_j at its particles
+    likelihood: FloatArray  # (g,): L_j = int f pi g_j dx
+    #: Weights of draws from detections with too few particles, by index in `gated`.
     drawn: dict[int, FloatArray] = field(default_factory=dict)
 
 
 @dataclass
 class Component:
-    """A potential target.
+    """A potential target."""
 
-    Parameters
-    ----------
-    existence : float
-        r.
-    density : Density
-        f.
-    hits : float
-        Expected number of its detections, given that it exists.
-    scan : int
-        Number of the scan it was born in.
-    pose_error : float
-        Position error of the robot that detected it last, metres.
-    found_radius : float
-        T_r of the sensor of that robot, metres.
-    robot : str
-        Robot whose detection it was born from; '' of a target of another filter.
-    target : FoundTarget, optional
-        The reported target, if it is found.
-    labels : LabelTally
-        Its class and identity.
-    stale : bool
-        Whether `density` has changed since `target` was estimated.
-    answers : (k,) array
-        Log likelihood of its detections and misses since birth, with each of RATES.
-    """
-
-    existence: float
-    density: Density
-    hits: float
-    scan: int
-    pose_error: float
-    found_radius: float
-    robot: str = ''
-    target: FoundTarget | None = None
-    labels: LabelTally = field(default_factory=LabelTally)
-    stale: bool = False
+    existence: float  # r
+    density: Density  # f
+    hits: float  # Expected number of its detections, given that it exists
+    scan: int  # Number of the scan it was born in
+    pose_error: float  # Position error of the robot that detected it last, metres
+    found_radius: float  # T_r of the sensor of that robot, metres
+    robot: str = ''  # Robot whose detection it was born from; '' of a target of another filter
+    target: FoundTarget | None = None  # The reported target, if it is found
+    labels: LabelTally = field(default_factory=LabelTally)  # Its class and identity
+    stale: bool = False  # Whether `density` has changed since `target` was estimated
+    #: (k,): Log likelihood of its detections and misses since birth, with each of RATES.
     answers: FloatArray = field(default_factory=lambda: np.zeros(len(RATES)))
 
     @property
@@ -263,3 +229,43 @@ def merge(components: list[Component], distance: float) -> list[Component]:
         else:
             kept.append(i)
     return [components[i] for i in sorted(kept)]
+
+
+def can_be_found(item: Component, probability: float) -> bool:
+    """Return whether a component almost surely exists, at a precisely known position."""
+    return (
+        item.target is None
+        and item.existence > probability
+        and item.hits >= LEAST_HITS
+        and item.density.radius <= item.found_radius
+    )
+
+
+def is_known(i: int, components: Sequence[Component], caused: FloatArray) -> bool:
+    """Return whether component i may be the same target as a found component.
+
+    A target causes at most one detection per scan, so two components that together caused more than
+    one are two targets.
+    """
+    density = components[i].density
+    for f, other in enumerate(components):
+        if other.target is None or components[i].differs(other):
+            continue
+        if caused[[i, f]].sum() > SEEN_BOTH:
+            continue
+        offset = density.mean - other.density.mean
+        total = density.covariance + other.density.covariance
+        if squared_distance(offset, total) < SAME_TARGET:
+            return True
+    return False
+
+
+def nearest(target: FoundTarget, components: Sequence[Component]) -> Component | None:
+    """Return the nearest component that is not found within the gate of a target, or None."""
+    best, least = None, SAME_TARGET
+    for item in components:
+        if item.target is None:
+            gap = distance(item.density.mean, item.density.covariance, target)
+            if gap < least:
+                best, least = item, gap
+    return best

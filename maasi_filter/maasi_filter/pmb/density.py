@@ -173,34 +173,26 @@ class Density:
 
     Parameters
     ----------
-    particles : (n, d) array
-        Metres.
-    weights : (n,) array
-        They sum to 1.
     heads, terms : arrays
         Factors, at least one; see `factors`.
-    grid : (nx, ny, nz) array
-        e at birth, a factor too; empty where there is none. It is not written to.
-    frame : (3, 3) array
-        Lower and upper bounds of the environment, and the step of the grid.
 
     Attributes
     ----------
     mean, covariance : (d,) and (d, d) arrays
         Of the particles.
-    radius : float
-        Root mean square distance from the mean, metres.
     """
 
-    particles: FloatArray
-    weights: FloatArray
+    particles: FloatArray  # (n, d): Metres
+    weights: FloatArray  # (n,): They sum to 1
     heads: FloatArray
     terms: FloatArray
+    #: (nx, ny, nz): e at birth, a factor too; empty where there is none. It is not written
+    #: to.
     grid: FloatArray
-    frame: FloatArray
+    frame: FloatArray  # (3, 3): Lower and upper bounds of the environment, and the step of the grid
     mean: FloatArray = field(init=False)
     covariance: FloatArray = field(init=False)
-    radius: float = field(init=False)
+    radius: float = field(init=False)  # Root mean square distance from the mean, metres
 
     def __post_init__(self) -> None:
         d = self.particles.shape[1]
@@ -257,10 +249,19 @@ class Density:
         self._move(1.0, products, last, generator)
         self._update_moments()
 
-    def replace_particles(self, particles: FloatArray) -> None:
-        """Put others in place of the particles, with the same weights."""
-        self.particles = particles
+    def diffuse(self, variance: float, generator: np.random.Generator) -> None:
+        """Convolve with a normal density of `variance` [m^2] on each axis: a random walk.
+
+        Particles are moved, so they remain a sample of the true density. Its product of factors is
+        replaced by a normal density with their moments, which only Metropolis moves use afterwards.
+        """
+        d = self.particles.shape[1]
+        moved = self.particles + math.sqrt(variance) * generator.standard_normal(
+            self.particles.shape
+        )
+        self.particles = np.clip(moved, self.frame[0, :d], self.frame[1, :d])
         self._update_moments()
+        self.condense()
 
     def shift(self, way: FloatArray) -> None:
         """Move the whole density, factors included, by `way` (d,), metres."""
@@ -278,13 +279,7 @@ class Density:
         self.grid = np.empty((0, 0, 0))
 
     def restore(self, frame: FloatArray, grid: tuple[int, ...]) -> None:
-        """Check a saved density, whose grid has this shape if any, and let it share the frame.
-
-        Raises
-        ------
-        ValueError
-            If a shape or number is wrong.
-        """
+        """Check a saved density, whose grid has this shape if any, and let it share the frame."""
         n, d = len(self.weights), int((frame[1] > frame[0]).sum())
         shapes = {
             'particles': (self.particles.shape, (n, d)),

@@ -41,15 +41,7 @@ TERM = INFORMATION + 9
 def gaussian_terms(
     centres: FloatArray, covariances: FloatArray, cartesian: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return normal densities as terms (m, TERM), and Cholesky factors of their covariances.
-
-    Parameters
-    ----------
-    centres : (m, d) array
-        Means: positions if `cartesian` (m,), else range and angles.
-    covariances : (m, d, d) array
-        In the same space.
-    """
+    """Return normal densities as terms (m, TERM), and Cholesky factors of their covariances."""
     number, d = centres.shape
     roots: FloatArray = np.asarray(np.linalg.cholesky(covariances), float)
     information = np.zeros((number, 3, 3))

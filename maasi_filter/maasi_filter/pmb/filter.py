@@ -17,28 +17,41 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.clutter import measurement_space
-from maasi_filter.dropped import count_unexplained, within_range, without_repeats
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
     check_measurements,
     check_taken,
+    count_unexplained,
     pose_error_of,
+    within_range,
+    without_repeats,
 )
 from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.label import LabelTally
 from maasi_filter.pmb.answers import PRIOR, RATES, rate_of_targets, reflects
-from maasi_filter.pmb.association import Marginals, associate
+from maasi_filter.pmb.association import (
+    Marginals,
+    associate,
+    associate_by_identity,
+    learn_labels,
+    new_label,
+)
 from maasi_filter.pmb.births import Births, born, draw_births
-from maasi_filter.pmb.component import Component, View, merge, views
+from maasi_filter.pmb.component import (
+    LEAST_HITS,
+    Component,
+    View,
+    can_be_found,
+    is_known,
+    merge,
+    nearest,
+    views,
+)
 from maasi_filter.pmb.density import Density
-from maasi_filter.pmb.found import LEAST_HITS, can_be_found, is_known, nearest
-from maasi_filter.pmb.identity import associate_by_identity, learn_labels, new_label
 from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.scan import Scan, make_scan
-from maasi_filter.pmb.walk import diffuse, diffuse_unexplored
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.search_filter import FilterState
 from maasi_filter.settings import FilterSettings
@@ -195,7 +208,7 @@ class PmbFilter:
     ) -> bool:
         """Correct with one robot's scan; return whether what is found changed."""
         member = without_repeats(within_range(member, dropped), dropped)
-        space = measurement_space(member.sensor, self.bounds)
+        space = member.sensor.measurement_space(self.bounds)
         # kappa: clutter per unit of measurement space.
         kappa = self._learnt.clutter.per_scan(member.robot, member.sensor.clutter * space) / space
         believed = self._localised(member, kappa)
@@ -203,19 +216,14 @@ class PmbFilter:
         scan = self._scan(member)
         self._scans += 1
         # lambda_j = (N0 / V) int e pi g_j dx, by importance sampling from the detections.
-        births = draw_births(
-            scan,
-            self.exploration,
-            self._expected_targets,
-            self._numbers.pmb.particles,
-            self.generator,
-        )
+        number = self._numbers.pmb.particles
+        births = draw_births(scan, self.exploration, self._expected_targets, number, self.generator)
         # p_D = int f pi dx, L_j = int f pi g_j dx.
         seen = views(self.components, scan, births)
+        # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         odds = np.zeros((len(seen), len(scan.terms)))
         for i, (item, view) in enumerate(zip(self.components, seen)):
             odds[i, view.gated] = item.odds(view)
-        # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         other = kappa + births.intensity
         named = associate_by_identity(member.labels, self.components, odds, other)
         marginals = associate(odds, other)
@@ -226,9 +234,18 @@ class PmbFilter:
         count_unexplained(scan.centres[alone], self.bounds, dropped)
         changed = self._offsets.active and bool(self.own_found_targets())
         changed |= self._update(member, scan, births, seen, marginals, newly_found, time)
-        # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
+        # r = p_new lambda_j / (kappa + lambda_j).
         real = np.where(named, 0.0, births.intensity / (kappa + births.intensity))
-        existence = marginals.new * real
+        self._add_born(member, scan, births, marginals.new * real)
+        self._learnt.clutter.count(member.robot, float((marginals.new * (1.0 - real)).sum()))
+        # e <- e (1 - pi).
+        self.exploration.update(scan.detection, member.pose)
+        return changed
+
+    def _add_born(
+        self, member: CheckedMeasurement, scan: Scan, births: Births, existence: FloatArray
+    ) -> None:
+        """Add components of r = `existence` (m,) and f = e pi g_j / int e pi g_j."""
         likely, e = existence >= LEAST_EXISTENCE, self.exploration.kernel()[0]
         error, radius = member.pose_error, self._found_radius(member)
         for j, density in born(scan, births, likely, e, self._frame):
@@ -237,10 +254,6 @@ class PmbFilter:
             )
             item.labels = new_label(member.labels, j, self.components)
             self.components.append(item)
-        self._learnt.clutter.count(member.robot, float((marginals.new * (1.0 - real)).sum()))
-        # e <- e (1 - pi).
-        self.exploration.update(scan.detection, member.pose)
-        return changed
 
     def _update(
         self,
@@ -357,11 +370,11 @@ class PmbFilter:
         variance = walk**2 * max(time - last, 0.0)
         if variance == 0.0:
             return False
-        diffuse_unexplored(self.exploration, variance)
+        self.exploration.diffuse(variance)
         for item in self.components:
             if item.foreign:
                 continue
-            diffuse(item.density, variance, self.generator)
+            item.density.diffuse(variance, self.generator)
             item.stale = True
         return any(item.target is not None and item.stale for item in self.components)
 
@@ -461,13 +474,7 @@ class PmbFilter:
 
     @classmethod
     def from_state(cls, state: PmbState) -> PmbFilter:
-        """Return the filter of a state; it continues bit for bit as the saved one would have.
-
-        Raises
-        ------
-        ValueError
-            If a shape or number is wrong.
-        """
+        """Return the filter of a state; it continues bit for bit as the saved one would have."""
         search = cls(state.settings, state.bounds, state.generator)
         search.exploration.restore(state.exploration)
         for item in state.components:

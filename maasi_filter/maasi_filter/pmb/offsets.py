@@ -20,7 +20,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.association import associate
 from maasi_filter.pmb.component import Component
 from maasi_filter.pmb.factors import MOST_PROBABLE
-from maasi_filter.pmb.noise_scale import innovations
+from maasi_filter.pmb.learnt import innovations
 from maasi_filter.pmb.settings import OffsetSettings
 
 # Components below this r are not considered, nor associations below this probability.
@@ -38,32 +38,22 @@ class Offsets:
 
     Attributes
     ----------
-    keys : list
-        Names of robots, and ids of found targets.
     mean, covariance : (n d,), (n d, n d) arrays
         Metres.
-    last : dict
-        Reported position of each robot at its last scan, (3,), metres.
-    way : dict
-        Way of each robot on the level since its first scan, metres.
     """
 
     settings: OffsetSettings
     dimension: int
-    keys: list[str | int] = field(default_factory=list)
+    keys: list[str | int] = field(default_factory=list)  # Names of robots, and ids of found targets
     mean: FloatArray = field(default_factory=lambda: np.empty(0))
     covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    #: Reported position of each robot at its last scan, (3,), metres.
     last: dict[str, FloatArray] = field(default_factory=dict)
+    #: Way of each robot on the level since its first scan, metres.
     way: dict[str, float] = field(default_factory=dict)
 
     def check(self) -> None:
-        """Refuse saved offsets that do not fit each other.
-
-        Raises
-        ------
-        ValueError
-            Naming what was read and what is allowed.
-        """
+        """Refuse saved offsets that do not fit each other."""
         size = self.dimension * len(self.keys)
         shapes = self.mean.shape, self.covariance.shape
         if shapes != ((size,), (size, size)) or len(set(self.keys)) < len(self.keys):
@@ -86,14 +76,8 @@ class Offsets:
     ) -> CheckedMeasurement:
         """Return a robot's scan at its estimated pose; the components are moved.
 
-        Parameters
-        ----------
-        components : sequence of Component
-            Potential and found targets.
-        clutter : float
-            kappa, per unit of measurement space.
-        unseen : float
-            N0 / V, per m^d: the largest intensity of undetected targets.
+        `clutter` is kappa, per unit of measurement space; `unseen` N0 / V, per m^d: the largest
+        intensity of undetected targets.
         """
         self._predict(member)
         before = self.mean.copy()

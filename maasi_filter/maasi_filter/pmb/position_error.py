@@ -76,15 +76,9 @@ def _near(member: CheckedMeasurement, items: Sequence[Component], reach: float) 
 
 @dataclass
 class PositionErrors:
-    """Probabilities of the errors in LEVELS, for each robot.
+    """Probabilities of the errors in LEVELS, for each robot."""
 
-    Attributes
-    ----------
-    probabilities : dict
-        By robot: (k,).
-    """
-
-    probabilities: dict[str, FloatArray] = field(default_factory=dict)
+    probabilities: dict[str, FloatArray] = field(default_factory=dict)  # By robot: (k,)
 
     def learn(
         self,
@@ -95,12 +89,8 @@ class PositionErrors:
     ) -> float:
         """Return the most probable deviation [m] after a scan, on each axis.
 
-        Parameters
-        ----------
-        clutter : float
-            kappa, per unit of measurement space.
-        unseen : float
-            N0 / V, per m^d: the largest intensity of undetected targets.
+        `clutter` is kappa, per unit of measurement space; `unseen` N0 / V, per m^d: the largest
+        intensity of undetected targets.
         """
         before = self.probabilities.get(member.robot, PRIOR)
         unit = math.sqrt(member.sensor.covariance[0, 0])

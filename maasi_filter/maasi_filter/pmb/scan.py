@@ -37,39 +37,22 @@ class Scan:
 
     Parameters
     ----------
-    head : (HEAD,) array
-        Factor of the scan: sensor and its pi; c_0 is 1.
-    terms : (m, TERM) array
-        Factors of the detections; c_j is 1.
-    pose : Pose
-        Of the sensor.
-    detection : DetectionModel
-        pi.
     ranges, deviations : (m,) arrays
         Measured ranges and their standard deviations, metres.
-    cartesian : (m,) bool array
-        Whether the noise is Gaussian in space, not in range and angles.
-    origins : (m, d) array
-        Mean of the noise in that space: measured position, or range and angles.
-    centres : (m, d) array
-        Measured positions, metres.
-    roots : (m, d, d) array
-        Cholesky factors of the covariance in that space.
-    volume : (m,) array
-        |dx/dz| of Cartesian detections, else 1.
     """
 
-    head: FloatArray
-    terms: FloatArray
-    pose: Pose
-    detection: DetectionModel
+    head: FloatArray  # (HEAD,): Factor of the scan: sensor and its pi; c_0 is 1
+    terms: FloatArray  # (m, TERM): Factors of the detections; c_j is 1
+    pose: Pose  # Of the sensor
+    detection: DetectionModel  # pi
     ranges: FloatArray
     deviations: FloatArray
-    cartesian: BoolArray
+    cartesian: BoolArray  # (m,): Whether the noise is Gaussian in space, not in range and angles
+    #: (m, d): Mean of the noise in that space: measured position, or range and angles.
     origins: FloatArray
-    centres: FloatArray
-    roots: FloatArray
-    volume: FloatArray
+    centres: FloatArray  # (m, d): Measured positions, metres
+    roots: FloatArray  # (m, d, d): Cholesky factors of the covariance in that space
+    volume: FloatArray  # (m,): |dx/dz| of Cartesian detections, else 1
 
 
 def make_scan(member: CheckedMeasurement, factor: float, detection: DetectionModel) -> Scan:
@@ -77,13 +60,6 @@ def make_scan(member: CheckedMeasurement, factor: float, detection: DetectionMod
 
     The position error of the robot is added to the noise. Covariances that a camera reports come
     from Cartesian ones: next to the robot, where the bearing is unknown, they are used as such.
-
-    Parameters
-    ----------
-    factor : float
-        Of the variances of the noise.
-    detection : DetectionModel
-        pi, with edges blurred by the position error.
     """
     values, pose = member.values, member.pose
     number, d = values.shape
