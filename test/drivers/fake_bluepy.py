@@ -14,7 +14,7 @@ import time
 from types import ModuleType
 from typing import ClassVar
 
-from maasi_sim.emulators.mambo.commands import ALL_STATES, obey
+from maasi_sim.emulators.mambo.fake_mambo import ALL_STATES, obey
 
 _SERVICES = {
     'fa00': ('fa0a', 'fa0b', 'fa0c', 'fa1e'),

@@ -14,7 +14,7 @@ import zlib
 
 import numpy as np
 
-from maasi_sim.emulators.mavlink.flight_model import FlightLimits, FlightModel
+from maasi_sim.emulators.mavlink.autopilot_reports import FlightLimits, FlightModel
 
 _STEP, _FEED_PERIOD = 0.02, 0.1
 GROUND, AIR, LANDING = range(3)

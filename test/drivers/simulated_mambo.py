@@ -17,8 +17,8 @@ from maasi_sim.emulators.mambo.firmware import (
     FlyingState,
     MamboFirmware,
     Piloting,
+    TiltBodySettings,
 )
-from maasi_sim.emulators.mambo.tilt_body import TiltBodySettings
 from maasi_sim.world.odometry import OdometrySettings
 from maasi_sim.world.robots import BatterySettings
 
@@ -64,8 +64,8 @@ class Flight:
             BatterySettings(charge=battery),
             OdometrySettings(position_noise=0.002, heading_noise=0.002),
         )
-        self.firmware.limit_tilt(math.degrees(TILT))
-        self.firmware.limit_climb(0.5)
+        self.firmware.limit('tilt', math.degrees(TILT))
+        self.firmware.limit('climb', 0.5)
         self.connected, self.error = True, ''
         self.tilt, self.climb = TILT, 0.5
         self.position = None

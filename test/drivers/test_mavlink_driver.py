@@ -15,6 +15,7 @@ import yaml
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
+from mavlink_play import take_mode
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
@@ -345,7 +346,7 @@ def test_a_vehicle_in_the_air_is_taken_over_and_the_answer_says_so(fly):
         # A pilot has brought it there.
         autopilot.armed = True
         autopilot.body.position[2] = 1.0
-        autopilot.take_mode('GUIDED')
+        take_mode(autopilot, 'GUIDED')
     flight.until(lambda: flight.driver.link.status().get('in the air'))
     flight.until(lambda: 'it is armed in GUIDED' in flight.state.reason)
     assert flight.team.call('arm').message == 'it is in the air: it is taken over where it is'
@@ -450,7 +451,7 @@ def test_a_position_that_hangs(fly):
     flight = fly(odometry_timeout=0.5).fly()
     result = flight.under_way()
     with flight.vehicle._lock:
-        flight.vehicle.autopilot.freeze()
+        flight.vehicle.autopilot.reports.freeze()
     flight.gives_up(result, 'no LOCAL_POSITION_NED for')
 
 
@@ -491,7 +492,7 @@ def test_the_pilot_takes_over_and_keeps_it(fly, capfd):
     flight = fly().fly()
     result = flight.under_way()
     with flight.vehicle._lock:
-        flight.vehicle.autopilot.take_mode('LOITER')
+        take_mode(flight.vehicle.autopilot, 'LOITER')
     flight.gives_up(result, 'the pilot has taken over: mode LOITER')
     assert 'mode LOITER; the driver lets go' in capfd.readouterr().err
     flight.driver.halt()
@@ -516,14 +517,14 @@ def test_with_a_low_battery_it_lands_once_the_pilot_gives_it_back(fly):
     flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
     autopilot, lock = flight.vehicle.autopilot, flight.vehicle._lock
     with lock:
-        autopilot.take_mode('LOITER')
+        take_mode(autopilot, 'LOITER')
     flight.until(lambda: 'the pilot has taken over' in flight.state.reason)
     with lock:
         autopilot.charge = 0.15
     flight.until(lambda: 'battery at 0.15' in flight.state.reason)
     assert flight.mode == 'LOITER'
     with lock:
-        autopilot.take_mode('GUIDED')
+        take_mode(autopilot, 'GUIDED')
     flight.until(lambda: flight.mode == 'LAND')
     flight.until(lambda: not autopilot.armed)
 

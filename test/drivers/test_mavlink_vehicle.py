@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mavlink_play import FIRMWARES, HEIGHTS, Play, mavlink
+from mavlink_play import FIRMWARES, HEIGHTS, Play, mavlink, take_mode
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
@@ -215,11 +215,11 @@ def test_a_ground_station_of_its_own_id_does_not_keep_the_failsafe_from_acting()
 def test_a_barometer_that_drifts_before_arming_does_not_keep_it_at_its_take_off(drift):
     play = Play(autopilot={'barometer_drift': drift, 'estimator_time': 12.0})
     play.fly()
-    assert abs(play.autopilot._height_error) > 0.55
+    assert abs(play.autopilot.height_error) > 0.55
     play.run(4.0)
     # Above the ground, whatever the barometer says.
     assert play.autopilot.body.position[2] == pytest.approx(HEIGHTS['arducopter'], abs=0.1)
-    assert play.vehicle.estimate.origin[2] == pytest.approx(play.autopilot._height_error, abs=0.05)
+    assert play.vehicle.estimate.origin[2] == pytest.approx(play.autopilot.height_error, abs=0.05)
     assert len(play.commands(mavlink.MAV_CMD_NAV_TAKEOFF)) == 1
 
 
@@ -255,11 +255,11 @@ def test_a_take_off_that_was_accepted_is_not_asked_for_again():
 def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on():
     play = Play(autopilot={'charge': 0.01})
     play.until(lambda: play.vehicle.phase is Phase.ARMING)
-    play.autopilot.take_mode('LOITER')
+    take_mode(play.autopilot, 'LOITER')
     play.run(3.0)
     assert play.vehicle.phase is Phase.RELEASED
     play.autopilot.charge = 1.0
-    play.autopilot.take_mode('GUIDED')
+    take_mode(play.autopilot, 'GUIDED')
     play.run(10.0)
     assert 'GUIDED is back' in play.said
     assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
@@ -269,7 +269,7 @@ def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on():
 
 def test_the_loss_of_gnss_is_seen_in_flight():
     play = Play().fly().go(SPEED)
-    play.autopilot.lose_gnss()
+    play.autopilot.gnss_lost_at = play.autopilot.now
     play.run(1.5)
     assert play.vehicle.fault == 'vehicle: GNSS is lost (GPS_RAW_INT.fix_type 1)'
     play.run(9.0)
@@ -305,7 +305,7 @@ def test_a_status_that_another_program_turned_off_is_asked_for_again():
 
 def test_one_of_two_gnss_receivers_is_enough():
     play = Play(autopilot={'second_gnss': True}).fly().go(SPEED)
-    play.autopilot.lose_gnss()
+    play.autopilot.gnss_lost_at = play.autopilot.now
     play.run(12.0)
     assert play.vehicle.fault == ''
     play.autopilot.reports.muted = {'GPS2_RAW'}
@@ -459,7 +459,7 @@ def test_a_driver_that_finds_its_vehicle_in_the_air_does_not_guess_where_it_is()
     assert 'its place in the map is not known' in play.permit()
     assert play.vehicle.estimate.telemetry is None
     # After a landing it is not at its start either.
-    play.autopilot.take_mode('LAND')
+    take_mode(play.autopilot, 'LAND')
     play.until(lambda: not play.autopilot.armed)
     play.run(3.0)
     assert 'its place in the map is not known' in play.permit()
@@ -671,7 +671,7 @@ def test_after_a_short_cut_it_holds_where_it_is():
 
 def test_a_frozen_position_is_no_news():
     play = Play().fly()
-    play.autopilot.freeze()
+    play.autopilot.reports.freeze()
     play.run(0.2)
     number = play.vehicle.estimate.telemetry.number
     play.run(AT_MOST)
@@ -692,7 +692,7 @@ def test_a_position_that_is_not_finite_is_dropped():
 @firmwares
 def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
     play = Play(firmware).fly().go(SPEED)
-    play.autopilot.take_mode({'px4': 'POSCTL'}.get(firmware, 'ALT_HOLD'))
+    take_mode(play.autopilot, {'px4': 'POSCTL'}.get(firmware, 'ALT_HOLD'))
     play.run(AT_MOST)
     assert 'the pilot has taken over: mode' in play.vehicle.fault
     assert 'the driver lets go' in play.said
@@ -712,10 +712,10 @@ def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
 
 def test_a_pilot_can_give_the_mode_back():
     play = Play().fly().go(SPEED)
-    play.autopilot.take_mode('LOITER')
+    take_mode(play.autopilot, 'LOITER')
     play.run(2.0)
     here = play.autopilot.body.position.copy()
-    play.autopilot.take_mode('GUIDED')
+    take_mode(play.autopilot, 'GUIDED')
     play.run(3.0)
     assert play.vehicle.flying
     assert 'the pilot gives GUIDED back' in play.said

@@ -18,15 +18,15 @@ from waiting import PATIENCE, wait_until
 
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_filter.models.pose import Pose
-from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, main
+from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, Frame, FrameError, frames, main
 from maasi_sim.emulators.mambo.firmware import (
     FirmwareSettings,
     FlyingState,
     MamboFirmware,
     Piloting,
+    TiltBody,
+    TiltBodySettings,
 )
-from maasi_sim.emulators.mambo.frames import Frame, FrameError, frames
-from maasi_sim.emulators.mambo.tilt_body import TiltBody, TiltBodySettings, TiltCommand
 from maasi_sim.world.robots import BatterySettings
 
 START = Pose.from_yaw([1.0, 2.0, 0.1], 0.5 * math.pi)
@@ -89,7 +89,7 @@ def test_take_off_and_landing():
 
 def test_piloting_moves_it_along_its_own_axes():
     made = hovering()
-    made.limit_tilt(5.0)
+    made.limit('tilt', 5.0)
     before = made.state.pose.position
     fly(made, 2.0, Piloting(pitch=50))
     assert made.flying_state == FlyingState.FLYING
@@ -114,7 +114,7 @@ def test_piloting_moves_it_along_its_own_axes():
 @pytest.mark.parametrize('drag', [0.3, 0.6, 2.6])
 def test_a_tilt_accelerates_it_until_the_drag_holds_against_it(drag):
     made = hovering(settings=FirmwareSettings(delay=0.0, body=TiltBodySettings(drag=drag)))
-    made.limit_tilt(10.0)
+    made.limit('tilt', 10.0)
     acceleration = 9.81 * math.tan(0.6 * math.radians(10.0))
     fly(made, 0.5, Piloting(pitch=60))
     # The tilt is there 0.1 s late.
@@ -155,7 +155,7 @@ def test_vertical_speed_and_rotation_rate_come_with_their_time_constants():
     settings = TiltBodySettings(climb_time=0.5, turn_time=0.25)
     body = TiltBody(settings, START)
     for _ in range(25):
-        body.step(TiltCommand(climb=1.0, turn=2.0), 0.1, 0.02)
+        body.step((0.0, 0.0, 1.0, 2.0), 0.1, 0.02)
     state = body.robot_state()
     assert_allclose(state.velocity[2], 1.0 - math.exp(-1.0), rtol=1e-6)
     assert_allclose(state.angular_velocity[2], 2.0 * (1.0 - math.exp(-2.0)), rtol=1e-6)

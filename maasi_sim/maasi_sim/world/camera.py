@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_drivers.vision.camera_model import Camera
+from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.models.pose import Pose
 from maasi_sim.world.floor_scene import Shape
 from maasi_sim.world.noise_streams import noise_stream
@@ -31,8 +32,6 @@ from maasi_sim.world.render_kernels import (
 )
 from maasi_sim.world.render_settings import RenderSettings
 
-Array = NDArray[np.float64]
-
 _NOISE_TABLE_SIZE = 1 << 16
 
 
@@ -43,23 +42,7 @@ def _noise_table() -> NDArray[np.float32]:
 
 
 class CameraRenderer:
-    """
-    Renders what one robot's camera sees.
-
-    Parameters
-    ----------
-    camera : Camera
-        True geometry; the driver may have another calibration.
-    settings : RenderSettings
-        Light, noise, blur.
-    shapes : sequence of Shape
-        What lies on the floor, bottom first; see `scene_of`.
-    seed : int
-        Of the run.
-    robot : str
-        Whose camera it is: with the seed and the step it keys the noise.
-
-    """
+    """Renders what one robot's camera sees."""
 
     def __init__(
         self,
@@ -104,7 +87,7 @@ class CameraRenderer:
         self._drift = np.zeros((len(shapes), 2))
         self._floor_colour = np.array(settings.floor_colour, dtype=float)
 
-    def _shape_rims(self) -> Array:
+    def _shape_rims(self) -> FloatArray:
         """Points (n, 16, 3) around each shape, a little outside it."""
         angles = np.arange(16) * (np.pi / 8.0)
         circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -118,7 +101,7 @@ class CameraRenderer:
             rim[:, 1] = shape[2] + shape[6] * local[:, 0] + shape[5] * local[:, 1]
         return rims
 
-    def gains(self, time: float) -> Array:
+    def gains(self, time: float) -> FloatArray:
         """Return exposure times white balance of R, G, B at a time [s], shape (3,)."""
         waves = np.sin(self._drift_phases + self._drift_rates * time)
         exposure = 1.0 + self.settings.exposure_drift * waves[0]
@@ -131,29 +114,8 @@ class CameraRenderer:
         time: float,
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> NDArray[np.uint8]:
-        """
-        Render an image.
-
-        Parameters
-        ----------
-        pose : Pose
-            True pose of the robot at the middle of the exposure, map frame.
-        step : int
-            Discrete step: keys the noise.
-        time : float
-            For the drift of exposure and white balance [s].
-        velocity : array_like, shape (3,)
-            Of the robot, map frame [m/s].
-        angular_velocity : array_like, shape (3,)
-            Of the robot, its own frame [rad/s].
-
-        Returns
-        -------
-        ndarray, shape (h, w, 3), uint8
-            R, G, B.
-
-        """
+    ) -> ImageArray:
+        """Render an image."""
         settings, camera = self.settings, self.camera
         rotation = pose.rotation()
         turn = rotation @ camera.rotation
@@ -210,7 +172,7 @@ class CameraRenderer:
         )
 
 
-def through_jpeg(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+def through_jpeg(image: ImageArray, quality: int) -> ImageArray:
     """Return an RGB image after JPEG compression at a quality of 1 to 100."""
     _, encoded = cv2.imencode(
         '.jpg', cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]

@@ -10,11 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from maasi_drivers.vision.camera_model import project_points
-
-Array = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray
 
 DISC, RECTANGLE = 0, 1
 _MAXIMUM_SUBSAMPLES = 33
@@ -24,19 +22,19 @@ _TEXTURE_CELL = 0.01
 class View(NamedTuple):
     """A camera in the map: centre (3,) [m], turn (3, 3) from camera to map, and its model."""
 
-    centre: Array
-    turn: Array
-    matrix: Array
-    distortion: Array
+    centre: FloatArray
+    turn: FloatArray
+    matrix: FloatArray
+    distortion: FloatArray
     largest_radius: float
 
 
 class Motion(NamedTuple):
     """Of the robot during the exposure: origin (3,) [m], map frame [m/s, rad/s], time [s]."""
 
-    origin: Array
-    velocity: Array
-    rotation_rate: Array
+    origin: FloatArray
+    velocity: FloatArray
+    rotation_rate: FloatArray
     exposure_time: float
 
 
@@ -55,9 +53,9 @@ class Exposure(NamedTuple):
         Deviation in the dark, variance for each grey level [grey level].
     """
 
-    lens: Array
-    light: Array
-    gains: Array
+    lens: FloatArray
+    light: FloatArray
+    gains: FloatArray
     read_noise: float
     shot_noise: float
 
@@ -79,8 +77,7 @@ def floor_points(rays, turn, centre, floor_x, floor_y):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def place(shapes, rims, floor_x, floor_y, view, motion, margin, boxes, drift):  # type: ignore[no-untyped-def]
-    """
-    Find the pixels that each shape may touch, and how far it moves during the exposure.
+    """Find the pixels that each shape may touch, and how far it moves during the exposure.
 
     boxes (n, 4): left, top, right, bottom; empty where the shape is out of view. drift (n, 2): in
     the floor's coordinates of mid exposure [m].
@@ -246,8 +243,7 @@ def floor_albedo(floor_x, floor_y, colour, texture, albedo):  # type: ignore[no-
 
 @njit(cache=True)
 def expose(albedo, floor_x, floor_y, exposure, noise, offsets, image):  # type: ignore[no-untyped-def]
-    """
-    Turn albedo (3, h, w) into grey levels (h, w, 3): light, gains, noise, quantisation.
+    """Turn albedo (3, h, w) into grey levels (h, w, 3): light, gains, noise, quantisation.
 
     The light is a wave of parabolas, a cheap approximation of a sine.
     """

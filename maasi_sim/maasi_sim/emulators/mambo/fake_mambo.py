@@ -1,6 +1,8 @@
 """A fake Parrot Mambo: the drone's side of its WiFi protocol, with a simulated firmware.
 
-The protocol is that of pyparrot 1.5.20: a handshake in JSON over TCP, then frames over UDP.
+The protocol is that of pyparrot 1.5.20: a handshake in JSON over TCP, then frames over UDP,
+`<BBBI` type, buffer, sequence, total size; and in commands and events `<BBH` project, class, id,
+as in Parrot's minidrone.xml.
 """
 
 from __future__ import annotations
@@ -16,26 +18,95 @@ import struct
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from maasi_filter.models.pose import Pose, quaternion_product
+from maasi_filter.models.pose import Pose
 from maasi_sim.arguments import whole
-from maasi_sim.emulators.mambo.commands import ALL_STATES, obey
 from maasi_sim.emulators.mambo.firmware import (
-    CLIMB_RANGE,
-    TILT_RANGE,
-    TURN_RANGE,
+    LIMITS,
     Estimate,
     FirmwareSettings,
     MamboFirmware,
+    Piloting,
+    TiltBodySettings,
 )
-from maasi_sim.emulators.mambo.frames import ACK, DATA, DATA_WITH_ACK, Frame, FrameError, frames
-from maasi_sim.emulators.mambo.tilt_body import TiltBodySettings
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import robot_type
+
+ACK, DATA, LOW_LATENCY, DATA_WITH_ACK = 1, 2, 3, 4
+_HEADER = struct.Struct('<BBBI')
+
+
+class FrameError(ValueError):
+    """Bytes that are no frame."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame: its type, buffer and sequence number, and what is in it."""
+
+    kind: int
+    buffer: int
+    sequence: int
+    payload: bytes = b''
+
+    def encode(self) -> bytes:
+        """Return its bytes."""
+        size = _HEADER.size + len(self.payload)
+        return _HEADER.pack(self.kind, self.buffer, self.sequence, size) + self.payload
+
+
+def frames(data: bytes) -> Iterator[Frame]:
+    """Yield the frames of a datagram."""
+    while data:
+        if len(data) < _HEADER.size:
+            raise FrameError(f'frame: got {len(data)} bytes, allowed are at least {_HEADER.size}')
+        kind, buffer, sequence, size = _HEADER.unpack_from(data)
+        if not _HEADER.size <= size <= len(data):
+            raise FrameError(
+                f'frame size: got {size}, allowed is {_HEADER.size} to the {len(data)} bytes there'
+            )
+        yield Frame(kind, buffer, sequence, data[_HEADER.size : size])
+        data = data[size:]
+
+
+ALL_STATES = (0, 4, 0)
+_TAKE_OFF, _PILOTING, _LAND, _EMERGENCY = (2, 0, 1), (2, 0, 2), (2, 0, 3), (2, 0, 4)
+_LIMITS = {(2, 8, 1): 'tilt', (2, 1, 0): 'climb', (2, 1, 1): 'turn'}
+
+
+def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) -> None:
+    """Execute a command on a firmware; `ValueError` where the content is no such command's.
+
+    Unknown ones are ignored.
+    """
+    try:
+        if number == _PILOTING:
+            flag, roll, pitch, yaw, climb, _ = struct.unpack('<BbbbbI', content)
+            values = [max(-100, min(value, 100)) for value in (roll, pitch, yaw, climb)]
+            if not flag:
+                # Without the flag the drone keeps itself level.
+                values[:2] = [0, 0]
+            firmware.pilot(Piloting(*values))
+        elif number == _TAKE_OFF:
+            firmware.take_off()
+        elif number == _LAND:
+            firmware.land()
+        elif number == _EMERGENCY:
+            firmware.emergency()
+        elif number in _LIMITS:
+            (value,) = struct.unpack('<f', content)
+            if not math.isfinite(value):
+                raise ValueError(f'command {number}: got {value}, allowed is a finite number')
+            firmware.limit(_LIMITS[number], value)
+    except struct.error as error:
+        raise ValueError(f'command {number}: {error}') from error
+
 
 #: Port of the handshake, fixed in pyparrot.
 HANDSHAKE_PORT = 44444
@@ -57,15 +128,7 @@ _TRIES = 100
 
 
 def free_address() -> str:
-    """
-    Return a loopback address where a fake can be reached for its handshake.
-
-    Raises
-    ------
-    OSError
-        If there is none.
-
-    """
+    """Return a loopback address where a fake can be reached for its handshake."""
     for _ in range(_TRIES):
         numbers = [secrets.randbelow(200) + 20 for _ in range(3)]
         address = '.'.join(map(str, [127, *numbers]))
@@ -86,19 +149,9 @@ def free_port() -> int:
 
 
 class FakeMambo:
-    """
-    A Mambo on this host, which a client such as pyparrot connects to.
+    """A Mambo on this host, which a client such as pyparrot connects to.
 
     Its time advances by calls of `advance`, or in real time after `run`.
-
-    Parameters
-    ----------
-    firmware : MamboFirmware
-        Its flight.
-    address : str
-        Of this host; several fakes have different ones (127.0.0.1, 127.0.0.2, ...).
-    command_port : int
-        UDP; 0: any that is free.
 
     Attributes
     ----------
@@ -108,7 +161,6 @@ class FakeMambo:
         Whether the network loses received, and sent, datagrams.
     refused : int
         Number of invalid datagrams and commands.
-
     """
 
     def __init__(
@@ -249,10 +301,9 @@ class FakeMambo:
     def _tell_all(self) -> None:
         self._said = None
         self._tell_state()
-        limits = self.firmware.limits
-        self._event((2, 9, 1), struct.pack('<fff', math.degrees(limits.tilt), *TILT_RANGE))
-        self._event((2, 5, 0), struct.pack('<fff', limits.climb, *CLIMB_RANGE))
-        self._event((2, 5, 1), struct.pack('<fff', math.degrees(limits.turn), *TURN_RANGE))
+        for number, (name, (most, unit)) in zip(((2, 9, 1), (2, 5, 0), (2, 5, 1)), LIMITS.items()):
+            value = getattr(self.firmware.limits, name) / unit
+            self._event(number, struct.pack('<fff', value, *most))
         self._event((0, 5, 0), b'')
 
     def _send_sensors(self, elapsed: float) -> None:
@@ -262,7 +313,9 @@ class FakeMambo:
         # Down and right are positive here.
         self._event((2, 18, 1), struct.pack('<fffH', forward, -left, -up, stamp))
         self._event((2, 18, 2), struct.pack('<fH', self.firmware.height, stamp))
-        self._event((2, 18, 4), struct.pack('<ffffH', *_quaternion(estimate), stamp))
+        # From north-east-down at the start to forward-right-down.
+        turn = Pose.from_rpy(np.zeros(3), (estimate.roll, -estimate.pitch, -estimate.yaw))
+        self._event((2, 18, 4), struct.pack('<ffffH', *turn.orientation, stamp))
         if self.position_sent == 'none':
             return
         if self.position_sent == 'stuck':
@@ -356,16 +409,6 @@ class FakeMambo:
             obey(self.firmware, number, frame.payload[_ID.size :])
         except ValueError:
             self.refused += 1
-
-
-def _quaternion(estimate: Estimate) -> list[float]:
-    """Return w, x, y, z of the turn from north-east-down at the start to forward-right-down."""
-    turned = np.array([1.0, 0.0, 0.0, 0.0])
-    for axis, angle in ((3, -estimate.yaw), (2, -estimate.pitch), (1, estimate.roll)):
-        turn = np.zeros(4)
-        turn[0], turn[axis] = math.cos(0.5 * angle), math.sin(0.5 * angle)
-        turned = quaternion_product(turned, turn)
-    return [float(value) for value in turned]
 
 
 def build_parser() -> argparse.ArgumentParser:

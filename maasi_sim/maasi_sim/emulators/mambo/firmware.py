@@ -1,9 +1,23 @@
-"""What a Mambo's own computer does with commands: take-off, flight, landing, and its watchdogs.
+"""What a Mambo's own computer does with commands, and how its body moves.
 
 Stands in for Parrot's firmware, which is not public. A piloting command "executes once and goes
 back to hovering without new commands coming in" (pyparrot, `Minidrone.fly_direct`). When the
 connection is lost it hovers on, says pyparrot's author (amymcgovern/pyparrot, issue 165), and
-Parrot's manual that it lands: a setting here, as the times are. The body is that of `tilt_body`.
+Parrot's manual that it lands: a setting here, as the times are.
+
+Roll and pitch of a piloting command are shares of the largest tilt, not of a speed (pyparrot,
+docs/minidronecommands.rst, `fly_direct`; Parrot's minidrone.xml, PCMD and MaxTilt). At level
+flight the thrust carries the weight, so that a tilt accelerates by g tan(tilt), and the rotors'
+drag grows with the speed (Mahony, Kumar, Corke, "Multirotor aerial vehicles", IEEE Robotics &
+Automation Magazine 19(3), 2012; Martin, Salaun, "The true role of accelerometer feedback in
+quadrotor control", ICRA 2010):
+
+    dv/dt = g tan(tilt) - drag v
+
+gym-pybullet-drones has k = 9.18e-7 kg for a Crazyflie (after Forster, "System identification of
+the Crazyflie 2.0", ETH Zurich 2015): 0.2 1/s at its 27 g. Nobody has published that of a Mambo.
+Without roll and pitch it stabilises itself by its downward camera: "0 m/s horizontal speed
+reference" (minidrone.xml, PilotingModeChanged, mode easy).
 
 Frames: the position is relative to the take-off point and heading, x forward, y left, z up.
 """
@@ -12,30 +26,124 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import Settings
 from maasi_planner.motion import RobotState
-from maasi_sim.emulators.mambo.tilt_body import TiltBody, TiltBodySettings, TiltCommand
 from maasi_sim.world.odometry import OdometryModel, OdometrySettings
 from maasi_sim.world.robots import Battery, BatterySettings
 
-FloatArray = NDArray[np.float64]
+_GRAVITY = 9.81
+
+
+class TiltBodySettings(Settings):
+    """How the body of a fake Mambo answers its commands."""
+
+    drag: float = Field(
+        default=0.5, gt=0.0, le=20.0, description='Deceleration for each m/s of speed [1/s]'
+    )
+    tilt_time: float = Field(
+        default=0.1, gt=0.0, le=2.0, description='Time constant of the tilt [s]'
+    )
+    climb_time: float = Field(
+        default=0.2, gt=0.0, le=2.0, description='Time constant of the vertical speed [s]'
+    )
+    turn_time: float = Field(
+        default=0.1, gt=0.0, le=2.0, description='Time constant of the rotation rate [s]'
+    )
+    hover_gain: float = Field(
+        default=2.0,
+        ge=0.0,
+        le=20.0,
+        description='Deceleration for each m/s while it hovers; 0: it only levels itself, as in '
+        'the modes medium and difficult [1/s]',
+    )
+
+
+class TiltBody:
+    """A quadrotor under commanded tilts, without a floor.
+
+    Attributes
+    ----------
+    position, velocity : ndarray, shape (3,)
+        In the map [m], [m/s].
+    roll, pitch, yaw : float
+        Right-handed about forward, left and up [rad].
+    """
+
+    def __init__(self, settings: TiltBodySettings, pose: Pose) -> None:
+        self.settings = settings
+        self.rest_at(pose)
+
+    def rest_at(self, pose: Pose) -> None:
+        """Be at rest at a pose."""
+        self.position = pose.position.copy()
+        self.velocity = np.zeros(3)
+        self.roll = self.pitch = 0.0
+        self.yaw = pose.yaw
+        self._rates = np.zeros(3)
+
+    def step(self, command: Sequence[float], most_tilt: float, h: float) -> None:
+        """Go on for `h` seconds, at most 0.05; hovering it tilts by `most_tilt` [rad] at most.
+
+        The command is the tilt that accelerates it forward, and to the right [rad], the vertical
+        speed [m/s], and the rotation rate, anticlockwise [rad/s]; without tilt it hovers.
+        """
+        settings = self.settings
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        vx, vy, vz = self.velocity.tolist()
+        ahead, left = cosine * vx + sine * vy, cosine * vy - sine * vx
+        pitch, roll, climb, turn_rate = command
+        if pitch == roll == 0.0:
+            pitch, roll = (
+                min(max(settings.hover_gain * speed / _GRAVITY, -most_tilt), most_tilt)
+                for speed in (-ahead, left)
+            )
+        follow = 1.0 - math.exp(-h / settings.tilt_time)
+        pitch_step, roll_step = follow * (pitch - self.pitch), follow * (roll - self.roll)
+        self.pitch += pitch_step
+        self.roll += roll_step
+        forward = _GRAVITY * math.tan(self.pitch) - settings.drag * ahead
+        leftward = -_GRAVITY * math.tan(self.roll) - settings.drag * left
+        rising = (climb - vz) * (1.0 - math.exp(-h / settings.climb_time)) / h
+        acceleration = np.array(
+            [cosine * forward - sine * leftward, sine * forward + cosine * leftward, rising]
+        )
+        before = self.velocity
+        self.velocity = before + h * acceleration
+        self.position = self.position + 0.5 * h * (before + self.velocity)
+        turn = self._rates[2]
+        turn += (1.0 - math.exp(-h / settings.turn_time)) * (turn_rate - turn)
+        self.yaw += h * turn
+        self._rates = np.array([roll_step / h, pitch_step / h, turn])
+
+    def robot_state(self) -> RobotState:
+        """Return pose, velocity in the map, and angular velocity about the body's axes."""
+        return RobotState(
+            Pose.from_rpy(self.position, (self.roll, self.pitch, self.yaw)),
+            self.velocity.copy(),
+            self._rates.copy(),
+        )
+
 
 # Commands act from one piece of time to the next [s].
 _PIECE = 0.02
 _TAKE_OFF_SPEED, _LANDING_SPEED = 0.5, 0.4
 _DEGREE = math.pi / 180.0
-# Ranges of the settings that a controller may make: tilt [degrees], speed [m/s], turn [degrees/s].
-TILT_RANGE, CLIMB_RANGE, TURN_RANGE = (5.0, 25.0), (0.5, 2.0), (50.0, 360.0)
+# What a controller may set: range, and unit: tilt [degrees], climb [m/s], turn [degrees/s].
+LIMITS = {
+    'tilt': ((5.0, 25.0), _DEGREE),
+    'climb': ((0.5, 2.0), 1.0),
+    'turn': ((50.0, 360.0), _DEGREE),
+}
 
 
 class FlyingState(IntEnum):
@@ -87,14 +195,12 @@ class FirmwareSettings(Settings):
 
 @dataclass(frozen=True)
 class Piloting:
-    """
-    A piloting command (PCMD), each in whole per cent of the largest.
+    """A piloting command (PCMD), each in whole per cent of the largest.
 
     Attributes
     ----------
     roll, pitch, yaw, climb : int
         To the right, forward, clockwise, up.
-
     """
 
     roll: int = 0
@@ -110,8 +216,7 @@ class Piloting:
 
 @dataclass(frozen=True)
 class Estimate:
-    """
-    What the firmware believes of its flight.
+    """What the firmware believes of its flight.
 
     Attributes
     ----------
@@ -123,7 +228,6 @@ class Estimate:
         Forward, left, up, axes turned by the heading only [m/s].
     roll, pitch : float
         Right-handed about forward and left [rad].
-
     """
 
     position: FloatArray
@@ -144,27 +248,7 @@ class Limits:
 
 @dataclass
 class MamboFirmware:
-    """
-    A Mambo's flight, without its network.
-
-    Parameters
-    ----------
-    start : Pose
-        Where it stands on the floor, in the map.
-    settings : FirmwareSettings
-        Body, heights and watchdogs.
-    battery : BatterySettings
-        Capacity and drain; the motors drain only in flight.
-    odometry : OdometrySettings
-        Noise and drift of what it believes.
-    seed : int
-        Of that noise.
-    name : str
-        Keys it.
-    on_change : callable
-        Called when the flying state or the battery's percentage has changed.
-
-    """
+    """A Mambo's flight, without its network."""
 
     start: Pose
     settings: FirmwareSettings = field(default_factory=FirmwareSettings)
@@ -230,17 +314,10 @@ class MamboFirmware:
         """Take a piloting command, which holds until the next one or its time is up."""
         self._piloted.append((self.time + self.settings.delay, piloting))
 
-    def limit_tilt(self, degrees: float) -> None:
-        """Set the tilt of 100 per cent [degrees], cut to what is allowed."""
-        self.limits.tilt = float(np.clip(degrees, *TILT_RANGE)) * _DEGREE
-
-    def limit_climb(self, speed: float) -> None:
-        """Set the climb of 100 per cent [m/s], cut to what is allowed."""
-        self.limits.climb = float(np.clip(speed, *CLIMB_RANGE))
-
-    def limit_turn(self, degrees: float) -> None:
-        """Set the turn rate of 100 per cent [degrees/s], cut to what is allowed."""
-        self.limits.turn = float(np.clip(degrees, *TURN_RANGE)) * _DEGREE
+    def limit(self, name: str, value: float) -> None:
+        """Set what 100 per cent are, of a name in `LIMITS` and in its unit, cut to its range."""
+        (low, high), unit = LIMITS[name]
+        setattr(self.limits, name, min(max(value, low), high) * unit)
 
     # ---- time --------------------------------------------------------------------------------
 
@@ -289,18 +366,18 @@ class MamboFirmware:
         acts = 0.0 <= self.time - began <= self.settings.command_timeout
         return piloting if acts else Piloting()
 
-    def _command(self) -> TiltCommand:
+    def _command(self) -> tuple[float, float, float, float]:
         """Return the command of the body."""
         if self.flying_state == FlyingState.TAKING_OFF:
-            return TiltCommand(climb=_TAKE_OFF_SPEED)
+            return 0.0, 0.0, _TAKE_OFF_SPEED, 0.0
         if self.flying_state == FlyingState.LANDING:
-            return TiltCommand(climb=-_LANDING_SPEED)
+            return 0.0, 0.0, -_LANDING_SPEED, 0.0
         piloting, limits = self._current(), self.limits
-        return TiltCommand(
-            pitch=0.01 * limits.tilt * piloting.pitch,
-            roll=0.01 * limits.tilt * piloting.roll,
-            climb=0.01 * limits.climb * piloting.climb,
-            turn=-0.01 * limits.turn * piloting.yaw,
+        return (
+            0.01 * limits.tilt * piloting.pitch,
+            0.01 * limits.tilt * piloting.roll,
+            0.01 * limits.climb * piloting.climb,
+            -0.01 * limits.turn * piloting.yaw,
         )
 
     def _touch(self) -> None:

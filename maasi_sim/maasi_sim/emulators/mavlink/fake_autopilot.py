@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maasi_drivers.links.mavlink.estimate import (
     swap_enu_ned,
@@ -28,59 +27,39 @@ from maasi_drivers.links.mavlink.estimate import (
 )
 from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER
 from maasi_drivers.links.mavlink.protocol import mavlink
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_sim.emulators.mavlink.autopilot_parameters import (
-    FIRMWARES,
+from maasi_sim.emulators.mavlink.autopilot_reports import AutopilotReports, AutopilotState
+from maasi_sim.emulators.mavlink.autopilot_settings import (
     PARAMETERS,
     WHOLE_NUMBERS,
+    AutopilotSettings,
 )
-from maasi_sim.emulators.mavlink.autopilot_reports import AutopilotReports
-from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
-from maasi_sim.emulators.mavlink.flight_model import FlightLimits, FlightModel
-
-Array = NDArray[np.float64]
 
 # ArduCopter disarms on the ground after so long [s].
 _DISARM_DELAY = 10.0
 # PX4 wants setpoints for so long, and not so long ago, before OFFBOARD [s].
 _OFFBOARD_STREAM, _OFFBOARD_AGE = 1.0, 0.5
 _LANDING, _SURFACING = 0.5, 0.3
-# From the loss of GNSS to that of the position estimate [s].
-_DEAD_RECKONING = 8.0
 _POSITION_IGNORED, _VELOCITY_IGNORED, _YAW_IGNORED = 0b111, 0b111 << 3, 1 << 10
 
 
 @dataclass
 class _Setpoint:
-    position: Array
-    velocity: Array | None = None
+    position: FloatArray
+    velocity: FloatArray | None = None
     yaw: float | None = None
 
 
-class FakeAutopilot:
-    """
-    One vehicle with its autopilot, without a connection and a clock.
+class FakeAutopilot(AutopilotState):
+    """One vehicle with its autopilot, without a connection and a clock.
 
     A setpoint that is not finite crashes it, as it did ArduPilot: it reports that and is silent.
-
-    Parameters
-    ----------
-    settings : AutopilotSettings
-        Its behaviour.
-    sender : MAVLink
-        Packs messages and writes them to the wire.
-    yaw : float
-        At the start, from east [rad].
-    generator : Generator
-        Of the noise.
 
     Attributes
     ----------
     crashed : str
         Reason of a crash; else empty.
-    now : float
-        Time since its start [s].
-
     """
 
     def __init__(
@@ -90,54 +69,23 @@ class FakeAutopilot:
         yaw: float,
         generator: np.random.Generator,
     ) -> None:
-        self.settings = settings
-        self.firmware = FIRMWARES[settings.firmware]
+        super().__init__(settings, yaw)
         self.parameters = {**PARAMETERS[settings.firmware], **settings.parameters}
         self.crashed = ''
-        self.armed = False
-        self.charge = settings.charge
-        submarine = self.firmware.kind == 'submarine'
-        self._first_mode = self.mode = next(
-            number
-            for number, name in self.firmware.modes.items()
-            if name in ('STABILIZE', 'MANUAL')
-        )
-        self.body = FlightModel(
-            FlightLimits(
-                speed=settings.speed,
-                acceleration=settings.acceleration,
-                buoyancy=0.1 if submarine else -3.0,
-            ),
-            submarine,
-            np.array([0.0, 0.0, -settings.depth if submarine else 0.0]),
-            yaw,
-        )
+        self._first_mode = self.mode
         self._sender = sender
-        self.now = 0.0
         self._setpoint: _Setpoint | None = None
         # Start of the uninterrupted setpoint stream, and time of its last setpoint.
         self._streaming_since, self._streamed_at = math.inf, -math.inf
-        self._rising_to: float | None = None
-        # True height at arming, and error of the estimated height [m].
-        self._home, self._height_error = 0.0, 0.0
-        # True place of the EKF's origin [m].
-        self._origin = np.zeros(3)
+        # True height at arming [m].
+        self._home = 0.0
         # System, component and link of what was heard; the driver is on link 0.
         self._routes: set[tuple[int, int, int]] = set()
-        # Time of the loss of GNSS; the position estimate is lost later.
-        self._gnss_lost_at = math.inf
         self._armed_at = -math.inf
         self._station_at = math.inf
         self._failed: set[str] = set()
         self._reported_ready = False
         self.reports = AutopilotReports(self, sender, generator)
-
-    # ---- for tests and demonstrations --------------------------------------------------------
-
-    @property
-    def ready(self) -> bool:
-        """Whether its position estimate is ready."""
-        return self.now >= self.settings.estimator_time
 
     @property
     def mode_name(self) -> str:
@@ -148,24 +96,11 @@ class FakeAutopilot:
         """Return the true pose in its local frame, ENU."""
         return Pose.from_yaw(self.body.position, self.body.yaw)
 
-    def take_mode(self, name: str) -> None:
-        """Change the mode as a pilot does with the remote control."""
-        self.mode = next(number for number, known in self.firmware.modes.items() if known == name)
-        self._hold()
-
-    def freeze(self) -> None:
-        """Send the same position from now on, with new stamps."""
-        self.reports.freeze()
-
-    def lose_gnss(self) -> None:
-        """Lose the first receiver's fix; without a second one the position estimate later."""
-        self._gnss_lost_at = self.now
-
     def restart(self) -> None:
         """Restart, as after a brown-out: disarmed, with clock and message rates reset."""
         self.armed = self._reported_ready = False
         # The barometer is calibrated again.
-        self.now = self._height_error = 0.0
+        self.now = self.height_error = 0.0
         self._routes.clear()
         self._hold()
         self.mode = self._first_mode
@@ -181,10 +116,10 @@ class FakeAutopilot:
             return
         if self.ready and not self._reported_ready:
             self._reported_ready = True
-            self._origin = self.body.position.copy()
+            self.origin = self.body.position.copy()
             if self.body.submarine:
                 # Depths are from the surface.
-                self._origin[2] = 0.0
+                self.origin[2] = 0.0
             self.reports.say(6, 'EKF3 IMU0 is using GPS')
         self._move(dt)
         self._look_after_failsafes(dt)
@@ -193,23 +128,23 @@ class FakeAutopilot:
     def _move(self, dt: float) -> None:
         body = self.body
         if not self.armed:
-            self._height_error += self.settings.barometer_drift * dt
+            self.height_error += self.settings.barometer_drift * dt
             if not body.grounded:
                 body.drift(dt)
             return
-        if body.grounded and self._rising_to is None and not self._lifts_off():
+        if body.grounded and self.rising_to is None and not self._lifts_off():
             if self.now - self._armed_at > _DISARM_DELAY:
                 self._disarm('Disarming motors')
             return
         firmware, setpoint = self.firmware, self._setpoint
         if self.mode == firmware.land:
             self._come_down(dt)
-        elif self._rising_to is not None:
-            target = np.array([*body.position[:2], self._rising_to])
+        elif self.rising_to is not None:
+            target = np.array([*body.position[:2], self.rising_to])
             body.fly_to(target, None, dt)
-            if abs(body.position[2] - self._rising_to) < 0.1 * (self._rising_to - self._home):
+            if abs(body.position[2] - self.rising_to) < 0.1 * (self.rising_to - self._home):
                 self._setpoint = _Setpoint(target)
-                self._rising_to = None
+                self.rising_to = None
         elif setpoint is not None and setpoint.velocity is not None:
             body.fly(setpoint.velocity, dt)
         elif setpoint is not None:
@@ -237,11 +172,11 @@ class FakeAutopilot:
 
     def _disarm(self, text: str) -> None:
         self.armed = False
-        self._rising_to = self._setpoint = None
+        self.rising_to = self._setpoint = None
         self.reports.say(6, text)
 
     def _hold(self) -> None:
-        self._rising_to = None
+        self.rising_to = None
         self._setpoint = _Setpoint(self.body.position.copy())
 
     def _look_after_failsafes(self, dt: float) -> None:
@@ -282,39 +217,6 @@ class FakeAutopilot:
     def _fail_to(self, mode: int) -> None:
         self.mode = mode
         self._hold()
-
-    @property
-    def estimating(self) -> bool:
-        """Whether its position estimate is good."""
-        gnss = self.settings.second_gnss or not self._gnss_lost_for(_DEAD_RECKONING)
-        return self.ready and gnss
-
-    @property
-    def has_fix(self) -> bool:
-        """Whether its first GNSS receiver has a fix."""
-        return not self._gnss_lost_for(0.0)
-
-    def _gnss_lost_for(self, time: float) -> bool:
-        return self.now - self._gnss_lost_at >= time
-
-    def landed_state(self) -> int:
-        """Return MAV_LANDED_STATE."""
-        if self.body.grounded:
-            return int(mavlink.MAV_LANDED_STATE_ON_GROUND)
-        if self.mode == self.firmware.land:
-            return int(mavlink.MAV_LANDED_STATE_LANDING)
-        if self._rising_to is not None:
-            return int(mavlink.MAV_LANDED_STATE_TAKEOFF)
-        return int(mavlink.MAV_LANDED_STATE_IN_AIR)
-
-    def believed_position(self) -> Array:
-        """Return the position that it believes, ENU [m]."""
-        return self.body.position + self._offset
-
-    @property
-    def _offset(self) -> Array:
-        """What it believes, less what is true [m]."""
-        return np.array([0.0, 0.0, self._height_error]) - self._origin
 
     # ---- receiving ---------------------------------------------------------------------------
 
@@ -422,7 +324,7 @@ class FakeAutopilot:
             or not self.body.grounded
         ):
             return int(mavlink.MAV_RESULT_FAILED)
-        self._setpoint, self._rising_to = None, self._home + float(message.param7)
+        self._setpoint, self.rising_to = None, self._home + float(message.param7)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _on_setpoint(self, message: Any) -> None:
@@ -444,12 +346,12 @@ class FakeAutopilot:
         if self.now - self._streamed_at > _OFFBOARD_AGE:
             self._streaming_since = self.now
         self._streamed_at = self.now
-        if self.mode != self.firmware.external or self._rising_to is not None:
+        if self.mode != self.firmware.external or self.rising_to is not None:
             return
         if not (wants_position or wants_velocity):
             return
         self._setpoint = _Setpoint(
-            swap_enu_ned(position) - self._offset,
+            swap_enu_ned(position) - self.offset,
             None if wants_position else swap_enu_ned(velocity),
             None if mask & _YAW_IGNORED else swap_yaw(message.yaw),
         )

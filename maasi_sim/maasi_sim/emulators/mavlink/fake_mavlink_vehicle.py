@@ -17,8 +17,7 @@ from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
-from maasi_sim.emulators.mavlink.autopilot_parameters import FIRMWARES
-from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
+from maasi_sim.emulators.mavlink.autopilot_settings import FIRMWARES, AutopilotSettings
 from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
 from maasi_sim.scenario.schema import RobotSettings
 
@@ -41,26 +40,7 @@ class _Gate:
 
 
 class FakeVehicle:
-    """
-    A fake autopilot with a connection and a thread that runs it in real time.
-
-    Parameters
-    ----------
-    settings : AutopilotSettings
-        Its behaviour.
-    url : str
-        Of the driver, in the form of pymavlink.
-    start : Pose
-        In the map, of the origin of its local frame, and its heading; that frame is ENU.
-    generator : Generator
-        Of its noise.
-
-    Raises
-    ------
-    LinkError
-        If the connection cannot be opened.
-
-    """
+    """A fake autopilot with a connection and a thread that runs it in real time."""
 
     def __init__(
         self, settings: AutopilotSettings, url: str, start: Pose, generator: np.random.Generator
@@ -123,15 +103,7 @@ class FakeVehicle:
 
 
 def vehicle_of(robot: RobotSettings, generator: np.random.Generator) -> FakeVehicle:
-    """
-    Return the vehicle of a robot of a scenario, at its start.
-
-    Raises
-    ------
-    LinkError
-        If the connection cannot be opened.
-
-    """
+    """Return the vehicle of a robot of a scenario, at its start."""
     link = robot.mavlink or MavlinkSettings()
     host, port = link.url.removeprefix('udpin:').split(':')
     return FakeVehicle(
@@ -181,13 +153,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def read_parameters(items: list[str]) -> dict[str, float]:
-    """Return parameters given as NAME=VALUE.
-
-    Raises
-    ------
-    ValueError
-        Where one is not.
-    """
+    """Return parameters given as NAME=VALUE."""
     parameters = {}
     for item in items:
         name, _, value = item.partition('=')
