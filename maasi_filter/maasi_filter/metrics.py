@@ -20,21 +20,15 @@ class Gospa:
 
     Parameters
     ----------
-    total : float
-        The metric, metres.
-    localisation : float
-        Sum of distances of matched pairs, to the power p.
     missed, false : float
         c^p / 2 for each target, or estimate, that is not matched.
-    matched : int
-        Number of pairs.
     """
 
-    total: float
-    localisation: float
+    total: float  # The metric, metres
+    localisation: float  # Sum of distances of matched pairs, to the power p
     missed: float
     false: float
-    matched: int
+    matched: int  # Number of pairs
 
 
 def _points(name: str, value: ArrayLike) -> FloatArray:
@@ -108,19 +102,15 @@ class Match:
 
     Parameters
     ----------
-    pairs : list of (int, int)
-        Index of the found, and of the true target.
     true_found, missed, false_found : int
         Numbers of pairs, of unmatched true targets, and of unmatched found targets.
-    rmse : float
-        Root mean square distance of the pairs, metres; nan without pairs.
     """
 
-    pairs: list[tuple[int, int]]
+    pairs: list[tuple[int, int]]  # Index of the found, and of the true target
     true_found: int
     missed: int
     false_found: int
-    rmse: float
+    rmse: float  # Root mean square distance of the pairs, metres; nan without pairs
 
 
 def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Match:
@@ -146,31 +136,18 @@ def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Matc
     )
 
 
-def normalised_error(error: ArrayLike, covariance: ArrayLike) -> float:
-    """Return the normalised estimation error squared (NEES) of one estimate.
-
-    Its mean is d for a consistent covariance.
-    """
-    vector = np.asarray(error, dtype=float)
-    return float(vector @ np.linalg.solve(np.asarray(covariance, dtype=float), vector))
-
-
 @dataclass(frozen=True)
 class RestrictedMean:
     """Restricted mean time of runs of which some are censored.
 
     Parameters
     ----------
-    mean : float
-        Area under the Kaplan-Meier curve up to the cap.
-    standard_error : float
-        Of the mean (Greenwood's plug-in); 0 for a single run.
     finished, runs : int
         Runs that finished within the cap, and all.
     """
 
-    mean: float
-    standard_error: float
+    mean: float  # Area under the Kaplan-Meier curve up to the cap
+    standard_error: float  # Of the mean (Greenwood's plug-in); 0 for a single run
     finished: int
     runs: int
 

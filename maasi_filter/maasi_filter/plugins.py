@@ -78,13 +78,9 @@ class PluginGroup:
         return [*sorted(self.own), *sorted(set(self._installed()) - set(self.own))]
 
     def load(self, name: str) -> type:
-        """Return a class.
+        """Return a class by one of `names`, or `module:Class`.
 
-        Parameters
-        ----------
-        name : str
-            One of `names`, or `module:Class`; modules beside the scenario file and in the current
-            folder are found too.
+        Modules beside the scenario file and in the current folder are found too.
 
         Raises
         ------
@@ -149,18 +145,10 @@ class PluginGroup:
 
 @dataclass(frozen=True)
 class OwnSettings:
-    """Marks the field of settings that holds the own settings of a plugin.
+    """Marks the field of settings that holds the own settings of a plugin."""
 
-    Parameters
-    ----------
-    group : PluginGroup
-        Kind of the plugin.
-    selector : str
-        Field that names the plugin; it stands before the marked one.
-    """
-
-    group: PluginGroup
-    selector: str
+    group: PluginGroup  # Kind of the plugin
+    selector: str  # Field that names the plugin; it stands before the marked one
 
     def check(self, value: Any, info: ValidationInfo) -> BaseModel | None:
         """Return the plugin's settings; a validator of the marked field."""
@@ -174,15 +162,7 @@ class OwnSettings:
 
 
 def own_settings(info: FieldInfo, values: Mapping[str, Any], prefix: str = '') -> Any:
-    """Return the model of a field marked with `OwnSettings`, or None.
-
-    Parameters
-    ----------
-    info : FieldInfo
-        The field.
-    values : mapping
-        Of the settings that it belongs to; keys have `prefix`.
-    """
+    """Return the model of a field marked with `OwnSettings`, or None."""
     for mark in info.metadata:
         if isinstance(mark, OwnSettings):
             name = values.get(prefix + mark.selector)

@@ -45,13 +45,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def pack(tree: Any) -> dict[str, NDArray[Any]]:
-    """Return a tree as a few arrays; one that occurs twice is stored once.
-
-    Raises
-    ------
-    ValueError
-        If a random generator is of a kind that cannot be restored.
-    """
+    """Return a tree as a few arrays; one that occurs twice is stored once."""
     parts: dict[str, list[NDArray[Any]]] = {}
     sizes: dict[str, int] = {}
     known: dict[int, Any] = {}
@@ -143,13 +137,7 @@ class SavedState:
             raise StateFileError(f'{self.path}: does not hold a usable state: {reason}') from None
 
     def read(self, name: str, kind: type[T]) -> T:
-        """Return a tree of a type.
-
-        Raises
-        ------
-        StateFileError
-            If it is missing or of another type; file, field, value and what is allowed are named.
-        """
+        """Return a tree of a type."""
         with self.named():
             value: T = self._value(kind, self._trees[name], name)
             return value

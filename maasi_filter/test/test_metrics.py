@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from maasi_filter import gospa, match_targets, restricted_mean
-from maasi_filter.metrics import normalised_error
 
 points = st.lists(
     st.tuples(st.floats(-10.0, 10.0), st.floats(-10.0, 10.0)), min_size=0, max_size=4
@@ -51,10 +50,6 @@ def test_matching_is_one_to_one_and_takes_as_many_pairs_as_it_can():
     assert (match.true_found, match.missed, match.false_found) == (2, 0, 1)
     assert match.rmse == pytest.approx(np.sqrt((1.0 + 1.21) / 2))
     assert np.isnan(match_targets([], [[0.0, 0.0]], 1.0).rmse)
-
-
-def test_normalised_error():
-    assert normalised_error([2.0, 0.0], np.diag([4.0, 1.0])) == pytest.approx(1.0)
 
 
 def test_restricted_mean_of_finished_runs_is_their_mean():

@@ -26,7 +26,8 @@ from quality_conditions import CONDITIONS, RETURNS, SCENARIOS, SEEDS
 from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
-from maasi_filter.metrics import match_targets, normalised_error, restricted_mean
+from maasi_filter.metrics import match_targets, restricted_mean
+from maasi_filter.vector_math import squared_distance
 from maasi_sim.experiments.execution import run_command
 from maasi_sim.experiments.statistics import paired_difference
 from maasi_sim.scenario.loading import load_scenario
@@ -120,7 +121,7 @@ def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | N
     found = np.array([target.position for target in result.found_targets]).reshape(-1, d)
     match = match_targets(found, result.truth, scoring_radius(scenario, result.truth))
     normalised = sum(
-        normalised_error(found[i] - result.truth[j], result.found_targets[i].covariance)
+        squared_distance(found[i] - result.truth[j], result.found_targets[i].covariance)
         for i, j in match.pairs
     )
     return Run(

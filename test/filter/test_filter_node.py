@@ -133,15 +133,19 @@ def world():
         yield everything
 
 
-def test_a_target_seen_again_and_again_is_found(world):
+def test_a_target_seen_again_and_again_is_found_with_class_and_identity(world):
     node, team, until = world
     for number in range(1, 9):
-        team.measure(number, ['a', 'b'], {'a': [(0.3, 0.5)], 'b': [(0.3, 0.5)]})
+        detection = Detection(
+            range=0.3, bearing=0.5, class_id='ball', score=0.5 + 0.04 * number, identity='tag_7'
+        )
+        team.measure(number, ['a', 'b'], {'a': [], 'b': []}, detections=[detection])
         until(lambda number=number: len(team.updates) == number)
     until(lambda: team.found and len(team.found[-1].targets) == 1)
     target = team.found[-1].targets[0]
     assert target.position.x == pytest.approx(1.0 + 0.3 * math.cos(0.5), abs=0.02)
     assert target.position.y == pytest.approx(1.0 + 0.3 * math.sin(0.5), abs=0.02)
+    assert (target.class_id, target.score, target.identity) == ('ball', 1.0, 'tag_7')
     assert [update.batch_id for update in team.updates] == list(range(1, 9))
     assert [item.robot for item in team.updates[0].members] == ['a', 'b']
     assert {item.pose.position.x for item in team.updates[-1].members} == {1.0}
@@ -171,19 +175,6 @@ def test_the_filter_of_the_papers_counts_detections_of_found_targets_which_are_n
         assert status.level == DiagnosticStatus.OK and status.message == 'active'
 
 
-def test_the_diagnostics_say_what_was_dropped(world):
-    node, team, until = world
-    reports = []
-    team.node.create_subscription(DiagnosticArray, '/diagnostics', reports.append, 10)
-    team.measure(1, ['a'], {'a': [(0.3, 0.5)]}, robot='nobody')
-    until(lambda: node.dropped)
-    reports.clear()
-    until(lambda: reports)
-    status = reports[-1].status[0]
-    assert status.level == DiagnosticStatus.WARN
-    assert status.message == 'active; dropped: bad detections 1'
-
-
 def test_detections_that_do_not_fit_are_said_in_log_and_diagnostics(world):
     _, team, until = world
     reports, lines = [], []
@@ -201,20 +192,6 @@ def test_detections_that_do_not_fit_are_said_in_log_and_diagnostics(world):
     status = reports[-1].status[0]
     assert status.level == DiagnosticStatus.WARN
     assert status.message.startswith('active; a: detections of found targets are')
-
-
-def test_found_targets_carry_class_and_identity():
-    changed = SETTINGS.filter.model_copy(update={'method': 'pmb'})
-    with running(filter=changed) as (_, team, until):
-        for number in range(1, 9):
-            detection = Detection(
-                range=0.3, bearing=0.5, class_id='ball', score=0.5 + 0.04 * number, identity='tag_7'
-            )
-            team.measure(number, ['a'], {'a': []}, detections=[detection])
-            until(lambda number=number: len(team.updates) == number)
-        until(lambda: team.found and len(team.found[-1].targets) == 1)
-        target = team.found[-1].targets[0]
-        assert (target.class_id, target.score, target.identity) == ('ball', 1.0, 'tag_7')
 
 
 def test_a_missing_robot_is_named_and_its_late_answer_is_a_batch_of_its_own(world):
@@ -265,9 +242,14 @@ def test_what_is_said_again_counts_once():
 )
 def test_what_is_wrong_is_dropped_and_counted_and_the_node_goes_on(world, changes, reason):
     node, team, until = world
+    reports = []
+    team.node.create_subscription(DiagnosticArray, '/diagnostics', reports.append, 10)
     team.measure(1, ['a'], {'a': [(0.3, 0.5)]}, **changes)
     until(lambda: len(team.updates) == 1)
     assert node.dropped[reason] == 1
+    if changes == {'robot': 'nobody'}:
+        until(lambda: reports and reports[-1].status[0].level == DiagnosticStatus.WARN)
+        assert reports[-1].status[0].message == 'active; dropped: bad detections 1'
     assert team.updates[0].expected_number == 0.0
     team.measure(2, ['a'], {'a': [(0.3, 0.5)]})
     until(lambda: len(team.updates) == 2)
@@ -334,24 +316,6 @@ def test_an_absurd_batch_is_refused_and_the_next_one_is_not(world, number):
     team.measure(2, ['a'], {'a': []})
     until(lambda: len(team.updates) == 2)
     assert team.updates[1].batch_id == 2
-
-
-def test_wrong_parameters_are_refused_by_name():
-    flat = flatten(SETTINGS)
-    with Domain(None) as domain:
-        context = Context()
-        rclpy.init(context=context, domain_id=domain.number)
-        try:
-            wrong = {**flat, 'filter.particles': -3}
-            node = FilterNode(
-                context=context,
-                parameter_overrides=[Parameter(key, value=item) for key, item in wrong.items()],
-            )
-            assert node.trigger_configure().name == 'FAILURE'
-            assert 'filter.particles: Input should be greater than' in node.problem
-            node.destroy_node()
-        finally:
-            rclpy.shutdown(context=context)
 
 
 def seen_from_a(team, until, numbers):

@@ -182,27 +182,16 @@ def test_a_thousand_detections_at_once_are_all_used():
     assert 700.0 < result.expected_number + len(search.found_targets) < 3000.0
 
 
-def test_detections_outside_the_environment_are_counted():
-    search = cube_search()
-    result = search.step([drone([[200.0, np.pi, 0.0], [20.0, 0.0, 0.0]])], 1, 0.0)
-    assert result.dropped == {'outside': 1}
-    assert result.expected_number == pytest.approx(1.0, abs=0.05)
-
-
-def test_detections_where_nothing_can_be_seen_are_counted():
-    search = IcPhdFilter(FilterSettings(), FLOOR, np.random.default_rng(0))
-    pose = Pose([1.0, 1.0, 1.0])
-    values = np.array([[0.6, 0.0], [0.1, 0.0]])
-    result = search.step([AgentMeasurement('mambo', pose, floor_sensor(), values)], 1, 0.0)
-    assert result.dropped == {'unseen': 1}
-
-
-def test_detections_beyond_the_largest_range_are_counted():
+def test_detections_that_nothing_explains_are_counted():
     sensor = cube_sensor()
-    sensor.maximum_range = 50.0
-    result = cube_search().step([drone([[60.0, 0.3, 0.1]], sensor=sensor)], 1, 0.0)
-    assert result.dropped == {'range': 1}
-    assert result.expected_number == 0.0
+    sensor.maximum_range = 250.0
+    values = [[260.0, 0.3, 0.1], [200.0, np.pi, 0.0], [20.0, 0.0, 0.0]]
+    result = cube_search().step([drone(values, sensor=sensor)], 1, 0.0)
+    assert result.dropped == {'range': 1, 'outside': 1}
+    assert result.expected_number == pytest.approx(1.0, abs=0.1)
+    search = IcPhdFilter(FilterSettings(), FLOOR, np.random.default_rng(0))
+    member = drone([[0.6, 0.0], [0.1, 0.0]], [1.0, 1.0, 1.0], sensor=floor_sensor())
+    assert search.step([member], 1, 0.0).dropped == {'unseen': 1}
 
 
 def test_a_target_right_below_the_robot_is_found():
@@ -224,31 +213,6 @@ def test_a_target_right_below_the_robot_is_found():
             search.step([AgentMeasurement('mambo', pose, sensor, values, covariances)], 1, step)
         assert len(search.found_targets) == 1
         np.testing.assert_allclose(search.found_targets[0].position, target[0], atol=0.02)
-
-
-@pytest.mark.parametrize(
-    ('members', 'word'),
-    [
-        ([drone([[np.nan, 0.0, 0.0]])], 'values'),
-        ([drone([[1.0, np.inf, 0.0]])], 'values'),
-        ([drone([[1.0, 0.0]])], 'values'),
-        ([drone([[1.0, 0.0, 0.0]], sensor=floor_sensor())], 'dimensions'),
-        ([drone([[1.0, 0.0, 0.0]]), drone([[1.0, 0.0, 0.0]])], 'once'),
-    ],
-)
-def test_bad_measurements_are_refused_and_change_nothing(members, word):
-    search = cube_search()
-    search.step([drone([[20.0, 0.3, 0.1]], name='other')], 1, 0.0)
-    before = state(search)
-    with pytest.raises(ValueError, match=word):
-        search.step([drone([[25.0, 0.3, 0.1]], name='a_good_one'), *members], 1, 1.0)
-    assert state(search) == before
-
-
-@pytest.mark.parametrize(('steps', 'time'), [(-1, 0.0), (0.5, 0.0), (True, 0.0), (1, np.nan)])
-def test_bad_steps_and_times_are_refused(steps, time):
-    with pytest.raises(ValueError, match=r'steps|time'):
-        cube_search().step([], steps, time)
 
 
 def test_bad_sensors_are_refused():
@@ -294,10 +258,10 @@ def test_the_papers_presets_find_a_target(preset):
 @settings(max_examples=25, deadline=None)
 @given(
     st.integers(0, 100_000),
-    st.sampled_from(['paper_000', 'paper_002', 'paper_003']),
+    st.sampled_from(['measurement', 'uniform', 'gaussian']),
     st.sampled_from([2, 3]),
 )
-def test_whatever_is_measured_the_expected_number_stays_sound(seed, preset, dimension):
+def test_whatever_is_measured_the_expected_number_stays_sound(seed, births, dimension):
     generator = np.random.default_rng(seed)
     bounds = np.array([[0.0, 10.0]] * dimension)
     kind = str(generator.choice(['exponential', 'gaussian', 'box']))
@@ -307,7 +271,9 @@ def test_whatever_is_measured_the_expected_number_stays_sound(seed, preset, dime
         clutter=float(generator.choice([0.0, 0.01])),
     ).build('any', dimension)
     search = IcPhdFilter(
-        FilterSettings(preset=preset, particles=300, found_radius=0.5), bounds, generator
+        FilterSettings(births=births, particles=300, birth_particles=100, found_radius=0.5),
+        bounds,
+        generator,
     )
     total = 0
     for step in range(6):
@@ -318,6 +284,7 @@ def test_whatever_is_measured_the_expected_number_stays_sound(seed, preset, dime
         assert np.isfinite(result.expected_number)
         assert 0.0 <= result.expected_number <= total + 6.0 + 1e-9
         assert ((search.particles >= 0.0) & (search.particles <= 10.0)).all()
+        assert np.isfinite(search.weights).all() and (search.weights >= 0.0).all()
         for cluster in result.clusters:
             assert np.isfinite(cluster.position).all()
             assert np.isfinite(cluster.covariance).all()
@@ -342,30 +309,6 @@ def test_warm_up_leaves_nothing_to_compile():
     mow_floor(0)
     assert [len(kernel.signatures) for kernel in kernels] == before
     assert sum(before) >= 6
-
-
-@pytest.mark.parametrize(
-    'wrong',
-    [np.full((3, 3), np.nan), np.diag([-1.0, 1.0, 1.0]), np.eye(2), np.full((3, 3), np.inf)],
-)
-def test_a_covariance_of_the_position_that_is_none_is_refused(wrong):
-    search = cube_search()
-    values = np.array([[30.0, 0.1, 0.1]])
-    with pytest.raises(ValueError, match='drone: position_covariance'):
-        search.step([drone(values, position_covariance=wrong)], 1, 0.0)
-    assert len(search.particles) == 0
-
-
-@pytest.mark.parametrize('births', ['measurement', 'uniform', 'gaussian'])
-def test_every_birth_model_gives_finite_numbers(births):
-    generator = np.random.default_rng(3)
-    targets = generator.uniform(100.0, 160.0, (3, 3))
-    search = cube_search(births=births, birth_targets=1.0, birth_particles=400)
-    visit(search, targets, flight(generator, 10), generator)
-    assert np.isfinite(search.particles).all()
-    assert np.isfinite(search.weights).all()
-    assert (search.weights >= 0.0).all()
-    assert search.expected_number + len(search.found_targets) > 0.1
 
 
 def test_the_floor_is_searched_without_false_targets():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -79,16 +78,6 @@ def test_no_particles_leave_a_detection_to_the_background():
     factor, normaliser = phd_correct(positions[:0], weights[:0], scan, background)
     assert factor.shape == (0,)
     np.testing.assert_array_equal(normaliser, background)
-
-
-def test_threads_change_no_bit():
-    sensor, pose, positions, weights, values, background = case(3, particles=100_000)
-    scan = make_scan(values, sensor, pose)
-    alone = phd_correct(positions, weights, scan, background)
-    with ThreadPoolExecutor(3) as pool:
-        together = phd_correct(positions, weights, scan, background, pool)
-    for one, other in zip(alone, together):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_weights_equal_stone_soups():

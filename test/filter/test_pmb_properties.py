@@ -14,9 +14,10 @@ from maasi_filter import (
 )
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.make_filter import load_filter, make_filter
-from maasi_filter.metrics import match_targets, normalised_error
+from maasi_filter.metrics import match_targets
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.state_file import pack
+from maasi_filter.vector_math import squared_distance
 
 
 def scans(seed, number=25, clutter=1.0, shift=(0.0, 0.0), yaw=0.0, order=None):
@@ -121,6 +122,7 @@ def test_method_is_chosen_by_the_settings(tmp_path):
         FilterSettings(pmb={'particles': 3})
 
 
+@pytest.mark.parametrize('method', ['pmb', 'ic_phd'])
 @pytest.mark.parametrize(
     ('change', 'text'),
     [
@@ -129,25 +131,28 @@ def test_method_is_chosen_by_the_settings(tmp_path):
         ({'covariances': np.zeros((2, 2, 2))}, 'covariances: got shape'),
         ({'covariances': -np.ones((1, 2, 2))}, 'allowed is a symmetric positive definite'),
         ({'position_covariance': -np.eye(3)}, 'position_covariance: got'),
+        ({'position_covariance': np.eye(2)}, 'position_covariance: got'),
+        ({'position_covariance': np.full((3, 3), np.nan)}, 'position_covariance: got'),
         ({'sensor': cube_sensor()}, 'sensor: got 3 dimensions'),
     ],
 )
-def test_bad_measurements_are_refused_and_change_nothing(change, text):
-    search = play(plane_filter(particles=100), scans(3, number=5))
+def test_bad_measurements_are_refused_and_change_nothing(method, change, text):
+    settings = FilterSettings(method=method, use_detection_covariances=True)
+    search = play(make_filter(settings, PLANE, np.random.default_rng(0)), scans(3, number=5))
     before = pack(search.state())
     fields = {
-        'robot': 'a',
+        'robot': 'b',
         'pose': Pose([1.0, 1.0, 0.0]),
         'sensor': plane_sensor(),
         'values': np.array([[10.0, 0.0]]),
         **change,
     }
+    good = measured(plane_sensor(), (1.0, 1.0), [[10.0, 0.0]])
     with pytest.raises(ValueError, match=text):
-        search.step([AgentMeasurement(**fields)], 1, 9.0)
-    for steps, time in ((-1, 0.0), (True, 0.0), (1, np.inf)):
+        search.step([good, AgentMeasurement(**fields)], 1, 9.0)
+    for steps, time in ((-1, 0.0), (0.5, 0.0), (True, 0.0), (1, np.inf)):
         with pytest.raises(ValueError, match=r'steps|time'):
             search.step([], steps, time)
-    good = measured(plane_sensor(), (1.0, 1.0), [[10.0, 0.0]])
     with pytest.raises(ValueError, match='each robot once'):
         search.step([good, good], 1, 9.0)
     for name, array in pack(search.state()).items():
@@ -230,7 +235,7 @@ def judged(search, targets):
     out = []
     for item in sorted(search.components, key=lambda item: -item.existence):
         distances = [
-            normalised_error(item.density.mean - targets[t], item.density.covariance) for t in left
+            squared_distance(item.density.mean - targets[t], item.density.covariance) for t in left
         ]
         is_target = bool(distances) and min(distances) < 25.0
         if is_target:
@@ -248,7 +253,7 @@ def test_covariances_and_existence_are_as_they_say():
         match = match_targets(positions, targets, 5.0)
         errors.append(match.false_found)
         normalised += [
-            normalised_error(positions[i] - targets[j], search.found_targets[i].covariance)
+            squared_distance(positions[i] - targets[j], search.found_targets[i].covariance)
             for i, j in match.pairs
         ]
     assert len(normalised) > 300

@@ -96,13 +96,7 @@ def register(function: Callable[..., float], values: FloatArray) -> tuple[int, i
 
 
 def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
-    """Put the addresses of this process into saved parameters (n, PARAMETERS), in place.
-
-    Raises
-    ------
-    ValueError
-        If no sensor in this process has such a function.
-    """
+    """Put the addresses of this process into saved parameters (n, PARAMETERS), in place."""
     for row in np.flatnonzero(kinds == CUSTOM).tolist():
         block = _blocks.get(int(parameters[row, NUMBER]))
         if block is None:

@@ -17,13 +17,7 @@ LEAST_PER_SCAN = 0.05
 
 
 def check_covariance(name: str, covariance: FloatArray, dimension: int) -> None:
-    """Refuse a covariance that is not symmetric positive definite.
-
-    Raises
-    ------
-    ValueError
-        Naming `name`, what was read, and what is allowed.
-    """
+    """Refuse a covariance that is not symmetric positive definite."""
     if covariance.shape != (dimension, dimension):
         raise ValueError(
             f'{name}: got shape {covariance.shape}, allowed is ({dimension}, {dimension})'

@@ -57,13 +57,7 @@ def stamp_of_step(step: int, duration: float) -> int:
 
 
 def bounded(name: str, values: Iterable[float], limit: float) -> None:
-    """Refuse non-finite numbers, and numbers that would overflow in later arithmetic.
-
-    Raises
-    ------
-    ValueError
-        The message names `name`.
-    """
+    """Refuse numbers of a field that are not finite, or would overflow in later arithmetic."""
     # Also false for NaN.
     if not all(abs(value) <= limit for value in values):
         raise ValueError(
@@ -91,14 +85,7 @@ def pose_to_ros(pose: Pose) -> PoseMessage:
 
 
 def pose_from_ros(message: PoseMessage) -> Pose:
-    """Return a pose.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite, the quaternion is zero, or the position is farther away than any
-        on Earth.
-    """
+    """Return a pose."""
     turn = message.orientation
     place = message.position
     bounded('position', (place.x, place.y, place.z), FARTHEST)
@@ -130,13 +117,7 @@ def cluster_to_ros(cluster: Cluster) -> ClusterMessage:
 
 
 def cluster_from_ros(message: ClusterMessage, dimension: int) -> Cluster:
-    """Return a cluster.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite or absurdly large, or the mass is negative.
-    """
+    """Return a cluster."""
     place = message.position
     bounded('clusters: position', (place.x, place.y, place.z), FARTHEST)
     bounded('clusters: covariance', message.covariance, FARTHEST**2)
@@ -183,17 +164,7 @@ def found_target_from_ros(message: FoundTargetMessage, dimension: int) -> FoundT
 def detections_to_ros(
     values: FloatArray, covariances: FloatArray | None, labels: Sequence[Label] = ()
 ) -> list[Detection]:
-    """Return detections.
-
-    Parameters
-    ----------
-    values : (m, d) array
-        Range, bearing and, in 3D, elevation [m, rad].
-    covariances : (m, d, d) array, optional
-        Covariances of the values.
-    labels : sequence of Label
-        Classes and identities; empty: none.
-    """
+    """Return detections."""
     messages = []
     for index, value in enumerate(values):
         label = labels[index] if labels else UNLABELLED
@@ -304,11 +275,6 @@ def measurement_from_ros(
 
     Invalid detections, duplicates, and those beyond `MOST_DETECTIONS` are left out: reason to texts
     and their numbers.
-
-    Raises
-    ------
-    ValueError
-        If the pose is not finite, or its covariance.
     """
     pose = pose_from_ros(message.pose.pose)
     position_covariance = np.array(message.pose.covariance, dtype=float).reshape(6, 6)[:3, :3]
@@ -396,17 +362,7 @@ def filter_markers(
     found: Iterable[FoundTarget],
     size: float,
 ) -> MarkerArray:
-    """Return markers of clusters (orange, scaled by their width) and found targets (red).
-
-    Parameters
-    ----------
-    header : Header
-        Stamp and frame.
-    clusters, found : iterables
-        What to show.
-    size : float
-        Diameter of a found target [m].
-    """
+    """Return markers of clusters (orange, scaled by their width) and found targets (red)."""
     markers = []
     for number, cluster in enumerate(clusters, start=1):
         markers.append(

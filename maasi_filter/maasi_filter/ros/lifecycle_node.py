@@ -64,8 +64,6 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     ----------
     name : str
         Of the node.
-    settings : type
-        Its settings; each becomes a parameter.
     in_robot : bool
         Whether its namespace is that of a robot: topics of the team are one level up.
     lockstep_member : bool
@@ -127,13 +125,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     # ---- life cycle --------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Create the objects that the settings describe, before `set_up`. In *configure*.
-
-        Raises
-        ------
-        SettingsError
-            If a setting is invalid in combination with others.
-        """
+        """Create the objects that the settings describe, before `set_up`. In *configure*."""
 
     def set_up(self) -> None:
         """Create publishers and subscriptions, compile and warm up. In *configure*."""
@@ -437,16 +429,9 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     # ---- diagnostics -------------------------------------------------------------------------
 
     def drop(self, reason: str, text: str, number: int = 1) -> None:
-        """Count discarded data, and warn, throttled.
+        """Count discarded data by a short reason, and warn, throttled.
 
-        Parameters
-        ----------
-        reason : str
-            Short; key of the count in the diagnostics.
-        text : str
-            Topic and field, what was read, what is allowed.
-        number : int
-            How many.
+        `text`: topic and field, what was read, what is allowed.
         """
         self.dropped[reason] += number
         self.warn_throttled(reason, f'dropped: {text}')

@@ -75,13 +75,7 @@ class NodeParameters(Generic[SettingsT]):
         node.add_post_set_parameters_callback(self._note)
 
     def read(self) -> SettingsT:
-        """Return the settings, and lock them until `release`.
-
-        Raises
-        ------
-        SettingsError
-            If some are invalid: each with its name, what was read and what is allowed.
-        """
+        """Return the settings, and lock them until `release`."""
         settings, problems = check(self._model, self._values())
         if settings is None:
             raise SettingsError('\n'.join(problems.values()))

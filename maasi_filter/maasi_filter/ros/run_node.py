@@ -47,15 +47,6 @@ def run(
     """Run a node until it is asked to end; return the exit code.
 
     SIGINT and SIGTERM stop all motion before the node is destroyed.
-
-    Parameters
-    ----------
-    make_node : callable
-        Makes the node; often its class.
-    arguments : list of str, optional
-        Of the command line.
-    kind : type, optional
-        The class that `--help` explains, where `make_node` is none.
     """
     if {'-h', '--help'} & set(sys.argv[1:] if arguments is None else arguments):
         explained = kind or (make_node if isinstance(make_node, type) else LockstepLifecycleNode)
