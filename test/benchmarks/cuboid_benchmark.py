@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'planner'))
 
 from cuboid_instances import joint_problems, problems_of_missions
 from literal_cuboid import TightProblem, solve_with_highs, solve_with_scip
+from timing import entry
 
 from maasi_planner.buildings import solve_jointly
 
@@ -33,17 +34,6 @@ def time_of(function: Callable[[], Any], repeats: int = 3) -> float:
         function()
         times.append(time.perf_counter() - begun)
     return min(times)
-
-
-def figure(
-    name: str,
-    value: float,
-    unit: str = 'ms',
-    baseline: str | None = None,
-    ratio: float | None = None,
-) -> dict[str, object]:
-    """Return a row."""
-    return {'name': name, 'value': value, 'unit': unit, 'baseline': baseline, 'ratio': ratio}
 
 
 def against(name: str, solve: Callable[..., Any], title: str, number: int) -> dict[str, object]:
@@ -65,7 +55,7 @@ def against(name: str, solve: Callable[..., Any], title: str, number: int) -> di
     if missed:
         what += f', {missed} of {number} stopped at {LIMIT:.0f} s'
     ratio = float(np.median(ratios))
-    return figure(name, ratio, 'times', what, ratio)
+    return entry(name, ratio, 'times', what, ratio)
 
 
 def run(share: float = 1.0) -> list[dict[str, object]]:
@@ -78,16 +68,16 @@ def run(share: float = 1.0) -> list[dict[str, object]]:
     for horizon in (3, 7, 10):
         solver, problems = problems_of_missions(horizon, few(300), seed=21)
         times = [1e3 * time_of(lambda p=p, s=solver: s.solve(p), 2) for p in problems]
-        rows.append(figure(f'cuboid_solve_t{horizon}', float(np.median(times))))
-        rows.append(figure(f'cuboid_solve_t{horizon}_p95', float(np.percentile(times, 95))))
-        rows.append(figure(f'cuboid_solve_t{horizon}_max', max(times)))
+        rows.append(entry(f'cuboid_solve_t{horizon}', float(np.median(times))))
+        rows.append(entry(f'cuboid_solve_t{horizon}_p95', float(np.percentile(times, 95))))
+        rows.append(entry(f'cuboid_solve_t{horizon}_max', max(times)))
     for robots in (3, 5):
         solver, joint = joint_problems(robots, 7, few(60), seed=22)
         times = [1e3 * time_of(lambda p=p, s=solver: solve_jointly(s, p), 1) for p in joint]
         name = f'cuboid_centralized_{robots}_7'
-        rows.append(figure(name, float(np.median(times))))
-        rows.append(figure(f'{name}_mean', float(np.mean(times))))
-        rows.append(figure(f'{name}_max', max(times)))
+        rows.append(entry(name, float(np.median(times))))
+        rows.append(entry(f'{name}_mean', float(np.mean(times))))
+        rows.append(entry(f'{name}_max', max(times)))
     rows.append(against('cuboid_vs_highs_t7', solve_with_highs, 'HiGHS', few(15)))
     rows.append(against('cuboid_vs_scip_t7', solve_with_scip, 'SCIP', few(15)))
     return rows

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from time import perf_counter
 from typing import Any
 
 import numpy as np
+from timing import entry, median_time
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
@@ -18,16 +17,6 @@ from maasi_sim.world.camera import CameraRenderer
 from maasi_sim.world.floor_scene import scene_of
 from maasi_sim.world.render_settings import RenderSettings
 from maasi_sim.world.world import TargetSettings, World
-
-
-def _time(function: Callable[[], object], repeats: int) -> float:
-    """Return the median time of a call [ms]."""
-    times = np.empty(repeats)
-    for index in range(repeats):
-        start = perf_counter()
-        function()
-        times[index] = perf_counter() - start
-    return 1e3 * float(np.median(times))
 
 
 def _image(settings: CameraSettings, seed: int = 1) -> tuple[np.ndarray, Pose, CameraRenderer]:
@@ -47,20 +36,7 @@ def _image(settings: CameraSettings, seed: int = 1) -> tuple[np.ndarray, Pose, C
 
 
 def run(share: float = 1.0) -> list[dict[str, Any]]:
-    """
-    Time the robust rule, beside the paper's rule on the same image, and the rendering.
-
-    Parameters
-    ----------
-    share : float
-        Of all calls.
-
-    Returns
-    -------
-    list of dict
-        name, value, unit, baseline (what was compared with) and ratio (its time over ours).
-
-    """
+    """Time the robust rule, beside the paper's on the same image, and the rendering."""
     repeats = max(1, round(share * 300))
     results: list[dict[str, Any]] = []
     for width, height, focal in ((160, 120, 220.0), (640, 480, 880.0)):
@@ -77,26 +53,13 @@ def run(share: float = 1.0) -> list[dict[str, Any]]:
         image, pose, renderer = _image(robust.settings)
         for detector in (robust, paper):
             detector.detect(image, pose)
-
-        ours = _time(partial(robust.detect, image, pose), repeats)
-        other = _time(partial(paper.detect, image, pose), repeats)
+        ours, other = (
+            1e3 * median_time(partial(detector.detect, image, pose), repeats)
+            for detector in (robust, paper)
+        )
         render = partial(renderer.render, pose, 1, 0.1, (0.3, 0.1, 0.0))
-        results.append(
-            {
-                'name': f'segment_{width}x{height}',
-                'value': ours,
-                'unit': 'ms',
-                'baseline': "the paper's rule on the same image",
-                'ratio': other / ours,
-            }
-        )
-        results.append(
-            {
-                'name': f'render_{width}x{height}',
-                'value': _time(render, repeats),
-                'unit': 'ms',
-                'baseline': None,
-                'ratio': None,
-            }
-        )
+        what = "the paper's rule on the same image"
+        results.append(entry(f'segment_{width}x{height}', ours, 'ms', what, other / ours))
+        drawn = 1e3 * median_time(render, repeats)
+        results.append(entry(f'render_{width}x{height}', drawn))
     return results

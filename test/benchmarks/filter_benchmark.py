@@ -9,11 +9,12 @@ from __future__ import annotations
 import datetime
 import statistics
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from timing import entry, median_time
 
 from maasi_filter import (
     AgentMeasurement,
@@ -77,19 +78,6 @@ def batch(targets: FloatArray, robots: int, seed: int = 2) -> list[AgentMeasurem
     return members
 
 
-def median(function: Callable[[], Any], prepare: Callable[[], Any], repeats: int) -> float:
-    """Return the median of the wall times of `function` in seconds, after one unmeasured call."""
-    prepare()
-    function()
-    times = []
-    for _ in range(repeats):
-        prepare()
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
-
-
 def phd_step_time(number: int, robots: int, repeats: int, threads: int | None) -> float:
     """Return the median time of one whole step of the PHD filter, seconds."""
     search, targets = phd_state(number, threads)
@@ -102,7 +90,10 @@ def phd_step_time(number: int, robots: int, repeats: int, threads: int | None) -
         search.exploration.values[...] = values
         search.found_targets.clear()
 
-    return median(lambda: search.step(members, 1, 0.0), prepare, repeats)
+    step = partial(search.step, members, 1, 0.0)
+    prepare()
+    step()
+    return median_time(step, repeats, prepare)
 
 
 def pmb_step_time(noise: NoiseSettings, number: int, robots: int, steps: int = 60) -> float:
@@ -174,7 +165,9 @@ def update_times(number: int = 10_000, repeats: int = 3) -> tuple[float, float]:
     """Return our median time of the weights' update and Stone Soup's, seconds."""
     particles, targets = cloud(number)
     member = batch(targets, 1)[0]
-    theirs = median(_stone_soup(particles, member.values, member.pose), lambda: None, repeats)
+    update = _stone_soup(particles, member.values, member.pose)
+    update()
+    theirs = median_time(update, repeats)
     weights = np.full(number, TARGETS / number)
     background = np.full(len(member.values), CLUTTER)
 
@@ -182,19 +175,8 @@ def update_times(number: int = 10_000, repeats: int = 3) -> tuple[float, float]:
         scan = make_scan(member.values, member.sensor, member.pose)
         return weights * phd_correct(particles, weights, scan, background)[0]
 
-    return median(ours, lambda: None, 200), theirs
-
-
-def _entry(
-    name: str, seconds: float, baseline: str | None = None, ratio: float | None = None
-) -> dict[str, Any]:
-    return {
-        'name': name,
-        'value': 1e3 * seconds,
-        'unit': 'ms',
-        'baseline': baseline,
-        'ratio': ratio,
-    }
+    ours()
+    return median_time(ours, 200), theirs
 
 
 def run(share: float = 1.0) -> list[dict[str, Any]]:
@@ -205,23 +187,21 @@ def run(share: float = 1.0) -> list[dict[str, Any]]:
 
     start = time.perf_counter()
     warm_up()
-    entries = [_entry('filter_warm_up', time.perf_counter() - start)]
-    entries.append(_entry('ic_phd_step_10k', phd_step_time(10_000, 1, few(200), 1)))
-    entries.append(_entry('ic_phd_step_100k', phd_step_time(100_000, 1, few(30), None)))
-    entries.append(_entry('ic_phd_step_1m', phd_step_time(1_000_000, 1, few(9), None)))
-    entries.append(_entry('ic_phd_step_ten_robots', phd_step_time(10_000, 10, few(100), 1)))
+    times = {
+        'filter_warm_up': time.perf_counter() - start,
+        'ic_phd_step_10k': phd_step_time(10_000, 1, few(200), 1),
+        'ic_phd_step_100k': phd_step_time(100_000, 1, few(30), None),
+        'ic_phd_step_1m': phd_step_time(1_000_000, 1, few(9), None),
+        'ic_phd_step_ten_robots': phd_step_time(10_000, 10, few(100), 1),
+    }
+    entries = [entry(name, 1e3 * seconds) for name, seconds in times.items()]
     ours, theirs = update_times(repeats=few(3))
     text = f'Stone Soup SMCPHDUpdater, {1e3 * theirs:.3g} ms'
-    entries.append(_entry('ic_phd_update', ours, text, theirs / ours))
-    entries.append(_entry('pmb_step_degrees', pmb_step_time(DEGREES, TARGETS, 1, max(12, few(60)))))
-    entries.append(_entry('pmb_step_radians', pmb_step_time(RADIANS, TARGETS, 1, max(12, few(60)))))
-    entries.append(_entry('pmb_step_100_targets', pmb_step_time(DEGREES, 100, 1, few(200))))
-    entries.append(
-        _entry('pmb_step_ten_robots', pmb_step_time(DEGREES, TARGETS, 10, max(12, few(60))))
-    )
-    return entries
-
-
-if __name__ == '__main__':
-    for entry in run():
-        print(entry)
+    entries.append(entry('ic_phd_update', 1e3 * ours, 'ms', text, theirs / ours))
+    times = {
+        'pmb_step_degrees': pmb_step_time(DEGREES, TARGETS, 1, max(12, few(60))),
+        'pmb_step_radians': pmb_step_time(RADIANS, TARGETS, 1, max(12, few(60))),
+        'pmb_step_100_targets': pmb_step_time(DEGREES, 100, 1, few(200)),
+        'pmb_step_ten_robots': pmb_step_time(DEGREES, TARGETS, 10, max(12, few(60))),
+    }
+    return entries + [entry(name, 1e3 * seconds) for name, seconds in times.items()]

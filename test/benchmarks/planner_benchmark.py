@@ -6,10 +6,8 @@ measured in the same run: the same objective with e updated on the whole grid, a
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 import numpy as np
+from timing import entry, median_time
 
 from maasi_filter.models.detection import ExponentialDetection
 from maasi_filter.models.pose import Pose
@@ -33,16 +31,6 @@ from maasi_planner.objective.weights import resolve
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)
 PAPER = PlannerSettings(objective='paper', alpha=0.5, beta=0.5, control_weight=0.01)
-
-
-def median_time(function: Callable[[], object], repeats: int) -> float:
-    """Return the median time of a call in seconds."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
 
 
 def half_explored(bounds: np.ndarray, spacing: float, seed: int = 0) -> UnexploredMap:
@@ -157,15 +145,8 @@ def run(share: float = 1.0) -> list[dict[str, object]]:
         planner = make_planner('maasi', settings)
         planner.decide(team)
         value = median_time(lambda: planner.decide(team), max(1, round(share * repeats)))
-        figures.append(
-            {
-                'name': name,
-                'value': 1e3 * value,
-                'unit': 'ms',
-                'baseline': baseline,
-                'ratio': None if against is None else against / value,
-            }
-        )
+        ratio = None if against is None else against / value
+        figures.append(entry(name, 1e3 * value, 'ms', baseline, ratio))
 
     single = drones(1)
     whole_grid_decision(single)
@@ -180,8 +161,3 @@ def run(share: float = 1.0) -> list[dict[str, object]]:
     add('maasi_decision_pair_information', drones(2), 30, information)
     add('maasi_decision_mambo_turtlebot_information', floor_pair(), 30, information)
     return figures
-
-
-if __name__ == '__main__':
-    for figure in run():
-        print(figure)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,44 +37,50 @@ Change = Callable[[Content, int], None]
 Measure = Callable[..., tuple[Any, Any]]
 
 
+def robots(*keys: str, **values: Any) -> Change:
+    """Other settings of each robot, in the part at these keys."""
+
+    def change(content: Content, seed: int) -> None:
+        for robot in content['robots'].values():
+            part = robot
+            for key in keys:
+                part = part.setdefault(key, {})
+            part.update(values)
+
+    return change
+
+
+def part(name: str, **values: Any) -> Change:
+    """Other settings of a part of the scenario."""
+
+    def change(content: Content, seed: int) -> None:
+        content[name] = {**content.get(name, {}), **values}
+
+    return change
+
+
+targets, filter_settings = partial(part, 'targets'), partial(part, 'filter')
+# Errors of the robots' positions, which they report; and what is true apart from what is believed.
+odometry, simulated = partial(robots, 'odometry'), partial(robots, 'simulated')
+
+
 def noise(name: str) -> Change:
     """The sensor's noise, as believed and true."""
-
-    def change(content: Content, seed: int) -> None:
-        for robot in content['robots'].values():
-            robot['sensor']['noise'] = NOISES[name].model_dump(by_alias=True)
-
-    return change
-
-
-def simulated(**values: Any) -> Change:
-    """What is true of each robot apart from what is believed."""
-
-    def change(content: Content, seed: int) -> None:
-        for robot in content['robots'].values():
-            robot.setdefault('simulated', {}).update(values)
-
-    return change
+    return robots('sensor', noise=NOISES[name].model_dump(by_alias=True))
 
 
 def clutter(per_scan: float, told: bool) -> Change:
     """False detections, of which the filter is told or not."""
+    believed = robots('sensor', clutter=per_scan / SPACE)
+    return both(simulated(clutter_per_scan=per_scan), *([believed] if told else []))
+
+
+def both(*changes: Change) -> Change:
+    """One change after the other."""
 
     def change(content: Content, seed: int) -> None:
-        for robot in content['robots'].values():
-            robot.setdefault('simulated', {})['clutter_per_scan'] = per_scan
-            if told:
-                robot['sensor']['clutter'] = per_scan / SPACE
-
-    return change
-
-
-def odometry(**values: Any) -> Change:
-    """Errors of the robots' positions, which they report."""
-
-    def change(content: Content, seed: int) -> None:
-        for robot in content['robots'].values():
-            robot['odometry'] = {**robot.get('odometry', {}), **values}
+        for item in changes:
+            item(content, seed)
 
     return change
 
@@ -83,17 +90,8 @@ def untold(**values: Any) -> Change:
 
     def change(content: Content, seed: int) -> None:
         for robot in content['robots'].values():
-            simulated = robot.setdefault('simulated', {})
-            simulated['odometry'] = {**robot.get('odometry', {}), **values}
-
-    return change
-
-
-def targets(**values: Any) -> Change:
-    """Other targets."""
-
-    def change(content: Content, seed: int) -> None:
-        content['targets'] = {**content['targets'], **values}
+            true = {**robot.get('odometry', {}), **values}
+            robot.setdefault('simulated', {})['odometry'] = true
 
     return change
 
@@ -112,57 +110,29 @@ def pairs(distance: float) -> Change:
     return change
 
 
-def offset(**values: float) -> Change:
-    """The filter estimates errors of the robots' positions that last."""
+def pmb(**values: Any) -> Change:
+    """Other settings of the multi-Bernoulli filter."""
 
     def change(content: Content, seed: int) -> None:
-        content['filter'].setdefault('pmb', {})['offset'] = values
+        content['filter'].setdefault('pmb', {}).update(values)
 
     return change
 
 
-def two_drones() -> Change:
-    """A second drone that starts in the opposite corner."""
+def two(name: str, start: list[float], **values: Any) -> Change:
+    """A second robot of the same kind that starts elsewhere."""
 
     def change(content: Content, seed: int) -> None:
-        drone = content['robots'].pop('drone')
-        content['robots'] = {
-            'drone1': drone,
-            'drone2': {**json.loads(json.dumps(drone)), 'start': [250.0, 250.0, 250.0]},
-        }
-
-    return change
-
-
-def two_turtlebots() -> Change:
-    """Two TurtleBots in opposite corners of the demo's floor."""
-
-    def change(content: Content, seed: int) -> None:
-        robot = content['robots']['turtlebot']
-        other = {**json.loads(json.dumps(robot)), 'start': [2.1, 2.1, 0.0], 'yaw': 3.14}
-        content['robots'] = {'turtlebot1': robot, 'turtlebot2': other}
-
-    return change
-
-
-def filter_settings(**values: Any) -> Change:
-    """Other settings of the filter."""
-
-    def change(content: Content, seed: int) -> None:
-        content['filter'] = {**content['filter'], **values}
+        robot = content['robots'][name]
+        other = {**json.loads(json.dumps(robot)), 'start': start, **values}
+        content['robots'] = {f'{name}1': robot, f'{name}2': other}
 
     return change
 
 
 def walk(deviation: float, told: bool = True) -> Change:
     """Targets that walk, of which the filter is told or not."""
-
-    def change(content: Content, seed: int) -> None:
-        content['targets']['walk'] = deviation
-        if told:
-            content['filter'].setdefault('pmb', {})['walk'] = deviation
-
-    return change
+    return both(targets(walk=deviation), *([pmb(walk=deviation)] if told else []))
 
 
 def duplicates(share: float, apart: float) -> Callable[[Measure], Measure]:
@@ -222,18 +192,18 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
     'positions off by 1 m': (DEGREES, odometry(position_noise=1.0)),
     'positions off by 3 m': (DEGREES, odometry(position_noise=3.0)),
     **{
-        f'{robots}{errors}{", estimated" if estimated else ""}': (
+        f'{drones}{errors}{", estimated" if estimated else ""}': (
             DEGREES,
             odometry(**change),
-            *((two_drones(),) if robots else ()),
-            *((offset(**told),) if estimated else ()),
+            *((two('drone', [250.0, 250.0, 250.0]),) if drones else ()),
+            *((pmb(offset=told),) if estimated else ()),
         )
         for errors, change, told in (
             ('drift 0.08 m/sqrt(m)', {'position_drift': 0.08}, {'drift': 0.08}),
             # Of a length of 1 m, on each axis.
             ('constant bias 1 m', {'position_offset': 1.0}, {'deviation': 0.577}),
         )
-        for robots in ('', 'two drones, ')
+        for drones in ('', 'two drones, ')
         for estimated in (False, True)
     },
     'noise 1.5 of believed': (DEGREES, simulated(noise_factor=1.5)),
@@ -262,7 +232,7 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
     'demo': (),
     'mambo': (),
     'drone_rov': (),
-    'two TurtleBots': (two_turtlebots(),),
+    'two TurtleBots': (two('turtlebot', [2.1, 2.1, 0.0], yaw=3.14),),
 }
 # What the sensor returns besides, by condition.
 RETURNS: dict[str, Callable[[Measure], Measure]] = {

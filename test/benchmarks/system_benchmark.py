@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from timing import entry
 
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import Domain, NodeProcess, find_executable, stop
@@ -24,11 +25,6 @@ from maasi_sim.run.replay_node import ReplayNode
 SECONDS = 40.0
 # For an answer of the filter node [s].
 PATIENCE = 30.0
-
-
-def row(name: str, value: float, unit: str) -> dict[str, Any]:
-    """Return one result; there is nothing to compare whole systems with."""
-    return {'name': name, 'value': value, 'unit': unit, 'baseline': None, 'ratio': None}
 
 
 def scenario(name: str, folder: Path, limit: float) -> float:
@@ -108,9 +104,9 @@ def run(share: float = 1.0) -> list[dict[str, Any]]:
         scenario('ranging_pair_3d', folder / 'space', 2.0 * share * SECONDS)
         times = latencies(folder / 'floor' / 'bag', folder)
         return [
-            row('demo_real_time_factor', real_time_factor(folder / 'floor'), 'x'),
-            row('ranging_pair_real_time_factor', real_time_factor(folder / 'space'), 'x'),
-            row('start_to_first_step', start, 's'),
-            row('detections_to_update_p50', 1e3 * float(np.percentile(times, 50)), 'ms'),
-            row('detections_to_update_p99', 1e3 * float(np.percentile(times, 99)), 'ms'),
+            entry('demo_real_time_factor', real_time_factor(folder / 'floor'), 'x'),
+            entry('ranging_pair_real_time_factor', real_time_factor(folder / 'space'), 'x'),
+            entry('start_to_first_step', start, 's'),
+            entry('detections_to_update_p50', 1e3 * float(np.percentile(times, 50)), 'ms'),
+            entry('detections_to_update_p99', 1e3 * float(np.percentile(times, 99)), 'ms'),
         ]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from timing import entry
 
 from maasi_sim.missions import load_mission
 from maasi_sim.view.event_log import Event, EventLog
@@ -29,11 +30,6 @@ from browsers import CHROMIUM, chromium
 # Of a run [s], and runs of each kind, of which the fastest counts: others share the machine.
 SECONDS, RUNS = 60.0, 3
 EVENTS, SEEKS = 100_000, 60
-
-
-def row(name: str, value: float, unit: str) -> dict[str, Any]:
-    """Return one result; there is nothing to compare it with."""
-    return {'name': name, 'value': value, 'unit': unit, 'baseline': None, 'ratio': None}
 
 
 def demo(folder: Path, watch: Callable[[str], Any] | None, seconds: float = SECONDS) -> float:
@@ -145,7 +141,7 @@ def seeks(folder: Path) -> Iterator[dict[str, Any]]:
     with chromium() as shown:
         begin = time.monotonic()
         shown.open(file.as_uri())
-        yield row('open_100000_events', time.monotonic() - begin, 's')
+        yield entry('open_100000_events', time.monotonic() - begin, 's')
         for share in rng.random(SEEKS):
             # From the request to the end of the frame in which it is drawn.
             took = shown.page.evaluate(
@@ -158,9 +154,9 @@ def seeks(folder: Path) -> Iterator[dict[str, Any]]:
                 float(share),
             )
             times.append(float(took))
-    yield row('replay_of_100000_events', file.stat().st_size / 1e6, 'MB')
-    yield row('seek_p50', float(np.median(times)), 'ms')
-    yield row('seek_largest', float(np.max(times)), 'ms')
+    yield entry('replay_of_100000_events', file.stat().st_size / 1e6, 'MB')
+    yield entry('seek_p50', float(np.median(times)), 'ms')
+    yield entry('seek_largest', float(np.max(times)), 'ms')
 
 
 def factors(
@@ -188,11 +184,11 @@ def results(share: float) -> Iterator[dict[str, Any]]:
         if CHROMIUM is not None:
             kinds['chromium'] = browser
         best = factors(folder, kinds, share * SECONDS)
-        yield row('demo_factor_without_view', best['none'], 'x')
+        yield entry('demo_factor_without_view', best['none'], 'x')
         for kind in list(kinds)[1:]:
-            yield row(f'demo_slower_with_{kind}', 100.0 * (best['none'] / best[kind] - 1.0), '%')
+            yield entry(f'demo_slower_with_{kind}', 100.0 * (best['none'] / best[kind] - 1.0), '%')
         if browser.usable:
-            yield row('page_usable_after', max(browser.usable), 's')
+            yield entry('page_usable_after', max(browser.usable), 's')
         if CHROMIUM is not None:
             yield from seeks(folder)
 
