@@ -31,7 +31,7 @@ def executed(monkeypatch):
     original = campaign.execute
 
     def execute(task):
-        made.append((task.case, task.number))
+        made.append((task.case.name, task.number))
         return original(task)
 
     monkeypatch.setattr(campaign, 'execute', execute)

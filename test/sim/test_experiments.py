@@ -169,9 +169,9 @@ def test_more_maps_later_keep_the_first_and_other_settings_are_run_anew(toy, tmp
     assert len(made) == 2
     assert first.items() <= run_files(tmp_path).items()
     changed = Experiment(**{**toy.__dict__, 'cases': lambda small: [Case('first', {'bias': 2})]})
-    assert [task.case for task in plan(changed, tmp_path, 1).tasks] == ['first']
+    assert [task.case.name for task in plan(changed, tmp_path, 1).tasks] == ['first']
     assert not plan(toy, tmp_path, 1).tasks
-    task = campaign.Task('000-toy', 'first', 0, 1, False, 'another')
+    task = campaign.Task('000-toy', toy.cases(False)[0], 0, 1, toy_run, 'another')
     assert 'another version' in campaign.execute(task)
 
 

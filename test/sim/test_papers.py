@@ -130,7 +130,11 @@ def test_cluster_makes_the_same_runs(tmp_path):
         running('scheduler', *scheduler, '--scheduler-file', address, folder=tmp_path),
         running('worker', '--scheduler-file', address, *worker, folder=tmp_path),
     ):
-        wait_until(address.exists, what=(tmp_path / 'scheduler.log').read_text)
+        # The file is there before its content.
+        wait_until(
+            lambda: address.exists() and address.read_text().endswith('}'),
+            what=(tmp_path / 'scheduler.log').read_text,
+        )
         where = yaml.safe_load(address.read_text())['address']
         arguments = ['000-fig7', '--small', '--out', str(tmp_path / 'there'), '--cluster', where]
         assert reproduce.main(arguments) == 0

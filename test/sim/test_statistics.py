@@ -49,35 +49,6 @@ def test_intervals_of_few_values():
     assert result.mean == pytest.approx(ours.mean - 2.0)
 
 
-def test_restricted_mean_is_the_area_under_scipys_survival_curve():
-    times = np.array([2.0, 3.0, 3.0, 5.0, 6.0, 8.0, 9.0, 11.0])
-    ended = np.array([True, True, False, True, False, True, True, True])
-    limit = 10.0
-    survival = stats.ecdf(stats.CensoredData.right_censored(times, ~ended)).sf
-    grid = np.linspace(0.0, limit, 200_001)
-    area = survival.evaluate(0.5 * (grid[1:] + grid[:-1])).sum() * (grid[1] - grid[0])
-    result = statistics.restricted_mean(times, ended, limit)
-    assert result.mean == pytest.approx(area, abs=1e-4)
-    assert 0.0 < result.half_width < limit
-
-
-def test_restricted_mean_of_runs_that_did_not_get_there():
-    result = statistics.restricted_mean([10.0, 20.0, 30.0, 30.0], [True, True, False, False], 30.0)
-    assert result == mean_interval([10.0, 20.0, 30.0, 30.0])
-    # A run cut short after all others have ended, below the limit, takes the other way.
-    other = statistics.restricted_mean([1.0, 2.0, 4.0, 7.0, 8.0], [True] * 4 + [False], 9.0)
-    assert other.mean == pytest.approx((1.0 + 2.0 + 4.0 + 7.0 + 9.0) / 5.0)
-
-
-@pytest.mark.parametrize(
-    ('times', 'ended', 'limit'),
-    [([1.0, math.nan], [True, True], 2.0), ([1.0], [True], math.inf), ([1.0], [True, True], 2.0)],
-)
-def test_restricted_mean_refuses(times, ended, limit):
-    with pytest.raises(ValueError):
-        statistics.restricted_mean(times, ended, limit)
-
-
 @pytest.mark.parametrize(('effect', 'expected'), [(0.2, 199), (0.5, 34), (0.8, 15)])
 def test_pairs_needed_are_those_of_cohens_tables(effect, expected):
     values = np.array([-1.0, 1.0] * 50)
@@ -102,16 +73,6 @@ def test_bootstrap_of_few_or_equal_values():
     assert one.mean == 2.0 and math.isnan(one.low) and not one.told_from_zero
     same = statistics.bootstrap_difference([1.0, 2.0], [1.0, 2.0])
     assert (same.mean, same.low, same.high, same.needed) == (0.0, 0.0, 0.0, None)
-
-
-def test_survival_is_that_of_freireichs_patients():
-    """Weeks in remission with 6-mercaptopurine, and the estimates that textbooks print."""
-    weeks = [6, 6, 6, 6, 7, 9, 10, 10, 11, 13, 16, 17, 19, 20, 22, 23, 25, 32, 32, 34, 35]
-    relapsed = [1, 1, 1, 0, 1, 0, 1, 0, 0, 1, 1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0]
-    times, shares = statistics.survival(weeks, np.array(relapsed, bool))
-    at = dict(zip(times, shares))
-    printed = {0: 1.0, 6: 0.857, 7: 0.807, 10: 0.753, 13: 0.690, 16: 0.627, 22: 0.538, 23: 0.448}
-    assert {week: at[week] for week in printed} == pytest.approx(printed, abs=5e-4)
 
 
 def test_verdict_says_when_the_seeds_are_too_few():

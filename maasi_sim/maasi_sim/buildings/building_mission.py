@@ -10,9 +10,8 @@ from maasi_filter.ros.parameters import flatten
 from maasi_planner.buildings.node_settings import CuboidPlannerSettings, box_numbers, face_words
 from maasi_sim.buildings.observer import CuboidObserver, CuboidRecord
 from maasi_sim.buildings.report import build_cuboid_report, cuboid_summary
-from maasi_sim.buildings.scenario import CuboidScenario
+from maasi_sim.buildings.scenario import CuboidScenario, warm_up_buildings
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
-from maasi_sim.warm_up import warm_up_buildings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,29 +11,24 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from maasi_sim.experiments.compared_searches import comparison_of
-from maasi_sim.experiments.experiment import Case, Experiment, Results, Run
-from maasi_sim.experiments.papers import find
+from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Results, Run
 from maasi_sim.experiments.runs import DamagedRun, RunFolder, run_of
 from maasi_sim.experiments.workers import Workers
-from maasi_sim.machine import machine_difference
+from maasi_sim.machine import code_digest, machine_difference
 
 
 @dataclass(frozen=True)
 class Task:
-    """One run to be made; plain values only, so that it can be sent to a worker.
-
-    `settings` are those of a comparison; None: the worker finds the experiment by its name.
-    """
+    """One run to be made, by a function of settings and seed; it can be sent to a worker."""
 
     experiment: str
-    case: str
+    case: Case
     number: int
     seed: int
-    small: bool
-    digest: str
-    settings: dict[str, object] | None = None
+    run: Callable[[dict[str, Any], int], Outcome]
+    code: str
 
 
 class MixedWorkers(ValueError):
@@ -43,18 +38,12 @@ class MixedWorkers(ValueError):
 def execute(task: Task) -> Run | str:
     """Make a run and return it, or the error."""
     try:
-        if task.settings is None:
-            experiment = find(task.experiment)
-        else:
-            experiment = comparison_of(task.experiment, [Case(task.case, task.settings)])
-        case = next((c for c in experiment.cases(task.small) if c.name == task.case), None)
-        if case is None or case.digest() != task.digest:
-            return 'this worker has other settings of this case: another version of the code'
-        seed = experiment.seed(task.number, task.seed)
+        if task.code != code_digest():
+            return 'this worker has another version of the code'
         begin = time.process_time()
-        outcome = experiment.run(case.settings, seed)
+        outcome = task.run(task.case.settings, task.seed)
         outcome.timing['processor_time'] = time.process_time() - begin
-        return run_of(experiment.name, case, task.number, seed, outcome)
+        return run_of(task.experiment, task.case, task.number, task.seed, outcome)
     except Exception as error:
         return f'{type(error).__name__}: {error}'
 
@@ -104,18 +93,17 @@ def plan(
         for case in cases.values():
             if number - first >= experiment.maps_of(case, runs):
                 continue
+            map_seed = experiment.seed(number, seed)
             try:
-                run = result.folder.load(case, number, experiment.seed(number, seed))
+                run = result.folder.load(case, number, map_seed)
             except DamagedRun as error:
                 result.complaints[result.folder.file(case, number)] = str(error)
                 run = None
             if run is not None:
                 result.done[case.name, number] = run
             else:
-                sent = case.settings if experiment.compared else None
-                result.tasks.append(
-                    Task(experiment.name, case.name, number, seed, small, case.digest(), sent)
-                )
+                task = Task(experiment.name, case, number, map_seed, experiment.run, code_digest())
+                result.tasks.append(task)
     return result
 
 
@@ -160,9 +148,9 @@ def carry_out(
             difference = machine_difference(machine, run.machine)
             problem = difference and f'not kept, made by a different worker: {difference}'
         if problem:
-            problems.append(f'{task.experiment}, {task.case}, map {task.number}: {problem}')
+            problems.append(f'{task.experiment}, {task.case.name}, map {task.number}: {problem}')
         else:
-            work.folder.write(work.cases[task.case], run)
-            work.done[task.case, task.number] = run
+            work.folder.write(task.case, run)
+            work.done[task.case.name, task.number] = run
         advance(task)
     return problems

@@ -161,7 +161,9 @@ def _new_folder() -> Path:
 def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
     """Refuse a folder with whole searches of the same names and seeds but other settings."""
     missing = [
-        (work, work.file(task.case, task.number)) for work in campaigns for task in work.tasks
+        (work, work.folder.file(task.case, task.number))
+        for work in campaigns
+        for task in work.tasks
     ]
     other = sum(file.exists() and file not in work.complaints for work, file in missing)
     if other:

@@ -66,13 +66,7 @@ def code_of(scenario: Scenario) -> str:
 
 
 def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
-    """Run a search of a case and return its results.
-
-    Raises
-    ------
-    RuntimeError
-        If the code differs from that of the settings.
-    """
+    """Run a search of a case; RuntimeError if the code differs from that of the settings."""
     scenario = scenario_from_content(settings['scenario'], 'settings')
     if settings['code'] != code_of(scenario):
         raise RuntimeError('this worker has another version of the code')

@@ -143,7 +143,7 @@ class _Display:
     def advance(self, task: Task) -> None:
         """Count a run."""
         self._made += 1
-        what = f'{task.experiment} {task.case}'
+        what = f'{task.experiment} {task.case.name}'
         self._bar.update(self._task, completed=self._made, description=what)
         now = time.monotonic()
         if self._bar.disable and now - self._last >= _QUIET_PERIOD:

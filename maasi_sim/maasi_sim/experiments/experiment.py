@@ -168,8 +168,7 @@ class Experiment:
     maps : str, optional
         Experiments with the same value have the same maps; none: maps of its own.
     compared : bool
-        Whether searches are compared: the seed is the number of the map, and workers are sent the
-        settings, as they do not know the experiment.
+        Whether searches are compared: the seed is the number of the map.
     """
 
     name: str

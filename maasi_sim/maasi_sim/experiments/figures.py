@@ -8,10 +8,11 @@ from operator import getitem
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import stats
 
 from maasi_filter.arrays import FloatArray
 from maasi_sim.experiments.experiment import Results, Run
-from maasi_sim.experiments.statistics import mean_interval, survival
+from maasi_sim.experiments.statistics import mean_interval
 from maasi_sim.experiments.tables import COMPLETE, TIME, difference, interval, shown
 
 if TYPE_CHECKING:
@@ -93,15 +94,19 @@ def draw_curves(
     axes.set_ylim(0.0, 1.06 * max(targets, 1.0))
     axes.set_xlabel(label)
     axes.set_ylabel('targets found')
-    axes.grid(color='#E6E6E6', lw=0.8)
+    _frame(axes)
     axes.set_axisbelow(True)
-    axes.spines[['top', 'right']].set_visible(False)
     if by == 'measurements':
         _mark_published(axes, results, styles)
     axes.legend(loc='lower right', fontsize=8, frameon=False)
     runs = [] if path is None else results.runs.get(path, [])
     if runs:
         _draw_path(figure, (1, 2, 2), results, runs[0])
+
+
+def _frame(axes: Axes) -> None:
+    axes.grid(color='#E6E6E6', lw=0.8)
+    axes.spines[['top', 'right']].set_visible(False)
 
 
 def _mark_published(axes: Axes, results: Results, styles: Mapping[str, str]) -> None:
@@ -221,8 +226,7 @@ def draw_against(
         axes.errorbar(places, means, yerr=halves, fmt='o-', color=_OTHERS[index], ms=4, capsize=2)
         axes.set_xlabel(label)
         axes.set_ylabel(quantity.title())
-        axes.grid(color='#E6E6E6', lw=0.8)
-        axes.spines[['top', 'right']].set_visible(False)
+        _frame(axes)
 
 
 def draw_table(
@@ -289,14 +293,16 @@ def _draw_survival(axes: Axes, results: Results) -> None:
     end = 0.0
     for index, name in enumerate(results.names()):
         durations = results.values(name, TIME.name)
-        times, shares = survival(durations, results.values(name, COMPLETE.name) > 0.0)
+        missing = results.values(name, COMPLETE.name) == 0.0
+        curve = stats.ecdf(stats.CensoredData.right_censored(durations, missing)).sf
+        shares = [100.0, *(100.0 * curve.probabilities)]
         last = float(durations.max())
         end = max(end, last)
         line = _LINES[index // len(_COMPARED) % len(_LINES)]
         colour = _COMPARED[index % len(_COMPARED)]
         axes.step(
-            [*times, last],
-            [*(100.0 * shares), 100.0 * shares[-1]],
+            [0.0, *curve.quantiles, last],
+            [*shares, shares[-1]],
             line,
             where='post',
             color=colour,
@@ -308,8 +314,7 @@ def _draw_survival(axes: Axes, results: Results) -> None:
     axes.set_xlabel('time [s]')
     axes.set_ylabel('searches that still miss targets [%]')
     axes.set_title(results.experiment.name, loc='left', fontsize=10, fontweight='bold')
-    axes.grid(color='#E6E6E6', lw=0.8)
-    axes.spines[['top', 'right']].set_visible(False)
+    _frame(axes)
     axes.legend(fontsize=8, frameon=False)
 
 

@@ -114,7 +114,7 @@ def _run(wanted: Sequence[Experiment], options: argparse.Namespace) -> list[str]
         runs = options.runs or experiment.runs
         work = plan(experiment, options.out, runs, options.seed, options.small)
         if options.case:
-            work.tasks = [task for task in work.tasks if task.case in options.case]
+            work.tasks = [task for task in work.tasks if task.case.name in options.case]
         campaigns.append(work)
 
     def finished(work: Campaign) -> str:

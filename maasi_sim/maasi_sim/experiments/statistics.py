@@ -1,4 +1,4 @@
-"""Means with confidence intervals: of numbers, censored durations, and paired differences."""
+"""Means with confidence intervals: of numbers, and of paired differences."""
 
 from __future__ import annotations
 
@@ -52,57 +52,6 @@ def mean_interval(values: ArrayLike) -> Interval:
         return Interval(mean, math.nan, 1, 0.0)
     error = float(array.std(ddof=1)) / math.sqrt(number)
     return Interval(mean, error * _student(number - 1), number, number - 1.0)
-
-
-def restricted_mean(durations: ArrayLike, finished: ArrayLike, limit: float) -> Interval:
-    """Return the restricted mean of durations T, censored where they are not `finished`.
-
-    The area under Kaplan and Meier's curve up to the limit. Without censoring before the limit it
-    is the mean of min(T, limit) with Student's interval; otherwise Greenwood's variance is used.
-
-    Raises
-    ------
-    ValueError
-        If anything is negative or not finite, or the lengths differ.
-    """
-    times = np.asarray(durations, dtype=float)
-    ended = np.asarray(finished, dtype=bool)
-    if times.shape != ended.shape or times.ndim != 1:
-        raise ValueError(f'durations, finished: got shapes {times.shape}, {ended.shape}')
-    if not (np.isfinite(times).all() and (times >= 0.0).all()):
-        raise ValueError('durations: allowed are finite numbers from 0')
-    if not (math.isfinite(limit) and limit >= 0.0):
-        raise ValueError(f'limit: got {limit}, allowed are finite numbers from 0')
-    ended = ended & (times <= limit)
-    if (ended | (times >= limit)).all():
-        return mean_interval(np.minimum(times, limit))
-    number = len(times)
-    steps, deaths = np.unique(times[ended], return_counts=True)
-    risk = (times >= steps[:, None]).sum(axis=1)
-    alive = np.concatenate([[1.0], np.cumprod(1.0 - deaths / risk)])
-    areas = np.cumsum(alive * np.diff([0.0, *steps, limit]))
-    left = risk > deaths
-    spread = (deaths / (risk * np.maximum(risk - deaths, 1)))[left]
-    variance = float(((areas[-1] - areas[:-1][left]) ** 2 * spread).sum())
-    half = math.sqrt(variance) * _student(max(number - 1, 1))
-    return Interval(
-        float(areas[-1]), half if number > 1 else math.nan, number, max(number - 1.0, 0.0)
-    )
-
-
-def survival(
-    durations: ArrayLike, finished: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Kaplan and Meier's curve: times, and the share not finished from each time on.
-
-    Durations that are not `finished` are censored.
-    """
-    times, ended = np.asarray(durations, dtype=float), np.asarray(finished, dtype=bool)
-    curve = stats.ecdf(stats.CensoredData.right_censored(times, ~ended)).sf
-    return (
-        np.concatenate([[0.0], curve.quantiles]),
-        np.concatenate([[1.0], curve.probabilities]),
-    )
 
 
 def _gaps(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:

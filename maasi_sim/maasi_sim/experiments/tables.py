@@ -21,7 +21,6 @@ from maasi_sim.experiments.statistics import (
     independent_difference,
     mean_interval,
     paired_difference,
-    restricted_mean,
 )
 from maasi_sim.machine import code_digest, this_machine
 
@@ -37,9 +36,8 @@ def interval(results: Results, case: str, quantity: Quantity) -> Interval:
     if quantity.kind == 'mean':
         return mean_interval(values)
     limits = results.values(case, quantity.limit)
-    return restricted_mean(
-        np.where(np.isnan(values), limits, values), ~np.isnan(values), float(limits.min())
-    )
+    # All that is censored reached a limit, so that this is the area under the survival curve.
+    return mean_interval(np.minimum(np.where(np.isnan(values), limits, values), limits.min()))
 
 
 def median(values: np.ndarray, quantity: Quantity) -> float:
