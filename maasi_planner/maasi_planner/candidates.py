@@ -8,17 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.detection import detection_probability_at
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.unexplored_map import UnexploredMap, check_bounds
-from maasi_planner.objective.predicted_measurements import Kernel, reach_of
-from maasi_planner.objective.unexplored_nodes import box_within
+from maasi_planner.objective.predicted_measurements import reach_of
 from maasi_planner.settings import CandidateSettings
-
-FloatArray = NDArray[np.float64]
 
 
 class CandidateSet:
@@ -228,37 +226,42 @@ def unseen_parts(
     members = list(viewers.values()) if isinstance(viewers, Mapping) else list(viewers)
     for viewer in members:
         places, yaws = _poses(viewer, size)
-        kernel = viewer.sensor.detection.kernel()
-        reach = reach_of(*kernel)
+        detection = viewer.sensor.detection
+        kernel, reach = detection.kernel(), reach_of(detection)
         _mark_seen(seen, (lower, step), places, yaws, grid.dimension, kernel, reach, probability)
     return _parts(grid, seen)
 
 
 @njit(cache=True)
 def _mark_seen(
-    seen: NDArray[np.bool_],
+    seen: BoolArray,
     grid: tuple[FloatArray, FloatArray],
     places: FloatArray,
     yaws: FloatArray,
     dimension: int,
-    kernel: Kernel,
+    kernel: tuple[int, FloatArray],
     reach: float,
     probability: float,
 ) -> None:
     """Mark the nodes that some pose sees in seen (nx, ny, nz); `grid`: first node, distances."""
     lower, step = grid
     kind, parameters = kernel
-    box = np.zeros((2, 3), np.int64)
+    low, high = np.zeros(3, np.int64), np.array(seen.shape)
     left = seen.size - np.sum(seen)
     for m in range(places.shape[0]):
         if left == 0:
             break
         cosine = math.cos(yaws[m])
         sine = math.sin(yaws[m])
-        box_within(places[m], reach, lower, step, seen.shape, box)
-        for i in range(box[0, 0], box[1, 0]):
-            for j in range(box[0, 1], box[1, 1]):
-                for k in range(box[0, 2], box[1, 2]):
+        for axis in range(3):
+            if reach < np.inf and step[axis] > 0.0:
+                centre = (places[m, axis] - lower[axis]) / step[axis]
+                width = reach / step[axis]
+                low[axis] = max(math.floor(centre - width), 0)
+                high[axis] = min(math.ceil(centre + width) + 1, seen.shape[axis])
+        for i in range(low[0], high[0]):
+            for j in range(low[1], high[1]):
+                for k in range(low[2], high[2]):
                     if seen[i, j, k]:
                         continue
                     dz = lower[2] + k * step[2] - places[m, 2] if dimension == 3 else 0.0
@@ -323,7 +326,7 @@ def _turns(viewer: Viewer, size: float) -> bool:
     )
 
 
-def _parts(grid: UnexploredMap, seen: NDArray[np.bool_]) -> Unseen:
+def _parts(grid: UnexploredMap, seen: BoolArray) -> Unseen:
     """Return the connected parts of nodes not seen."""
     hidden = ~seen.reshape(grid.values.shape)
     if not hidden.any():

@@ -8,18 +8,16 @@ import math
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid, Path
-from numpy.typing import NDArray
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.conversions import FASTEST, bounded, colour, point_to_ros, pose_from_ros
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_msgs.msg import AgentState, Candidate, PlanDecision
 from maasi_msgs.msg import RobotDecision as RobotDecisionMessage
 from maasi_planner.motion import RobotState
 from maasi_planner.team import Decision, RobotDecision
-
-FloatArray = NDArray[np.float64]
 
 # J of an inadmissible candidate; messages contain finite numbers only.
 NOT_ALLOWED = -1e30

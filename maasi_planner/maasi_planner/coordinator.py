@@ -9,8 +9,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
@@ -24,8 +24,6 @@ from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import make_planner
 from maasi_planner.planners.base import check_decision
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass

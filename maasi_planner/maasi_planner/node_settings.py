@@ -9,7 +9,6 @@ from typing_extensions import Self
 
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
-from maasi_planner.objective.weights import resolve
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 
 
@@ -87,7 +86,7 @@ class PlannerNodeSettings(NodeSettings):
 
     def resolved(self) -> Self:
         """Return a copy with the values of the objective."""
-        planner, weights = self.planner, resolve(self.planner)
+        planner, weights = self.planner, self.planner.weights()
         clusters = planner.cluster_candidates
         values = {
             'beta': weights.beta,

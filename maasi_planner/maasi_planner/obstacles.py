@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.settings import Obstacle
 
-FloatArray = NDArray[np.float64]
 CORNERS = 12
 
 
@@ -37,7 +37,7 @@ class Obstacles:
 
     centres: FloatArray
     radii: FloatArray
-    spheres: NDArray[np.bool_]
+    spheres: BoolArray
 
     @classmethod
     def from_settings(cls, obstacles: Sequence[Obstacle]) -> Obstacles:

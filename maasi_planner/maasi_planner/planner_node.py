@@ -6,11 +6,10 @@ import time
 from functools import partial
 from typing import Any
 
-import numpy as np
 from nav_msgs.msg import Path
-from numpy.typing import NDArray
 from std_msgs.msg import Header
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence, StampGate
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
@@ -33,8 +32,6 @@ from maasi_planner.search_control.search_action import Progress, SearchAction
 from maasi_planner.search_control.search_modes import Mode, SearchModes
 from maasi_planner.search_control.search_services import offer_services
 from maasi_planner.search_control.team_goals import HeardState
-
-FloatArray = NDArray[np.float64]
 
 _CHECK_PERIOD = 0.1
 # At shutdown: longest wait for answers to goals, which are then cancelled [s], and executor rounds

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -170,6 +170,20 @@ class MotionSettings(Settings):
     )
 
 
+class Weights(NamedTuple):
+    """Weights and choices of the objective, with the defaults of the objective in use."""
+
+    information: bool
+    alpha: float
+    beta: float
+    control: float
+    per_distance: bool
+    arrival: bool
+    present: bool
+    own: bool
+    extend: bool
+
+
 class PlannerSettings(Settings):
     """Choice of planner, and its parameters. None means the default of the objective."""
 
@@ -304,6 +318,25 @@ class PlannerSettings(Settings):
         """
         values = {key: getattr(self, key) for key in type(self).model_fields}
         return PlannerSettings.model_validate({**values, 'name': name, 'settings': None})
+
+    def weights(self) -> Weights:
+        """Return the weights of the objective."""
+        information = self.objective == 'information'
+
+        def given(value: float | None, paper: float, other: float) -> float:
+            return value if value is not None else other if information else paper
+
+        return Weights(
+            information=information,
+            alpha=self.alpha,
+            beta=given(self.beta, 0.5, 1.0),
+            control=given(self.control_weight, 1.0, 1e-6),
+            per_distance=self.normalisation == 'distance',
+            arrival=bool(given(self.measure_at_arrival, False, True)),
+            present=bool(given(self.count_present, True, False)),
+            own=self.own_measurement is not False,
+            extend=self.extension == 'measuring',
+        )
 
     @property
     def own_explorations(self) -> bool:

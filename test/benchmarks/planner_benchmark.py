@@ -26,7 +26,6 @@ from maasi_planner import (
     make_planner,
     warm_up,
 )
-from maasi_planner.objective.weights import resolve
 
 CUBE = np.array([[0.0, 260.0]] * 3)
 FLOOR = np.array([[-0.3, 2.4]] * 2)
@@ -112,7 +111,7 @@ def whole_grid_decision(team: TeamView) -> int:
     """Decide for one robot with (17) to (22) as they are written, e on the whole grid."""
     name = team.planning()[0]
     view = team.robots[name]
-    weights = resolve(PAPER)
+    weights = PAPER.weights()
     prediction = view.motion.predict(view.state, view.candidates, team.step_time)
     centres = np.stack([cluster.position for cluster in team.clusters])
     values = []

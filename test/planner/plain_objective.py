@@ -7,7 +7,6 @@ import itertools
 import numpy as np
 
 from maasi_filter.models.pose import Pose
-from maasi_planner.objective.weights import resolve
 
 
 def measurement_steps(team, name, trajectories, choice, weights, horizon):
@@ -47,7 +46,7 @@ def measurement_steps(team, name, trajectories, choice, weights, horizon):
 
 def plain_terms(team, settings, trajectories, choice):
     """Return {robot: (C, T, E, J)} of a joint choice under the objective `paper`."""
-    weights = resolve(settings)
+    weights = settings.weights()
     planning = team.planning()
     horizon = max(int(trajectories[name].lengths.max()) for name in planning)
     steps = {
@@ -137,7 +136,7 @@ def information(team, name, trajectories, w, weights, present_only=False):
 
 def plain_information_terms(team, settings, trajectories, choice):
     """Return {robot: (C, T, E, J)} of a joint choice under the objective `information`."""
-    weights = resolve(settings)
+    weights = settings.weights()
     planning = team.planning()
     own, present, measured = {}, {}, {}
     for name in team.names():

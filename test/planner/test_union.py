@@ -12,10 +12,9 @@ from planner_helpers import random_team
 from maasi_filter.models.pose import Pose
 from maasi_planner import PlannerSettings, RobotState, make_motion, make_planner
 from maasi_planner.objective.team_objective import TeamObjective
-from maasi_planner.objective.weights import resolve
 
 SETTINGS = PlannerSettings(control_weight=0.0, exploration_nodes=1_000_000)
-WEIGHTS = resolve(SETTINGS)
+WEIGHTS = SETTINGS.weights()
 
 
 def team_of(seed, planning, equal=False):

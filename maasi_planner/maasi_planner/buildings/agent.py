@@ -9,8 +9,9 @@ from typing import Literal
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_planner.buildings.battery import Hazard, HeardPlan, rewards
 from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.guidance import WayFinder, assigned, nearest
@@ -18,8 +19,6 @@ from maasi_planner.buildings.preplanning import Mission, detection_probability
 from maasi_planner.buildings.problem import Objective, Plan, PlanSolver, Problem
 from maasi_planner.buildings.settings import CuboidSettings, HazardSettings
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
 
 # Tolerances of arrival at the station [m, m/s].

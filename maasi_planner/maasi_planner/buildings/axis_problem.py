@@ -15,12 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray, IntArray
 from maasi_planner.buildings.dynamics import Dynamics
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # The objective is scaled so that its rows are of the size of one.
 SCALE = 1e4

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from maasi_filter.arrays import BoolArray
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.buildings.axis_problem import solve_axis
 from maasi_planner.buildings.search_tree import Tree, copy_node, free, pop, push
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # A plan must be better than the best by this much, scaled objective.
 GAP = 1e-3

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from geometry_msgs.msg import Vector3
-from numpy.typing import NDArray
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.conversions import (
     FARTHEST,
     FASTEST,
@@ -21,8 +21,6 @@ from maasi_msgs.msg import Snapshot as SnapshotMessage
 from maasi_planner.buildings.agent import Broadcast, Choice, SearchAgent, Snapshot
 from maasi_planner.buildings.battery import Hazard
 from maasi_planner.buildings.preplanning import Mission
-
-FloatArray = NDArray[np.float64]
 
 # Upper bound of the parameters of a battery.
 _LARGEST_HAZARD = 1e9

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings.settings import DynamicsSettings
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import heapq
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.buildings.preplanning import segment_cuts
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 # Distance of intermediate targets from the corners of obstacles [m].
 _BERTH = 3.0
 
@@ -112,7 +110,7 @@ class WayFinder:
         free = ((points >= self.area[:, 0]) & (points <= self.area[:, 1])).all(axis=1)
         low = points[:, None, :] > self.solids[None, :, :, 0]
         high = points[:, None, :] < self.solids[None, :, :, 1]
-        within: NDArray[np.bool_] = np.all(low & high, axis=2)
+        within: BoolArray = np.all(low & high, axis=2)
         free &= ~within.any(axis=1)
         return np.asarray(points[free])
 

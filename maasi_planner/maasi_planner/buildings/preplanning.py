@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_planner.buildings.settings import (
     FACES,
     BoxSettings,
@@ -17,7 +18,6 @@ from maasi_planner.buildings.settings import (
     SearchCameraSettings,
 )
 
-FloatArray = NDArray[np.float64]
 # Least thickness of a cuboid [m].
 _THINNEST = 1.0
 
@@ -120,7 +120,7 @@ class Mission:
         """Objects and obstacles, (n, 3, 2) [m]."""
         return np.concatenate([self.objects, self.obstacles])
 
-    def inside(self, position: ArrayLike) -> NDArray[np.bool_]:
+    def inside(self, position: ArrayLike) -> BoolArray:
         """Return which cuboids a position (3,) is in, (N,)."""
         place = np.asarray(position, dtype=float)
         return np.asarray(
@@ -142,7 +142,7 @@ class Mission:
         )
 
 
-def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> NDArray[np.bool_]:
+def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolArray:
     """Return which boxes (n, 3, 2) have an interior that segments (..., 3) cut, (..., n)."""
     way = end - begin
     with np.errstate(divide='ignore', invalid='ignore'):

@@ -8,16 +8,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.buildings import branch_and_bound as bb
 from maasi_planner.buildings.axis_problem import SCALE, AxisRows, axis_rows
 from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.search_tree import make_tree
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 # Relaxation of bounds if rounding leaves the state outside of them [m, m/s].
 GIVE = 1e-4

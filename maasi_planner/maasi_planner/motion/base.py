@@ -9,16 +9,15 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion.steering import Steering, Surroundings, sideways_command
 from maasi_planner.obstacles import KeepOut, Obstacles
 from maasi_planner.settings import MotionSettings
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 STEPS_LIMIT = 20_000
 
 
@@ -90,7 +89,7 @@ class Trajectories:
     yaws: FloatArray
     lengths: IntArray
     control_cost: FloatArray
-    reached: NDArray[np.bool_]
+    reached: BoolArray
 
     def arrays(self) -> TrajectoryArrays:
         """Return the arrays that a roll-out fills."""
@@ -348,9 +347,7 @@ def add_position(
 
 
 @njit(cache=True)
-def _trim(
-    positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: NDArray[np.bool_]
-) -> int:
+def _trim(positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: BoolArray) -> int:
     """Fill what was reached, cut lengths, extend trajectories; return the longest length."""
     limit = positions.shape[1] - 1
     longest = 0

@@ -11,9 +11,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray
 
 # x, y [m, map], heading [rad], forward speed [m/s], turn rate [rad/s].
 UnicycleState = tuple[float, float, float, float, float]

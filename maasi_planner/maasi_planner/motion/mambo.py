@@ -15,8 +15,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
@@ -43,8 +44,6 @@ from maasi_planner.motion.obstacle_term import KINDS, ObstacleTerm, add_obstacle
 from maasi_planner.motion.steering import Steering, Surroundings, sideways_command
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
-
-FloatArray = NDArray[np.float64]
 
 
 @njit(cache=True)

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.motion.mambo_gains import (
     COUNT_FORCE,
     GRAVITY,
@@ -28,7 +28,6 @@ from maasi_planner.motion.mambo_gains import (
     YAW_RATE,
 )
 
-FloatArray = NDArray[np.float64]
 # vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
 Command = tuple[float, float, float, float]
 

@@ -6,11 +6,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.settings import MotionSettings
-
-FloatArray = NDArray[np.float64]
 
 GRAVITY = 9.81
 MASS = 0.063

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from maasi_filter.arrays import FloatArray
+
 KINDS = ('none', 'printed', 'away')
 PRINTED = 1
 

@@ -7,11 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_planner.obstacles import hold_back, next_point, segment_distance
-
-FloatArray = NDArray[np.float64]
 
 
 class Surroundings(NamedTuple):

@@ -15,8 +15,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import (
     Body,
@@ -44,7 +45,6 @@ from maasi_planner.motion.steering import Surroundings
 from maasi_planner.obstacles import Obstacles, next_point
 from maasi_planner.settings import MotionSettings
 
-FloatArray = NDArray[np.float64]
 K_RHO = 1.5
 K_ALPHA = 3.0
 # Beyond this bearing error the robot turns on the spot.

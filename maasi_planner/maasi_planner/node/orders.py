@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from std_msgs.msg import Header
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.conversions import point_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_msgs.action import GoToWaypoint
@@ -99,7 +99,7 @@ class Orders:
 
     # ---- goals -------------------------------------------------------------------------------
 
-    def send(self, name: str, number: int, waypoint: NDArray[np.float64], header: Header) -> None:
+    def send(self, name: str, number: int, waypoint: FloatArray, header: Header) -> None:
         """Send a goal to a robot."""
         goal = GoToWaypoint.Goal(goal_id=number, step=self._node.step)
         goal.waypoint.header = header

@@ -7,17 +7,15 @@ from functools import partial
 
 import numpy as np
 from geometry_msgs.msg import PointStamped
-from numpy.typing import NDArray
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence
 from maasi_filter.ros.conversions import point_to_ros, stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE
 from maasi_planner.node_settings import PlannerNodeSettings
-
-FloatArray = NDArray[np.float64]
 
 
 class OtherPlanners:

@@ -2,54 +2,92 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from maasi_planner.objective.candidate_table import CandidateTable
-from maasi_planner.objective.information import expected_new_targets, information_gain
-from maasi_planner.objective.paper import explored
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_planner.objective.information import InformationTerms, information_gain
+from maasi_planner.objective.paper import PaperTerms, left_by
+from maasi_planner.objective.predicted_measurements import Measurements
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+
+class CandidateTable(NamedTuple):
+    """The candidates of the planning robots, with the terms of the objective in use.
+
+    G candidates of R robots, one robot after the other; robot r has start[r] to start[r + 1].
+    """
+
+    start: IntArray
+    robot: IntArray
+    allowed: BoolArray
+    waypoints: FloatArray
+    radii: FloatArray
+    control: FloatArray
+    norm: FloatArray
+    alpha: float
+    beta: float
+    control_weight: float
+    planned: Measurements
+    is_paper: bool
+    paper: PaperTerms
+    information: InformationTerms
 
 
 @njit(cache=True)
-def _weighed(
-    control: float,
-    refinement: float,
-    exploration: float,
-    norm: float,
-    alpha: float,
-    beta: float,
-    control_weight: float,
-) -> float:
-    """Return J (17), (26) of one candidate."""
-    return (-control_weight * control + alpha * refinement + beta * exploration) / norm
+def _counted_before(table: CandidateTable, g: int, chosen: IntArray) -> IntArray:
+    """Return the chosen candidates of others whose measurements g gets no credit for.
+
+    In `information` what two see counts for the one with the shorter way.
+    """
+    out = np.empty(chosen.shape[0], np.int64)
+    number = 0
+    for r in range(chosen.shape[0]):
+        other = chosen[r]
+        if r == table.robot[g] or other < 0:
+            continue
+        shorter = table.norm[other] < table.norm[g]
+        tie = table.norm[other] == table.norm[g] and r < table.robot[g]
+        if table.is_paper or shorter or tie:
+            out[number] = other
+            number += 1
+    return out[:number]
+
+
+@njit(cache=True)
+def _exploration(table: CandidateTable, g: int, others: IntArray) -> float:
+    """Return E of candidate g, given others that count before it."""
+    if table.is_paper:
+        left = table.paper.value[table.paper.start[g] : table.paper.start[g + 1]].copy()
+    else:
+        left = table.information.unseen * (1.0 - table.information.miss[g])
+    for other in others:
+        if table.is_paper:
+            factor = left_by(table.paper, table.planned, g, other)
+        else:
+            factor = table.information.miss[other]
+        for i in range(left.shape[0]):
+            left[i] *= factor[i]
+    total = 0.0
+    for i in range(left.shape[0]):
+        total += left[i]
+    return total
 
 
 @njit(cache=True)
 def candidate_value(
     table: CandidateTable, g: int, chosen: IntArray, work: FloatArray
 ) -> tuple[float, float, float]:
-    """Return T, E and J of candidate g, given the others' choices in `chosen` (R,), -1 for none."""
-    if table.information:
-        refinement = information_gain(table, g, chosen, work)
-        exploration = expected_new_targets(table, g, chosen) if table.beta > 0.0 else 0.0
+    """Return T, E and J (17), (26) of g, given the others' choices (R,), -1 for none."""
+    others = _counted_before(table, g, chosen)
+    if table.is_paper:
+        refinement = table.paper.refinement[g]
     else:
-        refinement = table.refinement[g]
-        exploration = explored(table, g, chosen) if table.beta > 0.0 else 0.0
-    value = _weighed(
-        table.control[g],
-        refinement,
-        exploration,
-        table.norm[g],
-        table.alpha,
-        table.beta,
-        table.control_weight,
-    )
-    return refinement, exploration, value
+        refinement = information_gain(table.information, g, others, work)
+    exploration = _exploration(table, g, others) if table.beta > 0.0 else 0.0
+    value = -table.control_weight * table.control[g] + table.alpha * refinement
+    return refinement, exploration, (value + table.beta * exploration) / table.norm[g]
 
 
 @njit(cache=True)
@@ -80,48 +118,14 @@ def total_value(table: CandidateTable, chosen: IntArray, work: FloatArray) -> fl
 
 
 @njit(cache=True)
-def alone_on_paper(
-    refinement: FloatArray,
-    entry_start: IntArray,
-    entry_value: FloatArray,
-    control: FloatArray,
-    norm: FloatArray,
-    allowed: BoolArray,
-    alpha: float,
-    beta: float,
-    control_weight: float,
-    out: FloatArray,
-) -> None:
-    """Do what `alone_values` does for `paper`, without handing over the whole table."""
-    for g in range(out.shape[0]):
-        explored = 0.0
-        for i in range(entry_start[g], entry_start[g + 1]):
-            explored += entry_value[i]
-        out[g, 0] = refinement[g]
-        out[g, 1] = explored
-        value = _weighed(control[g], refinement[g], explored, norm[g], alpha, beta, control_weight)
-        out[g, 2] = value if allowed[g] else -np.inf
-
-
-@njit(cache=True)
-def alone_values(table: CandidateTable, out: FloatArray) -> None:
-    """Write T, E and J of each candidate without the other planning robots into out (G, 3)."""
-    chosen = np.full(table.radii.shape[0], -1, np.int64)
+def values_given(table: CandidateTable, first: int, last: int, chosen: IntArray) -> FloatArray:
+    """Return T, E and J of the candidates `first` to `last`, given the others' choices, (n, 3)."""
+    out = np.empty((last - first, 3))
     work = np.zeros((3, 3, 3))
-    for g in range(out.shape[0]):
+    for g in range(first, last):
         refinement, exploration, value = candidate_value(table, g, chosen, work)
-        out[g, 0] = refinement
-        out[g, 1] = exploration
-        out[g, 2] = value if table.allowed[g] else -np.inf
-
-
-@njit(cache=True)
-def given_values(table: CandidateTable, robot: int, chosen: IntArray, out: FloatArray) -> None:
-    """Write T, E and J of each candidate of one robot, given the others, into out (W, 3)."""
-    work = np.zeros((3, 3, 3))
-    for g in range(table.start[robot], table.start[robot + 1]):
-        refinement, exploration, value = candidate_value(table, g, chosen, work)
-        row = g - table.start[robot]
-        out[row, 0] = refinement
-        out[row, 1] = exploration
-        out[row, 2] = value if table.allowed[g] and not collides(table, g, chosen) else -np.inf
+        out[g - first, 0] = refinement
+        out[g - first, 1] = exploration
+        admissible = table.allowed[g] and not collides(table, g, chosen)
+        out[g - first, 2] = value if admissible else -np.inf
+    return out

@@ -3,35 +3,186 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from maasi_filter.models.detection import detection_probability_at
+from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.models.detection import BOX, detection_probability_at
 from maasi_filter.models.pose import Pose
-from maasi_planner.objective.candidate_table import CandidateTable
-from maasi_planner.objective.predicted_measurements import Events, Kernel
-from maasi_planner.team import RobotView
+from maasi_planner.objective.predicted_measurements import (
+    NEVER,
+    Measurements,
+    apply_misses,
+    first_of_each,
+)
+from maasi_planner.settings import PlannerSettings
+from maasi_planner.team import RobotView, TeamView
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+
+class InformationTerms(NamedTuple):
+    """What T and E of candidates consist of.
+
+    Of the clusters mass (C,) and covariance (C, d, d), and the sum of pi H' R^-1 H of measurements
+    that do not depend on the choice, base (C, d, d), and of each candidate, gain (G, C, d, d).
+    unseen (L,): targets that are expected beside them; miss (G, L): share that a candidate misses.
+    """
+
+    mass: FloatArray
+    covariance: FloatArray
+    base: FloatArray
+    gain: FloatArray
+    unseen: FloatArray
+    miss: FloatArray
+
+
+# Of the objective `paper`.
+NO_INFORMATION = InformationTerms(
+    mass=np.zeros(0),
+    covariance=np.zeros((0, 3, 3)),
+    base=np.zeros((0, 3, 3)),
+    gain=np.zeros((0, 0, 3, 3)),
+    unseen=np.zeros(0),
+    miss=np.zeros((0, 0)),
+)
 
 
 @njit(cache=True)
-def _information(
-    matrices: FloatArray, probabilities: FloatArray, first: int, own: IntArray, out: FloatArray
+def _chances(measured: Measurements, rows: IntArray, robot: int, centres: FloatArray) -> FloatArray:
+    """Return pi at centres (C, 3) of some measurements of a robot, (n, C)."""
+    out = np.empty((rows.shape[0], centres.shape[0]))
+    for i in range(rows.shape[0]):
+        place, turn = measured.places[rows[i]], measured.turns[rows[i]]
+        for c in range(centres.shape[0]):
+            out[i, c] = detection_probability_at(
+                measured.kind[robot],
+                measured.parameters[robot],
+                centres[c, 0] - place[0],
+                centres[c, 1] - place[1],
+                centres[c, 2] - place[2],
+                turn[0],
+                turn[1],
+            )
+    return out
+
+
+@njit(cache=True)
+def _add_weighed(
+    matrices: FloatArray, weights: FloatArray, owners: IntArray, out: FloatArray
 ) -> None:
-    """Sum pi H' R^-1 H over measurements: matrices (W, H, C, d, d) into out (W, C, d, d)."""
-    d = matrices.shape[3]
-    for w in range(matrices.shape[0]):
-        for i in range(first, own[w]):
-            for c in range(matrices.shape[2]):
-                p = probabilities[w, i, c]
-                if p > 0.0:
-                    for a in range(d):
-                        for b in range(d):
-                            out[w, c, a, b] += p * matrices[w, i, c, a, b]
+    """Add weights (n, C) times matrices (n, C, d, d) to the rows of out of their owners (n,)."""
+    for i in range(owners.shape[0]):
+        for c in range(weights.shape[1]):
+            for a in range(matrices.shape[2]):
+                for b in range(matrices.shape[3]):
+                    out[owners[i], c, a, b] += weights[i, c] * matrices[i, c, a, b]
+
+
+def _whitened(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return H' R^-1 H for each H (n, d, d), by Cholesky's factors in plain sums."""
+    d = covariance.shape[0]
+    lower = np.zeros((d, d))
+    for i in range(d):
+        for j in range(i + 1):
+            rest = float(covariance[i, j]) - sum(float(lower[i, k] * lower[j, k]) for k in range(j))
+            lower[i, j] = math.sqrt(rest) if i == j else rest / lower[j, j]
+    out = np.zeros((len(jacobian), d, d))
+    rows: list[FloatArray] = []
+    for i in range(d):
+        row = jacobian[:, i, :].copy()
+        for k in range(i):
+            row -= lower[i, k] * rows[k]
+        rows.append(row / lower[i, i])
+        out += rows[i][:, :, None] * rows[i][:, None, :]
+    return out
+
+
+def _information(
+    views: Sequence[RobotView], measured: Measurements, first: int, centres: FloatArray, d: int
+) -> FloatArray:
+    """Return sum pi H' R^-1 H over the planned measurements from `first` on, (W, C, d, d)."""
+    out = np.zeros((len(measured.own), len(centres), d, d))
+    if not len(centres):
+        return out
+    owner = np.repeat(np.arange(len(measured.own)), np.diff(measured.start))
+    index = np.arange(len(owner)) - measured.start[owner]
+    counts = (index >= first) & (index < measured.own[owner])
+    for robot, view in enumerate(views):
+        sensor = view.sensor
+        rows = np.flatnonzero(counts & (measured.robot[owner] == robot))
+        chances = _chances(measured, rows, robot, centres)
+        offsets = (centres[None, :, :] - measured.places[rows][:, None, :])[..., :d]
+        # Nearer than the noise of the range the linear model would promise too much.
+        least = math.sqrt(float(sensor.covariance[0, 0]))
+        distance = np.sqrt((offsets * offsets).sum(axis=2))
+        offsets = offsets * np.maximum(1.0, least / np.maximum(distance, 1e-12))[..., None]
+        matrices = np.zeros((*chances.shape, d, d))
+        seen = chances > 0.0
+        if seen.any():
+            jacobian = sensor.measurement.jacobian(offsets[seen], Pose(np.zeros(3)))
+            matrices[seen] = _whitened(jacobian, sensor.covariance)
+        _add_weighed(matrices, chances, owner[rows], out)
+    return out
+
+
+def _unseen(
+    team: TeamView, settings: PlannerSettings, every_node: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return places (3, L) [m], nodes of e or blocks of them, and the unseen targets of each."""
+    values, lower, step = team.exploration.kernel()
+    volumes = team.exploration.cell_volumes().reshape(values.shape)
+    most, stride = settings.exploration_nodes, 1
+    while not every_node and np.prod([-(-size // stride) for size in values.shape]) > most:
+        stride += 1
+    left = values * volumes
+    for axis, size in enumerate(values.shape):
+        left = np.add.reduceat(left, np.arange(0, size, stride), axis=axis)
+    start = lower + 0.5 * (stride - 1) * step
+    places = start[:, None] + (stride * step)[:, None] * np.indices(left.shape).reshape(3, -1)
+    if team.dimension == 2:
+        places[2] = 0.0
+    return places, left.ravel() * (settings.expected_targets / float(volumes.sum()))
+
+
+@njit(cache=True)
+def _misses(measured: Measurements, first: int, places: FloatArray) -> FloatArray:
+    """Return the product of 1 - pi of planned measurements from `first` on, at places, (W, L)."""
+    out = np.ones((measured.own.shape[0], places.shape[1]))
+    until = np.full(places.shape[1], NEVER)
+    for w in range(out.shape[0]):
+        apply_misses(places, until, out[w], measured, w, first, measured.own[w])
+    return out
+
+
+def information_terms(
+    team: TeamView,
+    settings: PlannerSettings,
+    planned: tuple[Sequence[RobotView], Measurements],
+    settled: tuple[Sequence[RobotView], Measurements],
+    first: int,
+    centres: FloatArray,
+) -> InformationTerms:
+    """Return the terms of candidates: robots that plan, and their measurements from `first` on.
+
+    `settled`: the robots that do not plan, and their measurements.
+    """
+    d, clusters = team.dimension, team.clusters
+    # What does not depend on the choice: settled robots, and the present measurements.
+    given = [settled, (planned[0], first_of_each(planned[1]))][: 1 + first]
+    places, left = _unseen(team, settings, bool((planned[1].kind >= BOX).any()))
+    for _, measured in given:
+        left *= _misses(measured, 0, places).prod(axis=0)
+    kept = np.flatnonzero(left > 0.0)
+    return InformationTerms(
+        mass=np.array([min(1.0, max(0.0, cluster.mass)) for cluster in clusters], float),
+        covariance=np.array([c.covariance[:d, :d] for c in clusters], float).reshape(-1, d, d),
+        base=sum(_information(*group, 0, centres, d).sum(axis=0) for group in given),
+        gain=_information(*planned, first, centres, d),
+        unseen=left[kept],
+        miss=_misses(planned[1], first, np.ascontiguousarray(places[:, kept])),
+    )
 
 
 @njit(cache=True)
@@ -49,148 +200,27 @@ def _log_det(matrix: FloatArray) -> float:
 
 
 @njit(cache=True)
-def _is_credited(table: CandidateTable, other: int, g: int) -> bool:
-    """Return whether what `other` and g both see counts for `other`: its way is shorter."""
-    if table.norm[other] != table.norm[g]:
-        return table.norm[other] < table.norm[g]
-    return table.robot[other] < table.robot[g]
-
-
-@njit(cache=True)
-def information_gain(table: CandidateTable, g: int, chosen: IntArray, work: FloatArray) -> float:
-    """Return T of `information` for candidate g, given the others with a shorter way."""
-    d = table.dimension
+def information_gain(terms: InformationTerms, g: int, others: IntArray, work: FloatArray) -> float:
+    """Return T of candidate g, given the candidates `others` that count before it."""
+    d = terms.base.shape[1]
+    known, before, after = work[0, :d, :d], work[1, :d, :d], work[2, :d, :d]
     total = 0.0
-    robot = table.robot[g]
-    for c in range(table.mass.shape[0]):
+    for c in range(terms.mass.shape[0]):
         helps = False
         for a in range(d):
-            if table.gain[g, c, a, a] > 0.0:
-                helps = True
+            helps |= terms.gain[g, c, a, a] > 0.0
         if not helps:
             continue
+        known[:] = terms.base[c]
+        for other in others:
+            known += terms.gain[other, c]
         for a in range(d):
             for b in range(d):
-                work[0, a, b] = table.base[c, a, b]
-        for r in range(chosen.shape[0]):
-            if r != robot and chosen[r] >= 0 and _is_credited(table, chosen[r], g):
-                for a in range(d):
-                    for b in range(d):
-                        work[0, a, b] += table.gain[chosen[r], c, a, b]
-        for a in range(d):
-            for b in range(d):
-                without = 1.0 if a == b else 0.0
+                before[a, b] = 1.0 if a == b else 0.0
                 extra = 0.0
                 for k in range(d):
-                    without += table.covariance[c, a, k] * work[0, k, b]
-                    extra += table.covariance[c, a, k] * table.gain[g, c, k, b]
-                work[1, a, b] = without
-                work[2, a, b] = without + extra
-        total += (
-            0.5 * table.mass[c] * max(0.0, _log_det(work[2, :d, :d]) - _log_det(work[1, :d, :d]))
-        )
+                    before[a, b] += terms.covariance[c, a, k] * known[k, b]
+                    extra += terms.covariance[c, a, k] * terms.gain[g, c, k, b]
+                after[a, b] = before[a, b] + extra
+        total += 0.5 * terms.mass[c] * max(0.0, _log_det(after) - _log_det(before))
     return total
-
-
-@njit(cache=True)
-def expected_new_targets(table: CandidateTable, g: int, chosen: IntArray) -> float:
-    """Return E of `information` for candidate g, given the others with a shorter way."""
-    robot = table.robot[g]
-    others = 0
-    first = -1
-    for r in range(chosen.shape[0]):
-        if r != robot and chosen[r] >= 0 and _is_credited(table, chosen[r], g):
-            others += 1
-            first = chosen[r]
-    total = 0.0
-    if others == 0:
-        for node in range(table.unseen.shape[0]):
-            total += table.unseen[node] * (1.0 - table.miss[g, node])
-    elif others == 1:
-        for node in range(table.unseen.shape[0]):
-            seen = 1.0 - table.miss[g, node]
-            if seen > 0.0:
-                total += table.unseen[node] * seen * table.miss[first, node]
-    else:
-        for node in range(table.unseen.shape[0]):
-            seen = 1.0 - table.miss[g, node]
-            if seen > 0.0:
-                left = table.unseen[node] * seen
-                for r in range(chosen.shape[0]):
-                    if r != robot and chosen[r] >= 0 and _is_credited(table, chosen[r], g):
-                        left *= table.miss[chosen[r], node]
-                total += left
-    return total
-
-
-def add_information(
-    view: RobotView,
-    kernel: Kernel,
-    item: Events,
-    first: int,
-    centres: FloatArray,
-    dimension: int,
-    out: FloatArray,
-) -> None:
-    """Add sum pi H' R^-1 H over the measurements to out (W, C, d, d)."""
-    most = int(item.own.max(initial=0))
-    if most <= first:
-        return
-    places = item.places[:, :most]
-    offsets = centres[None, None, :, :] - places[:, :, None, :]
-    if dimension == 2:
-        offsets[..., 2] = 0.0
-    sensor = view.sensor
-    probabilities = np.zeros(offsets.shape[:3])
-    _probabilities(item, offsets, first, kernel, probabilities)
-    flat = np.ascontiguousarray(offsets[..., :dimension].reshape(-1, dimension))
-    # Nearer than the noise of the range the linear model would promise too much.
-    least = math.sqrt(float(sensor.covariance[0, 0]))
-    distance = np.sqrt((flat * flat).sum(axis=1))
-    flat = flat * np.maximum(1.0, least / np.maximum(distance, 1e-12))[:, None]
-    needed = np.flatnonzero(probabilities.ravel() > 0.0)
-    matrices = np.zeros((len(flat), dimension, dimension))
-    if len(needed):
-        jacobian = sensor.measurement.jacobian(flat[needed], Pose(np.zeros(3)))
-        matrices[needed] = _whitened(jacobian, sensor.covariance)
-    blocks = matrices.reshape(*probabilities.shape, dimension, dimension)
-    _information(blocks, probabilities, first, item.own, out)
-
-
-def _whitened(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return H' R^-1 H for each H (n, d, d), by Cholesky's factors in plain sums."""
-    d = covariance.shape[0]
-    lower = np.zeros((d, d))
-    for i in range(d):
-        for j in range(i + 1):
-            rest = float(covariance[i, j]) - sum(float(lower[i, k] * lower[j, k]) for k in range(j))
-            lower[i, j] = math.sqrt(rest) if i == j else rest / lower[j, j]
-    rows: list[FloatArray] = []
-    for i in range(d):
-        row = jacobian[:, i, :].copy()
-        for k in range(i):
-            row -= lower[i, k] * rows[k]
-        rows.append(row / lower[i, i])
-    out = np.zeros((len(jacobian), d, d))
-    for row in rows:
-        out += row[:, :, None] * row[:, None, :]
-    return out
-
-
-@njit(cache=True)
-def _probabilities(
-    item: Events, offsets: FloatArray, first: int, kernel: Kernel, out: FloatArray
-) -> None:
-    kind, parameters = kernel
-    for w in range(offsets.shape[0]):
-        for i in range(first, item.own[w]):
-            for c in range(offsets.shape[2]):
-                out[w, i, c] = detection_probability_at(
-                    kind,
-                    parameters,
-                    offsets[w, i, c, 0],
-                    offsets[w, i, c, 1],
-                    offsets[w, i, c, 2],
-                    item.turns[w, i, 0],
-                    item.turns[w, i, 1],
-                )

@@ -4,42 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from maasi_planner.objective.candidate_table import CandidateTable
-from maasi_planner.objective.candidate_value import candidate_value, collides, total_value
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
+from maasi_filter.arrays import FloatArray, IntArray
+from maasi_planner.objective.candidate_value import (
+    CandidateTable,
+    candidate_value,
+    collides,
+    total_value,
+)
+from maasi_planner.settings import PlannerSettings
 
 # Moves of two robots at once are tried in teams up to this size.
 PAIRS_LIMIT = 5
 
 
 @njit(cache=True)
-def search_exactly(
+def _search_exactly(
     table: CandidateTable, alone: FloatArray, order: IntArray, best: IntArray, best_value: float
 ) -> tuple[float, int]:
     """Find the best joint choice (26), by depth-first search with bounds.
 
-    Parameters
-    ----------
-    joint : CandidateTable
-        All candidates.
-    alone : (G,) array
-        J of each candidate alone, an upper bound.
-    order : (G,) array
-        Candidates of each robot from the best to the worst alone.
-    best : (R,) array
-        Best choice known; replaced in place. best[0] = -1 if none is known.
-    best_value : float
-        Its value, or -inf.
-
-    Returns
-    -------
-    value, evaluated
-        Its value, and how many partial joint choices were evaluated.
+    J of a candidate alone is an upper bound; `best` (R,) with its value is the best choice known,
+    and is replaced in place. Returns its value, and how many partial choices were evaluated.
     """
     robots = table.radii.shape[0]
     rest = np.zeros(robots + 1)
@@ -115,7 +101,7 @@ def _best_reply(
 
 
 @njit(cache=True)
-def search_in_turn(
+def _search_in_turn(
     table: CandidateTable,
     alone: FloatArray,
     order: IntArray,
@@ -156,7 +142,7 @@ def search_in_turn(
 
 
 @njit(cache=True)
-def improve_in_pairs(
+def _improve_in_pairs(
     table: CandidateTable,
     alone: FloatArray,
     order: IntArray,
@@ -200,3 +186,40 @@ def improve_in_pairs(
                         total = value
                         improved = True
     return total, evaluated
+
+
+def search(
+    table: CandidateTable, alone: FloatArray, settings: PlannerSettings
+) -> tuple[IntArray, float, bool, int]:
+    """Return the best joint choice, its value, whether it is exact, and the work done.
+
+    `alone` (G,) is J of each candidate without the others. The choice (R,) has indices into all
+    candidates, -1 for a robot with none admissible.
+    """
+    robots = len(table.radii)
+    parts = [slice(*ends) for ends in zip(table.start[:-1].tolist(), table.start[1:].tolist())]
+    best = np.full(robots, -1, np.int64)
+    if robots == 0:
+        return best, 0.0, True, 0
+    if robots == 1:
+        if alone.max() > -np.inf:
+            best[0] = alone.argmax()
+        return best, float(alone.max()), True, len(alone)
+    order = np.concatenate([rows.start + np.argsort(-alone[rows], kind='stable') for rows in parts])
+    rounds = settings.improvement_rounds
+    value, work = _search_in_turn(table, alone, order, rounds, False, best)
+    number = np.prod([max(1.0, float(np.isfinite(alone[rows]).sum())) for rows in parts])
+    if number <= settings.enumeration_limit and (best >= 0).all():
+        value, count = _search_exactly(table, alone, order, best, value)
+        return best, value, True, work + count
+    tries = [(best, value, work)]
+    other = np.full(robots, -1, np.int64)
+    tries.append((other, *_search_in_turn(table, alone, order, rounds, True, other)))
+    if robots <= PAIRS_LIMIT:
+        for index, (choice, value, work) in enumerate(tries):
+            budget = settings.pair_budget
+            value, count = _improve_in_pairs(table, alone, order, value, budget, choice)
+            tries[index] = (choice, value, work + count)
+    # Prefer more moving robots, then the larger value.
+    best, value, _ = max(tries, key=lambda item: (int((item[0] >= 0).sum()), item[1]))
+    return best, value, False, sum(work for _, _, work in tries)

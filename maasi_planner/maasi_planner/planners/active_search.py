@@ -14,8 +14,8 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
     Options,
@@ -29,8 +29,6 @@ from maasi_planner.planners.base import (
 )
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
-
-FloatArray = NDArray[np.float64]
 
 
 class Sequences:

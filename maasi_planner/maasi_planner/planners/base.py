@@ -10,17 +10,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.plugins import PluginError
 from maasi_filter.records import Cluster
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 class Planner(ABC):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.base import (
@@ -17,9 +17,6 @@ from maasi_planner.planners.base import (
 )
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 class Intermittent(Planner):
@@ -72,7 +69,7 @@ class Intermittent(Planner):
         name: str,
         objective: TeamObjective,
         index: int,
-        chosen: NDArray[np.int64],
+        chosen: IntArray,
         points: FloatArray,
         prediction: Trajectories,
     ) -> RobotDecision:

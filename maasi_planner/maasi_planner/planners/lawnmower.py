@@ -9,14 +9,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import BOX
 from maasi_planner.planners.base import Planner, check_team, explain, state_problem
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
-
-FloatArray = NDArray[np.float64]
 
 
 def lanes(

@@ -18,8 +18,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
     Options,
@@ -33,7 +33,6 @@ from maasi_planner.planners.base import (
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, single_choice, stay
 
-FloatArray = NDArray[np.float64]
 EXACT_TERMS = 48
 DOUBLINGS = 40
 

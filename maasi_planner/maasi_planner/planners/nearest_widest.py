@@ -6,8 +6,8 @@ Without clusters a robot goes to the candidate with the largest e (ties: the nea
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.records import Cluster
 from maasi_planner.planners.base import (
     Planner,
@@ -20,8 +20,6 @@ from maasi_planner.planners.base import (
 )
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice, stay
-
-FloatArray = NDArray[np.float64]
 
 
 class NearestWidest(Planner):

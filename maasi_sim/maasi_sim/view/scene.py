@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from maasi_drivers.agent.flight_rules import make_fence, make_vehicle_fence
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.settings import DETECTIONS
-from maasi_planner.objective.weights import resolve
 from maasi_planner.settings import PlannerSettings
 from maasi_sim.buildings.scenario import NAME as BUILDINGS
 from maasi_sim.buildings.scenario import CuboidScenario
@@ -81,7 +80,7 @@ def _objective(settings: PlannerSettings) -> Scene:
     """Return what J is made of, for planners whose J is that of `PlannerSettings`."""
     if settings.name not in _WEIGHING:
         return {}
-    weights = resolve(settings)
+    weights = settings.weights()
     return {
         'objective': settings.objective,
         'weights': {
