@@ -56,7 +56,7 @@ def _counted_before(table: CandidateTable, g: int, chosen: IntArray) -> IntArray
 
 
 @njit(cache=True)
-def _exploration(table: CandidateTable, g: int, others: IntArray) -> float:
+def exploration_given(table: CandidateTable, g: int, others: IntArray) -> float:
     """Return E of candidate g, given others that count before it."""
     if table.is_paper:
         left = table.paper.value[table.paper.start[g] : table.paper.start[g + 1]].copy()
@@ -85,7 +85,7 @@ def candidate_value(
         refinement = table.paper.refinement[g]
     else:
         refinement = information_gain(table.information, g, others, work)
-    exploration = _exploration(table, g, others) if table.beta > 0.0 else 0.0
+    exploration = exploration_given(table, g, others) if table.beta > 0.0 else 0.0
     value = -table.control_weight * table.control[g] + table.alpha * refinement
     return refinement, exploration, (value + table.beta * exploration) / table.norm[g]
 

@@ -48,7 +48,7 @@ NO_PAPER = PaperTerms(
 
 
 @njit(cache=True)
-def _centre_sum(planned: Measurements, first: int, centres: FloatArray) -> FloatArray:
+def centre_sum(planned: Measurements, first: int, centres: FloatArray) -> FloatArray:
     """Return T of each candidate: the sum of pi at cluster centres (000, (19), (31))."""
     out = np.zeros(planned.own.shape[0])
     for g in range(out.shape[0]):
@@ -146,7 +146,7 @@ def paper_terms(
     pairs = len(planned.own) if len(planned.kind) > 1 else 0
     longest = int(np.diff(nodes[0]).max(initial=0))
     return PaperTerms(
-        _centre_sum(planned, first, centres),
+        centre_sum(planned, first, centres),
         *nodes,
         slot=np.full((pairs, pairs), -1),
         cache=np.empty((min(CACHE_ROWS, pairs * pairs), longest)),
