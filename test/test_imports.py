@@ -32,11 +32,7 @@ ROS_FILES = (
     '*_driver.py',
     'conversions.py',
     # Of the planner.
-    'found_keeper.py',
-    'search_action.py',
     'search_command.py',
-    'search_services.py',
-    'team_goals.py',
     # Of the drivers.
     '*_link.py',
     '*_topic.py',

@@ -132,12 +132,8 @@ class CandidateSet:
 class Unseen:
     """Parts of the environment that no robot can ever see from its candidates.
 
-    Attributes
-    ----------
-    fraction : float
-        Of the environment.
-    boxes : list of (d, 2) arrays
-        Around each connected part, the largest first, metres.
+    fraction: of the environment; boxes (d, 2): around each connected part, the largest first,
+    metres.
     """
 
     fraction: float
@@ -174,18 +170,9 @@ def _percent(share: float) -> str:
 class Viewer:
     """One robot for `unseen_parts`.
 
-    Parameters
-    ----------
-    candidates : (W, 3) array
-        All waypoints it can be sent to, metres.
-    start : (3,) array
-        Where it starts, metres.
-    sensor : Sensor
-        What it sees with.
-    spacing : float
-        Distance between measurements on the way, metres.
-    yaw : float or None
-        The heading it keeps, radians; None if it faces its travel.
+    candidates (W, 3): all waypoints it can be sent to, metres; start (3,): where it starts, metres;
+    sensor: what it sees with; spacing: distance between measurements on the way, metres; yaw: the
+    heading it keeps, radians; None if it faces its travel.
     """
 
     candidates: FloatArray
@@ -202,21 +189,7 @@ def unseen_parts(
     probability: float = 0.01,
     cells: int = 80,
 ) -> Unseen:
-    """Return what can never be seen on the straight ways between the candidates.
-
-    Parameters
-    ----------
-    bounds : (d, 2) array
-        Of the environment, metres.
-    viewers : mapping or sequence of Viewer
-        The robots.
-    margin : float
-        Targets are at least this far from the bounds, metres.
-    probability : float
-        A place counts as seen where some measurement detects with at least this probability.
-    cells : int
-        Cells along the longest side.
-    """
+    """Return what can never be seen on the straight ways between the candidates."""
     box = check_bounds(bounds)
     box = np.stack([box[:, 0] + margin, box[:, 1] - margin], axis=1)
     size = float((box[:, 1] - box[:, 0]).max())

@@ -1,9 +1,13 @@
-"""Conversions between messages and records of the planner."""
+"""Between messages and the records of the planner, and checks of what its node receives.
+
+The checks raise `ValueError` naming the field, what was read, and what is allowed.
+"""
 
 from __future__ import annotations
 
 import array
 import math
+from collections.abc import Collection
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -12,11 +16,23 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.ros.conversions import FASTEST, bounded, colour, point_to_ros, pose_from_ros
+from maasi_filter.models.pose import Pose
+from maasi_filter.records import Cluster
+from maasi_filter.ros.clocks import LAST_STAMP, batch_id_limit
+from maasi_filter.ros.conversions import (
+    FASTEST,
+    bounded,
+    cluster_from_ros,
+    colour,
+    point_to_ros,
+    pose_from_ros,
+)
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_msgs.msg import AgentState, Candidate, PlanDecision
+from maasi_msgs.msg import AgentState, Candidate, FilterUpdate, PlanDecision
 from maasi_msgs.msg import RobotDecision as RobotDecisionMessage
 from maasi_planner.motion import RobotState
+from maasi_planner.node_settings import PlannerNodeSettings
+from maasi_planner.planners.base import check_clusters
 from maasi_planner.team import Decision, RobotDecision
 
 # J of an inadmissible candidate; messages contain finite numbers only.
@@ -24,13 +40,7 @@ NOT_ALLOWED = -1e30
 
 
 def robot_state_from_ros(message: AgentState) -> RobotState:
-    """Return a robot's state.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite or absurdly large; the message names the field.
-    """
+    """Return a robot's state."""
     linear, angular = message.twist.linear, message.twist.angular
     bounded('twist.linear', (linear.x, linear.y, linear.z), FASTEST)
     bounded('twist.angular', (angular.x, angular.y, angular.z), FASTEST)
@@ -81,23 +91,7 @@ def decision_to_ros(
     explored: float,
     header: Header,
 ) -> PlanDecision:
-    """Return a joint decision.
-
-    Parameters
-    ----------
-    decision : Decision
-        Decision of the planner.
-    indices : dict
-        Decision index of each robot.
-    planner : str
-        Name.
-    batch : int
-        The last batch whose clusters were used.
-    explored : float
-        Share of the environment, 0 to 1.
-    header : Header
-        Stamp and frame.
-    """
+    """Return a joint decision."""
     reasons = [
         f'{name}: {robot.reason}' for name, robot in sorted(decision.robots.items()) if robot.stays
     ]
@@ -148,17 +142,7 @@ def exploration_to_ros(exploration: UnexploredMap, header: Header) -> OccupancyG
 def planner_markers(
     robots: dict[str, tuple[FloatArray, FloatArray, FloatArray]], header: Header, size: float
 ) -> MarkerArray:
-    """Return markers of robots (blue), waypoints (pink) and planned paths (green).
-
-    Parameters
-    ----------
-    robots : dict
-        Name to position (3,), waypoint (3,) and path (n, 3).
-    header : Header
-        Stamp and frame.
-    size : float
-        Diameter of a robot [m].
-    """
+    """Return markers of robots (blue), waypoints (pink) and planned paths (green)."""
     markers = []
     for number, name in enumerate(sorted(robots)):
         position, waypoint, path = robots[name]
@@ -181,3 +165,53 @@ def planner_markers(
         line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE
         markers.append(line)
     return MarkerArray(markers=markers)
+
+
+def _check_frame(header: Header, frame: str) -> None:
+    if header.frame_id != frame:
+        raise ValueError(f'header.frame_id: read {header.frame_id!r}, allowed is {frame!r}')
+
+
+def checked_state(name: str, message: AgentState, settings: PlannerNodeSettings) -> RobotState:
+    """Return the state in a message that came on the topic of a robot."""
+    if message.robot != name:
+        raise ValueError(f'robot: read {message.robot!r}, allowed is {name!r}')
+    _check_frame(message.header, settings.frame)
+    state = robot_state_from_ros(message)
+    if message.step * settings.step >= LAST_STAMP:
+        raise ValueError(f'step: read {message.step}, allowed are steps whose time is a stamp')
+    return state
+
+
+def checked_update(
+    message: FilterUpdate, names: Collection[str], settings: PlannerNodeSettings, batch: int
+) -> tuple[list[Cluster], dict[str, Pose]]:
+    """Return the clusters of an update and the poses of its members, by name.
+
+    Members may be robots of `names`; `batch` is the id of the last batch.
+
+    Ids and indices so large that the planner could not continue from them are refused.
+    """
+    _check_frame(message.header, settings.frame)
+    dimension = settings.environment.dimension
+    clusters = [cluster_from_ros(item, dimension) for item in message.clusters]
+    strangers = {item.robot for item in message.members} - set(names)
+    if strangers:
+        raise ValueError(f'members: read {sorted(strangers)}, allowed are {names}')
+    check_clusters(clusters)
+    limit = batch_id_limit(batch)
+    if message.batch_id > limit:
+        raise ValueError(f'batch_id: read {message.batch_id}, allowed is up to {limit}')
+    limit = batch_id_limit(0)
+    poses = {}
+    for member in message.members:
+        if member.measurement > limit:
+            raise ValueError(
+                f'members: {member.robot}: measurement: read {member.measurement}, allowed is '
+                f'up to {limit}'
+            )
+        try:
+            poses[member.robot] = pose_from_ros(member.pose)
+        except ValueError as error:
+            raise ValueError(f'members: {member.robot}: pose.{error}') from None
+    return clusters, poses

@@ -5,23 +5,24 @@ Used by the planner node and the in-process search (000, algorithms 1 and 2).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.models.detection import BOX
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap, default_spacing
-from maasi_planner.arrival import arrival_radius
 from maasi_planner.candidates import CandidateSet
 from maasi_planner.measurement_trigger import MeasurementTrigger
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.obstacles import Obstacles
-from maasi_planner.planners import make_planner
+from maasi_planner.planners import Planner, make_planner
 from maasi_planner.planners.base import check_decision
 from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
 
@@ -30,12 +31,7 @@ from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView
 class PresentRobot:
     """A robot that takes part in a step.
 
-    Attributes
-    ----------
-    state : RobotState
-        Present state.
-    free : bool
-        Whether it has no goal, or its goal has ended.
+    free: whether it has no goal, or its goal has ended.
     """
 
     state: RobotState
@@ -83,19 +79,8 @@ class _Plan:
 class Coordinator:
     """Plans for a team of robots step by step.
 
-    Parameters
-    ----------
-    settings : PlannerNodeSettings
-        Robots, planner and environment.
-
-    Attributes
-    ----------
-    exploration : UnexploredMap
-        e after the last measurements.
-    clusters : list of Cluster
-        Potential targets after the last measurements.
-    finished : str or None
-        Why no gain is left; None before.
+    settings: robots, planner and environment; exploration: e after the last measurements; clusters:
+    potential targets after the last measurements; finished: why no gain is left; None before.
     """
 
     def __init__(self, settings: PlannerNodeSettings) -> None:
@@ -349,17 +334,7 @@ class Coordinator:
     def measuring(
         self, step: int, robots: Mapping[str, PresentRobot], able: Collection[str] | None = None
     ) -> list[Member]:
-        """Return M_k, the robots that measure at a step, in order of their names.
-
-        Parameters
-        ----------
-        step : int
-            k.
-        robots : mapping
-            The robots that take part, by name.
-        able : collection of str, optional
-            Robots whose sensor has data now; measurements of the others are postponed. None: all.
-        """
+        """Return M_k, the robots that measure at a step, in order of their names."""
         members = []
         for name in sorted(robots):
             plan = self._plans[name]
@@ -396,18 +371,36 @@ class Coordinator:
             plan.nearest = distance
 
     def absorb(self, poses: Mapping[str, Pose], clusters: list[Cluster]) -> None:
-        """Update with a batch that the filter has processed.
-
-        Parameters
-        ----------
-        poses : mapping
-            Poses of the measurements of the members, by name (000, eq. (20), (30); 002, eq. (12)).
-        clusters : list of Cluster
-            Potential targets after the batch.
-        """
+        """Update with a batch that the filter has processed."""
         for name in sorted(poses):
             plan = self._plans[name]
             self.exploration.update(plan.sensor.detection, poses[name])
             if plan.exploration is not None:
                 plan.exploration.update(plan.sensor.detection, poses[name])
         self.clusters = clusters
+
+
+def arrival_radius(motion: MotionModel, sensor: Sensor, planner: Planner) -> float:
+    """Return the distance from its waypoint at which a robot takes its next decision [m].
+
+    The setting `arrival_radius` where it is given. Else 0, as in 000, for the objective of the
+    papers and for planners that measure at waypoints only; and for the others the distance at
+    which the robot begins to brake, at most what its sensor sees to each side: what it would have
+    seen from the waypoint is then still seen from its path.
+    """
+    given = motion.settings.arrival_radius
+    if given is not None:
+        return given
+    if planner.settings.objective == 'paper' or not planner.measures_underway:
+        return 0.0
+    return min(motion.braking_distance(), _view(sensor))
+
+
+def _view(sensor: Sensor) -> float:
+    """Return how far a sensor sees level to each side [m]: half its box, or F."""
+    kind, parameters = sensor.detection.kernel()
+    if kind == BOX:
+        low, high = parameters[1:3], parameters[4:6]
+        return 0.5 * float((high - low).min())
+    scale = float(parameters[1:3].max())
+    return 1.0 / scale if scale > 0.0 else math.inf

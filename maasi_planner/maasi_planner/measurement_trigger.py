@@ -21,21 +21,7 @@ def expected_use(
     exploration: UnexploredMap,
     gamma: float,
 ) -> float:
-    """Return the left side of 000, eq. (24) and (33): the sum of pi at centres plus gamma e.
-
-    Parameters
-    ----------
-    sensor : Sensor
-        Of the robot.
-    pose : Pose
-        Pose of the measurement.
-    clusters : sequence of Cluster
-        After the last measurement.
-    exploration : UnexploredMap
-        e after the last measurement.
-    gamma : float
-        Weight of e at the robot's position.
-    """
+    """Return the left side of 000, eq. (24) and (33): the sum of pi at centres plus gamma e."""
     use = gamma * float(exploration.at(pose.position)[0])
     if clusters:
         centres = np.stack([cluster.position for cluster in clusters])
@@ -48,11 +34,6 @@ class MeasurementTrigger:
 
     A robot always measures at its decision (index 0). `relative` compares with the mean of the same
     quantity along the predicted trajectory, evaluated at the decision.
-
-    Parameters
-    ----------
-    settings : PlannerSettings
-        `measurement`, `trigger`, `gamma` and `threshold`.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -73,21 +54,7 @@ class MeasurementTrigger:
         clusters: Sequence[Cluster],
         exploration: UnexploredMap,
     ) -> None:
-        """Store a new trajectory; call at each decision of the robot.
-
-        Parameters
-        ----------
-        robot : str
-            Name.
-        sensor : Sensor
-            Of the robot.
-        positions, yaws : (K + 1, 3), (K + 1,) arrays
-            Predicted trajectory, metres and radians.
-        period_steps : int
-            Steps between possible measurements.
-        clusters, exploration
-            Values at the decision.
-        """
+        """Store a new trajectory; call at each decision of the robot."""
         if self.settings.measurement == 'periodic' or self.settings.trigger == 'absolute':
             return
         places = np.asarray(positions, dtype=float)[::period_steps]
@@ -109,19 +76,7 @@ class MeasurementTrigger:
         clusters: Sequence[Cluster],
         exploration: UnexploredMap,
     ) -> bool:
-        """Return whether the robot measures now.
-
-        Parameters
-        ----------
-        robot : str
-            Name.
-        index : int
-            m, of this possible measurement since the robot's decision, which is 0.
-        sensor, pose
-            Sensor of the robot, and its present pose.
-        clusters, exploration
-            Values after the last measurement of any robot.
-        """
+        """Return whether the robot measures now."""
         settings = self.settings
         if settings.measurement == 'periodic' or index == 0:
             return True

@@ -378,20 +378,10 @@ def hold_back(position: FloatArray, circles: FloatArray, rate: float, velocity: 
 class KeepOut:
     """Obstacles as one robot must see them: inflated by its radius, with ways around.
 
-    Parameters
-    ----------
-    obstacles : Obstacles
-        In their own size.
-    radius : float
-        Of the robot, metres.
-    clearance : float
-        Kept beyond that by planned ways and by waypoints, metres.
-
-    Attributes
-    ----------
-    circles : (n, 5) array
-        x, y, z, inflated radius with a tenth of the clearance, and 1 for a sphere. Robots stop
-        short of these, so that rounding does not put them into an obstacle.
+    obstacles: in their own size; radius: of the robot, metres; clearance: kept beyond that by
+    planned ways and by waypoints, metres; circles (n, 5): x, y, z, inflated radius with a tenth of
+    the clearance, and 1 for a sphere. Robots stop short of these, so that rounding does not put
+    them into an obstacle.
     """
 
     def __init__(self, obstacles: Obstacles, radius: float, clearance: float) -> None:
@@ -434,12 +424,6 @@ class KeepOut:
         """Return a waypoint moved to the minimum admissible distance (001, section 4.3).
 
         It moves along the line that joins robot and waypoint, towards the robot.
-
-        Returns
-        -------
-        (3,) array or None
-            The waypoint itself if it is far enough from every obstacle; None if there is no such
-            point on the line.
         """
         start = np.asarray(robot, dtype=float)
         point = np.array(waypoint, dtype=float)

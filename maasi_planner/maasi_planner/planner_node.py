@@ -18,20 +18,17 @@ from maasi_filter.ros.run_node import run
 from maasi_msgs.action import SearchTargets
 from maasi_msgs.msg import AgentState, LockstepStep, PlanDecision
 from maasi_planner import warm_up
-from maasi_planner.conversions import decision_to_ros, path_to_ros
+from maasi_planner.conversions import checked_state, decision_to_ros, path_to_ros
 from maasi_planner.coordinator import Coordinator, PresentRobot
-from maasi_planner.found_keeper import FoundKeeper
 from maasi_planner.node.batches import Batches
-from maasi_planner.node.checks import checked_state
-from maasi_planner.node.filter_guard import FilterGuard
+from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
+from maasi_planner.node.search_action import Progress, SearchAction, offer_services
+from maasi_planner.node.search_modes import Mode, SearchModes
+from maasi_planner.node.team_goals import HeardState
 from maasi_planner.node.views import PlannerViews
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_planner.search_control.search_action import Progress, SearchAction
-from maasi_planner.search_control.search_modes import Mode, SearchModes
-from maasi_planner.search_control.search_services import offer_services
-from maasi_planner.search_control.team_goals import HeardState
 
 _CHECK_PERIOD = 0.1
 # At shutdown: longest wait for answers to goals, which are then cancelled [s], and executor rounds

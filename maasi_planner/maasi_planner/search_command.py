@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-from maasi_planner.search_control.search_modes import COMMANDS
+from maasi_planner.node.search_modes import COMMANDS
 
 DONE, REFUSED, ABSENT, INTERRUPTED = 0, 1, 2, 130
 # Commands that only drivers have.

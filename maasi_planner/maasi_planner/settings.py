@@ -309,13 +309,7 @@ class PlannerSettings(Settings):
     )
 
     def renamed(self, name: str) -> PlannerSettings:
-        """Return the settings of another planner, with the same numbers.
-
-        Raises
-        ------
-        ValidationError
-            If there is none of that name, or it needs settings of its own.
-        """
+        """Return the settings of another planner, with the same numbers."""
         values = {key: getattr(self, key) for key in type(self).model_fields}
         return PlannerSettings.model_validate({**values, 'name': name, 'settings': None})
 

@@ -173,19 +173,7 @@ class Decision:
 def single_choice(
     points: FloatArray, prediction: Trajectories, chosen: int, reason: str
 ) -> RobotDecision:
-    """Return a decision without the terms of J, for planners that do not use it.
-
-    Parameters
-    ----------
-    points : (W, 3) array
-        Waypoints, metres.
-    prediction : Trajectories
-        Trajectories to the waypoints.
-    chosen : int
-        Index of the chosen waypoint.
-    reason : str
-        Explanation of the choice.
-    """
+    """Return a decision without the terms of J, for planners that do not use it."""
     length = int(prediction.lengths[chosen])
     return RobotDecision(
         chosen=chosen,

@@ -6,8 +6,8 @@ import numpy as np
 
 from maasi_planner.buildings import CuboidSettings, HazardSettings, Objective, PlanSolver
 from maasi_planner.buildings.agent import inflated
-from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.problem import Problem
+from maasi_planner.buildings.robot_model import Dynamics
 from maasi_sim.buildings.mission import CuboidMission, SearchRobot
 
 AREA = np.array([[0.0, 250.0], [0.0, 400.0], [0.0, 80.0]])

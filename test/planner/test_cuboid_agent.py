@@ -15,8 +15,8 @@ from maasi_planner.buildings import (
     SearchAgent,
     plan_mission,
 )
-from maasi_planner.buildings.battery import Hazard, HeardPlan, rewards
 from maasi_planner.buildings.guidance import WayFinder, assigned
+from maasi_planner.buildings.robot_model import Hazard, HeardPlan, rewards
 
 HOME = [166.0, 235.0, 5.0]
 NEVER = HazardSettings(failures=False)

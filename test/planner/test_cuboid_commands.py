@@ -17,7 +17,7 @@ from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
 from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
-from maasi_planner.buildings.node_settings import CuboidPlannerSettings
+from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_sim.run.processes import Domain
 
 SETTINGS = CuboidPlannerSettings.model_validate(

@@ -7,7 +7,7 @@ from test_planner_node import ROBOTS, begin, running
 
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTarget, FoundTargetArray
-from maasi_planner.filter_watch import FilterWatch
+from maasi_planner.node.filter_guard import FilterWatch
 
 
 def test_a_filter_without_a_heartbeat_is_absent():

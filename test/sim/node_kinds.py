@@ -17,7 +17,7 @@ from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
-from maasi_planner.buildings.node_settings import CuboidPlannerSettings
+from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
 from maasi_sim.buildings.cuboid_sim_node import CuboidSimNode

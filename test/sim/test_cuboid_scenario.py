@@ -11,7 +11,7 @@ from report_check import check_report
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.parameters import unflatten
 from maasi_planner.buildings import Dynamics
-from maasi_planner.buildings.node_settings import CuboidPlannerSettings
+from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_sim.buildings.building_mission import BuildingMission, plan_nodes
 from maasi_sim.buildings.observer import CuboidRecord, Moment, SnapshotRecord
 from maasi_sim.buildings.scenario import (

@@ -11,9 +11,9 @@ from maasi_planner.buildings.agent import (
     decision_stream,
 )
 from maasi_planner.buildings.centralized import JointPlan, solve_jointly
-from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.preplanning import Mission, plan_mission
 from maasi_planner.buildings.problem import Objective, Plan, PlanSolver, Problem
+from maasi_planner.buildings.robot_model import Dynamics
 from maasi_planner.buildings.settings import (
     BoxSettings,
     CuboidSettings,

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_planner.buildings.battery import Hazard, HeardPlan, rewards
-from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.guidance import WayFinder, assigned, nearest
 from maasi_planner.buildings.preplanning import Mission, detection_probability
 from maasi_planner.buildings.problem import Objective, Plan, PlanSolver, Problem
+from maasi_planner.buildings.robot_model import Dynamics, Hazard, HeardPlan, rewards
 from maasi_planner.buildings.settings import CuboidSettings, HazardSettings
 
 How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
@@ -41,26 +40,11 @@ class Activity(Enum):
 class Broadcast:
     """Message of a robot to those in range at a step (V-B).
 
-    Attributes
-    ----------
-    robot : str
-        Its name.
-    step : int
-        t.
-    position, velocity : (3,) arrays
-        [m, m/s].
-    searching : bool
-        Whether it takes part; a robot on its way home still shares its search map.
-    visited : (N,) array of bool
-        V, its search map.
-    flight_steps : int
-        t_Fl, since its last recharge.
-    plan : mapping
-        Steps from now until the visit, by cuboid, of its previous plan.
-    hazard : Hazard
-        Of its battery.
-    predicted : (3,) array
-        Position at t + tau* + 1 in its previous plan [m].
+    robot: its name; step: t; position, velocity (3,): [m, m/s]; searching: whether it takes part; a
+    robot on its way home still shares its search map; visited (N,): V, its search map;
+    flight_steps: t_Fl, since its last recharge; plan: steps from now until the visit, by cuboid, of
+    its previous plan; hazard: of its battery; predicted (3,): position at t + tau* + 1 in its
+    previous plan [m].
     """
 
     robot: str
@@ -79,22 +63,9 @@ class Broadcast:
 class Snapshot:
     """Snapshot of a cell.
 
-    Attributes
-    ----------
-    robot : str
-        Name of the robot.
-    step : int
-        Time step.
-    cuboid : int
-        Index of the cuboid of the cell.
-    position : (3,) array
-        Of the robot [m].
-    direction : (3,) array
-        Optical axis, opposite to the normal of the face.
-    distance : float
-        From the face [m].
-    detection_probability : float
-        p_d at that distance.
+    robot: name of the robot; step: time step; cuboid: index of the cuboid of the cell; position
+    (3,): of the robot [m]; direction (3,): optical axis, opposite to the normal of the face;
+    distance: from the face [m]; detection_probability: p_d at that distance.
     """
 
     robot: str
@@ -110,21 +81,10 @@ class Snapshot:
 class Choice:
     """Decision of a robot at a step.
 
-    Attributes
-    ----------
-    control : (3,) array
-        Force until the next step [N].
-    velocity : (3,) array
-        Resulting velocity at the next step [m/s].
-    plan : Plan
-        Plan of the decision.
-    how : str
-        optimal; best_so_far: a limit ended the solve; shifted: no solution, it continues the
-        previous plan; brake: no valid previous plan either.
-    target : (3,) array
-        x* [m].
-    activity : Activity
-        Present activity.
+    control (3,): force until the next step [N]; velocity (3,): resulting velocity at the next step
+    [m/s]; plan: plan of the decision; how: optimal; best_so_far: a limit ended the solve; shifted:
+    no solution, it continues the previous plan; brake: no valid previous plan either; target (3,):
+    x* [m]; activity: present activity.
     """
 
     control: FloatArray
@@ -163,26 +123,7 @@ class SearchAgent:
 
     At each step: `observe` its state, send the returned message, and `decide` with the messages
     received.
-
-    Parameters
-    ----------
-    name : str
-        Name of the robot.
-    settings : CuboidSettings
-        Of the search.
-    mission : Mission
-        From `plan_mission`; the same for all robots.
-    dynamics : Dynamics
-        Of the robot.
-    hazard : HazardSettings
-        Of its battery.
-    home : array_like, shape (3,)
-        G, where it recharges [m].
-
-    Raises
-    ------
-    ValueError
-        If home is outside the area, inside an object, or no cuboid can be reached from it.
+    `mission` is the same for all robots; `home` is G, where it recharges (3,) [m].
     """
 
     def __init__(
@@ -251,13 +192,7 @@ class SearchAgent:
         return bool(self.visited.all())
 
     def observe(self, step: int, position: ArrayLike, velocity: ArrayLike) -> Broadcast | None:
-        """Update its own state; return the message to the others, None while it recharges.
-
-        Raises
-        ------
-        ValueError
-            If the state is not finite.
-        """
+        """Update its own state; return the message to the others, None while it recharges."""
         place = np.array(position, dtype=float)
         speed = np.array(velocity, dtype=float)
         if not (np.isfinite(place).all() and np.isfinite(speed).all()):
@@ -313,17 +248,7 @@ class SearchAgent:
     def decide(
         self, heard: Sequence[Broadcast], rng: np.random.Generator, wanted: BoolArray | None = None
     ) -> Choice:
-        """Decide for the step that was observed last.
-
-        Parameters
-        ----------
-        heard : sequence of Broadcast
-            Messages from robots in range, of the same step.
-        rng : numpy.random.Generator
-            Generator of this robot and step, for battery, recharge and rewards.
-        wanted : (N,) array of bool, optional
-            Cuboids to plan for, instead of the draw (14); used by the sequential scheme.
-        """
+        """Decide for the step that was observed last."""
         fails, minutes = rng.random(2)
         if self.activity is not Activity.RECHARGING:
             for message in heard:

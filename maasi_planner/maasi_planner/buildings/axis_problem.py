@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_planner.buildings.dynamics import Dynamics
+from maasi_planner.buildings.robot_model import Dynamics
 
 # The objective is scaled so that its rows are of the size of one.
 SCALE = 1e4
@@ -43,20 +43,10 @@ class AxisRows:
     Rows: positions P_2 to P_T, velocities v_1 to v_T, forces, and P_T plus the ways that are left
     after each step of braking, as if air resistance were all. P_1 is given by the state.
 
-    Attributes
-    ----------
-    matrix : (m, T) array
-        Rows.
-    gram : (m, m) array
-        matrix H^-1 matrix', H the Hessian of the objective.
-    gain : (T, m) array
-        H^-1 matrix'.
-    inverse : (T, T) array
-        H^-1.
-    pull : (T + 1,) array
-        Weight of the squared distance from the target at P_0 to P_T, scaled [1/m^2].
-    smoothness : float
-        Weight of the squared change of force, scaled [1/N^2].
+    matrix (m, T): rows; gram (m, m): matrix H^-1 matrix', H the Hessian of the objective; gain (T,
+    m): H^-1 matrix'; inverse (T, T): H^-1; pull (T + 1,): weight of the squared distance from the
+    target at P_0 to P_T, scaled [1/m^2]; smoothness: weight of the squared change of force, scaled
+    [1/N^2].
     """
 
     matrix: FloatArray
@@ -114,23 +104,6 @@ def solve_axis(
     The method of Goldfarb and Idnani, written in the values y = free + gram lambda. Returns the
     objective above that of the free minimum; inf where there is no solution, or where the
     objective is certain to exceed `cutoff`.
-
-    Parameters
-    ----------
-    gram : (m, m) array
-        As in `AxisRows`.
-    free : (m,) array
-        Values at the free minimum.
-    lower, upper : (m,) arrays
-        Bounds.
-    most : int
-        Most rows that can be active: the number of forces.
-    cutoff : float
-        Objective at which to give up.
-    y : (m,) array
-        Output: the values.
-    room : AxisRoom
-        Scratch.
     """
     active, multipliers, factor, work = room
     m = free.shape[0]

@@ -31,36 +31,15 @@ FOUND, EXHAUSTED, UNFINISHED, FULL = 0, 1, 2, 3
 class Instance(NamedTuple):
     """One problem for the compiled search; objectives scaled.
 
-    Attributes
-    ----------
-    gram : (3, m, m) array
-        Of the axes.
-    free, lower, upper : (3, m) arrays
-        Values of the rows at the free minimum, and their bounds.
-    rise, sink : (3, J) arrays
-        What the ways to brake are longer by than their rows, going up and down [m].
-    given : (2, 3) array
-        P_0 and P_1 [m].
-    area : (3, 2) array
-        [m].
-    horizon : int
-        T.
-    visit_step, visit_cuboid : (Q,) arrays
-        Visits to choose from, in order of their steps.
-    visit_reward : (Q,) array
-        Their rewards.
-    visit_lower, visit_upper : (Q, 3) arrays
-        Their cuboids [m].
-    ahead : (Q,) array
-        Most reward that can follow a visit.
-    follows : (Q, Q) array of bool
-        Whether a visit (column) may follow another (row).
-    obstacles : (O, 3, 2) array
-        Corners, clearance included [m].
-    between : bool
-        Whether segments, and not only positions, keep away from obstacles.
-    brakes : bool
-        Whether the way to brake after the horizon keeps away from them as well.
+    gram (3, m, m): of the axes; free, lower, upper (3, m): values of the rows at the free minimum,
+    and their bounds; rise, sink (3, J): what the ways to brake are longer by than their rows, going
+    up and down [m]; given (2, 3): P_0 and P_1 [m]; area (3, 2): [m]; horizon: T; visit_step,
+    visit_cuboid (Q,): visits to choose from, in order of their steps; visit_reward (Q,): their
+    rewards; visit_lower, visit_upper (Q, 3): their cuboids [m]; ahead (Q,): most reward that can
+    follow a visit; follows (Q, Q): whether a visit (column) may follow another (row); obstacles (O,
+    3, 2): corners, clearance included [m]; between: whether segments, and not only positions, keep
+    away from obstacles; brakes: whether the way to brake after the horizon keeps away from them as
+    well.
     """
 
     gram: FloatArray
@@ -384,17 +363,7 @@ def longest_chains(
     fall: FloatArray,
     climb: FloatArray,
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which visits may follow which, and the most reward that can follow each.
-
-    Parameters
-    ----------
-    visit_step, visit_cuboid, reward : (Q,) arrays
-        Visits in order of their steps.
-    lower, upper : (Q, 3) arrays
-        Their cuboids, cut to what can be reached then [m].
-    fall, climb : (3, T + 1) arrays
-        Sums of the lowest and highest velocities up to each step, times the step [m].
-    """
+    """Return which visits may follow which, and the most reward that can follow each."""
     number = visit_step.shape[0]
     follows = np.zeros((number, number), dtype=np.bool_)
     ahead = np.zeros(number)

@@ -24,16 +24,9 @@ _GAP = 1e-7
 class JointPlan:
     """Plans of all robots.
 
-    Attributes
-    ----------
-    plans : list of Plan
-        In the order of the problems.
-    objective : float
-        Their sum, (6) with each cuboid counted once.
-    status : str
-        optimal, or time_limit: conflicts were resolved in the order of the robots.
-    solves : int
-        Number of solved problems of single robots.
+    plans: in the order of the problems; objective: their sum, (6) with each cuboid counted once;
+    status: optimal, or time_limit: conflicts were resolved in the order of the robots; solves:
+    number of solved problems of single robots.
     """
 
     plans: list[Plan]
@@ -45,17 +38,7 @@ class JointPlan:
 def solve_jointly(
     solver: PlanSolver, problems: Sequence[Problem], time_limit: float = math.inf
 ) -> JointPlan | None:
-    """Return the optimal plans of all robots; None if a robot has none.
-
-    Parameters
-    ----------
-    solver : PlanSolver
-        Common solver, as the robots are identical.
-    problems : sequence of Problem
-        One for each robot.
-    time_limit : float
-        Wall time after which conflicts are resolved sequentially [s].
-    """
+    """Return the optimal plans of all robots; None if a robot has none."""
     begun = time.perf_counter()
     known: dict[tuple[int, frozenset[int]], Plan | None] = {}
 

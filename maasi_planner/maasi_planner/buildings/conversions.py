@@ -19,8 +19,8 @@ from maasi_filter.ros.conversions import (
 from maasi_msgs.msg import CuboidDecision, SearchLink
 from maasi_msgs.msg import Snapshot as SnapshotMessage
 from maasi_planner.buildings.agent import Broadcast, Choice, SearchAgent, Snapshot
-from maasi_planner.buildings.battery import Hazard
 from maasi_planner.buildings.preplanning import Mission
+from maasi_planner.buildings.robot_model import Hazard
 
 # Upper bound of the parameters of a battery.
 _LARGEST_HAZARD = 1e9
@@ -59,20 +59,7 @@ def broadcast_to_ros(broadcast: Broadcast, header: Header) -> SearchLink:
 
 
 def broadcast_from_ros(message: SearchLink, cuboids: int) -> Broadcast:
-    """Return the broadcast of another robot.
-
-    Parameters
-    ----------
-    message : SearchLink
-        As received.
-    cuboids : int
-        Number of cuboids in the mission.
-
-    Raises
-    ------
-    ValueError
-        If the message does not fit the mission; it names the field.
-    """
+    """Return the broadcast of another robot."""
     if len(message.visited) != cuboids:
         raise ValueError(
             f'visited: read {len(message.visited)} cuboids, allowed are {cuboids}: the missions '

@@ -37,12 +37,12 @@ from maasi_planner.buildings.conversions import (
     vector_from_ros,
     vector_to_ros,
 )
-from maasi_planner.buildings.dynamics import Dynamics
-from maasi_planner.buildings.node_settings import CuboidPlannerSettings
 from maasi_planner.buildings.preplanning import plan_mission
+from maasi_planner.buildings.robot_model import Dynamics
+from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_planner.conversions import path_to_ros
-from maasi_planner.search_control.search_modes import Mode, SearchModes
-from maasi_planner.search_control.search_services import offer_services
+from maasi_planner.node.search_action import offer_services
+from maasi_planner.node.search_modes import Mode, SearchModes
 
 # Largest difference of the stamps of odometry and step [ns].
 _STAMP_TOLERANCE = 1_000_000

@@ -40,14 +40,8 @@ def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntAr
 class WayFinder:
     """Paths around boxes: a visibility graph over their corners, weighted by travel time.
 
-    Parameters
-    ----------
-    solids : (n, 3, 2) array
-        Boxes [m].
-    area : (3, 2) array
-        Where robots may be [m].
-    speed, climb : float
-        Largest speed on each axis, and of a steady climb [m/s].
+    solids (n, 3, 2): boxes [m]; area (3, 2): where robots may be [m]; speed, climb: largest speed
+    on each axis, and of a steady climb [m/s].
     """
 
     def __init__(self, solids: FloatArray, area: FloatArray, speed: float, climb: float) -> None:

@@ -31,13 +31,7 @@ def detection_probability(distance: float, camera: SearchCameraSettings) -> floa
 
 
 def distance_for(probability: float, camera: SearchCameraSettings) -> float:
-    """Return the largest distance [m] at which p_d is `probability`.
-
-    Raises
-    ------
-    ValueError
-        If it is not above 0 and at most 1.
-    """
+    """Return the largest distance [m] at which p_d is `probability`."""
     if not 0.0 < probability <= 1.0:
         raise ValueError(f'detection_probability: got {probability}, allowed is above 0, at most 1')
     span = camera.largest_distance - camera.least_distance
@@ -53,18 +47,9 @@ def footprint(distance: float, camera: SearchCameraSettings) -> float:
 class Cell:
     """A part of a face and the cuboid that it is searched from.
 
-    Attributes
-    ----------
-    target : int
-        Index of the object.
-    face : str
-        west, east, south, north, bottom or top.
-    centre, normal : (3,) arrays
-        Of the cell [m], and outward.
-    size : (2,) array
-        Sides of the cell [m].
-    box : (3, 2) array
-        Lower and upper corner of the cuboid [m].
+    target: index of the object; face: west, east, south, north, bottom or top; centre, normal (3,):
+    of the cell [m], and outward; size (2,): sides of the cell [m]; box (3, 2): lower and upper
+    corner of the cuboid [m].
     """
 
     target: int
@@ -83,20 +68,10 @@ class Cell:
 class Mission:
     """Mission, planned before take-off.
 
-    Attributes
-    ----------
-    cells : list of Cell
-        Searchable cells.
-    lost : list of (Cell, str)
-        Other cells, and why they are lost.
-    area : (3, 2) array
-        Admissible positions [m].
-    objects, obstacles : (n, 3, 2) arrays
-        True size, without clearance [m].
-    distance, footprint : float
-        d and r [m].
-    coverage : float
-        Share of the searchable faces that the snapshots cover, 0 to 1.
+    cells: searchable cells; lost: other cells, and why they are lost; area (3, 2): admissible
+    positions [m]; objects, obstacles (n, 3, 2): true size, without clearance [m]; distance,
+    footprint: d and r [m]; coverage: share of the searchable faces that the snapshots cover, 0 to
+    1.
     """
 
     cells: list[Cell]
@@ -158,20 +133,7 @@ def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolA
 
 
 def plan_mission(settings: CuboidSettings, area: ArrayLike) -> Mission:
-    """Return the cuboids of a mission.
-
-    Parameters
-    ----------
-    settings : CuboidSettings
-        Objects, obstacles, camera and probability.
-    area : array_like, shape (3, 2)
-        Bounds of the environment [m].
-
-    Raises
-    ------
-    ValueError
-        If there is no object, one lies outside the area, or no cuboid can be reached.
-    """
+    """Return the cuboids of a mission."""
     bounds = np.asarray(area, dtype=float)
     if bounds.shape != (3, 2) or not np.isfinite(bounds).all():
         raise ValueError('area: allowed are three pairs of finite numbers, low and high [m]')

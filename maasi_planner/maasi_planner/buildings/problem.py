@@ -12,7 +12,7 @@ import numpy as np
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.buildings import branch_and_bound as bb
 from maasi_planner.buildings.axis_problem import SCALE, AxisRows, axis_rows
-from maasi_planner.buildings.dynamics import Dynamics
+from maasi_planner.buildings.robot_model import Dynamics
 from maasi_planner.buildings.search_tree import make_tree
 
 # Relaxation of bounds if rounding leaves the state outside of them [m, m/s].
@@ -29,20 +29,8 @@ _HOMING_SMOOTHNESS = 1e-2
 class Objective:
     """Weights and horizon of (9).
 
-    Parameters
-    ----------
-    horizon : int
-        T, at least 2.
-    guidance_step : int
-        tau*, limited to T - 1.
-    guidance : float
-        w1 [1/m^2].
-    smoothness : float
-        w2 [1/N^2].
-    visit : float
-        w3 [1].
-    discount : float
-        Factor of w3 per step of delay of a visit; 1 in the paper.
+    horizon: T, at least 2; guidance_step: tau*, limited to T - 1; guidance: w1 [1/m^2]; smoothness:
+    w2 [1/N^2]; visit: w3 [1]; discount: factor of w3 per step of delay of a visit; 1 in the paper.
     """
 
     horizon: int = 10
@@ -71,13 +59,7 @@ class Objective:
         return min(self.guidance_step, self.horizon - 1) + 1
 
     def rewards(self, put_off: int = 0) -> FloatArray:
-        """Return the reward of a visit at P_0 to P_T, (T + 1,) [1].
-
-        Parameters
-        ----------
-        put_off : int
-            Consecutive postponements of the first visit: each adds one step of discount.
-        """
+        """Return the reward of a visit at P_0 to P_T, (T + 1,) [1]."""
         steps = np.maximum(np.arange(self.horizon + 1) - 1, 0)
         return np.asarray(self.visit * self.discount ** ((1 + put_off) * steps))
 
@@ -86,29 +68,13 @@ class Objective:
 class Problem:
     """State and knowledge of a robot when it plans.
 
-    Attributes
-    ----------
-    position, velocity : (3,) arrays
-        Its state [m, m/s].
-    target : (3,) array
-        x*, guidance target [m].
-    cuboids : (N, 3, 2) array
-        Lower and upper corners [m].
-    wanted : (N,) array of bool
-        Which are unvisited and have a reward of 1.
-    obstacles : (O, 3, 2) array
-        Objects and obstacles, clearance included [m].
-    area : (3, 2) array
-        Admissible positions [m].
-    homing : bool
-        Whether it only flies to its target, without search (8).
-    between, brakes : bool
-        Whether segments between positions avoid obstacles too, and whether the terminal state
-        allows braking in time.
-    hint : list of (int, int)
-        Visits (step, cuboid) of the previous plan, shifted to now.
-    put_off : int
-        Consecutive postponements of the first visit; without effect if rewards are not discounted.
+    position, velocity (3,): its state [m, m/s]; target (3,): x*, guidance target [m]; cuboids (N,
+    3, 2): lower and upper corners [m]; wanted (N,): which are unvisited and have a reward of 1;
+    obstacles (O, 3, 2): objects and obstacles, clearance included [m]; area (3, 2): admissible
+    positions [m]; homing: whether it only flies to its target, without search (8); between, brakes:
+    whether segments between positions avoid obstacles too, and whether the terminal state allows
+    braking in time; hint: visits (step, cuboid) of the previous plan, shifted to now; put_off:
+    consecutive postponements of the first visit; without effect if rewards are not discounted.
     """
 
     position: FloatArray
@@ -129,20 +95,10 @@ class Problem:
 class Plan:
     """A plan, starting at P_0.
 
-    Attributes
-    ----------
-    positions, velocities : (T + 1, 3) arrays
-        From now on [m, m/s].
-    controls : (T, 3) array
-        Forces [N].
-    visits : list of (int, int)
-        Step, from 1, and cuboid; each cuboid once, in order of the steps.
-    objective : float
-        Value of (9), without cuboids visited earlier.
-    status : str
-        optimal, or the limit that ended the solve.
-    nodes : int
-        Number of solved relaxations.
+    positions, velocities (T + 1, 3): from now on [m, m/s]; controls (T, 3): forces [N]; visits:
+    step, from 1, and cuboid; each cuboid once, in order of the steps; objective: value of (9),
+    without cuboids visited earlier; status: optimal, or the limit that ended the solve; nodes:
+    number of solved relaxations.
     """
 
     positions: FloatArray
@@ -157,16 +113,7 @@ class Plan:
 class PlanSolver:
     """Solves the problems of one kind of robot; reuses its matrices and workspace.
 
-    Parameters
-    ----------
-    dynamics : Dynamics
-        Of the robot.
-    objective : Objective
-        Weights and horizon.
-    node_limit : int
-        Relaxations after which a solve returns the best plan so far.
-    time_limit : float
-        Wall time after which it returns that plan [s].
+    After `node_limit` relaxations or `time_limit` [s of wall time] it returns the best plan so far.
     """
 
     def __init__(

@@ -14,32 +14,14 @@ from maasi_planner.buildings.axis_problem import AxisRoom
 class Tree(NamedTuple):
     """Nodes of the search, best bound first, in arrays that are reused.
 
-    Attributes
-    ----------
-    bound, reward : (n,) arrays
-        Lower bound of the objective, and the reward of the visits made.
-    cost : (n, 3) array
-        Of each axis.
-    dirty : (n,) array
-        Bit mask of the axes that have to be solved anew.
-    closed : (n,) array of bool
-        Whether no further visits are made.
-    visits, number : (n, V) and (n,) arrays
-        The visits made.
-    low, high : (n, 3, T + 2) arrays
-        Bounds of the positions P_0 to P_T and, last, of the way to brake [m].
-    values : (n, 3, m) array
-        Of the rows.
-    heap, spare : (n,) arrays
-        Nodes by bound, and nodes that are free.
-    counts : (6,) array
-        Sizes of `heap` and `spare`, nodes solved, best node (-1: none), out of nodes, axes solved.
-    best : (1,) array
-        Objective of the best node.
-    scratch : (3, m) array
-        Bounds of an axis while it is solved.
-    room : AxisRoom
-        Scratch of `solve_axis`.
+    bound, reward (n,): lower bound of the objective, and the reward of the visits made; cost (n,
+    3): of each axis; dirty (n,): bit mask of the axes that have to be solved anew; closed (n,):
+    whether no further visits are made; visits, number (n, V): the visits made; low, high (n, 3, T +
+    2): bounds of the positions P_0 to P_T and, last, of the way to brake [m]; values (n, 3, m): of
+    the rows; heap, spare (n,): nodes by bound, and nodes that are free; counts (6,): sizes of
+    `heap` and `spare`, nodes solved, best node (-1: none), out of nodes, axes solved; best (1,):
+    objective of the best node; scratch (3, m): bounds of an axis while it is solved; room: scratch
+    of `solve_axis`.
     """
 
     bound: FloatArray

@@ -292,13 +292,7 @@ def check_waypoint(waypoint: ArrayLike) -> FloatArray:
 
 
 def check_waypoints(waypoints: ArrayLike) -> FloatArray:
-    """Return waypoints as a (W, 3) array.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or a number is not finite.
-    """
+    """Return waypoints as a (W, 3) array."""
     array = np.ascontiguousarray(waypoints, dtype=float)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f'waypoints: got shape {array.shape}, allowed is (W, 3)')
@@ -309,13 +303,7 @@ def check_waypoints(waypoints: ArrayLike) -> FloatArray:
 
 
 def check_command(velocity_command: ArrayLike) -> FloatArray:
-    """Return a velocity command as a (4,) array.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or a number is not finite.
-    """
+    """Return a velocity command as a (4,) array."""
     array = np.array(velocity_command, dtype=float)
     if array.shape != (4,) or not np.isfinite(array).all():
         raise ValueError(f'velocity command: got {array.tolist()}, allowed are four finite numbers')
@@ -323,13 +311,7 @@ def check_command(velocity_command: ArrayLike) -> FloatArray:
 
 
 def check_step(step: float) -> float:
-    """Return a duration.
-
-    Raises
-    ------
-    ValueError
-        If it is not a finite number above 0.
-    """
+    """Return a duration."""
     if not (math.isfinite(step) and step > 0.0):
         raise ValueError(f'step: got {step}, allowed are finite numbers above 0 [s]')
     return float(step)

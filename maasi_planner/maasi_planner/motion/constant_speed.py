@@ -159,15 +159,7 @@ def _roll_out(
 
 
 class ConstantSpeedBody(Body):
-    """A point with a largest speed and, if wanted, a largest acceleration.
-
-    Parameters
-    ----------
-    settings : MotionSettings
-        `speed`, `acceleration` and `yaw_rate` are its limits.
-    state : RobotState
-        Where it starts.
-    """
+    """A point with a largest speed and, if wanted, a largest acceleration."""
 
     def __init__(self, settings: MotionSettings, state: RobotState) -> None:
         self.settings = settings

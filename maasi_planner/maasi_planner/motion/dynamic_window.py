@@ -87,23 +87,7 @@ def window_command(
     circles: FloatArray,
     clearance: float,
 ) -> tuple[float, float]:
-    """Return forward speed and turn rate.
-
-    Parameters
-    ----------
-    state : UnicycleState
-        Of the robot.
-    target_x, target_y : float
-        Point to head for, in sight.
-    left : float
-        Length of the way to the waypoint, metres.
-    limits : (6,) array
-        Approach rate, speed, braking rate, yaw rate, acceleration, yaw acceleration.
-    circles : (n, 5) array
-        Obstacles, inflated by the robot's radius.
-    clearance : float
-        Distance from obstacles above which a larger one is not better, metres.
-    """
+    """Return forward speed and turn rate."""
     x, y, yaw, forward, turn = state
     fastest = min(limits[SPEED], limits[RATE] * left)
     deceleration = min(limits[ACCELERATION], 2.0 * limits[SPEED])

@@ -32,8 +32,7 @@ from maasi_planner.motion.base import (
     check_command,
     check_step,
 )
-from maasi_planner.motion.mambo_dynamics import control_periods
-from maasi_planner.motion.mambo_gains import GRAVITY
+from maasi_planner.motion.mambo_dynamics import GRAVITY, control_periods
 from maasi_planner.motion.steering import Steering, Surroundings, sideways_command
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MotionSettings
@@ -158,18 +157,7 @@ def _rotate(state: FloatArray, p: float, q: float, r: float, h: float) -> None:
 def quadrotor_step(
     state: FloatArray, command: FloatArray, limits: FloatArray, periods: int, h: float
 ) -> float:
-    """Fly `periods` control periods of `h` seconds, in place; return the sum of u'u.
-
-    Parameters
-    ----------
-    state : (13,) array
-        Position, quaternion w x y z, velocity (map), angular velocity (body).
-    command : (4,) array
-        vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
-    limits : (6,) array
-        Speed, level and vertical acceleration, tangent of the tilt, yaw rate, and whether the
-        force counts.
-    """
+    """Fly `periods` control periods of `h` seconds, in place; return the sum of u'u."""
     turn = min(max(command[3], -limits[YAW_RATE]), limits[YAW_RATE])
     cost = 0.0
     for _ in range(periods):
@@ -251,17 +239,8 @@ def quadrotor_limits(settings: MotionSettings) -> FloatArray:
 class QuadrotorBody(Body):
     """A rigid body with thrust along its axis and torques, and its inner loops at 200 Hz.
 
-    Parameters
-    ----------
-    settings : MotionSettings
-        Limits.
-    state : RobotState
-        Where it starts.
-
-    Attributes
-    ----------
-    state : (13,) array
-        Position [m, map], quaternion w x y z, velocity [m/s, map], angular velocity [rad/s, body].
+    state (13,): position [m, map], quaternion w x y z,
+    velocity [m/s, map], angular velocity [rad/s, body].
     """
 
     def __init__(self, settings: MotionSettings, state: RobotState) -> None:

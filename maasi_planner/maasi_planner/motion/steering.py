@@ -15,14 +15,8 @@ from maasi_planner.obstacles import hold_back, next_point, segment_distance
 class Surroundings(NamedTuple):
     """Obstacles of a robot, inflated by its radius.
 
-    Attributes
-    ----------
-    circles : (n, 5) array
-        x, y, z, radius [m, map], 1 for a sphere.
-    vertices : (m, 2) array
-        Of the visibility graph [m, map].
-    clearance : float
-        Kept beyond the radius by planned ways [m].
+    circles (n, 5): x, y, z, radius [m, map], 1 for a sphere; vertices (m, 2): of the visibility
+    graph [m, map]; clearance: kept beyond the radius by planned ways [m].
     """
 
     circles: FloatArray
@@ -33,22 +27,10 @@ class Surroundings(NamedTuple):
 class Steering(NamedTuple):
     """How a robot approaches its waypoint.
 
-    Attributes
-    ----------
-    rate : float
-        Speed per distance left [1/s].
-    speed : float
-        At most [m/s].
-    barrier : float
-        Speed towards an obstacle per distance to it, at most [1/s].
-    deceleration : float
-        Next to obstacles the speed is what this can stop [m/s^2]; infinite: no such limit.
-    face_travel : bool
-        Whether the heading turns to the direction of travel.
-    yaw_rate : float
-        At most [rad/s].
-    tolerance : float
-        Distance at which the waypoint is reached [m].
+    rate: speed per distance left [1/s]; speed: at most [m/s]; barrier: speed towards an obstacle
+    per distance to it, at most [1/s]; deceleration: next to obstacles the speed is what this can
+    stop [m/s^2]; infinite: no such limit; face_travel: whether the heading turns to the direction
+    of travel; yaw_rate: at most [rad/s]; tolerance: distance at which the waypoint is reached [m].
     """
 
     rate: float
@@ -113,25 +95,7 @@ def sideways_command(
     work: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write the command of a robot that can move in any direction into `out` (4,), body axes.
-
-    Parameters
-    ----------
-    position : array
-        Begins with x, y, z [m, map].
-    goal : (3,) array
-        Metres, frame `map`.
-    yaw : float
-        Heading, radians.
-    to_goal : (m,) array
-        See `next_point`.
-    steering : Steering
-        Speeds.
-    around : Surroundings
-        Obstacles.
-    work : (2, 3) array
-        Scratch.
-    """
+    """Write the command of a robot that can move in any direction into `out` (4,), body axes."""
     if around.circles.shape[0] == 0:
         out[0], out[1], out[2], out[3] = straight_command(
             goal[0] - position[0], goal[1] - position[1], goal[2] - position[2], yaw, steering

@@ -128,25 +128,7 @@ def unicycle_command(
     around: Surroundings,
     work: FloatArray,
 ) -> tuple[float, float]:
-    """Return the command of a robot among obstacles: forward speed and turn rate.
-
-    Parameters
-    ----------
-    state : UnicycleState
-        Of the robot.
-    goal : (3,) array
-        Waypoint.
-    to_goal : (m,) array
-        See `next_point`.
-    limits : (6,) array
-        See `unicycle_limits`.
-    window : bool
-        Whether the dynamic window chooses the speeds near obstacles.
-    around : Surroundings
-        Obstacles.
-    work : (2, 3) array
-        Scratch.
-    """
+    """Return the command of a robot among obstacles: forward speed and turn rate."""
     x, y, yaw = state[0], state[1], state[2]
     circles = around.circles
     clearance = around.clearance
@@ -234,17 +216,8 @@ def unicycle_limits(settings: MotionSettings) -> FloatArray:
 class UnicycleBody(Body):
     """A robot that drives forward and turns, with largest speeds and accelerations.
 
-    Parameters
-    ----------
-    settings : MotionSettings
-        `speed`, `acceleration`, `yaw_rate` and `yaw_acceleration` are its limits.
-    state : RobotState
-        Where it starts; its height is kept.
-
-    Attributes
-    ----------
-    state : (5,) array
-        x, y [m, map], heading [rad], forward speed [m/s], turn rate [rad/s].
+    Its height is kept. state (5,): x, y [m, map], heading [rad], forward speed
+    [m/s], turn rate [rad/s].
     """
 
     def __init__(self, settings: MotionSettings, state: RobotState) -> None:

@@ -11,8 +11,8 @@ from std_msgs.msg import Header
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE, UPDATES
 from maasi_msgs.msg import BatchMember, FilterUpdate, MeasurementBatch
+from maasi_planner.conversions import checked_update
 from maasi_planner.coordinator import Coordinator, Member
-from maasi_planner.node.checks import checked_update
 from maasi_planner.node.filter_guard import FilterGuard
 from maasi_planner.node_settings import PlannerNodeSettings
 
@@ -23,6 +23,10 @@ _MEASUREMENTS_KEPT = 1000
 class Batches:
     """Requests measurements, and hands the filter's updates to the coordinator.
 
+    last: id of the last batch; used: largest id of an update that was used; waiting: whether the
+    update of the last batch has not come; published_at: when the last batch was published,
+    monotonic clock [s]; update: the last one that was used, and measurements of all of them.
+
     Publishes
     ---------
     `measurement_batch` (maasi_msgs/MeasurementBatch): M_k
@@ -30,30 +34,6 @@ class Batches:
     Subscribes
     ----------
     `filter_update` (maasi_msgs/FilterUpdate)
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The planner node.
-    guard : FilterGuard
-        Told of each batch and update.
-    on_answer : callable
-        Called after the update of the last batch.
-
-    Attributes
-    ----------
-    last : int
-        Id of the last batch.
-    used : int
-        Largest id of an update that was used.
-    waiting : bool
-        Whether the update of the last batch has not come.
-    published_at : float
-        When the last batch was published, monotonic clock [s].
-    update : FilterUpdate
-        The last one that was used.
-    measurements : int
-        Measurements of all updates that were used.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Supervision of the filter by the planner node."""
+"""Supervision of the filter by the planner node, and found targets kept for it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,59 @@ import math
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
 
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
-from maasi_planner.filter_watch import FilterWatch
+from maasi_filter.ros.qos import LATCHED
+from maasi_msgs.msg import FoundTarget, FoundTargetArray
 from maasi_planner.node_settings import PlannerNodeSettings
+
+
+class FilterWatch:
+    """Detects a silent filter by its heartbeat and by the oldest batch without an update.
+
+    Both count only if there was something to wait for: a filter that never sent a heartbeat, while
+    no batch is open, is no fault.
+
+    A timeout of 0 disables the supervision.
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
+        self._beat: float | None = None
+        self._open: dict[int, float] = {}
+
+    def beat(self, now: float) -> None:
+        """Note a heartbeat of the executor of the filter."""
+        self._beat = now
+
+    def asked(self, batch: int, now: float) -> None:
+        """Note that a batch was published."""
+        self._open[batch] = now
+
+    def answered(self, batch: int) -> None:
+        """Note the update of a batch: updates of earlier ones will not arrive any more."""
+        self._open = {number: since for number, since in self._open.items() if number > batch}
+
+    def stalled(self, seconds: float) -> None:
+        """Note that the planner itself was suspended: messages of that time are not read yet."""
+        if self._beat is not None:
+            self._beat += seconds
+        self._open = {number: since + seconds for number, since in self._open.items()}
+
+    def problem(self, now: float) -> str:
+        """Return why the filter counts as absent; empty if it does not."""
+        if not self.timeout:
+            return ''
+        if self._beat is not None and now - self._beat > self.timeout:
+            return f'no heartbeat of the filter for {now - self._beat:.1f} s'
+        if self._open:
+            number = min(self._open)
+            waited = now - self._open[number]
+            if waited > self.timeout:
+                return f'no filter_update of batch {number} for {waited:.1f} s'
+        return ''
+
 
 # A longer gap between two checks means that the planner itself was suspended [s].
 _LONGEST_GAP = 1.0
@@ -24,11 +73,6 @@ class FilterGuard:
     ----------
     `/diagnostics` (diagnostic_msgs/DiagnosticArray): heartbeats of the publishers of
     `filter_update`
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The planner node.
     """
 
     def __init__(self, node: LockstepLifecycleNode[PlannerNodeSettings]) -> None:
@@ -66,3 +110,39 @@ class FilterGuard:
                 for info in self._node.get_publishers_info_by_topic('filter_update')
             }
         return self.watch.problem(now)
+
+
+class FoundKeeper:
+    """Republishes found targets, latched: a latched message is lost with its publisher.
+
+    Targets are kept until a new search, even if the filter no longer has them.
+
+    Subscribes
+    ----------
+    `found_targets` (maasi_msgs/FoundTargetArray, latched)
+
+    Publishes
+    ---------
+    `found_targets/kept` (maasi_msgs/FoundTargetArray, latched): from the start, empty at first
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._targets: dict[int, FoundTarget] = {}
+        self._publisher = node.create_publisher(FoundTargetArray, 'found_targets/kept', LATCHED)
+        self._publisher.publish(FoundTargetArray())
+        node.create_subscription(FoundTargetArray, 'found_targets', self._on_found, LATCHED)
+
+    def _on_found(self, message: FoundTargetArray) -> None:
+        self._targets.update({item.id: item for item in message.targets})
+        self._publisher.publish(
+            FoundTargetArray(
+                header=message.header,
+                batch_id=message.batch_id,
+                targets=[self._targets[number] for number in sorted(self._targets)],
+            )
+        )
+
+    def forget(self) -> None:
+        """Remove all targets for a new search."""
+        self._targets.clear()
+        self._publisher.publish(FoundTargetArray())

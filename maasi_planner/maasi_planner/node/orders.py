@@ -12,23 +12,13 @@ from maasi_filter.ros.conversions import point_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_msgs.action import GoToWaypoint
 from maasi_planner.coordinator import Coordinator
+from maasi_planner.node.search_modes import Mode, SearchModes
+from maasi_planner.node.team_goals import Course, HeardState, TeamGoals
 from maasi_planner.node_settings import PlannerNodeSettings
-from maasi_planner.search_control.search_modes import Mode, SearchModes
-from maasi_planner.search_control.team_goals import Course, HeardState, TeamGoals
 
 
 class Orders:
-    """Sends goals, and tells which robot can take one.
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The planner node.
-    coordinator : Coordinator
-        Whose decisions are carried out.
-    modes : SearchModes
-        Which robots search.
-    """
+    """Sends goals, and tells which robot can take one."""
 
     def __init__(
         self,

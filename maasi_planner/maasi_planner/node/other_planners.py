@@ -28,15 +28,6 @@ class OtherPlanners:
     Publishes
     ---------
     `<robot>/destination` (geometry_msgs/PointStamped) of its own robots, each step
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The planner node.
-    names : sequence of str
-        Its own robots.
-    heard : callable
-        Called after a destination was received.
     """
 
     def __init__(

@@ -25,11 +25,6 @@ class PlannerViews:
     ---------
     `exploration` (latched; 2D: nav_msgs/OccupancyGrid, 3D: sensor_msgs/PointCloud2),
     `markers` (visualization_msgs/MarkerArray)
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The planner node.
     """
 
     def __init__(self, node: LockstepLifecycleNode[PlannerNodeSettings]) -> None:

@@ -127,6 +127,18 @@ def _information(
     return out
 
 
+@njit(cache=True)
+def _block_sums(values: FloatArray, stride: int) -> FloatArray:
+    """Return sums over blocks of `stride` nodes on each axis."""
+    x, y, z = values.shape
+    out = np.zeros((-(-x // stride), -(-y // stride), -(-z // stride)))
+    for i in range(x):
+        for j in range(y):
+            for k in range(z):
+                out[i // stride, j // stride, k // stride] += values[i, j, k]
+    return out
+
+
 def _unseen(
     team: TeamView, settings: PlannerSettings, every_node: bool
 ) -> tuple[FloatArray, FloatArray]:
@@ -136,9 +148,7 @@ def _unseen(
     most, stride = settings.exploration_nodes, 1
     while not every_node and np.prod([-(-size // stride) for size in values.shape]) > most:
         stride += 1
-    left = values * volumes
-    for axis, size in enumerate(values.shape):
-        left = np.add.reduceat(left, np.arange(0, size, stride), axis=axis)
+    left = _block_sums(values * volumes, stride)
     start = lower + 0.5 * (stride - 1) * step
     places = start[:, None] + (stride * step)[:, None] * np.indices(left.shape).reshape(3, -1)
     if team.dimension == 2:
@@ -173,7 +183,8 @@ def information_terms(
     given = [settled, (planned[0], first_of_each(planned[1]))][: 1 + first]
     places, left = _unseen(team, settings, bool((planned[1].kind >= BOX).any()))
     for _, measured in given:
-        left *= _misses(measured, 0, places).prod(axis=0)
+        for miss in _misses(measured, 0, places):
+            left *= miss
     kept = np.flatnonzero(left > 0.0)
     return InformationTerms(
         mass=np.array([min(1.0, max(0.0, cluster.mass)) for cluster in clusters], float),

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_filter.models.detection import detection_probability_at
+from maasi_filter.models.detection import fill_probabilities
 from maasi_planner.objective.predicted_measurements import Measurements, apply_misses
 
 Grid = tuple[FloatArray, FloatArray, FloatArray]
@@ -51,19 +51,17 @@ NO_PAPER = PaperTerms(
 def centre_sum(planned: Measurements, first: int, centres: FloatArray) -> FloatArray:
     """Return T of each candidate: the sum of pi at cluster centres (000, (19), (31))."""
     out = np.zeros(planned.own.shape[0])
+    number = centres.shape[0]
+    chance = np.empty(number)
     for g in range(out.shape[0]):
         robot = planned.robot[g]
+        kind, parameters = planned.kind[robot], planned.parameters[robot]
         for e in range(planned.start[g] + first, planned.start[g] + planned.own[g]):
-            for c in range(centres.shape[0]):
-                out[g] += detection_probability_at(
-                    planned.kind[robot],
-                    planned.parameters[robot],
-                    centres[c, 0] - planned.places[e, 0],
-                    centres[c, 1] - planned.places[e, 1],
-                    centres[c, 2] - planned.places[e, 2],
-                    planned.turns[e, 0],
-                    planned.turns[e, 1],
-                )
+            x, y, z = (centres - planned.places[e]).T.copy()
+            cosine, sine = planned.turns[e]
+            fill_probabilities(kind, parameters, x, y, z, number, cosine, sine, chance)
+            for c in range(number):
+                out[g] += chance[c]
     return out
 
 
@@ -91,7 +89,7 @@ def _nodes_around(
         for j in range(j0, j0 + 2):
             for k in range(k0, k0 + depth):
                 weight = (u if i > i0 else 1.0 - u) * (v if j > j0 else 1.0 - v)
-                weight *= (w if k > k0 else 1.0 - w) * values[i, j, k]
+                weight = weight * (w if k > k0 else 1.0 - w) * values[i, j, k]
                 if weight > 0.0:
                     value[number] = weight
                     place[0, number] = lower[0] + i * step[0]
@@ -120,12 +118,13 @@ def _unseen_nodes(
             time[before:number] = planned.times[e]
         start[g + 1] = number
         rows = slice(start[g], number)
-        where, when, left = place[:, rows], time[rows], value[rows]
+        where, when, left = place[:, rows], time[rows], np.ones(number - start[g])
         until = when if own_counts else when - 1
         apply_misses(where, until, left, planned, g, 0, planned.own[g])
+        value[rows] *= left
         for s in range(settled.own.shape[0]):
             total = settled.start[s + 1] - settled.start[s]
-            apply_misses(where, when, left, settled, s, 0, total)
+            apply_misses(where, when, value[rows], settled, s, 0, total)
     return start, value[:number], place[:, :number], time[:number]
 
 

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_planner.motion.base import Trajectories
-from maasi_planner.objective.candidate_value import CandidateTable, total_value, values_given
 from maasi_planner.objective.information import NO_INFORMATION, information_terms
-from maasi_planner.objective.joint_search import search
+from maasi_planner.objective.joint_search import CandidateTable, search, total_value, values_given
 from maasi_planner.objective.paper import NO_PAPER, paper_terms
 from maasi_planner.objective.predicted_measurements import (
     joined,
@@ -34,29 +33,11 @@ def _all(parts: Sequence[NDArray], dtype: type) -> NDArray:
 class TeamObjective:
     """Objective of all joint candidates at one step.
 
-    Parameters
-    ----------
-    team : TeamView
-        The team; robots that do not plan count with the rest of their trajectories.
-    settings : PlannerSettings
-        Weights.
-    candidates : mapping of str to (W, 3) array
-        Waypoints of each planning robot, metres.
-    trajectories : mapping of str to Trajectories
-        Predicted trajectories to the candidates.
-    allowed : mapping of str to (W,) array of bool
-        Admissible candidates.
-
-    Attributes
-    ----------
-    names : list of str
-        Planning robots with candidates, in order.
-    start : (R + 1,) array
-        Where the candidates of each begin among all.
-    table : CandidateTable
-        All candidates.
-    measurements : (G,) array
-        M of each candidate.
+    team: the team; robots that do not plan count with the rest of their trajectories; settings:
+    weights; candidates (W, 3): waypoints of each planning robot, metres; trajectories: predicted
+    trajectories to the candidates; allowed (W,): admissible candidates; names: planning robots with
+    candidates, in order; start (R + 1,): where the candidates of each begin among all; table: all
+    candidates; measurements (G,): M of each candidate.
     """
 
     def __init__(

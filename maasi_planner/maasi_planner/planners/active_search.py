@@ -34,14 +34,8 @@ from maasi_planner.team import Decision, RobotDecision, RobotView, TeamView, sin
 class Sequences:
     """All sequences of positions of one robot, with their T and e.
 
-    Attributes
-    ----------
-    first : (S,) array
-        Index of the first position among the candidates.
-    refinement : (S,) array
-        T of each sequence.
-    explored : (S, horizon) array
-        e at each position.
+    first (S,): index of the first position among the candidates; refinement (S,): T of each
+    sequence; explored (S, horizon): e at each position.
     """
 
     def __init__(

@@ -61,9 +61,6 @@ class Planner(ABC):
             If the view of the team itself is wrong: not finite, no step time, periods below 1.
         """
 
-    def reset(self) -> None:  # noqa: B027
-        """Reset for a new search."""
-
     def finished(self, team: TeamView) -> str | None:
         """Return why nothing is left to gain, or None while something is.
 
@@ -142,26 +139,14 @@ def check_team(team: TeamView) -> None:
 
 
 def check_clusters(clusters: Sequence[Cluster]) -> None:
-    """Refuse clusters with numbers that are not finite.
-
-    Raises
-    ------
-    ValueError
-        Naming the cluster.
-    """
+    """Refuse clusters with numbers that are not finite."""
     for index, cluster in enumerate(clusters):
         if not (finite(cluster.position, cluster.covariance) and math.isfinite(cluster.mass)):
             raise ValueError(f'clusters[{index}]: got a number that is not finite')
 
 
 def check_decision(planner: Planner, team: TeamView, decision: Decision) -> None:
-    """Refuse a decision that robots cannot follow.
-
-    Raises
-    ------
-    PluginError
-        Naming planner, robot and field, what was read, and what is allowed.
-    """
+    """Refuse a decision that robots cannot follow."""
     origin = f'planner {type(planner).__module__}:{type(planner).__qualname__}'
     if not (isinstance(decision, Decision) and isinstance(decision.robots, dict)):
         raise PluginError(f'{origin}: decide returned {decision!r:.80}, allowed is a Decision')
@@ -240,17 +225,7 @@ def in_bounds(points: FloatArray, bounds: FloatArray) -> tuple[BoolArray, int]:
 def usable_candidates(
     team: TeamView, name: str, extra: FloatArray | None = None
 ) -> tuple[FloatArray, str]:
-    """Return a robot's candidates moved out of obstacles, and which were dropped.
-
-    Parameters
-    ----------
-    team : TeamView
-        The team.
-    name : str
-        The robot.
-    extra : (n, 3) array, optional
-        Further waypoints; dropped silently where they are not usable.
-    """
+    """Return a robot's candidates moved out of obstacles, and which were dropped."""
     view = team.robots[name]
     points = np.ascontiguousarray(view.candidates, dtype=float).reshape(-1, 3)
     dropped: list[str] = []
@@ -309,14 +284,8 @@ def free_of_robots(
 class Options:
     """Candidates of one planning robot.
 
-    Attributes
-    ----------
-    points : (W, 3) array
-        Waypoints, moved out of obstacles, metres.
-    prediction : Trajectories
-        To them.
-    allowed : (W,) array of bool
-        Which are reachable, not the present place, and apart from where others will stand.
+    points (W, 3): waypoints, moved out of obstacles, metres; prediction: to them; allowed (W,):
+    which are reachable, not the present place, and apart from where others will stand.
     """
 
     points: FloatArray
@@ -330,19 +299,7 @@ def options_of(
     places: list[tuple[FloatArray, float]],
     extra: FloatArray | None = None,
 ) -> Options | str:
-    """Return the candidates of a robot, or why it has to stay.
-
-    Parameters
-    ----------
-    team : TeamView
-        The team.
-    name : str
-        A robot that plans.
-    places : list
-        From `waiting_places`.
-    extra : (n, 3) array, optional
-        Further waypoints.
-    """
+    """Return the candidates of a robot, or why it has to stay."""
     view = team.robots[name]
     problem = state_problem(view)
     if problem is not None:

@@ -31,10 +31,6 @@ class Intermittent(Planner):
         super().__init__(settings)
         self._prospects: dict[str, float] = {}
 
-    def reset(self) -> None:
-        """See `Planner.reset`."""
-        self._prospects.clear()
-
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
         check_team(team)

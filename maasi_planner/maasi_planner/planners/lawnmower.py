@@ -20,23 +20,7 @@ from maasi_planner.team import Decision, RobotDecision, TeamView, single_choice,
 def lanes(
     bounds: FloatArray, spacing: float, layer_spacing: float, margin: float
 ) -> list[FloatArray]:
-    """Return the lanes that cover an environment.
-
-    Parameters
-    ----------
-    bounds : (d, 2) array
-        Metres.
-    spacing, layer_spacing : float
-        Largest distance between lanes, and between layers in 3D, metres; evened out.
-    margin : float
-        Distance of the outer lanes from the bounds, metres.
-
-    Returns
-    -------
-    list of (2, 3) arrays
-        Start and end of each lane along x, boustrophedon: each starts near the end of the one
-        before. z is 0 in 2D.
-    """
+    """Return the lanes that cover an environment."""
     d = len(bounds)
     low = bounds[:, 0] + margin
     high = bounds[:, 1] - margin
@@ -72,10 +56,6 @@ class Lawnmower(Planner):
 
     def __init__(self, settings: PlannerSettings) -> None:
         super().__init__(settings)
-        self.reset()
-
-    def reset(self) -> None:
-        """See `Planner.reset`."""
         self._blocks: list[list[FloatArray]] = []
         self._side: dict[str, tuple[int, int]] = {}
         self._pending: dict[str, list[FloatArray]] = {}

@@ -148,10 +148,6 @@ class MutualInformation(Planner):
         super().__init__(settings)
         self._headings: dict[str, FloatArray] = {}
 
-    def reset(self) -> None:
-        """See `Planner.reset`."""
-        self._headings.clear()
-
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
         check_team(team)

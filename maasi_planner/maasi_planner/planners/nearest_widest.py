@@ -29,10 +29,6 @@ class NearestWidest(Planner):
         super().__init__(settings)
         self._turns: dict[str, int] = {}
 
-    def reset(self) -> None:
-        """See `Planner.reset`."""
-        self._turns.clear()
-
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
         check_team(team)

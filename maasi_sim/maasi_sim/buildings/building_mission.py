@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.ros.parameters import flatten
-from maasi_planner.buildings.node_settings import CuboidPlannerSettings, box_numbers, face_words
+from maasi_planner.buildings.settings import CuboidPlannerSettings, box_numbers, face_words
 from maasi_sim.buildings.observer import CuboidObserver, CuboidRecord
 from maasi_sim.buildings.report import build_cuboid_report, cuboid_summary
 from maasi_sim.buildings.scenario import CuboidScenario, warm_up_buildings

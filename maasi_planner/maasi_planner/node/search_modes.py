@@ -31,10 +31,7 @@ _ALLOWED: dict[str, tuple[frozenset[Mode] | None, Mode]] = {
 class SearchModes:
     """Mode of each robot, and its transitions by commands.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Robots.
+    names: robots.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -51,21 +48,7 @@ class SearchModes:
         return any(mode in (Mode.SEARCHING, Mode.PAUSED, Mode.HOME) for mode in self.of.values())
 
     def command(self, word: str, names: Collection[str] | None = None) -> list[str]:
-        """Apply a command to robots.
-
-        Parameters
-        ----------
-        word : str
-            One of `COMMANDS`.
-        names : collection of str, optional
-            Robots; none: all.
-
-        Returns
-        -------
-        list of str
-            Robots that follow it, in order. The others keep their mode: a robot that was never
-            started cannot be paused or resumed.
-        """
+        """Apply a command to robots."""
         allowed, mode = _ALLOWED[word]
         follow = [
             name

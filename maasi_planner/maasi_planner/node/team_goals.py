@@ -75,16 +75,9 @@ class TeamGoals:
 
     In lockstep only states are used: they belong to a step, while results arrive at any time.
 
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        Owner of the clients.
-    topics : dict
-        Name of the action of each robot.
-    lockstep : bool
-        Whether results are ignored.
-    on_answer : callable
-        Called with robot and number of an answered goal, and whether it was accepted.
+    node: owner of the clients; topics: name of the action of each robot; lockstep: whether results
+    are ignored; on_answer: called with robot and number of an answered goal, and whether it was
+    accepted.
     """
 
     def __init__(

@@ -1,18 +1,20 @@
-"""Action `search`: a client starts, monitors and ends a search."""
+"""The action and the services that start, pause and end a search."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
+from std_srvs.srv import Trigger
 
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_msgs.action import SearchTargets
+from maasi_planner.node.search_modes import COMMANDS
 
 Result: TypeAlias = SearchTargets.Result
 
@@ -21,16 +23,8 @@ Result: TypeAlias = SearchTargets.Result
 class Progress:
     """Progress of a search.
 
-    Attributes
-    ----------
-    time : float
-        Time of the run [s].
-    feedback : SearchTargets.Feedback
-        For the client.
-    finished : str
-        Why no gain is left; empty otherwise.
-    robots : bool
-        Whether any robot is available, as far as is known.
+    time: time of the run [s]; feedback: for the client; finished: why no gain is left; empty
+    otherwise; robots: whether any robot is available, as far as is known.
     """
 
     time: float
@@ -45,16 +39,9 @@ class SearchAction:
     A goal starts a search, or takes over a running one. A newer goal preempts an older one, which
     is aborted, while the robots continue, so that a dead client does not block the next one.
 
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        Owner of the server.
-    problem : callable
-        Returns why no goal is accepted now; empty if one is.
-    on_begin, on_end : callable
-        Called when a search begins, and when the robots must stop.
-    on_refusal : callable
-        Called with the kind of a refusal, and its reason.
+    node: owner of the server; problem: returns why no goal is accepted now; empty if one is;
+    on_begin, on_end: called when a search begins, and when the robots must stop; on_refusal: called
+    with the kind of a refusal, and its reason.
     """
 
     def __init__(
@@ -163,3 +150,29 @@ async def _conclusion(outcome: Future, handle: Any) -> Result:
     else:
         handle.succeed()
     return result
+
+
+# Takes a command and robots (none: all), returns whether it was accepted, and an answer as text.
+Commander = Callable[[str, 'list[str] | None'], 'tuple[bool, str]']
+
+
+def offer_services(
+    node: LockstepLifecycleNode[Any], names: Sequence[str], commander: Commander
+) -> None:
+    """Offer `search/<command>` for the team and `<robot>/search/<command>` for each robot."""
+    services: dict[str, list[str] | None] = {}
+    for word in COMMANDS:
+        for name in names:
+            services[node.team_topic(f'{name}/search/{word}')] = [name]
+        # In the namespace of its only robot, the team is that robot.
+        services.setdefault(node.resolve_service_name(f'search/{word}'), None)
+    for service, robots in services.items():
+        word = service.rpartition('/')[2]
+        node.offer_service(service, partial(_serve, commander, word, robots))
+
+
+def _serve(
+    commander: Commander, word: str, names: list[str] | None, _: Any, response: Trigger.Response
+) -> Trigger.Response:
+    response.success, response.message = commander(word, names)
+    return response

@@ -1,1 +1,0 @@
-"""Starting, pausing, resuming and ending a search: its action, services and modes."""
