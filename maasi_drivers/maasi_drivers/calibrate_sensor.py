@@ -86,13 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def read_parameters(path: Path) -> DriverSettings:
-    """Return the settings in a driver's parameter file.
-
-    Raises
-    ------
-    CalibrationError
-        If it cannot be read, or a value is not allowed.
-    """
+    """Return the settings in a driver's parameter file."""
     try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
         (node,) = content.values()
@@ -133,35 +127,7 @@ def _dotted(node: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 class RecordedRobot:
-    """A robot in a recording.
-
-    Parameters
-    ----------
-    bag : Path
-        Folder or file of the recording.
-    settings : DriverSettings
-        Of its driver.
-    robot : str, optional
-        Its namespace; none: the only one that is there.
-    use : {'images', 'detections'}, optional
-        What is taken for what it saw; none: images if there are any.
-    poses : str, optional
-        Topic of its poses; none: its `state`, else its `odom`.
-
-    Attributes
-    ----------
-    robot, use, poses : str
-        As found out.
-    left_out : int
-        Images and detections without a pose of their stamp, or that could not be used.
-    recovered : str
-        What is wrong with the recording, if not all of it can be read; else empty.
-
-    Raises
-    ------
-    CalibrationError
-        If the recording cannot be read or lacks something; what is there is named.
-    """
+    """A robot in a recording."""
 
     def __init__(
         self,

@@ -87,21 +87,7 @@ class Leg:
 class MeasuringFlight:
     """Flies the legs.
 
-    Parameters
-    ----------
-    link : MamboLink
-        To the drone, which stands on the floor.
-    way : float
-        That a leg may take at most [m].
-    legs : int
-        How many.
-    clock : callable
-        Monotonic clock [s].
-
-    Attributes
-    ----------
-    legs : list of Leg
-        Those flown.
+    Units: way [m].
     """
 
     def __init__(self, link: MamboLink, way: float, legs: int, clock: Callable[[], float]) -> None:
@@ -115,13 +101,7 @@ class MeasuringFlight:
         self._event: PositionEvent | None = None
 
     def steps(self) -> Iterator[str]:
-        """Take off and fly; yield, every control period, what it does. Landing is the caller's.
-
-        Raises
-        ------
-        MeasurementError
-            If the flight has to be aborted.
-        """
+        """Take off and fly; yield, every control period, what it does. Landing is the caller's."""
         link = self.link
         yield from self._await('connecting', lambda: link.connected)
         yield from self._await(
@@ -202,17 +182,7 @@ class MeasuringFlight:
 def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
     """Return speed and delay that explain the legs best, by least squares.
 
-    Parameters
-    ----------
-    legs : list of Leg
-        Those flown.
-    tilt : float
-        The largest [rad].
-
-    Raises
-    ------
-    MeasurementError
-        If the events are too few, or do not fit, or leave the speed open.
+    Units: tilt [rad].
     """
     from scipy.optimize import least_squares
 

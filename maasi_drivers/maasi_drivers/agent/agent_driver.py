@@ -335,16 +335,6 @@ class RobotStop:
     """A latched stop.
 
     It outlives *cleanup* and *configure* of its node, but not its process.
-
-    Parameters
-    ----------
-    on_stop, on_release : callable
-        Called after the service.
-
-    Attributes
-    ----------
-    latched : bool
-        Whether the stop is in force.
     """
 
     def __init__(self, on_stop: Callable[[], None], on_release: Callable[[], None]) -> None:

@@ -50,11 +50,6 @@ class BatteryTopic:
     Subscribes
     ----------
     `battery_state` (sensor_msgs/BatteryState)
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
     """
 
     def __init__(self, driver: RobotNode) -> None:
@@ -95,18 +90,7 @@ _PATIENCE = 10.0
 
 
 class BatteryWatch:
-    """Keeps the last known charge, and compares it with `battery_minimum`.
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
-
-    Attributes
-    ----------
-    charge : float
-        0 to 1; -1 where the last reading was unknown.
-    """
+    """Keeps the last known charge, and compares it with `battery_minimum`."""
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver

@@ -16,10 +16,7 @@ UNTIL_ARM = 'until the service arm is called'
 class ArmPermission:
     """Whether a vehicle may take off: one take-off for each call of the service.
 
-    Parameters
-    ----------
-    timeout : float
-        After which an unused permission expires [s].
+    Units: timeout [s].
     """
 
     def __init__(self, timeout: float) -> None:
@@ -55,17 +52,7 @@ def make_fence(
 ) -> FloatArray:
     """Return the lowest and highest x, y, z (3, 2) of goals [m, map].
 
-    Parameters
-    ----------
-    given : list, optional
-        By the settings; none: the bounds with the radius around them, from the ground to 1 m above
-        the start.
-    bounds : ndarray, shape (2 or 3, 2)
-        Of the environment [m].
-    radius : float
-        Of the robot [m].
-    ground, start : float
-        Heights of the floor and of the start [m].
+    Shapes and units: bounds (2 or 3, 2) [m]; radius [m]; ground, start [m].
     """
     return _fence(given, bounds, radius, (ground, start + _HEIGHT))
 

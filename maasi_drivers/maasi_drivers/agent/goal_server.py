@@ -26,20 +26,6 @@ class GoalServer:
     The newest goal replaces the one before, and the robot turns to it without a stop. One that
     cannot be taken is aborted at once, with the reason in its result: the protocol has no reason
     in a rejection.
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
-    link : RobotLink
-        Informed of each goal.
-    frames : RobotFrames
-        Transforms waypoints into the map.
-
-    Attributes
-    ----------
-    away : bool
-        Whether the robot has left the team, in lockstep.
     """
 
     def __init__(self, driver: RobotNode, link: RobotLink, frames: RobotFrames) -> None:

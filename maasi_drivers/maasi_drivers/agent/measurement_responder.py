@@ -57,14 +57,7 @@ class MeasurementQueue(Generic[DataT]):
 
     An image answers one request at most: it is one measurement.
 
-    Parameters
-    ----------
-    history : PoseHistory
-        Of the robot.
-    offset : int
-        Added to an image's stamp for the time of its pose [ns].
-    frames, requests : int
-        How many are kept; the oldest go first.
+    Units: offset [ns].
     """
 
     def __init__(
@@ -148,20 +141,6 @@ class MeasurementResponder:
     Publishes
     ---------
     `detections` (maasi_msgs/DetectionArray)
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
-    sensor : SensorInput
-        Its sensor.
-    watchdog : Watchdog
-        Informed of each image.
-
-    Attributes
-    ----------
-    left_out : Counter
-        Detections that were not published: reason to number.
     """
 
     def __init__(self, driver: RobotNode, sensor: SensorInput, watchdog: Watchdog) -> None:

@@ -105,13 +105,7 @@ class MapOdometry:
 
 
 def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedPose:
-    """Return the pose at a stamp between two others: position linear, orientation by slerp.
-
-    Raises
-    ------
-    ValueError
-        If the stamp is not between theirs.
-    """
+    """Return the pose at a stamp between two others: position linear, orientation by slerp."""
     if not first.stamp <= stamp <= second.stamp:
         raise ValueError(f'stamp: got {stamp}, allowed from {first.stamp} to {second.stamp} [ns]')
     if stamp == first.stamp:
@@ -211,12 +205,7 @@ class PoseSpeed:
     def place(self, stamp: int, pose: Pose) -> StampedPose:
         """Return a pose with velocities by the difference from the one before; zero at first.
 
-        Parameters
-        ----------
-        stamp : int
-            [ns].
-        pose : Pose
-            In the map.
+        Units: stamp [ns].
         """
         velocity, turning = np.zeros(3), np.zeros(3)
         before, self._before = self._before, (stamp, pose)

@@ -23,11 +23,6 @@ class OdometryTopic:
     Subscribes
     ----------
     `odom` (nav_msgs/Odometry)
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
     """
 
     def __init__(self, driver: RobotNode) -> None:
@@ -89,13 +84,6 @@ class PoseTopic:
     Subscribes
     ----------
     `pose` (geometry_msgs/PoseStamped), in the map
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The robot's driver.
-    on_pose : callable
-        Takes stamp [ns] and pose in the map.
     """
 
     def __init__(

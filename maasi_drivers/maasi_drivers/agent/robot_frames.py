@@ -63,15 +63,7 @@ def base_frame(robot: str, settings: DriverSettings) -> str:
 
 
 def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
-    """Return the frames of a robot's sensors, as far as the settings say where these sit.
-
-    Parameters
-    ----------
-    robot : str
-        Its name.
-    settings : DriverSettings
-        Of its driver.
-    """
+    """Return the frames of a robot's sensors, as far as the settings say where these sit."""
     base = base_frame(robot, settings)
     frames: list[FixedFrame] = []
     if settings.camera is not None:
@@ -128,20 +120,6 @@ class RobotFrames:
     Subscribes
     ----------
     `tf`, `tf_static` of the team, not in lockstep: there only the robot's own frames are known
-
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        The robot's driver.
-    robot : str
-        Its name.
-    on_pose : callable
-        Takes stamp [ns] and pose in the map, with `pose_source: tf`.
-
-    Raises
-    ------
-    SettingsError
-        If poses are to come from tf and tf2_msgs is not installed.
     """
 
     def __init__(
@@ -214,15 +192,7 @@ class RobotFrames:
     # ---- what is published -------------------------------------------------------------------
 
     def publish(self, placed: StampedPose, map_from_odom: Pose) -> None:
-        """Publish where the robot is, `tf_rate` times a second of its stamps at most.
-
-        Parameters
-        ----------
-        placed : StampedPose
-            As in `state`.
-        map_from_odom : Pose
-            Of the odometry's frame in the map.
-        """
+        """Publish where the robot is, `tf_rate` times a second of its stamps at most."""
         settings = self._settings
         if settings.poses == 'tf' or not settings.tf_rate:
             return
@@ -322,12 +292,7 @@ class RobotFrames:
 
         A waypoint without a stamp is one in its frame as it is now.
 
-        Parameters
-        ----------
-        waypoint : geometry_msgs/PoseStamped
-            Its position and frame are changed.
-        now : int
-            Stamp of the robot's latest pose [ns].
+        Units: now [ns].
         """
         header, settings = waypoint.header, self._settings
         frame = header.frame_id.strip('/')

@@ -63,13 +63,7 @@ BATTERY, STOP = 'battery', 'stop'
 
 
 class Health:
-    """The present faults of a robot; without any it can follow goals.
-
-    Parameters
-    ----------
-    on_fault : callable
-        Called with the text of each new fault.
-    """
+    """The present faults of a robot; without any it can follow goals."""
 
     def __init__(self, on_fault: Callable[[str], None]) -> None:
         self._on_fault = on_fault
@@ -88,15 +82,7 @@ class Health:
         return self._faults.get(kind, '')
 
     def begin(self, kind: str, text: str) -> bool:
-        """Set a fault, or the text of one that is set; return whether it is new.
-
-        Parameters
-        ----------
-        kind : str
-            To end it by.
-        text : str
-            The cause, for the planner.
-        """
+        """Set a fault, or the text of one that is set; return whether it is new."""
         new = kind not in self._faults
         self._faults[kind] = text
         if new:

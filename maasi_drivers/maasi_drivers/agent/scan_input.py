@@ -43,25 +43,7 @@ def scan_points(
 ) -> FloatArray:
     """Return where the beams of a scan ended, (n, 2) in the map [m].
 
-    Parameters
-    ----------
-    ranges : array_like, shape (m,)
-        Infinite: nothing hit; not a number: no measurement [m].
-    angles : tuple of float
-        Of the first beam, and from one to the next, in the scanner's frame [rad].
-    limits : tuple of float
-        Smallest and largest range that is a measurement [m].
-    seconds_per_beam : float
-        From one beam to the next: the robot moves on meanwhile [s].
-    placed : StampedPose
-        Of the robot at the first beam.
-    mount : array_like, shape (3,)
-        x, y and heading of the scanner in the robot's frame [m, rad].
-
-    Raises
-    ------
-    ValueError
-        If the angles, limits or the time are not finite, or there is no beam.
+    Shapes and units: angles [rad]; seconds_per_beam [s]; mount (3,) [m, rad].
     """
     distances = np.asarray(ranges, dtype=float)
     fields = {
@@ -154,16 +136,7 @@ class ScanUnicycle(Unicycle):
     Ways around known obstacles are planned; what is seen beside them is avoided locally, so that
     the robot can get stuck in a pocket: the driver gives up a waypoint that gets no nearer.
 
-    Parameters
-    ----------
-    settings : MotionSettings
-        Limits of the robot.
-    obstacles : Obstacles
-        Known ones.
-    radius : float
-        Of the robot [m].
-    scan : ScanSettings
-        Distance of avoidance.
+    Units: radius [m].
     """
 
     def __init__(
@@ -223,20 +196,12 @@ _PROGRESS = 0.02
 
 
 class ScanInput:
-    """Hands scans to the controller, and finds out whether they are silent or the robot is blocked.
+    """
+    Hands scans to the controller, and finds out whether they are silent or the robot is blocked.
 
     Subscribes
     ----------
     `scan` (sensor_msgs/LaserScan)
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
-    settings : ScanSettings
-        Place of the scanner, and timeouts.
-    motion : ScanUnicycle
-        The controller.
     """
 
     def __init__(self, driver: RobotNode, settings: ScanSettings, motion: ScanUnicycle) -> None:

@@ -74,13 +74,8 @@ _ANY_ANGLE = np.pi**2 / 3.0
 class RangingMount:
     """Turns sweeps of a mounted sensor into measurements from the robot's position.
 
-    Parameters
-    ----------
-    settings : RangingSettings
-        Where it sits.
-    sensor : Sensor
-        Its measurement model and noise R; R is that of range, bearing and elevation in the
-        sensor's frame. In a planar search the elevation has the noise of the bearing.
+    R of the sensor is that of range, bearing and elevation in its own frame; in a planar search the
+    elevation has the noise of the bearing.
     """
 
     def __init__(self, settings: RangingSettings, sensor: Sensor) -> None:
@@ -98,21 +93,8 @@ class RangingMount:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return what the robot measured.
 
-        Parameters
-        ----------
-        sweep : ndarray, shape (m, 3)
-            Slant range [m], bearing and elevation [rad] in the sensor's frame: x forward, y left.
-        pose : StampedPose
-            Of the robot at the sweep; the covariance of its orientation counts.
-
-        Returns
-        -------
-        values : ndarray, shape (m, d)
-            Range, bearing and, in 3D, elevation, axes of the map [m, rad].
-        covariances : ndarray, shape (m, d, d)
-            Of the values; the error of the robot's position is left to the filter.
-        positions : ndarray, shape (m, d)
-            Where that is [m, map].
+        Shapes and units: sweep (m, 3) [rad]; returned: values (m, d) [m, rad], covariances (m, d,
+        d), positions (m, d) [m, map].
         """
         d = self._model.dimension
         if not len(sweep):

@@ -49,10 +49,7 @@ def _still(stamp: int, pose: Pose) -> StampedPose:
 class TransformBuffer:
     """Poses of frames in their parents, interpolated in time; nothing is extrapolated.
 
-    Parameters
-    ----------
-    horizon : int
-        How long transforms are kept, by their stamps [ns].
+    Units: horizon [ns].
     """
 
     def __init__(self, horizon: int = 10_000_000_000) -> None:
@@ -71,21 +68,7 @@ class TransformBuffer:
         A single stamp that jumps by more than the horizon is not added; the next one that follows
         it is, and what was before it is forgotten.
 
-        Parameters
-        ----------
-        parent, child : str
-            Names of the frames.
-        pose : Pose
-            Of the child in its parent.
-        stamp : int
-            [ns]; ignored for a static transform.
-        static : bool
-            Whether it holds at all times.
-
-        Raises
-        ------
-        ValueError
-            On an invalid name, a loop of frames, a negative stamp, or too many frames.
+        Units: stamp [ns].
         """
         for name in (parent, child):
             if not 0 < len(name) <= _LONGEST_NAME:
@@ -153,11 +136,6 @@ class TransformBuffer:
         """Return the latest stamp [ns] at which all transforms between two frames are known.
 
         None where all of them are static.
-
-        Raises
-        ------
-        TransformError
-            If the frames are not connected.
         """
         ups, downs = self._between(target, source)
         return min((edge.stamps[-1] for edge in [*ups, *downs] if not edge.static), default=None)
@@ -165,17 +143,7 @@ class TransformBuffer:
     def pose(self, target: str, source: str, stamp: int | None = None) -> Pose:
         """Return the pose of frame `source` in frame `target`.
 
-        Parameters
-        ----------
-        target, source : str
-            Names of the frames.
-        stamp : int, optional
-            [ns]; none: the latest that all transforms between them are known at.
-
-        Raises
-        ------
-        TransformError
-            If the frames are not connected, or the stamp is before or after what is kept.
+        Units: stamp [ns].
         """
         ups, downs = self._between(target, source)
         dynamic = [edge for edge in [*ups, *downs] if not edge.static]

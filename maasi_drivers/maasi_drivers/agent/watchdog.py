@@ -20,13 +20,6 @@ class StatePublisher:
     Publishes
     ---------
     `state` (maasi_msgs/AgentState), with each pose; its liveliness is asserted by the executor
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
-    battery : BatteryWatch
-        Its charge.
     """
 
     def __init__(self, driver: RobotNode, battery: BatteryWatch) -> None:
@@ -96,26 +89,7 @@ _CLOCK_PATIENCE = 0.5
 
 
 class Watchdog:
-    """Stops a robot without odometry, with a frozen pose or with a silent sensor.
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
-    link : RobotLink
-        To it.
-    sensor : SensorInput
-        Its sensor.
-    state : StatePublisher
-        Publishes the fault of a robot without odometry.
-    battery : BatteryWatch
-        Its battery.
-
-    Attributes
-    ----------
-    moving : bool
-        Whether the last command must change pose and images.
-    """
+    """Stops a robot without odometry, with a frozen pose or with a silent sensor."""
 
     def __init__(
         self,

@@ -58,13 +58,7 @@ def has_end(path: Path) -> bool:
 
 
 def whole_length(path: Path) -> int:
-    """Return the number of bytes of an MCAP file up to the end of its last whole record.
-
-    Raises
-    ------
-    BagError
-        If it is not an MCAP file, or not even its header is whole.
-    """
+    """Return the number of bytes of an MCAP file up to the end of its last whole record."""
     size = path.stat().st_size
     with path.open('rb') as file:
         magic = file.read(len(_MAGIC))
@@ -98,25 +92,7 @@ def _sealed(path: Path, folder: Path) -> Path:
 
 
 class BagReader:
-    """Read a recording, also one whose end is missing (its writer was killed, or the disk full).
-
-    Parameters
-    ----------
-    path : Path
-        Its folder, the folder of the run that holds it as `bag`, or its `.mcap` file.
-
-    Attributes
-    ----------
-    path : Path
-        What is read.
-    recovered : str
-        What had to be recovered, in words; empty if the recording is whole.
-
-    Raises
-    ------
-    BagError
-        If there is none, or nothing of it can be read.
-    """
+    """Read a recording, also one whose end is missing (its writer was killed, or the disk full)."""
 
     def __init__(self, path: Path) -> None:
         path = Path(path)
@@ -193,13 +169,7 @@ class BagReader:
             yield BagMessage(topic, time, type_name, self.decode(data, type_name))
 
     def decode(self, data: bytes, type_name: str) -> Any:
-        """Return the message of serialised bytes.
-
-        Raises
-        ------
-        BagError
-            If they are not one of this type.
-        """
+        """Return the message of serialised bytes."""
         try:
             return self._reader.deserialize(data, type_name)
         except Exception as error:

@@ -96,21 +96,7 @@ def sensor_noise(
     In each observation the detection nearest to the target counts, unless it is eight times as far
     as the median.
 
-    Parameters
-    ----------
-    observations : sequence of Observation
-        At one target, from different places.
-    sensor : Sensor
-        Its measurement model, and the field of view in which misses are counted.
-    target : array_like, shape (d,), optional
-        Where it is [m, map]; none: the mean of where it was seen, which hides a bias.
-    least_range : float
-        Nearer observations are left out: the bearing means nothing there [m].
-
-    Raises
-    ------
-    ValueError
-        If fewer than ten observations show it, or the target is not finite.
+    Shapes and units: target (d,) [m, map]; least_range [m].
     """
     model = sensor.measurement
     seen = [model.inverse(observation.values, observation.pose) for observation in observations]

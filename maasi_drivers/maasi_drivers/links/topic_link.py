@@ -31,17 +31,6 @@ class CommandPublisher:
     """Publishes commands as TwistStamped, as Twist, or as what is subscribed.
 
     TurtleBot3s of Jazzy listen to TwistStamped, those of Humble to Twist, on the same topic.
-
-    Parameters
-    ----------
-    node : Node
-        Whose publishers they are.
-    topic : str
-        Relative name.
-    kind : {'auto', 'stamped', 'twist'}
-        auto: determined from the graph, by `refresh`.
-    lockstep : bool
-        Whether no command may be lost; there, auto is stamped.
     """
 
     def __init__(self, node: Node, topic: str, kind: CommandType, lockstep: bool = False) -> None:

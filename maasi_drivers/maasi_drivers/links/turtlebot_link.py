@@ -26,22 +26,7 @@ from maasi_planner.obstacles import Obstacles
 class Nav2Navigation:
     """Hands waypoints to Nav2's `navigate_to_pose` (nav2_msgs/NavigateToPose).
 
-    Parameters
-    ----------
-    node : LockstepLifecycleNode
-        In the robot's namespace.
-    frame : str
-        Of the waypoints: Nav2's global frame.
-    timeout : float
-        Longest silence while Nav2 has a goal [s]: its feedback comes many times a
-        second, whatever the robot does.
-    on_end : callable
-        Called when Nav2 ended a goal by itself: goal, whether it was reached, and why if not.
-
-    Raises
-    ------
-    SettingsError
-        If nav2_msgs is not installed.
+    Units: timeout [s].
     """
 
     def __init__(

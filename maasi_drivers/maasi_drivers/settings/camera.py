@@ -207,21 +207,7 @@ class CameraSettings(Settings):
     ) -> CameraSettings:
         """Return these settings with the intrinsics of a ``sensor_msgs/CameraInfo``.
 
-        Parameters
-        ----------
-        width, height : int
-            Size of the calibrated image [px].
-        k : sequence of 9 floats
-            Camera matrix, row by row [px].
-        d : sequence of 0, 4 or 5 floats
-            Distortion coefficients.
-        distortion_model : str
-            'plumb_bob', or empty for none.
-
-        Raises
-        ------
-        ValueError
-            On another distortion model, a skewed or non-finite matrix, or a wrong length.
+        Units: width, height [px]; k [px].
         """
         if distortion_model not in ('plumb_bob', ''):
             raise ValueError(f"distortion_model: got '{distortion_model}', allowed 'plumb_bob'")
@@ -252,13 +238,7 @@ class CameraSettings(Settings):
 
 
 def load_calibration(path: str | Path, settings: CameraSettings) -> CameraSettings:
-    """Return settings with the intrinsics of a calibration file of ROS's ``camera_calibration``.
-
-    Raises
-    ------
-    ValueError
-        Where a key is missing or a value is not allowed, with the file's name.
-    """
+    """Return settings with the intrinsics of a calibration file of ROS's ``camera_calibration``."""
     try:
         content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
         return settings.with_calibration(

@@ -57,16 +57,6 @@ class CameraInput(SensorInput[Picture]):
     ----------
     `camera/image_raw` (sensor_msgs/Image) or `camera/image_raw/compressed`;
     `camera/camera_info` (sensor_msgs/CameraInfo), whose calibration replaces the parameters'
-
-    Parameters
-    ----------
-    driver : RobotNode
-        The robot's node.
-
-    Attributes
-    ----------
-    camera : CameraSettings
-        With the calibration in use.
     """
 
     name = 'image'

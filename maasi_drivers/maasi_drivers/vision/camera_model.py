@@ -314,27 +314,8 @@ def box_view_margin(
 ) -> float:
     """Return how far inside the image a box field of view lies, markers at its rim included.
 
-    Parameters
-    ----------
-    camera : Camera
-        On the robot.
-    lower, upper : array_like, at least 2 values
-        Offsets of the box from the robot, in its frame, of which x and y are used [m].
-    robot_height : float
-        Height of the robot's origin over the floor [m].
-    marker_radius : float
-        Markers whose centre lies in the box must be seen as a whole [m].
-
-    Returns
-    -------
-    float
-        Smallest distance of the box to the image's border [px]; negative where a
-        part of the box is not seen, minus infinity where it lies behind the camera.
-
-    Raises
-    ------
-    ValueError
-        Where a bound is not finite, or a lower one is not below its upper one.
+    The distance to the border [px] is negative where a part of the box is not seen, minus infinity
+    where it lies behind the camera. `lower` and `upper` are offsets from the robot [m].
     """
     low = np.asarray(lower, dtype=np.float64)[:2]
     high = np.asarray(upper, dtype=np.float64)[:2]

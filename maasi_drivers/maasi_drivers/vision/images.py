@@ -47,28 +47,7 @@ def image_to_array(
 ) -> ImageArray:
     """Turn the fields of a ``sensor_msgs/Image`` into an RGB array.
 
-    Parameters
-    ----------
-    height, width : int
-        Rows and columns [px].
-    encoding : str
-        One of ``COLOUR_ENCODINGS``.
-    step : int
-        Length of a full row [bytes]; more than what ``width`` pixels take if rows are padded.
-    data : bytes-like
-        ``step * height`` bytes; half as much again for nv12 and nv21.
-
-    Returns
-    -------
-    ndarray, shape (height, width, 3), uint8
-        Channels in the order R, G, B, rows contiguous or strided by ``step``. A read-only view of
-        ``data`` where nothing has to be converted.
-
-    Raises
-    ------
-    ValueError
-        On a size of zero, an encoding without colour or unknown, an odd size where colours are
-        subsampled, a step too short for the width, or data of another length.
+    Units: height, width [px]; step [bytes].
     """
     for name, value in (('height', height), ('width', width)):
         if not 0 < value <= _MAXIMUM_SIDE:
@@ -104,25 +83,7 @@ def image_to_array(
 
 
 def decode_image(data: bytes | bytearray | array | ImageArray, kind: str) -> ImageArray:
-    """Decode the data of a ``sensor_msgs/CompressedImage``.
-
-    Parameters
-    ----------
-    data : bytes-like
-        JPEG, PNG, ...
-    kind : str
-        Its format, for messages.
-
-    Returns
-    -------
-    ndarray, shape (height, width, 3), uint8
-        R, G, B.
-
-    Raises
-    ------
-    ValueError
-        If it is nothing that OpenCV decodes.
-    """
+    """Decode the data of a ``sensor_msgs/CompressedImage``."""
     flat = np.frombuffer(data, np.uint8)
     image = cv2.imdecode(flat, cv2.IMREAD_COLOR) if flat.size else None
     if image is None:
@@ -165,16 +126,6 @@ class VideoSource:
     """Reads a source in a thread of its own, and keeps the newest frame.
 
     A stream or device that breaks off is opened again. A file is played at its own rate, once.
-
-    Parameters
-    ----------
-    source : str
-        Address (rtsp://..., udp://...), device (/dev/video0, or its number), or file.
-
-    Raises
-    ------
-    ImageSourceError
-        If it is none of these, or a file that cannot be read.
     """
 
     def __init__(self, source: str) -> None:

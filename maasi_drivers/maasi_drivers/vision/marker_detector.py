@@ -31,19 +31,8 @@ def propagate(
 ) -> FloatArray:
     """Return the covariances (n, 2, 2) of floor positions, from those of pixels and pose [m^2].
 
-    Parameters
-    ----------
-    by_pixel, by_pose : ndarray, shapes (n, 2, 2) and (n, 2, 6)
-        Derivatives, from `Camera.back_project`.
-    pixel_covariances : array_like, shape (n, 2, 2) or (2, 2)
-        [px^2].
-    pose_covariance : array_like, shape (6, 6), optional
-        Of x, y, z [m] and of rotations about the map's axes [rad].
-
-    Raises
-    ------
-    ValueError
-        If the pose's covariance has another shape or is not finite.
+    Shapes and units: by_pixel, by_pose (n, 2, 2) and (n, 2, 6); pixel_covariances (n, 2, 2)
+    [px^2]; pose_covariance (6, 6) [rad].
     """
     pixel = np.asarray(pixel_covariances, dtype=np.float64)
     covariances = by_pixel @ pixel @ by_pixel.transpose(0, 2, 1)
@@ -68,28 +57,10 @@ def range_bearing(
     """
     Turn floor positions into range, bearing (and elevation) from the robot (000, eq. (6) to (9)).
 
-    Parameters
-    ----------
-    positions : ndarray, shape (n, 2)
-        On the floor, map frame [m].
-    covariances : ndarray, shape (n, 2, 2)
-        Of the positions [m^2].
-    pose : Pose
-        Of the robot; the bearing counts from the map's x axis, whatever the yaw.
-    dimension : {2, 3}
-        2: horizontal range and bearing; 3: range in space, bearing, elevation.
-    floor_height : float
-        Of the positions [m].
-    floor_deviation : float
-        How well that height is known [m]; keeps the covariance regular in 3D.
-
-    Returns
-    -------
-    values : ndarray, shape (n, dimension)
-        [m, rad(, rad)].
-    covariances : ndarray, shape (n, dimension, dimension)
-        To first order. Right over a target the bearing says nothing: its variance is bounded by
-        that of a uniform angle.
+    Returned are values (n, dimension) and their covariances (n, dimension, dimension), to first
+    order, from positions (n, 2) [m] and covariances (n, 2, 2) [m^2] on the floor. The bearing
+    counts from the map's x axis; right over a target it says nothing, and its variance is that of
+    a uniform angle. `floor_deviation` [m] keeps the covariance regular in 3D.
     """
     if dimension not in (2, 3):
         raise ValueError(f'dimension: got {dimension}, allowed 2 or 3')

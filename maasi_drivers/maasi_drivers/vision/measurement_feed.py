@@ -104,13 +104,7 @@ class FeedPacket:
 
 
 def encode(packet: FeedPacket) -> bytes:
-    """Return a packet as a datagram.
-
-    Raises
-    ------
-    FeedError
-        If it holds too many blobs, or numbers that are not allowed.
-    """
+    """Return a packet as a datagram."""
     blobs = packet.blobs
     if len(blobs) > MOST:
         raise FeedError(f'blobs: got {len(blobs)}, allowed are at most {MOST}')
@@ -146,13 +140,7 @@ def encode(packet: FeedPacket) -> bytes:
 
 
 def decode(data: bytes) -> FeedPacket:
-    """Return the packet of a datagram.
-
-    Raises
-    ------
-    FeedError
-        If it is damaged, of another version, or holds values that are not allowed.
-    """
+    """Return the packet of a datagram."""
     least = _HEADER.size + _CHECKSUM.size
     if len(data) < least:
         raise FeedError(f'length: read {len(data)} bytes, allowed are at least {least}')
@@ -241,29 +229,7 @@ class ReceivedPacket:
 
 
 class FeedReceiver:
-    """Receives a feed; poll it often.
-
-    Parameters
-    ----------
-    port : int
-        UDP; 0: any that is free.
-    address : str
-        Of this host, on which it listens.
-    sender : str, optional
-        Address of the only sender that is used; none: any.
-
-    Attributes
-    ----------
-    counts : Counter
-        Packets that came ('received'), were lost or not used: reason to number.
-    problem : str
-        Text of the last one that was not used.
-
-    Raises
-    ------
-    OSError
-        If the port is taken.
-    """
+    """Receives a feed; poll it often."""
 
     def __init__(self, port: int, address: str = '127.0.0.1', sender: str | None = None) -> None:
         self.sender = sender

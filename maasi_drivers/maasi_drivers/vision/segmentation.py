@@ -27,13 +27,7 @@ _DARK = 6.0
 
 
 def check_image(image: NDArray[np.generic]) -> ImageArray:
-    """Return an image fit for segmentation.
-
-    Raises
-    ------
-    ValueError
-        Unless it is an (h, w, 3) array of bytes with h, w of at least 1.
-    """
+    """Return an image fit for segmentation."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise ValueError(
             f'image: got an array of shape {image.shape} and type {image.dtype}, '
@@ -150,12 +144,7 @@ def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     """
     Find blobs of a fixed blue excess, with the plain centroid of their pixels (001, section 6.1).
 
-    Parameters
-    ----------
-    image : ndarray, shape (h, w, 3), uint8
-        R, G, B.
-    settings : SegmentationSettings
-        ``threshold`` and ``minimum_area`` are used.
+    Shapes and units: image (h, w, 3).
     """
     mask = paper_mask(image, settings.threshold)
     _, members, starts, boxes = _components(mask)
@@ -405,12 +394,7 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     each pixel is marker. Sizes are gated where the geometry is known, in
     `maasi_drivers.vision.marker_detector`.
 
-    Parameters
-    ----------
-    image : ndarray, shape (h, w, 3), uint8
-        R, G, B.
-    settings : SegmentationSettings
-        All but ``threshold`` and ``minimum_area`` are used.
+    Shapes and units: image (h, w, 3).
     """
     image = check_image(image)
     gains, centre, deviation = _floor_statistics(image, _FLOOR_SAMPLES)
@@ -449,12 +433,7 @@ def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blob
     The detector finds whole markers only, so none is cut by the border. The centre is where the
     diagonals intersect, which perspective does not shift.
 
-    Parameters
-    ----------
-    image : ndarray, shape (h, w, 3), uint8
-        R, G, B.
-    settings : SegmentationSettings
-        ``dictionary`` is used.
+    Shapes and units: image (h, w, 3).
     """
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     found, ids, _ = _detector(settings.dictionary).detectMarkers(grey)

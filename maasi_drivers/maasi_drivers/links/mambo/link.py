@@ -76,20 +76,7 @@ class MamboLink:
     called `keep_alive` for `CALLER_TIMEOUT`, the drone is commanded to hover, and to land after
     `land_after` more.
 
-    Parameters
-    ----------
-    kind : {'wifi', 'ble'}
-        How it is reached.
-    address : str
-        IP address, or Bluetooth address.
-    port : int
-        UDP port on which the drone's events are received, on this host's address in its network.
-    tilt : float
-        Of 100 per cent roll or pitch [rad]; the drone takes 5 to 25 degrees.
-    climb : float
-        Of 100 per cent climb [m/s]; the drone takes 0.5 to 2.
-    land_after : float
-        Time without its caller after which the drone is commanded to land, from when it hovers [s].
+    Units: tilt [rad]; climb [m/s]; land_after [s].
     """
 
     def __init__(
@@ -138,13 +125,7 @@ class MamboLink:
     # ---- what the caller asks for ------------------------------------------------------------
 
     def connect(self) -> None:
-        """Begin to connect.
-
-        Raises
-        ------
-        MamboLinkError
-            If it is clear at once that this cannot work.
-        """
+        """Begin to connect."""
         make = self._make_drone()
         # pyparrot's own thread inherits that this one does not keep the process alive.
         self._thread = threading.Thread(
@@ -182,13 +163,7 @@ class MamboLink:
         self._want('land')
 
     def steer(self, forward: float, left: float, up: float, turn: float) -> None:
-        """Send one piloting command, each as a share of the largest, -1 to 1; turn anticlockwise.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
-        """
+        """Send a piloting command: shares of the largest, -1 to 1; turn anticlockwise."""
         values = (-left, forward, -turn, up)
         if not all(math.isfinite(value) for value in values):
             raise ValueError(
@@ -223,13 +198,7 @@ class MamboLink:
         self._wake.set()
 
     def check(self) -> Any:
-        """Return pyparrot's module for such drones, if it can be used here.
-
-        Raises
-        ------
-        MamboLinkError
-            If it cannot, with what can be done.
-        """
+        """Return pyparrot's module for such drones, if it can be used here."""
         try:
             # Only a driver that has such a robot needs it.
             minidrone = importlib.import_module('pyparrot.Minidrone')

@@ -84,13 +84,7 @@ def encode(order: Order) -> bytes:
 
 
 def decode(data: bytes) -> Order:
-    """Return the order of a datagram.
-
-    Raises
-    ------
-    OrderError
-        If it is damaged, of another version, or holds values that are not allowed.
-    """
+    """Return the order of a datagram."""
     size = _ORDER.size + _CHECKSUM.size
     if len(data) != size:
         raise OrderError(f'length: read {len(data)} bytes, allowed are {size}')
@@ -114,15 +108,7 @@ def decode(data: bytes) -> Order:
 
 
 class OrderSender:
-    """Sends orders to one robot.
-
-    Parameters
-    ----------
-    address : str
-        Of the robot.
-    port : int
-        UDP, on which it receives them.
-    """
+    """Sends orders to one robot."""
 
     def __init__(self, address: str, port: int) -> None:
         self._to = (address, port)

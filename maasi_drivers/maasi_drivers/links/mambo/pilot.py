@@ -54,25 +54,7 @@ class Phase(Enum):
 class MamboPilot:
     """Flies a Mambo from take-off to landing, and lands it on a fault.
 
-    Parameters
-    ----------
-    link : MamboLink
-        To the drone.
-    motion : MotionModel
-        Its controller and model.
-    settings : MamboSettings
-        Limits and times.
-    home : Pose
-        Where it hovers after take-off, in the map; it starts on the ground below.
-    fence : ndarray, shape (3, 2)
-        Lowest and highest x, y, z [m, map].
-
-    Attributes
-    ----------
-    phase : Phase
-        Of the flight.
-    problem : str
-        Why it takes no goals now; empty where it does.
+    Shapes and units: fence (3, 2) [m, map].
     """
 
     def __init__(
@@ -156,15 +138,7 @@ class MamboPilot:
     def fly(self, command: FloatArray) -> None:
         """Fly a velocity command, once; without another one the drone hovers.
 
-        Parameters
-        ----------
-        command : ndarray, shape (4,)
-            vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite; then it hovers.
+        Shapes and units: command (4,) [rad/s].
         """
         if not np.isfinite(command).all():
             self.hover()

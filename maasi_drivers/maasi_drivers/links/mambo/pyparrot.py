@@ -37,12 +37,7 @@ def mend(connection: Any) -> None:
 def ask_for_answer(connection: Any, tilt: float) -> None:
     """Send a command that the drone has to acknowledge, and that changes nothing.
 
-    Parameters
-    ----------
-    connection : BLEConnection
-        Of pyparrot.
-    tilt : float
-        The largest, as set before [rad].
+    Units: tilt [rad].
     """
     content = struct.pack('<f', math.degrees(tilt))
     _write(connection, 'SEND_WITH_ACK', 'DATA_WITH_ACK', _MAX_TILT, content)
@@ -65,13 +60,7 @@ _TIMEOUT = 0.3
 
 
 def address_towards(host: str) -> str:
-    """Return the address of this host from which it reaches another one.
-
-    Raises
-    ------
-    OSError
-        If there is no way to it.
-    """
+    """Return the address of this host from which it reaches another one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect((host, 9))
         return str(probe.getsockname()[0])
@@ -92,27 +81,7 @@ def frame_problem(data: bytes) -> str:
 
 
 class DroneSocket:
-    """Receives datagrams of one drone alone.
-
-    Parameters
-    ----------
-    drone : str
-        Its IP address.
-    port : int
-        UDP port of this host.
-
-    Attributes
-    ----------
-    dropped : Counter
-        Datagrams that were not used: reason to number.
-    problem : str
-        Text of the last one.
-
-    Raises
-    ------
-    OSError
-        If the drone cannot be reached, or the port is taken.
-    """
+    """Receives datagrams of one drone alone."""
 
     def __init__(self, drone: str, port: int) -> None:
         self.dropped: Counter[str] = Counter()

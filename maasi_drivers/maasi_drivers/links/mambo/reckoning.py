@@ -125,22 +125,7 @@ _PUSH_GAIN, _PUSH_TIME, _MOST_PUSH, _SLOW = 0.08, 2.0, 0.5, 0.1
 
 
 class DeadReckoning:
-    """Where the drone is between its position events.
-
-    Parameters
-    ----------
-    model : TiltModel
-        That flies the commands.
-    origin : Pose
-        Of the take-off point, in the map: what the events are relative to.
-    settings : MamboSettings
-        Delay, latency and noise.
-
-    Attributes
-    ----------
-    course : Course
-        Where it is now.
-    """
+    """Where the drone is between its position events."""
 
     def __init__(self, model: TiltModel, origin: Pose, settings: MamboSettings) -> None:
         self.model = model

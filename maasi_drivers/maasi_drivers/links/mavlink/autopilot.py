@@ -50,40 +50,7 @@ class ModeChange:
 
 
 class Autopilot:
-    """One autopilot, as its messages describe it.
-
-    Parameters
-    ----------
-    settings : MavlinkSettings
-        Of the link.
-    sender : MAVLink
-        Packs messages and writes them to the wire.
-    log : ReportLog
-        Takes reports.
-    place : FlightOrigin
-        Says where the map lies in its local frame.
-    on_restart : callable
-        Called when the autopilot was restarted.
-
-    Attributes
-    ----------
-    firmware : Firmware or None
-        Once it is known.
-    failsafes : FailsafeCheck or None
-        Its failsafe parameters, once the firmware is known.
-    refusal : str
-        Why it is not used at all; empty where it is.
-    armed : bool
-        Whether its motors are.
-    mode : int
-        Custom mode; -1 before it is known.
-    lost : bool
-        Whether nothing was received for `link_timeout`.
-    estimate : Estimate
-        Position, battery and fix.
-    commands : CommandQueue
-        Requests that are not answered yet.
-    """
+    """One autopilot, as its messages describe it."""
 
     def __init__(
         self,
@@ -255,17 +222,7 @@ class Autopilot:
         parameters: tuple[float, ...],
         on_accepted: Callable[[], None] | None = None,
     ) -> None:
-        """Send a command until it is answered; report a refusal.
-
-        Parameters
-        ----------
-        number : int
-            Of MAV_CMD.
-        parameters : tuple of float
-            The first of seven; the others are zero.
-        on_accepted : callable, optional
-            Called when the autopilot accepts it.
-        """
+        """Send a command until it is answered; report a refusal."""
 
         def answer(result: int | None) -> None:
             if result == mavlink.MAV_RESULT_ACCEPTED:

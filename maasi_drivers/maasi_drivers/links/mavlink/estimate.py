@@ -61,21 +61,7 @@ class FlightOrigin:
     A local frame lasts as long as its autopilot is on: a file has the place for a driver that is
     started again meanwhile, in the air or after a landing elsewhere.
 
-    Parameters
-    ----------
-    settings : MavlinkSettings
-        Of the link.
-    start : list of float
-        In the map, x, y, z [m].
-    path : Path or None
-        Of the file; None: nothing is kept.
-    log : ReportLog
-        Takes reports.
-
-    Attributes
-    ----------
-    problem : str
-        Why the place is not known; empty where it is.
+    Units: start [m].
     """
 
     def __init__(
@@ -90,14 +76,7 @@ class FlightOrigin:
     def find(self, position: FloatArray, booted: float, armed: bool) -> FloatArray | None:
         """Return the place (3,), ENU [m], or None where it cannot be known.
 
-        Parameters
-        ----------
-        position : ndarray, shape (3,)
-            First one of the vehicle that the driver hears, ENU [m].
-        booted : float
-            When the autopilot was switched on, on the steady clock [s].
-        armed : bool
-            Whether its motors are.
+        Units: booted [s].
         """
         kept = self._load(booted)
         if kept is not None:
@@ -188,34 +167,7 @@ class Telemetry:
 
 
 class Estimate:
-    """The newest data of an autopilot.
-
-    Parameters
-    ----------
-    settings : MavlinkSettings
-        Of the link.
-    place : FlightOrigin
-        Says where the origin is.
-    on_restart : callable
-        Called when the autopilot was restarted; earlier data is discarded.
-
-    Attributes
-    ----------
-    telemetry : Telemetry or None
-        Newest.
-    origin : ndarray, shape (3,)
-        What stands at the start in the map, in the local frame, ENU [m].
-    booted : float
-        When the autopilot was switched on, on the steady clock [s].
-    heard_at : float
-        When position or attitude were received last, on the steady clock [s].
-    landed : int
-        MAV_LANDED_STATE.
-    charge_reports : int
-        Messages on batteries so far.
-    dropped : Counter
-        Messages that could not be used.
-    """
+    """The newest data of an autopilot."""
 
     def __init__(
         self, settings: MavlinkSettings, place: FlightOrigin, on_restart: Callable[[], None]

@@ -204,13 +204,7 @@ FIRMWARES = (ARDUCOPTER, ARDUSUB, PX4_COPTER)
 
 
 def identify(autopilot: int, vehicle_type: int) -> Firmware:
-    """Return the firmware of a heartbeat.
-
-    Raises
-    ------
-    ValueError
-        If it is not supported.
-    """
+    """Return the firmware of a heartbeat."""
     kind = 'submarine' if vehicle_type == SUBMARINE else 'copter' if vehicle_type in COPTERS else ''
     for firmware in FIRMWARES:
         if firmware.autopilot == autopilot and firmware.kind == kind:
@@ -233,24 +227,6 @@ class FailsafeCheck:
 
     ArduPilot's ground station failsafe checks the system id of heartbeats alone
     (`GCS::sysid_is_gcs`): any program with the driver's id keeps it from acting.
-
-    Parameters
-    ----------
-    firmware : Firmware
-        Of the vehicle.
-    settings : MavlinkSettings
-        Of the link.
-    sender : MAVLink
-        Writes to the wire.
-    report : callable
-        Takes the severity as in MAVLink, and a text.
-
-    Attributes
-    ----------
-    values : dict
-        Parameters as read; None where the autopilot does not have one.
-    complete : bool
-        Whether all were answered, or requested in vain.
     """
 
     def __init__(

@@ -37,13 +37,7 @@ def make_sender(system: int) -> Any:
 
 
 def open_connection(url: str, system: int, component: int, baud: int = 57600) -> Any:
-    """Return pymavlink's connection, which speaks MAVLink 2.
-
-    Raises
-    ------
-    LinkError
-        If it cannot be opened; the text has the cause.
-    """
+    """Return pymavlink's connection, which speaks MAVLink 2."""
     if mavlink.WIRE_PROTOCOL_VERSION != '2.0':
         raise LinkError(
             'pymavlink was imported before maasi_drivers.links.mavlink and speaks MAVLink 1: set '
@@ -67,19 +61,7 @@ class VehicleLink:
 
     A wire that cannot be opened is retried; `failure` has the cause meanwhile.
 
-    Parameters
-    ----------
-    settings : MavlinkSettings
-        Of the link.
-    start : list of float
-        Where the take-off of the vehicle ends, in the map [m].
-    memory : Path
-        File that keeps the origin of a flight.
-
-    Attributes
-    ----------
-    failure : str
-        What is wrong with the wire; empty where it works.
+    Units: start [m].
     """
 
     def __init__(self, settings: MavlinkSettings, start: list[float], memory: Path) -> None:

@@ -63,15 +63,7 @@ class _Command:
 
 
 class CommandQueue:
-    """COMMAND_LONG, in the order of the requests.
-
-    Parameters
-    ----------
-    system : int
-        System id of the vehicle.
-    sender : MAVLink
-        Packs messages and writes them to the wire.
-    """
+    """COMMAND_LONG, in the order of the requests."""
 
     def __init__(self, system: int, sender: Any) -> None:
         self._system = system
@@ -85,17 +77,7 @@ class CommandQueue:
     def ask(
         self, number: int, parameters: tuple[float, ...], answer: Callable[[int | None], None]
     ) -> None:
-        """Add a command.
-
-        Parameters
-        ----------
-        number : int
-            Of MAV_CMD.
-        parameters : tuple of float
-            The first of seven; the others are zero.
-        answer : callable
-            Takes the MAV_RESULT, None if it was never answered.
-        """
+        """Add a command."""
         self._commands.append(_Command(number, parameters, answer))
 
     def clear(self) -> None:

@@ -20,15 +20,7 @@ _REACHED, _PROGRESS = 0.2, 0.1
 class Climb:
     """Detects the end or a stall of a climb or dive.
 
-    Parameters
-    ----------
-    timeout : float
-        Time without progress after which it is stalled [s].
-
-    Attributes
-    ----------
-    accepted : bool
-        Whether the autopilot has accepted the take-off: it refuses another one.
+    Units: timeout [s].
     """
 
     def __init__(self, timeout: float) -> None:
@@ -61,22 +53,7 @@ _POSITION_AND_YAW, _NO_YAW = 0x9F8, 0x400
 
 
 class Setpoint:
-    """Where an autopilot is to hold its vehicle.
-
-    Parameters
-    ----------
-    settings : MavlinkSettings
-        Of the link.
-    sender : MAVLink
-        Writes to the wire.
-
-    Attributes
-    ----------
-    position : ndarray, shape (3,), or None
-        In the local frame of the autopilot, ENU [m].
-    yaw : float or None
-        From east [rad]; None: as it is.
-    """
+    """Where an autopilot is to hold its vehicle."""
 
     def __init__(self, settings: MavlinkSettings, sender: Any) -> None:
         self._settings = settings
@@ -112,13 +89,7 @@ class Setpoint:
 
 
 def checked_target(position: ArrayLike, yaw: float) -> FloatArray:
-    """Return a position (3,) [m].
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite: such set-points have crashed autopilots.
-    """
+    """Return a position (3,) [m]."""
     target = np.array(position, dtype=float)
     if target.shape != (3,) or not np.isfinite([*target, yaw]).all():
         raise ValueError(

@@ -54,26 +54,7 @@ _UNABLE = (Phase.CONNECTING, Phase.RELEASED, Phase.ENDING, Phase.REFUSED)
 class Vehicle:
     """One vehicle, from the first heartbeat to the end.
 
-    Parameters
-    ----------
-    settings : MavlinkSettings
-        Of the link.
-    start : list of float
-        Where its take-off ends, in the map [m].
-    sender : MAVLink
-        Packs messages and writes them to the wire.
-    memory : Path or None
-        File that keeps the origin of a flight; None: there is none.
-
-    Attributes
-    ----------
-    phase : Phase
-        How far it is.
-    active : bool
-        Whether the driver is; while it is not, nothing is armed.
-    estimate : Estimate
-        Pose, battery and fix. The height of its origin is that of the ground when a copter is
-        armed: the estimate drifts until then.
+    Units: start [m].
     """
 
     def __init__(
@@ -174,17 +155,7 @@ class Vehicle:
     def set_target(self, position: ArrayLike, yaw: float) -> None:
         """Have it go to a position and stay there.
 
-        Parameters
-        ----------
-        position : array_like, shape (3,)
-            In its local frame, ENU [m].
-        yaw : float
-            From east [rad].
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
+        Shapes and units: position (3,) [m]; yaw [rad].
         """
         target = checked_target(position, yaw)
         if self.phase is Phase.FLYING:
@@ -194,10 +165,7 @@ class Vehicle:
         """
         Let it take off once, or be taken over where it flies; return why not, empty where it may.
 
-        Parameters
-        ----------
-        now : float
-            On the steady clock [s].
+        Units: now [s].
         """
         problem = self._objection(now)
         if problem:
@@ -242,13 +210,6 @@ class Vehicle:
         """Have it hold its position or land, and send it nowhere any more.
 
         A vehicle that others fly is left alone; on the ground it is not armed any more.
-
-        Parameters
-        ----------
-        ending : {'hold', 'land'}
-            What it is to do.
-        reason : str
-            For the planner.
         """
         self._permission.end()
         if self.phase is Phase.ENDING and self._ending == ending:
