@@ -192,9 +192,8 @@ def test_it_is_armed_flies_to_its_waypoint_and_lands_at_the_end(fly, firmware):
     assert flight.mode in ('LAND', 'SURFACE', 'AUTO.LAND')
 
 
-@pytest.mark.parametrize('firmware', ['arducopter', 'ardusub', 'px4'])
-def test_the_next_waypoint_replaces_one_without_a_stop(fly, firmware, monkeypatch):
-    flight = fly(firmware).fly()
+def test_the_next_waypoint_replaces_one_without_a_stop(fly, monkeypatch):
+    flight = fly().fly()
     height = flight.driver.settings.start[2]
     _, replaced = flight.team.send_accepted([1.0, -3.0, height], number=1)
     flight.until(lambda: flight.position[1] < -1.5)
@@ -353,17 +352,6 @@ def test_a_vehicle_in_the_air_is_taken_over_and_the_answer_says_so(fly):
     flight.wait_for_flight()
 
 
-def test_an_autopilot_that_restarts_is_said(fly, capfd):
-    flight = fly().fly()
-    result = flight.under_way()
-    with flight.vehicle._lock:
-        flight.vehicle.autopilot.restart()
-    flight.until(lambda: 'the autopilot has restarted' in flight.state.reason)
-    flight.until(result.done)
-    assert 'is disarmed: the autopilot has restarted' in capfd.readouterr().err
-    assert not flight.team.call('arm').success
-
-
 def test_what_the_autopilot_does_by_itself_is_shown(fly, capfd):
     flight = fly(autopilot={'parameters': {'FS_GCS_ENABLE': 0}})
     shown = []
@@ -425,34 +413,54 @@ def test_a_cancelled_goal_stops_it(fly):
     assert flight.mode == 'GUIDED'
 
 
-@pytest.mark.parametrize('firmware', ['arducopter', 'ardusub'])
-def test_a_cut_link(fly, firmware):
-    flight = fly(firmware, link={'link_timeout': 1.0}).fly()
-    result = flight.under_way([1.0, -6.0, flight.driver.settings.start[2]])
-    flight.vehicle.cut()
-    flight.gives_up(result, 'link: nothing heard from system 1')
-    # The autopilot misses the driver, too.
-    flight.until(lambda: flight.vehicle.autopilot.mode == flight.vehicle.autopilot.firmware.land)
-
-
-def test_a_link_that_comes_back(fly):
-    flight = fly(link={'link_timeout': 1.0}, autopilot={'parameters': {'FS_GCS_TIMEOUT': 60}})
-    result = flight.fly().under_way()
-    flight.vehicle.cut()
-    flight.gives_up(result, 'link: nothing heard from system 1')
-    flight.vehicle.cut(False)
-    flight.wait_for_flight()
-    _, result = flight.team.send_accepted([1.0, 1.5, 0.8])
-    flight.until(result.done)
-    assert result.result().result.reached
-
-
-def test_a_position_that_hangs(fly):
-    flight = fly(odometry_timeout=0.5).fly()
-    result = flight.under_way()
-    with flight.vehicle._lock:
-        flight.vehicle.autopilot.reports.freeze()
-    flight.gives_up(result, 'no LOCAL_POSITION_NED for')
+@pytest.mark.parametrize(
+    ('firmware', 'fault', 'reason', 'logged'),
+    [
+        ('arducopter', 'cut', 'link: nothing heard from system 1', ''),
+        ('ardusub', 'cut', 'link: nothing heard from system 1', ''),
+        ('arducopter', 'frozen', 'no LOCAL_POSITION_NED for', ''),
+        ('arducopter', 'restart', 'the autopilot has restarted', 'is disarmed: the autopilot has'),
+        (
+            'px4',
+            'pilot',
+            'the pilot has taken over: mode POSCTL',
+            'mode POSCTL; the driver lets go',
+        ),
+    ],
+)
+def test_a_fault_ends_the_way_and_is_said(fly, capfd, firmware, fault, reason, logged):
+    timeout = 0.5 if fault == 'frozen' else 5.0
+    parameters = {'FS_GCS_TIMEOUT': 60} if firmware == 'arducopter' else {}
+    flight = fly(
+        firmware, {'parameters': parameters}, {'link_timeout': 1.0}, odometry_timeout=timeout
+    )
+    vehicle, autopilot = flight.vehicle, flight.vehicle.autopilot
+    result = flight.fly().under_way([1.0, -6.0, flight.driver.settings.start[2]])
+    with vehicle._lock:
+        if fault == 'cut':
+            vehicle.cut()
+        elif fault == 'frozen':
+            autopilot.reports.freeze()
+        elif fault == 'restart':
+            autopilot.restart()
+            # Nothing is left to stop it.
+            autopilot.body.velocity[:] = 0.0
+        else:
+            take_mode(autopilot, 'POSCTL')
+    flight.gives_up(result, reason)
+    assert logged in capfd.readouterr().err
+    if fault == 'restart':
+        assert not flight.team.call('arm').success
+    elif fault == 'pilot':
+        flight.driver.halt()
+        assert flight.mode == 'POSCTL'
+    elif firmware == 'ardusub':
+        # The autopilot misses the driver, too.
+        flight.until(lambda: autopilot.mode == autopilot.firmware.land)
+    elif fault == 'cut':
+        vehicle.cut(False)
+        flight.wait_for_flight()
+        assert flight.team.takes([1.0, 1.5, 0.8])
 
 
 def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
@@ -488,17 +496,6 @@ def test_a_sensor_that_falls_silent(fly):
     assert flight.mode == 'GUIDED'
 
 
-def test_the_pilot_takes_over_and_keeps_it(fly, capfd):
-    flight = fly().fly()
-    result = flight.under_way()
-    with flight.vehicle._lock:
-        take_mode(flight.vehicle.autopilot, 'LOITER')
-    flight.gives_up(result, 'the pilot has taken over: mode LOITER')
-    assert 'mode LOITER; the driver lets go' in capfd.readouterr().err
-    flight.driver.halt()
-    assert flight.mode == 'LOITER'
-
-
 def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     monkeypatch.setattr(battery, '_PATIENCE', 2.5)
     flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
@@ -511,22 +508,17 @@ def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
         flight.vehicle.autopilot.charge = 0.15
     flight.gives_up(result, 'battery at 0.15, below 0.20')
     flight.until(lambda: flight.mode == 'LAND')
-
-
-def test_with_a_low_battery_it_lands_once_the_pilot_gives_it_back(fly):
-    flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
-    autopilot, lock = flight.vehicle.autopilot, flight.vehicle._lock
-    with lock:
-        take_mode(autopilot, 'LOITER')
+    # It lands again once a pilot who took it over gives it back.
+    with flight.vehicle._lock:
+        take_mode(flight.vehicle.autopilot, 'LOITER')
     flight.until(lambda: 'the pilot has taken over' in flight.state.reason)
-    with lock:
-        autopilot.charge = 0.15
-    flight.until(lambda: 'battery at 0.15' in flight.state.reason)
-    assert flight.mode == 'LOITER'
-    with lock:
-        take_mode(autopilot, 'GUIDED')
+    begin = time.monotonic()
+    flight.until(lambda: time.monotonic() - begin > 0.5)
+    assert flight.mode == 'LOITER' and 'battery at 0.15' in flight.state.reason
+    with flight.vehicle._lock:
+        take_mode(flight.vehicle.autopilot, 'GUIDED')
     flight.until(lambda: flight.mode == 'LAND')
-    flight.until(lambda: not autopilot.armed)
+    flight.until(lambda: not flight.vehicle.autopilot.armed)
 
 
 def test_the_service_stop_ends_a_take_off(fly):

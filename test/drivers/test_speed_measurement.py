@@ -36,39 +36,28 @@ def test_it_measures_the_speed_and_keeps_within_the_way(drag, delay):
     assert measured.doubt < 0.1 and far < WAY
 
 
-def flown(**faults):
-    """Fly half a measurement, then with a fault."""
-    flight = Flight(arm=False)
-    for count, _ in enumerate(MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps()):
-        flight.step()
-        if count == 200:
-            for name, value in faults.items():
-                setattr(flight, name, value)
-            if 'low' in faults:
-                flight.firmware.charge.charge = faults['low']
-    return flight
-
-
 @pytest.mark.parametrize(
-    ('faults', 'text'),
+    ('fault', 'text'),
     [
         ({'cut_down': True}, 'no position for 1.5 s'),
         ({'sent': 'none'}, 'no position for 1.5 s'),
         ({'error': 'the link broke'}, 'the link broke'),
+        ('draught', r'allowed are 1\.50 m'),
+        ('battery', r'battery: read 0\.15'),
     ],
 )
-def test_it_does_not_go_on_without_a_link(faults, text):
-    with pytest.raises(MeasurementError, match=text):
-        flown(**faults)
-
-
-def test_it_does_not_go_on_far_from_where_it_took_off():
+def test_a_fault_in_flight_ends_it(fault, text):
     flight = Flight(arm=False)
-    with pytest.raises(MeasurementError, match=r'allowed are 1\.50 m'):
-        for _ in MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps():
+    with pytest.raises(MeasurementError, match=text):
+        for count, _ in enumerate(MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps()):
             flight.step()
-            # A draught.
-            flight.firmware._body.position[1] += 0.01
+            if fault == 'draught':
+                flight.firmware._body.position[1] += 0.01
+            elif count == 200 and fault == 'battery':
+                flight.firmware.charge.charge = 0.15
+            elif count == 200:
+                vars(flight).update(fault)
+    assert flight.firmware.take_offs == 1
 
 
 def test_it_does_not_take_off_with_a_low_battery():
@@ -77,11 +66,6 @@ def test_it_does_not_take_off_with_a_low_battery():
         for _ in MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps():
             flight.step()
     assert flight.firmware.take_offs == 0
-
-
-def test_it_ends_with_a_battery_that_becomes_low_in_flight():
-    with pytest.raises(MeasurementError, match=r'battery: read 0\.15'):
-        flown(low=0.15)
 
 
 def leg(places):
