@@ -100,10 +100,20 @@ class SearchFilter(Protocol):
     ) -> FilterResult:
         """Predict over `steps` control steps, correct with every robot of M_k, and mark.
 
+        Parameters
+        ----------
+        measurements : sequence of AgentMeasurement
+            M_k, in any order; they are processed in the order of the robots' names. May be empty.
+        steps : int
+            Control steps since the last batch, from 0; irrelevant for pmb and static targets.
+        time : float
+            Time of newly found targets, seconds.
+
         Raises
         ------
         ValueError
-            If a measurement is not usable. Nothing has changed then.
+            If anything is not finite, a covariance is not positive definite, shapes or dimensions
+            do not fit, or a robot appears twice. The filter is then unchanged.
         """
 
     def own_found_targets(self) -> list[FoundTarget]:

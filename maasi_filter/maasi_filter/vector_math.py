@@ -98,7 +98,11 @@ def arctan2(y: float, x: float) -> float:
 
 @njit(cache=True, error_model='numpy', fastmath={'contract'})
 def exponential(x: float) -> float:
-    """Return exp(x), x not above 700, to a unit in the last place; 0 below -708."""
+    """Return exp(x), x not above 700, to a unit in the last place; 0 below -708.
+
+    With `math.exp` in its place, which is not vectorised, a step of the PHD filter takes 1.2 to 1.4
+    times as long (10,000 particles, 8 detections), one of the multi-Bernoulli filter 1.7 times.
+    """
     exponent = max(x, LEAST_EXPONENT)
     shifted = exponent * LOG2_E + MAGIC
     k = shifted - MAGIC

@@ -61,25 +61,7 @@ class IcPhdState(FilterState):
 class IcPhdFilter:
     """Particle PHD filter with an iterated corrector, K-means, and removal of found targets.
 
-    Parameters
-    ----------
-    settings : FilterSettings
-        None means the value of the preset.
-    bounds : (d, 2) array
-        Of the environment E, metres; d = 2 or 3.
-    generator : numpy.random.Generator
-        Every random draw comes from it.
-
-    Attributes
-    ----------
-    particles : (n, d) array
-        Metres, frame `map`.
-    weights : (n,) array
-        They sum to the expected number of targets that are not found yet.
-    clusters : list of Cluster
-        Potential targets, heaviest first.
-    exploration : UnexploredMap
-        e, updated with every measurement.
+    Settings that are None have the value of the preset. Everything is as of `SearchFilter`.
     """
 
     def __init__(
@@ -112,23 +94,7 @@ class IcPhdFilter:
     def step(
         self, measurements: Sequence[AgentMeasurement], steps: int, time: float
     ) -> FilterResult:
-        """Predict over `steps` control steps, correct with every robot of M_k, extract and mark.
-
-        Parameters
-        ----------
-        measurements : sequence of AgentMeasurement
-            M_k, in any order; they are processed in the order of the robots' names. May be empty.
-        steps : int
-            Control steps since the last batch, from 0.
-        time : float
-            Time of newly found targets, seconds.
-
-        Raises
-        ------
-        ValueError
-            If anything is not finite, shapes or dimensions do not fit, or a robot appears twice.
-            The filter is then unchanged.
-        """
+        """Predict over `steps` control steps, correct with every robot of M_k, extract and mark."""
         dropped: dict[str, int] = {}
         members = check_measurements(measurements, steps, time, self._settings, self.dimension)
         members = [self._without_found(member, dropped) for member in members]

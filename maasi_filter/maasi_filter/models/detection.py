@@ -113,69 +113,6 @@ def fill_probabilities(  # type: ignore[no-untyped-def]
             out[i] = gain * exponential(-0.5 * math.sqrt(u * u + v * v + w * w))
 
 
-@njit(cache=True, error_model='numpy')
-def offsets(  # type: ignore[no-untyped-def]
-    positions, start, number, sensor_position, x, y, z
-):
-    """Fill the offsets of `number` positions (n, d) from `start` on from the sensor, axes apart.
-
-    In two dimensions the height of the sensor plays no part, as in the papers: z is 0.
-    """
-    x0 = sensor_position[0]
-    y0 = sensor_position[1]
-    part = positions[start : start + number]
-    if positions.shape[1] == 3:
-        z0 = sensor_position[2]
-        # All axes in one loop: whole rows are read, and sorted in registers.
-        for i in range(number):
-            x[i] = part[i, 0] - x0
-            y[i] = part[i, 1] - y0
-            z[i] = part[i, 2] - z0
-    else:
-        for i in range(number):
-            x[i] = part[i, 0] - x0
-            y[i] = part[i, 1] - y0
-        for i in range(number):
-            z[i] = 0.0
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def probabilities(  # type: ignore[no-untyped-def]
-    kind, parameters, positions, sensor_position, yaw
-):
-    """Return pi(x, q) at positions (n, d)."""
-    number = positions.shape[0]
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    out = np.empty(number)
-    size = min(number, 512)
-    x = np.empty(size)
-    y = np.empty(size)
-    z = np.empty(size)
-    for start in range(0, number, 512):
-        part = min(512, number - start)
-        offsets(positions, start, part, sensor_position, x, y, z)
-        fill_probabilities(
-            kind,
-            parameters,
-            x,
-            y,
-            z,
-            part,
-            cos_yaw,
-            sin_yaw,
-            out[start : start + part],
-        )
-    return out
-
-
-def _positions(positions: ArrayLike) -> FloatArray:
-    array = np.ascontiguousarray(positions, dtype=float)
-    if array.ndim != 2 or array.shape[1] not in (2, 3):
-        raise ValueError(f'positions: got shape {array.shape}, allowed are (n, 2) and (n, 3)')
-    return array
-
-
 def _check_probability(probability: float) -> float:
     if not (math.isfinite(probability) and 0.0 <= probability <= 1.0):
         raise ValueError(f'probability: got {probability}, allowed are numbers in [0, 1]')
@@ -206,9 +143,16 @@ class DetectionModel:
         pose : Pose
             Of the sensor.
         """
-        return probabilities(
-            self._kind, self._parameters, _positions(positions), pose.position, pose.yaw
-        )
+        array = np.asarray(positions, dtype=float)
+        if array.ndim != 2 or array.shape[1] not in (2, 3):
+            raise ValueError(f'positions: got shape {array.shape}, allowed are (n, 2) and (n, 3)')
+        number, d = array.shape
+        offset, out = np.zeros((3, number)), np.empty(number)
+        np.subtract(array.T, pose.position[:d, None], out=offset[:d])
+        x, y, z = offset
+        cos_yaw, sin_yaw = math.cos(pose.yaw), math.sin(pose.yaw)
+        fill_probabilities(self._kind, self._parameters, x, y, z, number, cos_yaw, sin_yaw, out)
+        return out
 
 
 class _RadialDetection(DetectionModel):

@@ -89,25 +89,8 @@ class PmbState(FilterState):
 class PmbFilter:
     """Poisson multi-Bernoulli filter for a set M_k of measuring robots.
 
-    Parameters
-    ----------
-    settings : FilterSettings
-        None means derived from the measuring sensor.
-    bounds : (d, 2) array
-        Of the environment E, metres; d = 2 or 3.
-    generator : numpy.random.Generator
-        Every random draw comes from it.
-
-    Attributes
-    ----------
-    components : list of Component
-        Potential targets, including found ones.
-    found_targets : list of FoundTarget
-        In the order of being found.
-    clusters : list of Cluster
-        Potential targets that are not found, most probable first, with mass r.
-    exploration : UnexploredMap
-        e, updated with every measurement.
+    Settings that are None are derived from the measuring sensor. `components` are the potential
+    targets, including found ones; everything else is as of `SearchFilter`.
     """
 
     def __init__(
@@ -163,23 +146,7 @@ class PmbFilter:
     def step(
         self, measurements: Sequence[AgentMeasurement], steps: int, time: float
     ) -> FilterResult:
-        """Predict, correct with every robot of M_k, merge and mark.
-
-        Parameters
-        ----------
-        measurements : sequence of AgentMeasurement
-            M_k, in any order; they are processed in the order of the robots' names. May be empty.
-        steps : int
-            Control steps since the last batch, from 0; irrelevant for static targets.
-        time : float
-            Time of newly found targets, seconds.
-
-        Raises
-        ------
-        ValueError
-            If anything is not finite, a covariance is not positive definite, shapes or dimensions
-            do not fit, or a robot appears twice. The filter is then unchanged.
-        """
+        """Predict, correct with every robot of M_k, merge and mark."""
         members = check_measurements(measurements, steps, time, self._numbers, self.dimension)
         dropped: dict[str, int] = {}
         newly_found: list[FoundTarget] = []

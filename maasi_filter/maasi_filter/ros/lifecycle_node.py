@@ -96,8 +96,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.step = -1
         self._warned: dict[str, float] = {}
         self._peers: list[Callable[[], bool]] = []
-        self._peer_timer: Any = None
-        self._notice_timer: Any = None
+        self._timers_of_start: dict[str, Any] = {}
         self.step_subscription: Subscription | None = None
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
@@ -187,8 +186,10 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         """Start operation."""
         self.active = True
         self.start()
-        self._peer_timer = self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers)
-        self._notice_timer = self.create_wall_timer(_NOTICE_DELAY, self._say_what_is_missing)
+        self._timers_of_start = {
+            'peers': self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers),
+            'notice': self.create_wall_timer(_NOTICE_DELAY, self._say_what_is_missing),
+        }
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -219,19 +220,14 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         if self.configured:
             self.halt()
         self.active = False
-        self._end_peer_timer()
-        self._end_notice_timer()
+        self._end_timer('peers')
+        self._end_timer('notice')
 
-    def _end_peer_timer(self) -> None:
-        if self._peer_timer is not None:
-            self._peer_timer.cancel()
-            self.destroy_timer(self._peer_timer)
-            self._peer_timer = None
-
-    def _end_notice_timer(self) -> None:
-        if self._notice_timer is not None:
-            self.destroy_timer(self._notice_timer)
-            self._notice_timer = None
+    def _end_timer(self, name: str) -> None:
+        timer = self._timers_of_start.pop(name, None)
+        if timer is not None:
+            timer.cancel()
+            self.destroy_timer(timer)
 
     def _disconnect(self) -> None:
         self.active = False
@@ -245,8 +241,8 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.configured = False
         self._peers.clear()
         self._entities_made.clear()
-        self._peer_timer = self._ready_publisher = self._done_publisher = None
-        self.step_subscription = None
+        self._ready_publisher = self._done_publisher = self.step_subscription = None
+        self._timers_of_start.clear()
         self._parameters_read.release()
 
     def permanent(self, key: Hashable, make: Callable[[], T]) -> T:
@@ -298,14 +294,14 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def _look_for_peers(self) -> None:
         if not self.active or not all(condition() for condition in self._peers):
             return
-        self._end_peer_timer()
+        self._end_timer('peers')
         self.on_ready()
         if self._ready_publisher is not None:
             self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
 
     def _say_what_is_missing(self) -> None:
         """Name, once after activation, the topics that nobody publishes."""
-        self._end_notice_timer()
+        self._end_timer('notice')
         missing = unpublished_topics(self)
         if not self.active or not missing:
             return
