@@ -18,8 +18,6 @@ from maasi_drivers.settings.camera import SegmentationSettings
 from maasi_drivers.vision.detector import Blobs
 from maasi_filter.arrays import BoolArray, FloatArray, ImageArray, IntArray
 
-# Labels of pixels that are no marker, and of those not yet reached.
-_BACKGROUND, _UNLABELLED = -1, -2
 # About how many pixels the colour of the floor is taken from.
 _FLOOR_SAMPLES = 4096
 # Added to the mean of the channels before dividing by it: noise in the dark is not blue.
@@ -65,74 +63,40 @@ def _planes(image: ImageArray) -> list[ImageArray]:
     return [np.asarray(plane, dtype=np.uint8) for plane in cv2.split(image)]
 
 
-@njit(cache=True)
-def _fill(marked, labels, members, starts, boxes):
-    """See `_components`; returns their number."""
-    height, width = labels.shape
-    count = 0
-    reached = 0
-    for index in marked:
-        if labels[index // width, index % width] != _UNLABELLED:
-            continue
-        starts[count] = reached
-        row, column = index // width, index % width
-        labels[row, column] = count
-        members[reached] = index
-        done = reached
-        reached += 1
-        left, right, bottom = column, column, row
-        while done < reached:
-            r, c = members[done] // width, members[done] % width
-            done += 1
-            left, right, bottom = min(left, c), max(right, c), max(bottom, r)
-            for nr in range(max(r - 1, 0), min(r + 2, height)):
-                for nc in range(max(c - 1, 0), min(c + 2, width)):
-                    if labels[nr, nc] == _UNLABELLED:
-                        labels[nr, nc] = count
-                        members[reached] = nr * width + nc
-                        reached += 1
-        boxes[count, 0], boxes[count, 1] = left, row
-        boxes[count, 2], boxes[count, 3] = right - left + 1, bottom - row + 1
-        count += 1
-    starts[count] = reached
-    return count
-
-
 class _Components(NamedTuple):
     """The 8-connected components of a mask (h, w), in the order of rows.
 
     Attributes
     ----------
     labels : ndarray, shape (h, w)
-        Component from 0 on, or _BACKGROUND.
-    members : ndarray
-        Pixels, as row * w + column, one component after the other.
-    starts : ndarray, shape (n + 1,)
-        Where each component's members start.
+        Component plus one; 0: background.
     boxes : ndarray, shape (n, 4)
         Left, top, width, height.
+    areas : ndarray, shape (n,)
+        Pixels.
+    centroids : ndarray, shape (n, 2)
+        Means of columns and rows.
     """
 
     labels: NDArray[np.int32]
-    members: IntArray
-    starts: IntArray
     boxes: IntArray
+    areas: IntArray
+    centroids: FloatArray
 
 
 def _components(mask: ImageArray) -> _Components:
-    """Return the components of a mask.
-
-    Markers are few pixels of an image: a fill from the first pixel of each is faster than the
-    passes over the whole image of a general algorithm.
-    """
-    marked = np.flatnonzero(mask.view(np.bool_))
-    labels = np.full(mask.shape, _BACKGROUND, dtype=np.int32)
-    labels.reshape(-1)[marked] = _UNLABELLED
-    members = np.empty(len(marked), dtype=np.int64)
-    starts = np.empty(len(marked) + 1, dtype=np.int64)
-    boxes = np.empty((len(marked), 4), dtype=np.int64)
-    count = _fill(marked, labels, members, starts, boxes)
-    return _Components(labels, members, starts[: count + 1], boxes[:count])
+    # Labelled pixel by pixel: other algorithms number them in the order of blocks of pixels.
+    _, labels, stats, centroids = cv2.connectedComponentsWithStatsWithAlgorithm(
+        mask, 8, cv2.CV_32S, cv2.CCL_SAUF
+    )
+    numbers = stats[1:].astype(np.int64)
+    boxes = np.ascontiguousarray(numbers[:, :4])
+    return _Components(
+        np.asarray(labels, np.int32),
+        boxes,
+        numbers[:, 4].copy(),
+        np.asarray(centroids[1:], np.float64),
+    )
 
 
 def _border_cut(boxes: IntArray, shape: tuple[int, ...]) -> BoolArray:
@@ -147,16 +111,10 @@ def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     Shapes and units: image (h, w, 3).
     """
     mask = paper_mask(image, settings.threshold)
-    _, members, starts, boxes = _components(mask)
-    areas = np.diff(starts).astype(np.float64)
-    centroids = np.empty((len(areas), 2))
-    if len(areas):
-        rows, columns = np.divmod(members, mask.shape[1])
-        centroids[:, 0] = np.add.reduceat(columns, starts[:-1]) / areas
-        centroids[:, 1] = np.add.reduceat(rows, starts[:-1]) / areas
+    _, boxes, areas, centroids = _components(mask)
     blobs = Blobs(
         centroids,
-        areas,
+        areas.astype(np.float64),
         boxes[:, 2:].astype(np.float64),
         _border_cut(boxes, mask.shape),
         np.zeros((len(areas), 2, 2)),
@@ -252,23 +210,24 @@ def _shape_of(image, components, blob, gains, values):
 
     The lengths of the axes go as the roots of `long` and `short`, the principal second moments.
     """
-    width = components.labels.shape[1]
-    left, top = components.boxes[blob, 0], components.boxes[blob, 1]
-    first, last = components.starts[blob], components.starts[blob + 1]
-    count = last - first
+    left, top, width, height = components.boxes[blob]
+    count = components.areas[blob]
     sx = sy = sxx = syy = sxy = 0.0
     peak = 0.0
-    for index in range(first, last):
-        member = components.members[index]
-        row, column = member // width, member % width
-        x, y = float(column - left), float(row - top)
-        sx += x
-        sy += y
-        sxx += x * x
-        syy += y * y
-        sxy += x * y
-        peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
-        values[index - first] = _excess(image, row, column, gains)
+    reached = 0
+    for row in range(top, top + height):
+        for column in range(left, left + width):
+            if components.labels[row, column] != blob + 1:
+                continue
+            x, y = float(column - left), float(row - top)
+            sx += x
+            sy += y
+            sxx += x * x
+            syy += y * y
+            sxy += x * y
+            peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
+            values[reached] = _excess(image, row, column, gains)
+            reached += 1
     mx, my = sx / count, sy / count
     # Each pixel is a square with a second moment of 1/12.
     vxx = sxx / count - mx * mx + 1.0 / 12.0
@@ -291,7 +250,7 @@ def _surroundings(image, components, blob, gains):
     for row in range(max(top - 3, 0), min(bottom + 3, height)):
         for column in range(max(left - 3, 0), min(right + 3, width)):
             frame = row < top - 1 or row > bottom or column < left - 1 or column > right
-            if frame and labels[row, column] == _BACKGROUND:
+            if frame and labels[row, column] == 0:
                 value = _excess(image, row, column, gains)
                 around += 1
                 total += value
@@ -317,11 +276,11 @@ def _weigh(image, components, blob, gains, background, contrast, mean):
     spread_x = spread_y = 0.0
     for row in range(max(top - 1, 0), min(bottom + 1, height)):
         for column in range(max(left - 1, 0), min(right + 1, width)):
-            near = labels[row, column] == blob
-            if labels[row, column] == _BACKGROUND:
+            near = labels[row, column] == blob + 1
+            if labels[row, column] == 0:
                 for r in range(max(row - 1, 0), min(row + 2, height)):
                     for c in range(max(column - 1, 0), min(column + 2, width)):
-                        near |= labels[r, c] == blob
+                        near |= labels[r, c] == blob + 1
             if near:
                 weight = (_excess(image, row, column, gains) - background) / contrast
                 x, y = float(column - left), float(row - top)
@@ -355,9 +314,9 @@ class _Measures(NamedTuple):
 @njit(cache=True)
 def _measure_blobs(image, components, gains, gates, measures):
     """Measure each blob; keep those within the gates: least peak blueness, aspect, solidity."""
-    boxes, starts = components.boxes, components.starts
+    boxes = components.boxes
     for blob in range(boxes.shape[0]):
-        count = starts[blob + 1] - starts[blob]
+        count = components.areas[blob]
         measures.keep[blob] = False
         values = np.empty(count)
         mx, my, long, short, peak = _shape_of(image, components, blob, gains, values)
