@@ -24,7 +24,7 @@ from maasi_planner.node.batches import Batches
 from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
-from maasi_planner.node.search_action import Progress, SearchAction, offer_services
+from maasi_planner.node.search_action import SearchAction, SearchProgress, offer_services
 from maasi_planner.node.search_modes import Mode, SearchModes
 from maasi_planner.node.team_goals import HeardState
 from maasi_planner.node.views import PlannerViews
@@ -460,7 +460,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
 
     def _update_action(self) -> None:
         self._action.update(
-            Progress(
+            SearchProgress(
                 time=max(self._taken_step, 0) * self.settings.step,
                 feedback=SearchTargets.Feedback(
                     found=self._batches.update.found,

@@ -11,7 +11,7 @@ from maasi_planner.buildings.agent import (
     decision_stream,
 )
 from maasi_planner.buildings.centralized import JointPlan, solve_jointly
-from maasi_planner.buildings.preplanning import Mission, plan_mission
+from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
 from maasi_planner.buildings.problem import Objective, Plan, PlanSolver, Problem
 from maasi_planner.buildings.robot_model import Dynamics
 from maasi_planner.buildings.settings import (
@@ -27,12 +27,12 @@ __all__ = [
     'BoxSettings',
     'Broadcast',
     'Choice',
+    'CoveragePlan',
     'CuboidSettings',
     'Dynamics',
     'DynamicsSettings',
     'HazardSettings',
     'JointPlan',
-    'Mission',
     'ObjectSettings',
     'Objective',
     'Plan',

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_planner.buildings.guidance import WayFinder, assigned, nearest
-from maasi_planner.buildings.preplanning import Mission, detection_probability
+from maasi_planner.buildings.preplanning import CoveragePlan, detection_probability
 from maasi_planner.buildings.problem import Objective, Plan, PlanSolver, Problem
 from maasi_planner.buildings.robot_model import Dynamics, Hazard, HeardPlan, rewards
 from maasi_planner.buildings.settings import CuboidSettings, HazardSettings
@@ -130,7 +130,7 @@ class SearchAgent:
         self,
         name: str,
         settings: CuboidSettings,
-        mission: Mission,
+        mission: CoveragePlan,
         dynamics: Dynamics,
         hazard: HazardSettings,
         home: ArrayLike,

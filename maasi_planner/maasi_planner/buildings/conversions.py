@@ -19,7 +19,7 @@ from maasi_filter.ros.conversions import (
 from maasi_msgs.msg import CuboidDecision, SearchLink
 from maasi_msgs.msg import Snapshot as SnapshotMessage
 from maasi_planner.buildings.agent import Broadcast, Choice, SearchAgent, Snapshot
-from maasi_planner.buildings.preplanning import Mission
+from maasi_planner.buildings.preplanning import CoveragePlan
 from maasi_planner.buildings.robot_model import Hazard
 
 # Upper bound of the parameters of a battery.
@@ -135,7 +135,7 @@ def choice_to_ros(
     )
 
 
-def mission_markers(mission: Mission, header: Header) -> MarkerArray:
+def mission_markers(mission: CoveragePlan, header: Header) -> MarkerArray:
     """Return objects and obstacles as boxes."""
     markers = []
     for namespace, boxes, tint in (

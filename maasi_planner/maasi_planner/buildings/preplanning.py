@@ -65,8 +65,8 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Mission:
-    """Mission, planned before take-off.
+class CoveragePlan:
+    """Cells of the faces to search and their cuboids, planned before take-off.
 
     cells: searchable cells; lost: other cells, and why they are lost; area (3, 2): admissible
     positions [m]; objects, obstacles (n, 3, 2): true size, without clearance [m]; distance,
@@ -132,7 +132,7 @@ def segment_cuts(begin: FloatArray, end: FloatArray, boxes: FloatArray) -> BoolA
     return np.asarray(start < stop - 1e-12)
 
 
-def plan_mission(settings: CuboidSettings, area: ArrayLike) -> Mission:
+def plan_mission(settings: CuboidSettings, area: ArrayLike) -> CoveragePlan:
     """Return the cuboids of a mission."""
     bounds = np.asarray(area, dtype=float)
     if bounds.shape != (3, 2) or not np.isfinite(bounds).all():
@@ -164,7 +164,7 @@ def plan_mission(settings: CuboidSettings, area: ArrayLike) -> Mission:
             f'objects: no cuboid can be reached ({reasons}); allowed is an area that leaves room '
             f'at {distance:.1f} m from a face'
         )
-    return Mission(cells, lost, bounds, objects, obstacles, distance, side, seen / total)
+    return CoveragePlan(cells, lost, bounds, objects, obstacles, distance, side, seen / total)
 
 
 def _boxes(key: str, items: Sequence[BoxSettings], area: FloatArray) -> FloatArray:

@@ -235,7 +235,8 @@ class MotionModel(ABC):
 
     def steps_limit(self, state: RobotState, waypoints: FloatArray, step: float) -> int:
         """Return the steps after which a waypoint counts as out of reach."""
-        farthest = _farthest(waypoints, state.pose.position)
+        gaps = ((waypoints - state.pose.position) ** 2).sum(axis=1)
+        farthest = math.sqrt(gaps.max(initial=0.0))
         around = 0.0
         if len(self.keep_out.circles):
             around = 2.0 * math.pi * float(self.keep_out.circles[:, 3].sum())
@@ -359,15 +360,3 @@ def trimmed(out: Trajectories) -> Trajectories:
         out.control_cost,
         out.reached,
     )
-
-
-@njit(cache=True)
-def _farthest(points: FloatArray, place: FloatArray) -> float:
-    """Return the largest distance of points (n, 3) from a place (3,)."""
-    most = 0.0
-    for i in range(points.shape[0]):
-        square = 0.0
-        for axis in range(3):
-            square += (points[i, axis] - place[axis]) ** 2
-        most = max(most, square)
-    return math.sqrt(most)

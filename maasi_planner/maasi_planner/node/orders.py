@@ -13,7 +13,7 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_msgs.action import GoToWaypoint
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.node.search_modes import Mode, SearchModes
-from maasi_planner.node.team_goals import Course, HeardState, TeamGoals
+from maasi_planner.node.team_goals import GoalProgress, HeardState, TeamGoals
 from maasi_planner.node_settings import PlannerNodeSettings
 
 
@@ -127,21 +127,21 @@ class Orders:
             if heard.goal == number:
                 self._refused_since, self.refused_for = None, 0.0
             course = self.goals.course(name, number, heard)
-            if course is Course.UNDER_WAY:
+            if course is GoalProgress.UNDER_WAY:
                 return False
-            if course is Course.ENDED:
+            if course is GoalProgress.ENDED:
                 self.goals.forget(name)
                 return True
             self.goals.forget(name)
-            if course is Course.LOST:
+            if course is GoalProgress.LOST:
                 logger.warning(f'{name} has not taken goal {number}, or lost it')
                 self.refuse(name)
         number = self._homing.get(name, -1)
         if number > 0:
             course = self.goals.course(name, number, heard)
-            if course is Course.REPLACED:
+            if course is GoalProgress.REPLACED:
                 self._homing[name] = -1
-            elif course is not Course.UNDER_WAY:
+            elif course is not GoalProgress.UNDER_WAY:
                 self._homing[name] = 0
         if number >= 0:
             return False

@@ -20,7 +20,7 @@ Result: TypeAlias = SearchTargets.Result
 
 
 @dataclass
-class Progress:
+class SearchProgress:
     """Progress of a search.
 
     time: time of the run [s]; feedback: for the client; finished: why no gain is left; empty
@@ -79,7 +79,7 @@ class SearchAction:
         """Whether a client has a goal."""
         return self._goal is not None
 
-    def update(self, progress: Progress) -> None:
+    def update(self, progress: SearchProgress) -> None:
         """Publish feedback, and conclude the goal when the search has ended."""
         goal = self._goal
         if goal is None:

@@ -41,7 +41,7 @@ class HeardState:
     heard_at: float = field(default_factory=time.monotonic)
 
 
-class Course(Enum):
+class GoalProgress(Enum):
     """Progress of a goal of a robot."""
 
     UNDER_WAY = 0
@@ -124,47 +124,49 @@ class TeamGoals:
         """Discard the goal of a robot without cancelling it."""
         self._sent.pop(name, None)
 
-    def course(self, name: str, number: int, heard: HeardState) -> Course:
+    def course(self, name: str, number: int, heard: HeardState) -> GoalProgress:
         """Return the progress of goal `number` of a robot, by its last received state."""
         sent = self._sent.get(name)
         if sent is None or sent.number != number:
-            return Course.LOST
+            return GoalProgress.LOST
         same = heard.goal == number
         if self._lockstep:
             if same:
-                return Course.ENDED if heard.status in ENDED else Course.UNDER_WAY
+                return GoalProgress.ENDED if heard.status in ENDED else GoalProgress.UNDER_WAY
             return self._other(name, sent, heard)
         if sent.accepted_at is None:
-            return Course.UNDER_WAY
+            return GoalProgress.UNDER_WAY
         if sent.status == GoalStatus.STATUS_ABORTED and sent.reason == REPLACED:
             # The last state before the result shows the preempted goal.
-            return Course.REPLACED if heard.heard_at > sent.ended_at else Course.UNDER_WAY
+            return (
+                GoalProgress.REPLACED if heard.heard_at > sent.ended_at else GoalProgress.UNDER_WAY
+            )
         after = heard.heard_at > sent.accepted_at
         if same and after and heard.status in ENDED:
-            return Course.ENDED
+            return GoalProgress.ENDED
         if sent.status == GoalStatus.STATUS_ABORTED and not same:
             # Apparently refused: it was never the goal of the robot.
             return self._other(name, sent, heard, after)
         if sent.status is not None:
             if heard.status == AgentState.MOVING:
                 # A state from before the end, or with a goal of another client.
-                return Course.UNDER_WAY if same or not after else Course.REPLACED
-            return Course.ENDED
+                return GoalProgress.UNDER_WAY if same or not after else GoalProgress.REPLACED
+            return GoalProgress.ENDED
         if same or time.monotonic() - sent.accepted_at < _PATIENCE:
-            return Course.UNDER_WAY
+            return GoalProgress.UNDER_WAY
         return self._other(name, sent, heard)
 
-    def _other(self, name: str, sent: _Sent, heard: HeardState, after: bool = True) -> Course:
+    def _other(self, name: str, sent: _Sent, heard: HeardState, after: bool = True) -> GoalProgress:
         """Return the progress of a goal that a robot does not have, if heard after its answer."""
         if heard.status != AgentState.MOVING:
-            return Course.LOST
+            return GoalProgress.LOST
         before = sent.before
         if before is not None and heard.goal == before.number:
             # It has refused this one, and goes on to the one before.
             self._cancelled[name] = ({before.number}, time.monotonic())
             before.cancel()
-            return Course.LOST
-        return Course.REPLACED if after else Course.LOST
+            return GoalProgress.LOST
+        return GoalProgress.REPLACED if after else GoalProgress.LOST
 
     @staticmethod
     def driven(heard: HeardState) -> bool:

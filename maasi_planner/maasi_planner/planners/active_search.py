@@ -10,7 +10,6 @@ prediction.
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -18,13 +17,14 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
-    Options,
     Planner,
+    UsableCandidates,
     all_apart,
     check_team,
     explain,
     in_bounds,
     options_of,
+    search_jointly,
     waiting_places,
 )
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
@@ -39,7 +39,12 @@ class Sequences:
     """
 
     def __init__(
-        self, team: TeamView, view: RobotView, option: Options, horizon: int, informed: bool
+        self,
+        team: TeamView,
+        view: RobotView,
+        option: UsableCandidates,
+        horizon: int,
+        informed: bool,
     ) -> None:
         here = np.array(view.state.pose.position)
         steps = np.asarray(view.candidates, dtype=float) - here
@@ -120,7 +125,7 @@ class ActiveSearch(Planner):
         settings = self.settings
         places = waiting_places(team)
         decision = Decision(step=team.step)
-        options: dict[str, Options] = {}
+        options: dict[str, UsableCandidates] = {}
         sequences: dict[str, Sequences] = {}
         informed = settings.refinement == 'mutual_information'
         for name in team.planning():
@@ -153,34 +158,17 @@ class ActiveSearch(Planner):
             product = product * sequences[name].explored[chosen[name]]
         return refinement + self.settings.alpha * float(sum(product.tolist()))
 
-    def _fits(
-        self,
-        team: TeamView,
-        options: dict[str, Options],
-        sequences: dict[str, Sequences],
-        chosen: dict[str, int],
-    ) -> bool:
-        return all_apart(
-            team,
-            {
-                name: options[name].points[sequences[name].first[row]]
-                for name, row in chosen.items()
-                if row >= 0
-            },
-        )
-
     def _search(
-        self, team: TeamView, options: dict[str, Options], sequences: dict[str, Sequences]
+        self, team: TeamView, options: dict[str, UsableCandidates], sequences: dict[str, Sequences]
     ) -> tuple[dict[str, int], bool, int]:
         names = list(sequences)
-        best: dict[str, int] = dict.fromkeys(names, -1)
-        best_value = -math.inf
-        evaluated = 0
         if len(names) == 1:
             mine = sequences[names[0]]
             values = mine.refinement + self.settings.alpha * mine.explored.sum(axis=1)
             return {names[0]: int(np.argmax(values))}, True, len(values)
-        number = math.prod(len(sequences[name].first) for name in names)
+        rows = {name: range(len(sequences[name].first)) for name in names}
+        points = {name: options[name].points[sequences[name].first] for name in names}
+        number = math.prod(map(len, rows.values()))
         if len(names) == 2 and number <= self.settings.enumeration_limit:
             # Evaluate all pairs at once, then take the best admissible one.
             one, two = sequences[names[0]], sequences[names[1]]
@@ -189,39 +177,22 @@ class ActiveSearch(Planner):
                 values = values + self.settings.alpha * (
                     one.explored[:, j, None] * two.explored[None, :, j]
                 )
-            for flat in np.argsort(-values, axis=None, kind='stable').tolist():
-                rows = np.unravel_index(flat, values.shape)
-                joint = {name: int(row) for name, row in zip(names, rows)}
-                evaluated += 1
-                if self._fits(team, options, sequences, joint):
+            order = np.argsort(-values, axis=None, kind='stable').tolist()
+            for evaluated, flat in enumerate(order, 1):
+                joint = dict(zip(names, divmod(flat, values.shape[1])))
+                if all_apart(team, {name: points[name][row] for name, row in joint.items()}):
                     return joint, True, evaluated
-        elif number <= self.settings.enumeration_limit:
-            ranges = (range(len(sequences[name].first)) for name in names)
-            for rows in itertools.product(*ranges):
-                joint = dict(zip(names, rows))
-                value = self._value(sequences, joint)
-                evaluated += 1
-                if value > best_value and self._fits(team, options, sequences, joint):
-                    best, best_value = joint, value
-            if best_value > -math.inf:
-                return best, True, evaluated
-        for _ in range(1 + self.settings.improvement_rounds):
-            before = dict(best)
-            for name in names:
-                own, own_value = -1, -math.inf
-                for row in range(len(sequences[name].first)):
-                    joint = {**best, name: row}
-                    value = self._value(sequences, joint)
-                    evaluated += 1
-                    if value > own_value and self._fits(team, options, sequences, joint):
-                        own, own_value = row, value
-                best[name] = own
-            if best == before:
-                break
-        return best, not names, evaluated
+        best, _, exact, evaluated = search_jointly(
+            team, self.settings, rows, points, lambda joint: self._value(sequences, joint)
+        )
+        return best, exact, evaluated
 
     def _report(
-        self, name: str, option: Options, sequences: dict[str, Sequences], chosen: dict[str, int]
+        self,
+        name: str,
+        option: UsableCandidates,
+        sequences: dict[str, Sequences],
+        chosen: dict[str, int],
     ) -> RobotDecision:
         """Return the decision of one robot: for each waypoint the best sequence through it."""
         mine = sequences[name]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -281,7 +282,7 @@ def free_of_robots(
 
 
 @dataclass
-class Options:
+class UsableCandidates:
     """Candidates of one planning robot.
 
     points (W, 3): waypoints, moved out of obstacles, metres; prediction: to them; allowed (W,):
@@ -298,7 +299,7 @@ def options_of(
     name: str,
     places: list[tuple[FloatArray, float]],
     extra: FloatArray | None = None,
-) -> Options | str:
+) -> UsableCandidates | str:
     """Return the candidates of a robot, or why it has to stay."""
     view = team.robots[name]
     problem = state_problem(view)
@@ -313,7 +314,7 @@ def options_of(
     free = free_of_robots(points, view.radius, places)
     allowed = prediction.reached & free & (prediction.lengths > 0)
     if allowed.any():
-        return Options(points, prediction, allowed)
+        return UsableCandidates(points, prediction, allowed)
     if not free.any():
         return 'other robots stand at all candidates'
     if (prediction.lengths == 0).any():
@@ -353,3 +354,50 @@ def explain(decision: Decision) -> Decision:
         f'{name}: {robot.reason}' for name, robot in decision.robots.items()
     )
     return decision
+
+
+def search_jointly(
+    team: TeamView,
+    settings: PlannerSettings,
+    indices: Mapping[str, Sequence[int]],
+    points: Mapping[str, FloatArray],
+    value: Callable[[dict[str, int]], float],
+    margin: float = 0.0,
+) -> tuple[dict[str, int], float, bool, int]:
+    """Return the best joint choice, its value, whether it is exact, and choices evaluated.
+
+    All joint choices of `indices` into the waypoints are compared, or above the limit robots choose
+    in turn and improve in rounds. One is better by more than `margin`; -1: none is admissible.
+    """
+    best: dict[str, int] = dict.fromkeys(indices, -1)
+    best_value, evaluated = -math.inf, 0
+
+    def fits(joint: dict[str, int]) -> bool:
+        places = {name: points[name][row] for name, row in joint.items() if row >= 0}
+        return all_apart(team, places)
+
+    if math.prod(map(len, indices.values())) <= settings.enumeration_limit:
+        for rows in itertools.product(*indices.values()):
+            joint = dict(zip(indices, rows))
+            if fits(joint):
+                evaluated += 1
+                total = value(joint)
+                if total > best_value + margin:
+                    best, best_value = joint, total
+        if best_value > -math.inf:
+            return best, best_value, True, evaluated
+    for _ in range(1 + settings.improvement_rounds):
+        before = dict(best)
+        for name in indices:
+            own, own_value = -1, -math.inf
+            for row in indices[name]:
+                joint = {**best, name: row}
+                if fits(joint):
+                    evaluated += 1
+                    total = value(joint)
+                    if total > own_value + margin:
+                        own, own_value = row, total
+            best[name], best_value = own, max(own_value, best_value)
+        if best == before:
+            break
+    return best, best_value, False, evaluated

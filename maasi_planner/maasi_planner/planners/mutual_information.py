@@ -13,7 +13,6 @@ E p log p = E p * int (1 - pi) log(1 - pi) D, while E (1 - p) log(1 - p) is the 
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -22,12 +21,12 @@ from numba import njit
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.planners.base import (
-    Options,
     Planner,
-    all_apart,
+    UsableCandidates,
     check_team,
     explain,
     options_of,
+    search_jointly,
     waiting_places,
 )
 from maasi_planner.settings import PlannerSettings
@@ -153,7 +152,7 @@ class MutualInformation(Planner):
         check_team(team)
         places = waiting_places(team)
         decision = Decision(step=team.step)
-        options: dict[str, Options] = {}
+        options: dict[str, UsableCandidates] = {}
         for name in team.planning():
             found = options_of(team, name, places)
             if isinstance(found, str):
@@ -200,7 +199,7 @@ class MutualInformation(Planner):
     def _search(
         self,
         team: TeamView,
-        options: dict[str, Options],
+        options: dict[str, UsableCandidates],
         missed: dict[str, FloatArray],
         weights: FloatArray,
     ) -> tuple[dict[str, int], float, bool, int]:
@@ -210,42 +209,16 @@ class MutualInformation(Planner):
         for name in names:
             order = self._straight_on(team.robots[name], options[name].points, name)
             indices[name].sort(key=lambda w, order=order: -order[w])
-        number = math.prod(len(indices[name]) for name in names)
-        evaluated = 0
-        best: dict[str, int] = dict.fromkeys(names, -1)
-        best_value = -1.0
-        if number <= self.settings.enumeration_limit:
-            for choice in itertools.product(*(indices[name] for name in names)):
-                joint = dict(zip(names, choice))
-                if not self._fits(team, options, joint):
-                    continue
-                value = self._joint(missed, joint, weights)
-                evaluated += 1
-                if value > best_value + 1e-12:
-                    best, best_value = joint, value
-            if best_value >= 0.0 or not names:
-                return best, max(best_value, 0.0), True, evaluated
-        for _ in range(1 + self.settings.improvement_rounds):
-            before = dict(best)
-            for name in names:
-                own, own_value = best[name], -1.0
-                for w in indices[name]:
-                    joint = {**best, name: w}
-                    if not self._fits(team, options, joint):
-                        continue
-                    value = self._joint(missed, joint, weights)
-                    evaluated += 1
-                    if value > own_value + 1e-12:
-                        own, own_value = w, value
-                best[name] = own
-                best_value = max(own_value, best_value)
-            if best == before:
-                break
-        return best, max(best_value, 0.0), False, evaluated
-
-    def _fits(self, team: TeamView, options: dict[str, Options], joint: dict[str, int]) -> bool:
-        points = {name: options[name].points[index] for name, index in joint.items() if index >= 0}
-        return all_apart(team, points)
+        points = {name: options[name].points for name in names}
+        best, value, exact, evaluated = search_jointly(
+            team,
+            self.settings,
+            indices,
+            points,
+            lambda joint: self._joint(missed, joint, weights),
+            1e-12,
+        )
+        return best, max(value, 0.0), exact, evaluated
 
     def _straight_on(self, view: RobotView, points: FloatArray, name: str) -> FloatArray:
         """Return how much each waypoint lies straight on, (W,)."""
@@ -259,12 +232,12 @@ class MutualInformation(Planner):
     def _report(
         self,
         name: str,
-        options: dict[str, Options],
+        options: dict[str, UsableCandidates],
         missed: dict[str, FloatArray],
         weights: FloatArray,
         chosen: dict[str, int],
         view: RobotView,
-        option: Options,
+        option: UsableCandidates,
     ) -> RobotDecision:
         values = np.array(
             [self._joint(missed, {**chosen, name: w}, weights) for w in range(len(option.points))]

@@ -15,11 +15,11 @@ from maasi_planner.buildings import (
     Activity,
     Broadcast,
     Choice,
+    CoveragePlan,
     CuboidSettings,
     Dynamics,
     DynamicsSettings,
     HazardSettings,
-    Mission,
     SearchAgent,
     Snapshot,
     decision_stream,
@@ -45,7 +45,7 @@ class MissionRecord:
 
     Attributes
     ----------
-    mission : Mission
+    mission : CoveragePlan
         What was searched.
     steps, complete : int, bool
         Until all cuboids were visited, or it was given up; whether all were.
@@ -67,7 +67,7 @@ class MissionRecord:
         Predicted positions of all robots at the steps that were asked for.
     """
 
-    mission: Mission
+    mission: CoveragePlan
     steps: int
     complete: bool
     paths: dict[str, FloatArray]

@@ -10,7 +10,7 @@ import numpy as np
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.buildings import Mission
+from maasi_planner.buildings import CoveragePlan
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.run.run_record import RunEnd, RunRecord, TeamLog
 from maasi_sim.run.topics import STEP
@@ -47,7 +47,7 @@ class CuboidRecord(RunRecord):
 
     Attributes
     ----------
-    mission : Mission
+    mission : CoveragePlan
         Searched objects.
     snapshots : list of SnapshotRecord
         In the order of steps and robots; of a cuboid there can be several.
@@ -63,7 +63,7 @@ class CuboidRecord(RunRecord):
         When the last cuboid was visited.
     """
 
-    mission: Mission
+    mission: CoveragePlan
     snapshots: list[SnapshotRecord] = field(default_factory=list)
     choices: dict[str, int] = field(default_factory=dict)
     active: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.buildings import Mission
+from maasi_planner.buildings import CoveragePlan
 
 # Palette for colour-blind readers (Okabe and Ito).
 COLOURS = ('#CC79A7', '#D62728', '#009E73', '#0072B2', '#E69F00', '#56B4E9', '#8C564B')
@@ -28,7 +28,7 @@ def colours_of(names: Collection[str]) -> dict[str, str]:
 
 def draw_mission(
     axes: Any,
-    mission: Mission,
+    mission: CoveragePlan,
     paths: Mapping[str, ArrayLike],
     visited: Collection[int],
     plans: Mapping[str, ArrayLike] | None = None,

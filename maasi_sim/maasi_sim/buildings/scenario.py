@@ -12,11 +12,11 @@ from pydantic import Field
 
 from maasi_filter.settings import Finite, Settings
 from maasi_planner.buildings import (
+    CoveragePlan,
     CuboidSettings,
     Dynamics,
     DynamicsSettings,
     HazardSettings,
-    Mission,
     SearchAgent,
     plan_mission,
 )
@@ -79,7 +79,7 @@ class CuboidScenario(BaseScenario):
         """Return nothing: there is no filter, and no planner of the team."""
         return {}
 
-    def mission(self) -> Mission:
+    def mission(self) -> CoveragePlan:
         """Return what is searched."""
         return plan_mission(self.planner, self.environment.array())
 

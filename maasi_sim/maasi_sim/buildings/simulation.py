@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.buildings import Dynamics, Mission
+from maasi_planner.buildings import CoveragePlan, Dynamics
 from maasi_planner.motion import Body, RobotState
 from maasi_planner.motion.base import check_command
 from maasi_planner.settings import MotionSettings
@@ -51,7 +51,9 @@ class SearchingRobot:
 
     camera = ranging = laser = None
 
-    def __init__(self, name: str, scenario: CuboidScenario, mission: Mission, seed: int) -> None:
+    def __init__(
+        self, name: str, scenario: CuboidScenario, mission: CoveragePlan, seed: int
+    ) -> None:
         settings = scenario.robots[name]
         self.name = name
         self.collisions = 0
