@@ -217,17 +217,18 @@ def run(types, tmp_path):
     return Run(scenario_of(tmp_path, TARGETS), types)
 
 
-def test_radius_is_three_times_the_removal_distance():
-    assert matching_radius(0.05, TARGETS) == pytest.approx(0.15)
-
-
-def test_radius_is_at_most_half_the_smallest_distance():
-    assert matching_radius(0.05, [[0.0, 0.0], [0.2, 0.0], [1.0, 1.0]]) == pytest.approx(0.1)
-
-
-def test_radius_of_one_target_or_none():
-    assert matching_radius(0.05, [[0.0, 0.0]]) == pytest.approx(0.15)
-    assert matching_radius(0.05, np.zeros((0, 2))) == pytest.approx(0.15)
+@pytest.mark.parametrize(
+    ('truth', 'radius'),
+    [
+        # Three times the removal distance, at most half the smallest distance of two targets.
+        (TARGETS, 0.15),
+        ([[0.0, 0.0], [0.2, 0.0], [1.0, 1.0]], 0.1),
+        ([[0.0, 0.0]], 0.15),
+        (np.zeros((0, 2)), 0.15),
+    ],
+)
+def test_radius_of_scoring(truth, radius):
+    assert matching_radius(0.05, truth) == pytest.approx(radius)
 
 
 @pytest.mark.parametrize(

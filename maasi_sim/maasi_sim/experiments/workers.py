@@ -63,17 +63,16 @@ class Workers:
         """
         left = list(reversed(items))
         waiting: dict[Future[Any], Item] = {}
-        while left or waiting:
-            while left and len(waiting) < (self.ahead or len(items)):
-                item = left.pop()
-                waiting[self.executor.submit(function, item)] = item
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                try:
-                    result = future.result()
-                except Exception as error:
-                    reason = str(error) or type(error).__name__
-                    raise WorkersLost(f'a worker died: {reason}') from None
-                yield waiting.pop(future), result
+        try:
+            while left or waiting:
+                while left and len(waiting) < (self.ahead or len(items)):
+                    item = left.pop()
+                    waiting[self.executor.submit(function, item)] = item
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    yield waiting.pop(future), future.result()
+        except Exception as error:
+            reason = str(error) or type(error).__name__
+            raise WorkersLost(f'a worker died: {reason}') from None
 
 
 def make_workers(number: int, wanted: int | None = None, cluster: str | None = None) -> Workers:
