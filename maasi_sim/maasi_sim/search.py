@@ -24,7 +24,7 @@ from maasi_planner.planners import Planner
 from maasi_planner.settings import PlannerSettings
 from maasi_planner.team import Decision
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
-from maasi_sim.search_result import SearchProgress, SearchResult
+from maasi_sim.search_result import SearchResult, SearchState
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.targets.tally import numbered
 from maasi_sim.view.live_view import open_view
@@ -270,7 +270,7 @@ class _Search:
         self.trace.truth(0.0, truth)
         self._radius = scoring_radius(scenario, truth)
         self._counts = dict.fromkeys(self._robots, 0)
-        self._progress: list[SearchProgress] = []
+        self._progress: list[SearchState] = []
         self._decisions: list[Decision] = []
         # Whether the last score of a step was complete.
         self._complete = False
@@ -341,7 +341,7 @@ class _Search:
         scores = self._scores(found, truth)
         self._complete = self._complete or (bool(len(truth)) and scores.complete)
         self._progress.append(
-            SearchProgress(
+            SearchState(
                 time,
                 self.step,
                 sum(self._counts.values()),

@@ -16,7 +16,7 @@ from maasi_sim.view.search_trace import SearchTrace
 
 
 @dataclass(frozen=True)
-class SearchProgress(FoundCount):
+class SearchState(FoundCount):
     """State of a search after a measurement batch.
 
     Attributes
@@ -64,7 +64,7 @@ class SearchResult:
         Distance travelled by each robot [m].
     steps : int
         Length of the search.
-    progress : list of SearchProgress
+    progress : list of SearchState
         After each measurement batch.
     decisions : list of Decision
         In their order.
@@ -87,7 +87,7 @@ class SearchResult:
     measurements: dict[str, int]
     distance: dict[str, float]
     steps: int
-    progress: list[SearchProgress] = field(default_factory=list)
+    progress: list[SearchState] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     filter_times: list[float] = field(default_factory=list)
     planning_times: list[float] = field(default_factory=list)
@@ -113,7 +113,7 @@ class SearchResult:
         ----------
         table : str
             'found_targets': a row for each, with the columns of `found_targets.csv`. 'progress': a
-            row for each measurement batch, with the fields of `SearchProgress` and the
+            row for each measurement batch, with the fields of `SearchState` and the
             places of robots.
 
         Raises
