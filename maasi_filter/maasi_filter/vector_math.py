@@ -100,8 +100,8 @@ def arctan2(y: float, x: float) -> float:
 def exponential(x: float) -> float:
     """Return exp(x), x not above 700, to a unit in the last place; 0 below -708.
 
-    With `math.exp` in its place, which is not vectorised, a step of the PHD filter takes 1.2 to 1.4
-    times as long (10,000 particles, 8 detections), one of the multi-Bernoulli filter 1.7 times.
+    With `math.exp` in its place, which is not vectorised, a step of either filter takes 1.13 times
+    as long (10,000 and 300 particles, 8 detections).
     """
     exponent = max(x, LEAST_EXPONENT)
     shifted = exponent * LOG2_E + MAGIC

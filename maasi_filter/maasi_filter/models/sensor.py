@@ -16,20 +16,6 @@ from maasi_filter.models.measurement import MeasurementModel, RangeBearing, Rang
 LEAST_PER_SCAN = 0.05
 
 
-def check_covariance(name: str, covariance: FloatArray, dimension: int) -> None:
-    """Refuse a covariance that is not symmetric positive definite."""
-    if covariance.shape != (dimension, dimension):
-        raise ValueError(
-            f'{name}: got shape {covariance.shape}, allowed is ({dimension}, {dimension})'
-        )
-    if not np.isfinite(covariance).all():
-        raise ValueError(f'{name}: got {covariance.tolist()}, allowed are finite numbers only')
-    if not is_covariance(covariance):
-        raise ValueError(
-            f'{name}: got {covariance.tolist()}, allowed is a symmetric positive definite matrix'
-        )
-
-
 def is_covariance(covariance: FloatArray) -> bool:
     """Return whether a finite square matrix is symmetric positive definite despite rounding."""
     scale = np.sqrt(np.abs(np.diagonal(covariance)))
@@ -83,19 +69,22 @@ class Sensor:
 
     def __post_init__(self) -> None:
         self.covariance = np.array(self.covariance, dtype=float)
-        check_covariance(f'{self.name}: covariance', self.covariance, self.measurement.dimension)
-        if not (math.isfinite(self.clutter) and self.clutter >= 0.0):
+        d = self.measurement.dimension
+        if self.covariance.shape != (d, d):
             raise ValueError(
-                f'{self.name}: clutter: got {self.clutter}, allowed are finite numbers from 0'
+                f'{self.name}: covariance: got shape {self.covariance.shape}, allowed is ({d}, {d})'
             )
-        if not (math.isfinite(self.period) and self.period >= 0.0):
+        if not is_covariance(self.covariance):
             raise ValueError(
-                f'{self.name}: period: got {self.period}, allowed are finite numbers from 0'
+                f'{self.name}: covariance: got {self.covariance.tolist()}, allowed is a symmetric '
+                'positive definite matrix of finite numbers'
             )
-        if not (math.isfinite(self.resolution) and self.resolution >= 0.0):
-            raise ValueError(
-                f'{self.name}: resolution: got {self.resolution}, allowed are finite numbers from 0'
-            )
+        for name in ('clutter', 'period', 'resolution'):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(
+                    f'{self.name}: {name}: got {value}, allowed are finite numbers from 0'
+                )
         if not self.maximum_range > 0.0:
             raise ValueError(
                 f'{self.name}: maximum_range: got {self.maximum_range}, allowed are numbers above 0'

@@ -18,7 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.models.pose import Pose
-from maasi_filter.models.sensor import Sensor
+from maasi_filter.models.sensor import Sensor, is_covariance
 from maasi_filter.records import AgentMeasurement, Cluster, FoundTarget
 from maasi_msgs.msg import Cluster as ClusterMessage
 from maasi_msgs.msg import Detection, DetectionArray, RangeMeasurement
@@ -35,9 +35,6 @@ FASTEST = 1e5
 
 #: Most characters of a class or identity.
 LONGEST_NAME = 100
-
-# Relative tolerance of symmetry and positive definiteness.
-_ROUNDING = 1e-9
 
 
 def stamp_to_ros(nanoseconds: int) -> Time:
@@ -184,14 +181,9 @@ def detections_to_ros(
     return messages
 
 
-def label_of(message: Detection | RangeMeasurement) -> Label:
-    """Return the class and identity in a message without a `label_problem`."""
-    return Label(message.class_id, message.score, message.identity)
-
-
 def labels_of(messages: Sequence[Detection] | Sequence[RangeMeasurement]) -> tuple[Label, ...]:
     """Return their labels; empty if none has one."""
-    labels = tuple(label_of(message) for message in messages)
+    labels = tuple(Label(item.class_id, item.score, item.identity) for item in messages)
     return labels if any(label != UNLABELLED for label in labels) else ()
 
 
@@ -223,13 +215,11 @@ def detection_problem(detection: Detection, dimension: int) -> str | None:
     if size != dimension * dimension:
         return f'covariance: read {size} numbers, allowed are {dimension * dimension}, or none'
     matrix = np.array(detection.covariance).reshape(dimension, dimension)
-    if not np.isfinite(matrix).all():
-        return f'covariance: read {list(detection.covariance)}, allowed are finite numbers'
-    size_of = max(float(np.abs(matrix).max()), 1e-300)
-    if np.abs(matrix - matrix.T).max() > _ROUNDING * size_of:
-        return f'covariance: read {list(detection.covariance)}, allowed is a symmetric matrix'
-    if np.linalg.eigvalsh(matrix).min() <= 0.0:
-        return f'covariance: read {list(detection.covariance)}, allowed is a positive matrix'
+    if not is_covariance(matrix):
+        return (
+            f'covariance: read {list(detection.covariance)}, allowed is a symmetric positive '
+            'definite matrix of finite numbers'
+        )
     return None
 
 
