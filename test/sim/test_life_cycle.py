@@ -54,15 +54,23 @@ def in_graph(node):
     return counts
 
 
-def is_known(node):
-    """Tell whether the graph holds all endpoints that a node has by its own count."""
+def unknown(node):
+    """Return the endpoints of which the graph holds another number than the node has itself."""
     counts = in_graph(node)
     own = Counter()
     for kind in ('publisher', 'subscription'):
         own.update((kind, item.topic_name) for item in getattr(node, f'{kind}s'))
     own.update(('server', item.service_name) for item in node.services)
     own.update(('client', item.service_name) for item in node.clients)
-    return all(counts[key] == number for key, number in own.items() if '/_' not in key[1])
+    return {
+        key: (number, counts[key])
+        for key, number in own.items()
+        if counts[key] != number and '/_' not in key[1]
+    }
+
+
+def wait_until_known(node, turn=lambda: time.sleep(0.01)):
+    wait_until(lambda: not unknown(node), turn, lambda: f'own number, in graph: {unknown(node)}')
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -73,20 +81,20 @@ def test_after_twenty_cycles_a_node_has_the_same_entities(context, kind):
     def spin():
         executor.spin_once(0.01)
 
-    wait_until(lambda: is_known(node))
+    wait_until_known(node)
     unconfigured = made_by(node)
     assert node.trigger_configure().name == 'SUCCESS', node.problem
-    wait_until(lambda: is_known(node))
+    wait_until_known(node)
     waitables = set(node.waitables)
     assert node.trigger_cleanup().name == 'SUCCESS', node.problem
-    wait_until(lambda: is_known(node), spin)
+    wait_until_known(node, spin)
     # Services and actions live as long as the node: the executor crashes without its waitables.
     assert set(node.waitables) == waitables
     cleaned = made_by(node), in_graph(node)
     for entities in ('publishers', 'timers', 'clients'):
         assert cleaned[0][entities] == unconfigured[entities]
     assert node.trigger_configure().name == 'SUCCESS', node.problem
-    wait_until(lambda: is_known(node))
+    wait_until_known(node)
     configured = made_by(node), in_graph(node)
     assert configured[0]['publishers'] > unconfigured['publishers']
     # The recorder looks for topics after it has heard the last publisher of each node.
@@ -172,7 +180,7 @@ def test_a_timer_that_is_destroyed_is_not_called_any_more(context):
         while timers:
             node.destroy_timer(timers.pop())
 
-    wait_until(lambda: is_known(node))
+    wait_until_known(node)
     executor.spin_once(0.1)
     timers += [node.create_wall_timer(0.05, fire) for _ in range(5)]
     executor.spin_once(0.0)
