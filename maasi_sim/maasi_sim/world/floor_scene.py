@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from maasi_sim.world.noise_streams import noise_stream
 from maasi_sim.world.render_settings import RenderSettings
 from maasi_sim.world.world import World
 
-Array = NDArray[np.float64]
 Colour = Sequence[float]
 
 
@@ -62,16 +61,21 @@ def draw_distractors(
     radius = 0.5 * settings.marker_diameter
     shapes: list[Shape] = []
 
-    def draw(reach: float, clear: bool) -> tuple[float, float] | None:
+    def draw(clear: float, along: ArrayLike = (0.0, 0.0)) -> tuple[float, float] | None:
+        """Return a centre whose markers are farther than `clear` from it, or from a line."""
+        half = float(np.hypot(*np.asarray(along)))
+        axis = np.asarray(along) / (half or 1.0)
         for _ in range(1000):
-            x, y = generator.uniform(low, high)
-            gaps = np.linalg.norm(world.targets[:, :2] - np.array([x, y]), axis=1)
-            if not clear or not gaps.size or gaps.min() > reach + 2.0 * radius:
-                return float(x), float(y)
+            centre = generator.uniform(low, high)
+            offsets = world.targets[:, :2] - centre
+            nearest = np.clip(offsets @ axis, -half, half)[:, None] * axis
+            gaps = np.linalg.norm(offsets - nearest, axis=1)
+            if gaps.min(initial=np.inf) > clear:
+                return float(centre[0]), float(centre[1])
         return None
 
     for _ in range(counts.sheets):
-        centre = draw(0.0, False)
+        centre = draw(-1.0)
         sides = generator.uniform(0.05, 0.125, size=2)
         colour = np.array([0.60, 0.68, 0.80]) * generator.uniform(0.85, 1.15)
         if centre is not None:
@@ -82,7 +86,7 @@ def draw_distractors(
         half = float(generator.uniform(0.1, 0.4))
         width = float(generator.uniform(0.0015, 0.004))
         angle = float(generator.uniform(0, np.pi))
-        line = _clear_line(world, half, angle, radius, generator, low, high)
+        line = draw(2.5 * radius, half * np.array([np.cos(angle), np.sin(angle)]))
         if line is not None:
             shapes.append(Shape(line, (half, width), settings.marker_colour, True, angle))
     for count, size, colours in (
@@ -91,29 +95,10 @@ def draw_distractors(
         (counts.large, 3.0, [settings.marker_colour]),
     ):
         for _ in range(count):
-            centre = draw(size * radius, True)
+            centre = draw((size + 2.0) * radius)
             if centre is not None:
                 shapes.append(disc(centre, size * radius, colours[0]))
     return shapes
-
-
-def _clear_line(
-    world: World,
-    half: float,
-    angle: float,
-    radius: float,
-    generator: np.random.Generator,
-    low: Array,
-    high: Array,
-) -> tuple[float, float] | None:
-    along = np.array([np.cos(angle), np.sin(angle)])
-    for _ in range(1000):
-        centre = generator.uniform(low, high)
-        offsets = world.targets[:, :2] - centre
-        nearest = np.clip(offsets @ along, -half, half)[:, None] * along
-        if not len(offsets) or np.linalg.norm(offsets - nearest, axis=1).min() > 2.5 * radius:
-            return float(centre[0]), float(centre[1])
-    return None
 
 
 def scene_of(world: World, settings: RenderSettings, seed: int) -> list[Shape]:
