@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import carray, cfunc, njit, types
@@ -25,8 +25,7 @@ CUSTOM = 3
 REACH, NUMBER, ADDRESS = 4, 5, 6
 
 
-@dataclass(frozen=True)
-class _Block:
+class _Block(NamedTuple):
     """A function with its values, which must outlive all kernels that know its address."""
 
     function: Callable[..., float]
@@ -36,7 +35,6 @@ class _Block:
     entries: IntArray
 
 
-_compiled: dict[Any, Any] = {}
 _blocks: dict[int, _Block] = {}
 _retired: list[_Block] = []
 
@@ -87,9 +85,7 @@ def register(function: Callable[..., float], values: FloatArray) -> tuple[int, i
         if block is not None:
             # Redefined, as in a notebook; the old one may still be in use.
             _retired.append(block)
-        if function not in _compiled:
-            _compiled[function] = _compile(function)
-        compiled, own = _compiled[function], np.array(values, dtype=float)
+        compiled, own = _compiled(function), np.array(values, dtype=float)
         entries = np.array([compiled.address, own.ctypes.data, len(own)], np.int64)
         block = _blocks[number] = _Block(function, compiled, own, entries)
     return number, block.entries.ctypes.data
@@ -107,21 +103,15 @@ def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
         parameters[row, ADDRESS] = block.entries.ctypes.data
 
 
-def _compile(function: Callable[..., float]) -> Any:
+@cache
+def _compiled(function: Callable[..., float]) -> Any:
     inner = function
     if not isinstance(function, Dispatcher):
         inner = njit(error_model='numpy')(function)
+    number = types.float64
 
-    @cfunc(
-        types.float64(
-            types.float64,
-            types.float64,
-            types.float64,
-            types.CPointer(types.float64),
-            types.int64,
-        )
-    )
-    def call(forward, left, up, values, number):  # type: ignore[no-untyped-def]  # pragma: no cover
-        return inner(forward, left, up, carray(values, (number,)))
+    @cfunc(number(number, number, number, types.CPointer(number), types.int64))
+    def call(forward, left, up, values, size):  # type: ignore[no-untyped-def]  # pragma: no cover
+        return inner(forward, left, up, carray(values, (size,)))
 
     return call

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from numba import njit
@@ -69,16 +69,19 @@ class OwnDetection(DetectionModel):
         self.gain = float(probability)
         self.dimension = dimension
         reach = float(self._numbers(self.reach(), 'reach', ()))
-        if not (math.isfinite(reach) and reach > 0.0):
-            raise PluginError(
-                f'{self._name}: reach: got {reach}, allowed are finite numbers above 0'
-            )
+        if not 0.0 < reach < math.inf:
+            self._refuse(f'reach: got {reach}, allowed are finite numbers above 0')
         function = type(self).compiled
         if function is None:
             function, values = _interpolated, self._table(reach)
         else:
-            values = self._numbers(self.values(), 'values', None)
-            self._try(function, values, reach)
+            values = self._numbers(self.values(), 'values')
+            # At some places, where an exception would still be seen.
+            places = np.random.default_rng(1).uniform(-reach, reach, (_TRIALS, 3))
+            places[:, dimension:] = 0.0
+            places[0] = 0.0
+            results = [function(*place, values) for place in places.tolist()]
+            self._probabilities(results, (_TRIALS,), 'compiled')
         self._parameters = np.zeros(PARAMETERS)
         self._parameters[0] = self.gain
         # As of the radial models: the inverse of half the width of the view.
@@ -92,7 +95,7 @@ class OwnDetection(DetectionModel):
 
     def reach(self) -> float:
         """Return the distance beyond which nothing is detected, metres."""
-        raise NotImplementedError(f'{self._name} lacks reach')
+        raise NotImplementedError(f'{self._name()} lacks reach')
 
     def values(self) -> Sequence[float]:
         """Return what the compiled function needs to know."""
@@ -100,35 +103,33 @@ class OwnDetection(DetectionModel):
 
     def evaluate(self, forward: FloatArray, left: FloatArray, up: FloatArray) -> FloatArray:
         """Return pi, (n,), of targets at offsets (n,) each in the robot's axes, metres."""
-        raise NotImplementedError(f'{self._name} lacks compiled or evaluate')
+        raise NotImplementedError(f'{self._name()} lacks compiled or evaluate')
 
-    @property
-    def _name(self) -> str:
-        return f'{type(self).__module__}:{type(self).__qualname__}'
+    @classmethod
+    def _name(cls) -> str:
+        return f'{cls.__module__}:{cls.__qualname__}'
 
-    def _numbers(self, value: Any, what: str, shape: tuple[int, ...] | None) -> FloatArray:
-        """Return what a method gave as numbers of a shape; None: of any number of them."""
+    def _refuse(self, problem: str) -> NoReturn:
+        raise PluginError(f'{self._name()}: {problem}')
+
+    def _numbers(self, value: Any, what: str, shape: tuple[int, ...] | None = None) -> FloatArray:
+        """Return what a method gave as numbers of a shape; without one: (n,)."""
         try:
             found = np.asarray(value)
         except ValueError:  # rows of unequal lengths
             found = np.asarray(None)
         if found.dtype.kind not in 'biuf':
-            raise PluginError(f'{self._name}: {what}: got {value!r:.80}, allowed are numbers')
-        if found.shape != shape and not (shape is None and found.ndim == 1):
-            allowed = '(n,)' if shape is None else shape
-            raise PluginError(
-                f'{self._name}: {what}: got shape {found.shape}, allowed is {allowed}'
-            )
+            self._refuse(f'{what}: got {value!r:.80}, allowed are numbers')
+        allowed = '(n,)' if shape is None else shape
+        if found.ndim != 1 if shape is None else found.shape != shape:
+            self._refuse(f'{what}: got shape {found.shape}, allowed is {allowed}')
         return found.astype(float)
 
-    def _checked(self, result: Any, shape: tuple[int, ...], what: str) -> FloatArray:
-        found = self._numbers(result, what, shape)
+    def _probabilities(self, value: Any, shape: tuple[int, ...], what: str) -> FloatArray:
+        found = self._numbers(value, what, shape)
         wrong = found[~((found >= 0.0) & (found <= 1.0))]
         if wrong.size:
-            raise PluginError(
-                f'{self._name}: {what}: got a probability of {wrong[0]}, allowed are numbers '
-                'in [0, 1]'
-            )
+            self._refuse(f'{what}: got a probability of {wrong[0]}, allowed are numbers in [0, 1]')
         return found
 
     def _table(self, reach: float) -> FloatArray:
@@ -137,17 +138,8 @@ class OwnDetection(DetectionModel):
         axis = np.linspace(-reach, reach, 2 * cells + 1)
         height = axis if self.dimension == 3 else np.zeros(1)
         grids = [grid.ravel() for grid in np.meshgrid(axis, axis, height, indexing='ij')]
-        table = self._checked(self.evaluate(*grids), grids[0].shape, 'evaluate')
+        table = self._probabilities(self.evaluate(*grids), grids[0].shape, 'evaluate')
         return np.concatenate([[cells, cells / reach, self.dimension], table])
-
-    def _try(self, function: Callable[..., float], values: FloatArray, reach: float) -> None:
-        """Call a function at some places, where an exception would still be seen."""
-        generator = np.random.default_rng(1)
-        places = generator.uniform(-reach, reach, (_TRIALS, 3))
-        places[:, self.dimension :] = 0.0
-        places[0] = 0.0
-        results = [function(*place, values) for place in places.tolist()]
-        self._checked(results, (_TRIALS,), 'compiled')
 
 
 @njit(cache=True, error_model='numpy')
