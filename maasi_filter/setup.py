@@ -30,7 +30,7 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'filter_node = maasi_entry:maasi_filter.filter_node',
+            'filter_node = maasi_entry:filter_node',
         ],
     },
 )

@@ -30,9 +30,9 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'cuboid_planner_node = maasi_entry:maasi_planner.buildings.cuboid_planner_node',
-            'planner_node = maasi_entry:maasi_planner.planner_node',
-            'search_command = maasi_entry:maasi_planner.search_command',
+            'cuboid_planner_node = maasi_entry:cuboid_planner_node',
+            'planner_node = maasi_entry:planner_node',
+            'search_command = maasi_entry:search_command',
         ],
     },
 )

@@ -44,13 +44,13 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'cuboid_sim_node = maasi_entry:maasi_sim.buildings.cuboid_sim_node',
-            'sim_node = maasi_entry:maasi_sim.sim_node',
-            'fake_mambo = maasi_entry:maasi_sim.emulators.mambo.fake_mambo',
-            'fake_mavlink_vehicle = maasi_entry:maasi_sim.emulators.mavlink.fake_mavlink_vehicle',
-            'view_node = maasi_entry:maasi_sim.view.view_node',
-            'compare = maasi_entry:maasi_sim.experiments.compare',
-            'run_scenario = maasi_entry:maasi_sim.run.run_scenario',
+            'cuboid_sim_node = maasi_entry:cuboid_sim_node',
+            'sim_node = maasi_entry:sim_node',
+            'fake_mambo = maasi_entry:fake_mambo',
+            'fake_mavlink_vehicle = maasi_entry:fake_mavlink_vehicle',
+            'view_node = maasi_entry:view_node',
+            'compare = maasi_entry:compare',
+            'run_scenario = maasi_entry:run_scenario',
         ],
     },
 )

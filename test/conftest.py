@@ -10,7 +10,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def pytest_sessionfinish():
     """Remove what killed nodes left in shared memory."""
-    from maasi_sim.run.shared_memory import remove_dead
+    from maasi_sim.run.domain import remove_dead
 
     remove_dead()
 
@@ -18,7 +18,7 @@ def pytest_sessionfinish():
 @pytest.fixture
 def domain(monkeypatch):
     """Reserve a ROS domain for this test and the processes that it starts."""
-    from maasi_sim.run.processes import Domain
+    from maasi_sim.run.domain import Domain
 
     with Domain() as reserved:
         for name, value in reserved.environment().items():

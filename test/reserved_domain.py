@@ -2,7 +2,7 @@
 
 from contextlib import contextmanager
 
-from maasi_sim.run.processes import DOMAINS, Domain, ProcessError
+from maasi_sim.run.domain import DOMAINS, Domain, DomainError
 
 
 @contextmanager
@@ -14,9 +14,9 @@ def reserved_domain():
     for number in reversed(DOMAINS):
         try:
             domain = Domain(number, 'reserved for a test')
-        except ProcessError:
+        except DomainError:
             continue
         with domain:
             yield domain
         return
-    raise ProcessError('no ROS domain is left to reserve')
+    raise DomainError('no ROS domain is left to reserve')

@@ -19,6 +19,7 @@ import pytest
 import yaml
 from markdown_it import MarkdownIt
 
+import maasi_entry
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.node_parameters import check
 from maasi_filter.ros.node_settings import FilterNodeSettings
@@ -179,9 +180,9 @@ def commands(text: str) -> Iterator[list[str]]:
 def module_of(package: str, executable: str) -> str:
     """Return the module that `ros2 run` runs."""
     entries = (ROOT / package / 'setup.py').read_text()
-    found = re.search(rf"'{executable} = maasi_entry:([\w.]+)'", entries)
-    assert found, f'{package} has no {executable}'
-    return found[1]
+    assert f"'{executable} = maasi_entry:{executable}'" in entries, f'{package}: no {executable}'
+    (target,) = getattr(maasi_entry, executable).args
+    return target.partition(':')[0]
 
 
 def check_command(words: list[str]) -> None:

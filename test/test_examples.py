@@ -21,8 +21,9 @@ from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.run.bag import Bag
+from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import RunSettings
-from maasi_sim.run.processes import Domain, find_executable
+from maasi_sim.run.processes import find_executable
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search
 from maasi_sim.targets.mission import plan_nodes

@@ -1,47 +1,39 @@
 """Console scripts: imports end without a traceback on SIGINT.
 
-A package of its own, because importing a module of the others loads NumPy and rclpy first. The
-entry point `maasi_entry:maasi_filter.filter_node` runs `main` of `maasi_filter.filter_node`.
+A package of its own, because importing a module of the others loads NumPy and rclpy first.
 """
 
 from __future__ import annotations
 
-import importlib
 import signal
 import sys
+from functools import partial
+from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 # What the commands import at once, and only extras require.
 _OF_EXTRAS = ('distributed', 'matplotlib', 'rich', 'setproctitle')
 
 
-class _Script:
-    """Runs `main` of a module; each attribute is the script of a module inside it."""
-
-    def __init__(self, module: str) -> None:
-        self._module = module
-
-    def __getattr__(self, name: str) -> _Script:
-        return _Script(f'{self._module}.{name}')
-
-    def __call__(self) -> Any:
-        # Nothing has been created yet, so there is nothing to clean up. A node, and whatever has
-        # to clean up, sets its own handler in `main`.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        try:
-            return importlib.import_module(self._module).main()
-        except ModuleNotFoundError as error:
-            missing = error.name or ''
-            if _is_of_ros(missing):
-                needed = 'it needs ROS 2 Jazzy and maasi_msgs, built and sourced'
-            elif missing.partition('.')[0] in _OF_EXTRAS:
-                needed = 'it comes with an extra of the package'
-            else:
-                raise
-            name = self._module.rpartition('.')[2]
-            text = f'error: {name}: no module {missing}: {needed} (docs/install.md)'
-            print(text, file=sys.stderr)
-            return 2
+def _run(target: str) -> Any:
+    """Import a function, `module:name`, and return its result, the exit code."""
+    # Nothing has been created yet, so there is nothing to clean up. A node, and whatever has
+    # to clean up, sets its own handler in `main`.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        return resolve_name(target)()
+    except ModuleNotFoundError as error:
+        missing = error.name or ''
+        if _is_of_ros(missing):
+            needed = 'it needs ROS 2 Jazzy and maasi_msgs, built and sourced'
+        elif missing.partition('.')[0] in _OF_EXTRAS:
+            needed = 'it comes with an extra of the package'
+        else:
+            raise
+        name = Path(sys.argv[0]).name
+        print(f'error: {name}: no module {missing}: {needed} (docs/install.md)', file=sys.stderr)
+        return 2
 
 
 def _is_of_ros(module: str) -> bool:
@@ -51,8 +43,26 @@ def _is_of_ros(module: str) -> bool:
     )
 
 
-def __getattr__(package: str) -> _Script:
-    # Other attributes, which pytest asks for, start nothing.
-    if not package.startswith('maasi_'):
-        raise AttributeError(package)
-    return _Script(package)
+filter_node = partial(_run, 'maasi_filter.filter_node:main')
+cuboid_planner_node = partial(_run, 'maasi_planner.buildings.cuboid_planner_node:main')
+planner_node = partial(_run, 'maasi_planner.planner_node:main')
+search_command = partial(_run, 'maasi_planner.search_command:main')
+mambo_driver = partial(_run, 'maasi_drivers.mambo_driver:main')
+turtlebot_driver = partial(_run, 'maasi_drivers.turtlebot_driver:main')
+plugin_driver = partial(_run, 'maasi_drivers.plugin_driver:main')
+ranging_driver = partial(_run, 'maasi_drivers.ranging_driver:main')
+measurement_feed_sender = partial(_run, 'maasi_drivers.measurement_feed_sender:main')
+mavlink_driver = partial(_run, 'maasi_drivers.mavlink_driver:main')
+mavlink_camera_driver = partial(_run, 'maasi_drivers.mavlink_camera_driver:main')
+calibrate_sensor = partial(_run, 'maasi_drivers.calibrate_sensor:main')
+mambo_onboard_driver = partial(_run, 'maasi_drivers.mambo_onboard_driver:main')
+robot_command = partial(_run, 'maasi_drivers.robot_command:main')
+measure_mambo = partial(_run, 'maasi_drivers.measure_mambo:main')
+guard_node = partial(_run, 'maasi_drivers.guard_node:main')
+cuboid_sim_node = partial(_run, 'maasi_sim.buildings.cuboid_sim_node:main')
+sim_node = partial(_run, 'maasi_sim.sim_node:main')
+fake_mambo = partial(_run, 'maasi_sim.emulators.mambo.fake_mambo:main')
+fake_mavlink_vehicle = partial(_run, 'maasi_sim.emulators.mavlink.fake_mavlink_vehicle:main')
+view_node = partial(_run, 'maasi_sim.view.view_node:main')
+compare = partial(_run, 'maasi_sim.experiments.compare:main')
+run_scenario = partial(_run, 'maasi_sim.run.run_scenario:main')

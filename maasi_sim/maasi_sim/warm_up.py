@@ -1,13 +1,9 @@
-"""What nodes need at their start, done once before they are forked from a process."""
+"""What nodes need at their start, done once in the process that they are forked from."""
 
 from __future__ import annotations
 
-import gc
 import importlib
 import inspect
-from collections.abc import Callable
-from importlib.metadata import distribution
-from typing import Any
 
 import maasi_filter
 import maasi_planner
@@ -29,25 +25,16 @@ _MESSAGES = (
     'tf2_msgs',
     'visualization_msgs',
 )
-_PACKAGES = ('maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
 
 
 def warm_up() -> None:
-    """Compile, or load from the cache, all kernels of simulations."""
+    """Compile, or load from the cache, the kernels of simulations."""
     _play_robots()
-    warm_up_buildings()
-
-
-def warm_up_search() -> None:
-    """Compile, or load from the cache, the kernels of searches for targets."""
-    maasi_filter.warm_up()
-    maasi_planner.warm_up()
-    warm_up_drivers()
-    _play_robots()
+    mission_of(load_cuboid_scenario('buildings_four')).run(1)
 
 
 def _play_robots() -> None:
-    """Play one simulated robot of each kind."""
+    """Play one step of simulated robots of each kind."""
     for name in ('mambo_turtlebot_obstacles', 'ranging_pair_3d'):
         scenario = load_scenario(name)
         world = scenario.world(scenario.seed)
@@ -57,8 +44,15 @@ def _play_robots() -> None:
             robot.step(1, scenario.step)
 
 
-def prepare_copies() -> None:
-    """Do once what every node would do at its start, for copies of this process."""
+def prepare_nodes() -> None:
+    """Do once what nodes would do at their start, for nodes that are forked from here.
+
+    Kernels are those of searches for targets: in a search of buildings each node loads its own.
+    """
+    maasi_filter.warm_up()
+    maasi_planner.warm_up()
+    warm_up_drivers()
+    _play_robots()
     for package in _MESSAGES:
         importlib.import_module(f'{package}.msg')
     # Messages import it at their first use.
@@ -67,20 +61,3 @@ def prepare_copies() -> None:
     # and for its first log message.
     PLANNERS.names()
     inspect.getmodule(inspect.currentframe())
-    # Exclude what exists now from garbage collection: forked processes share its memory.
-    gc.collect()
-    gc.freeze()
-
-
-def main_of(package: str, executable: str) -> Callable[[], Any] | None:
-    """Return what runs an executable of this suite, or None for one of another package.
-
-    The node itself is imported when it is called: rclpy starts threads, and a process with several
-    threads must not be forked.
-    """
-    if package not in _PACKAGES:
-        return None
-    scripts = distribution(package).entry_points
-    (script,) = scripts.select(group='console_scripts', name=executable)
-    main: Callable[[], Any] = script.load()
-    return main

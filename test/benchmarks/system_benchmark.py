@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from timing import entry
 
+from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import NodePlan
-from maasi_sim.run.processes import Domain, NodeProcess, find_executable, stop
+from maasi_sim.run.processes import NodeProcess, find_executable, stop
 from maasi_sim.run.recording import FILTER, read_recording
 from maasi_sim.run.replay import REPLAYED
 from maasi_sim.run.replay_node import ReplayNode
@@ -75,9 +76,8 @@ def latencies(bag: Path, folder: Path) -> list[float]:
     with Domain(None) as domain:
         os.environ.update(domain.environment())
         executable = find_executable(plan.package, plan.executable)
-        process = NodeProcess(
-            plan.full_name, plan.command(executable, file), folder / 'filter_node.log'
-        )
+        command = plan.command(executable, file)
+        process = NodeProcess(plan.full_name, command, folder / 'filter_node.log', plan.package)
         process.start()
         node = ReplayNode(domain.number, sorted(recording.facts['scenario']['robots']))
         try:

@@ -14,7 +14,7 @@ from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.qos import RELIABLE
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 
 
 class Pair:

@@ -31,7 +31,7 @@ from maasi_msgs.msg import (
     FoundTargetArray,
     MeasurementBatch,
 )
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 
 BOX = {'kind': 'box', 'probability': 0.98, 'lower': [-0.5, -0.5], 'upper': [0.5, 0.5]}
 NOISE = {'range': 0.01, 'bearing': 0.03}

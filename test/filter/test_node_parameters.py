@@ -17,7 +17,7 @@ from waiting import PATIENCE, wait_until
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 
 SETTINGS = FilterNodeSettings.model_validate(
     {

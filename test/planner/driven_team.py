@@ -30,7 +30,7 @@ from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import AgentState, FilterUpdate, PlanDecision
 from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planner_node import PlannerNode
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 
 STEP = 0.05
 # Wall time of a step of the robots, where odometry is lost at most [s].

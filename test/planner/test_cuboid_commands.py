@@ -18,7 +18,7 @@ from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
 from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
 from maasi_planner.buildings.settings import CuboidPlannerSettings
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 
 SETTINGS = CuboidPlannerSettings.model_validate(
     {

@@ -32,7 +32,7 @@ from maasi_msgs.msg import (
 )
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.planner_node import PlannerNode
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 
 ROBOTS = ('a', 'b')
 START = {'a': (0.5, 0.5), 'b': (1.5, 1.5)}

@@ -3,14 +3,15 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 from node_kinds import KINDS
+from waiting import wait_until
 
-from maasi_sim.run.processes import Domain, find_executable
+from maasi_sim.run.domain import Domain
+from maasi_sim.run.processes import NodeProcess, find_executable, stop
 
 PATIENCE = 120.0
 # What a process has mapped at a moment of its start.
@@ -25,26 +26,12 @@ NODES = {
     'turtlebot': ('maasi_drivers', 'turtlebot_driver'),
     'sim': ('maasi_sim', 'sim_node'),
 }
-FORK = """
-import sys, time
-from pathlib import Path
-from maasi_sim.run.processes import NodeProcess
-from maasi_sim.warm_up import main_of
-main = main_of('maasi_filter', 'filter_node')
-node = NodeProcess('/node', sys.argv[2:], Path(sys.argv[1]), {}, main)
-node.start()
-print(node.pid, flush=True)
-while node.running:
-    time.sleep(0.002)
-print(node.how_it_ended(), flush=True)
-"""
 
 
 @pytest.fixture
 def environment():
     with Domain() as domain:
-        # A process with threads of BLAS would not be forked.
-        yield {**os.environ, **domain.environment(), 'OPENBLAS_NUM_THREADS': '1'}
+        yield {**os.environ, **domain.environment()}
 
 
 def wait_for(pid, library):
@@ -101,20 +88,14 @@ def test_run_scenario_says_no_more_than_that_it_was_interrupted(tmp_path, enviro
 
 @pytest.mark.parametrize('moment', ['ROS imports', 'node is made'])
 def test_a_forked_node_says_nothing(tmp_path, environment, moment):
-    log = tmp_path / 'log'
-    command = [sys.executable, '-c', FORK, str(log), 'filter_node']
-    with subprocess.Popen(
-        [*command, *arguments('filter', tmp_path)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            node = int(process.stdout.readline())
-            wait_for(node, MOMENTS[moment])
-            os.kill(node, signal.SIGINT)
-            ending, _ = process.communicate(timeout=PATIENCE)
-        finally:
-            process.kill()
-    assert ending.strip() in ('exited with 0', 'was killed by SIGINT'), log.read_text()
-    assert 'Traceback' not in log.read_text()
+    command = [str(find_executable('maasi_filter', 'filter_node')), *arguments('filter', tmp_path)]
+    node = NodeProcess('/node', command, tmp_path / 'log', 'maasi_filter', environment)
+    node.start()
+    try:
+        wait_for(node.pid, MOMENTS[moment])
+        node.signal(signal.SIGINT)
+        wait_until(lambda: not node.running)
+    finally:
+        stop([node])
+    assert node.how_it_ended() in ('exited with 0', 'was killed by SIGINT'), node.last_words()
+    assert 'Traceback' not in node.last_words(100)

@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 from waiting import wait_until
 
 from maasi_filter.ros.executor import executor_of
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 
 CYCLES = 20
 

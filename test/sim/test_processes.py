@@ -1,29 +1,17 @@
-"""Processes of a run: domains, endings, and that nothing is left over."""
+"""Nodes as processes: how they start and end, and that nothing is left over."""
 
 import os
 import signal
-import socket
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
+from node_kinds import KINDS
 from waiting import PATIENCE, wait_until
 
-from maasi_sim.run.processes import Domain, NodeProcess, ProcessError, find_executable, stop
-
-
-def alive(pid):
-    try:
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
-    except OSError:
-        return False
-
-
-def python(tmp_path, code, name='/node'):
-    log = tmp_path / f'{name.strip("/")}.log'
-    return NodeProcess(name, [sys.executable, '-u', '-c', code], log)
-
+from maasi_sim.run.processes import NodeProcess, ProcessError, find_executable, stop
 
 READY = 'print("ready", flush=True)\n'
 WAIT = 'import signal\n' + READY + 'signal.pause()\n'
@@ -35,6 +23,34 @@ IGNORE_INTERRUPT = (
 IGNORE_ALL = IGNORE_INTERRUPT.replace(
     'signal.SIG_IGN)\n', 'signal.SIG_IGN)\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n', 1
 )
+# A run whose nodes ignore all signals.
+RUN = """
+import signal, sys
+from pathlib import Path
+from maasi_sim.run.processes import NodeProcess
+if __name__ == '__main__':
+    nodes = [
+        NodeProcess('/node', [sys.executable, '-u', '-c', sys.argv[2]], Path(sys.argv[1]) / 'node'),
+        NodeProcess('/own', [sys.argv[3], '--help'], Path(sys.argv[1]) / 'own', 'maasi_filter'),
+    ]
+    for node in nodes:
+        node.start()
+    print(nodes[0].pid, flush=True)
+    signal.pause()
+"""
+
+
+def alive(pid):
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except OSError:
+        return False
+
+
+def python(tmp_path, code, name='/node', **environment):
+    log = tmp_path / f'{name.strip("/")}.log'
+    command = [sys.executable, '-u', '-c', textwrap.dedent(code)]
+    return NodeProcess(name, command, log, environment=environment)
 
 
 def started(process):
@@ -43,125 +59,74 @@ def started(process):
     return process
 
 
-def test_domains_are_not_shared(monkeypatch):
-    profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-    monkeypatch.delenv(profiles, raising=False)
-    with Domain() as first, Domain() as second:
-        assert first.number != second.number
-        assert 1 <= first.number <= 101
-        variables = first.environment()
-        assert Path(variables.pop(profiles)).exists()
-        assert variables == {
-            'ROS_DOMAIN_ID': str(first.number),
-            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        }
-        monkeypatch.setenv(profiles, 'of the user')
-        assert profiles not in first.environment()
+def ended(process):
+    process.start()
+    wait_until(lambda: not process.running)
+    return process
 
 
-def test_a_domain_that_was_asked_for_is_given_once(tmp_path):
-    with Domain(57, str(tmp_path)) as domain:
-        assert domain.number == 57
-        with pytest.raises(ProcessError, match='57 is used by another run'):
-            Domain(57, str(tmp_path))
-    Domain(57, str(tmp_path)).release()
-
-
-def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_path):
-    with Domain(57, str(tmp_path), team='team_a'):
-        with Domain(57, str(tmp_path), team='team/b', shared=True) as second:
-            assert second.number == 57
-            with pytest.raises(ProcessError, match='namespace /team/b in 57 is used by another'):
-                Domain(57, str(tmp_path), team='team/b', shared=True)
-            with pytest.raises(ProcessError, match='namespace /team_a in 57 is used by another'):
-                Domain(57, str(tmp_path), team='team_a', shared=True)
-            with pytest.raises(ProcessError, match='domain id: 57 is used by another run'):
-                Domain(57, str(tmp_path), team='team_c')
-        Domain(57, str(tmp_path), team='team/b', shared=True).release()
-
-
-@pytest.mark.parametrize('number', [-1, 102])
-def test_domains_that_do_not_exist_are_refused(number):
-    with pytest.raises(ProcessError, match='0 to 101'):
-        Domain(number)
-
-
-def test_a_domain_with_other_nodes_is_left_to_them():
-    with Domain() as domain:
-        number = domain.number
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(('', 7400 + 250 * number))
-        with Domain() as domain:
-            assert domain.number != number
-
-
-def test_the_lock_ends_with_the_process(tmp_path):
-    code = (
-        'import os, sys\nfrom maasi_sim.run.processes import Domain\n'
-        'Domain(33, sys.argv[1])\nos.kill(os.getpid(), 9)\n'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', code, str(tmp_path)], check=False, timeout=PATIENCE
-    )
-    assert done.returncode == -signal.SIGKILL
-    Domain(33, str(tmp_path)).release()
-
-
-def test_a_domain_is_locked_without_a_file():
-    """In a shared folder another user could have put a link in the place of one."""
-    code = (
-        'import os, sys\n'
-        'import maasi_filter.ros.loopback\nfrom maasi_sim.run.processes import Domain\n'
-        'def note(event, words):\n'
-        "    made = event == 'open' and isinstance(words[2], int) and words[2] & os.O_CREAT\n"
-        "    if made or event in ('os.mkdir', 'os.chmod', 'os.link', 'os.symlink'):\n"
-        '        print(event, *words)\n'
-        'sys.addaudithook(note)\nDomain().release()\n'
-    )
-    done = subprocess.run(
-        [sys.executable, '-B', '-c', code],
-        check=True,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-    )
-    assert done.stdout == ''
+def of_suite(tmp_path, *arguments, log='log'):
+    """Return a node of this suite, which inherits what the server has loaded."""
+    command = [str(find_executable('maasi_filter', 'filter_node')), '--ros-args', *arguments]
+    return NodeProcess('/node', command, tmp_path / log, 'maasi_filter')
 
 
 def test_a_process_writes_its_log_and_says_how_it_ended(tmp_path):
-    process = python(tmp_path, 'print("hello"); raise SystemExit(3)')
-    process.start()
-    wait_until(lambda: not process.running)
+    process = ended(python(tmp_path, 'print("hello"); raise SystemExit(3)'))
     assert process.code == 3
     assert process.how_it_ended() == 'exited with 3'
     assert process.last_words() == 'hello'
 
 
 def test_a_restart_goes_on_in_the_same_log(tmp_path):
-    process = python(tmp_path, 'print("hello")')
-    process.start()
-    wait_until(lambda: not process.running)
+    process = ended(python(tmp_path, 'print("hello")'))
     process.restart()
     wait_until(lambda: not process.running)
     assert process.restarts == 1
     assert process.last_words().splitlines() == ['hello', '--- start number 2 ---', 'hello']
 
 
-def test_environment_is_passed_on(tmp_path):
-    code = 'import os; print(os.environ["ROS_DOMAIN_ID"])'
-    process = NodeProcess(
-        '/node', [sys.executable, '-c', code], tmp_path / 'log', {'ROS_DOMAIN_ID': '44'}
+def test_output_and_environment_are_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv('OF_THE_RUN', 'run')
+    process = ended(
+        python(
+            tmp_path,
+            """
+            import os, sys
+            print(os.environ['ROS_DOMAIN_ID'], os.environ['OF_THE_RUN'], sys.stdin.read() == '')
+            print(os.getsid(0) == os.getpid(), file=sys.stderr)
+            os.system('echo of a child of the node')
+            """,
+            ROS_DOMAIN_ID='44',
+        )
     )
-    process.start()
-    wait_until(lambda: not process.running)
-    assert process.last_words() == '44'
+    assert process.last_words().splitlines() == ['44 run True', 'True', 'of a child of the node']
 
 
-def test_what_cannot_be_started_is_named(tmp_path):
+def test_a_node_that_cannot_be_executed_ends_and_says_why(tmp_path):
     process = NodeProcess('/node', [str(tmp_path / 'missing')], tmp_path / 'log')
-    with pytest.raises(ProcessError, match='/node: cannot be started'):
-        process.start()
     assert process.code is None and not process.running
+    assert ended(process).code == 1
+    assert 'FileNotFoundError' in process.last_words()
+
+
+def test_a_node_of_the_suite_is_shown_by_its_command_and_ends_as_it_says(tmp_path, domain):
+    KINDS['filter'].write(tmp_path / 'node.yaml')
+    process = of_suite(tmp_path, '--params-file', str(tmp_path / 'node.yaml'))
+    process.start()
+    line = Path(f'/proc/{process.pid}/cmdline')
+    wait_until(lambda: line.read_bytes().rstrip(bytes(1)).decode() == ' '.join(process.command))
+    assert os.getsid(process.pid) == process.pid
+    stop([process])
+    assert process.how_it_ended() in ('exited with 0', 'was killed by SIGINT')
+
+
+@pytest.mark.parametrize('log', ['log', 'full'])
+def test_a_node_of_the_suite_that_refuses_its_input_says_so(tmp_path, domain, log):
+    (tmp_path / 'full').symlink_to('/dev/full')
+    process = ended(of_suite(tmp_path, '--params-file', str(tmp_path / 'missing.yaml'), log=log))
+    assert process.code not in (0, None)
+    assert log == 'full' or 'missing.yaml' in (tmp_path / 'log').read_text()
 
 
 def test_interrupt_ends_what_listens(tmp_path):
@@ -184,37 +149,45 @@ def test_what_listens_to_nothing_is_killed(tmp_path):
 
 
 def test_stopping_what_has_ended_or_never_started_does_nothing(tmp_path):
-    ended = python(tmp_path, '')
-    ended.start()
-    wait_until(lambda: not ended.running)
-    assert stop([ended, python(tmp_path, '', '/other')]) == []
+    assert stop([ended(python(tmp_path, '')), python(tmp_path, '', '/other')]) == []
 
 
-def test_ctrl_c_in_the_terminal_does_not_reach_the_node(tmp_path):
-    process = started(python(tmp_path, WAIT))
-    assert os.getpgid(process.pid) != os.getpgid(0)
-    stop([process])
+def test_signals_of_the_run_are_not_those_of_the_node(tmp_path):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        process = started(python(tmp_path, WAIT))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert stop([process]) == []
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
 def test_nodes_do_not_outlive_a_killed_run(tmp_path, number):
-    code = (
-        'import signal, sys\nfrom pathlib import Path\n'
-        'from maasi_sim.run.processes import NodeProcess\n'
-        f'node = NodeProcess("/node", [sys.executable, "-u", "-c", {IGNORE_ALL!r}],'
-        ' Path(sys.argv[1]) / "log")\n'
-        'node.start()\nprint(node.pid, flush=True)\nsignal.pause()\n'
-    )
+    own = find_executable('maasi_filter', 'filter_node')
+    (tmp_path / 'run.py').write_text(RUN)
     run = subprocess.Popen(
-        [sys.executable, '-u', '-c', code, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, '-u', str(tmp_path / 'run.py'), str(tmp_path), IGNORE_ALL, str(own)],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     pid = int(run.stdout.readline())
-    wait_until(lambda: 'ready' in (tmp_path / 'log').read_text())
-    assert alive(pid)
+    wait_until(lambda: 'ready' in (tmp_path / 'node').read_text())
+    server = int(Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[1])
+    assert alive(pid) and server != run.pid
     run.send_signal(number)
     run.wait(PATIENCE)
     run.stdout.close()
-    wait_until(lambda: not alive(pid))
+    wait_until(lambda: not alive(pid) and not alive(server))
+
+
+def test_a_dead_server_is_started_again(tmp_path):
+    process = started(python(tmp_path, WAIT))
+    server = int(Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()[1])
+    assert os.getsid(server) == server
+    os.kill(server, signal.SIGKILL)
+    wait_until(lambda: not process.running)
+    assert not alive(process.pid)
+    assert ended(python(tmp_path, 'print(1)')).code == 0
 
 
 def test_unknown_packages_and_executables_are_named(tmp_path, monkeypatch):
@@ -231,14 +204,3 @@ def test_unknown_packages_and_executables_are_named(tmp_path, monkeypatch):
     executable.write_text('#!/bin/sh\n')
     executable.chmod(0o755)
     assert find_executable('maasi_here', 'some_node') == executable
-
-
-def test_a_run_says_that_the_loopback_interface_is_down():
-    code = 'from maasi_sim.run.run_scenario import main; raise SystemExit(main(["mambo"]))'
-    # A network namespace of its own has a loopback interface that is down.
-    alone = ['unshare', '--map-root-user', '--net']
-    if subprocess.run([*alone, 'true'], capture_output=True).returncode:
-        pytest.skip('no network namespaces here')
-    done = subprocess.run([*alone, sys.executable, '-c', code], capture_output=True, text=True)
-    assert done.returncode == 2
-    assert 'error: the loopback interface cannot be used' in done.stderr

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.ros.conversions import MarkerBoard
 from maasi_sim.missions import load_mission
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.scenario.loading import config_folder
 

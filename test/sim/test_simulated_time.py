@@ -16,7 +16,7 @@ from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.qos import RELIABLE, UPDATES
 from maasi_msgs.msg import AgentState, BatchMember, FilterUpdate, MeasurementBatch, PlanDecision
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
 
 SECOND = 1_000_000_000
 TIMEOUT = 0.3

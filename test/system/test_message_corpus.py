@@ -1,12 +1,9 @@
 """Hundreds of bad messages to every topic, service and action of every node, over DDS."""
 
-import json
 import os
-import subprocess
-import sys
+import signal
 import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 import rclpy
@@ -23,7 +20,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
-from waiting import wait_until
+from waiting import PATIENCE, wait_until
 
 from maasi_filter.ros.clocks import stamp_problem
 from maasi_filter.ros.qos import RELIABLE, SENSOR_READER, UPDATES
@@ -37,7 +34,8 @@ from maasi_msgs.msg import (
     LockstepDone,
     MeasurementBatch,
 )
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.domain import Domain
+from maasi_sim.run.processes import NodeProcess, find_executable, stop
 
 ROUNDS = 24
 # Of bad stamps per topic, at the end: the counters have to be exact.
@@ -59,7 +57,7 @@ class World:
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
         self.names, self.status, self.heard, self._publishers = {}, {}, {}, {}
-        items = []
+        self.processes = {}
         for kind in NODES:
             made = KINDS[kind]
             namespace = f'/{kind}{made.namespace}'
@@ -68,23 +66,13 @@ class World:
             made.write(file, **CHANGES.get(kind, {}))
             package, *_, executable = made.module.split('.')
             words = ['--ros-args', '--remap', f'__ns:={namespace}']
-            items.append(
-                {
-                    'name': kind,
-                    'package': package,
-                    'executable': executable,
-                    'arguments': [*words, '--params-file', str(file)],
-                    'log': str(folder / f'{kind}.log'),
-                }
+            self.processes[kind] = NodeProcess(
+                kind,
+                [str(find_executable(package, executable)), *words, '--params-file', str(file)],
+                folder / f'{kind}.log',
+                package,
             )
-        (folder / 'nodes.json').write_text(json.dumps(items))
-        script = Path(__file__).parent / 'start_nodes.py'
-        with (folder / 'ended.txt').open('w') as ended:
-            self.process = subprocess.Popen(
-                [sys.executable, str(script), str(folder / 'nodes.json')],
-                stdin=subprocess.PIPE,
-                stdout=ended,
-            )
+            self.processes[kind].start()
         self.folder = folder
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_status, 50)
 
@@ -100,10 +88,9 @@ class World:
         wait_until(condition, self.turn, what)
 
     def turn(self):
-        assert self.process.poll() is None, 'the nodes are gone'
-        ended = (self.folder / 'ended.txt').read_text().split('\n')[1:]
-        for line in filter(None, ended):
-            pytest.fail(f'{line}:\n{self.log(line.split()[0])}')
+        for kind, process in self.processes.items():
+            if not process.running:
+                pytest.fail(f'{kind} {process.how_it_ended()}:\n{self.log(kind)}')
         self.executor.spin_once(timeout_sec=0.05)
 
     def namespace(self, kind):
@@ -195,8 +182,7 @@ def running(folder):
         try:
             yield world
         finally:
-            world.process.kill()
-            world.process.wait()
+            stop(list(world.processes.values()), [(signal.SIGKILL, PATIENCE)])
             world.executor.shutdown()
             world.node.destroy_node()
             rclpy.shutdown(context=context)

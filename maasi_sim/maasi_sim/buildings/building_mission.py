@@ -33,10 +33,6 @@ class BuildingMission:
         """See `Mission.plan_nodes`."""
         return plan_nodes(self.scenario, run)
 
-    def warm_up(self) -> None:
-        """See `Mission.warm_up`."""
-        warm_up_buildings()
-
     def cameras(self) -> list[str]:
         """Return nothing: snapshots are simulated by the planners."""
         return []

@@ -112,9 +112,6 @@ class Mission(Protocol[Record]):
             If a link cannot keep this pace.
         """
 
-    def warm_up(self) -> None:
-        """Compile the kernels that its nodes use, or load them from the cache."""
-
     def cameras(self) -> list[str]:
         """Return the robots whose images are shown."""
 

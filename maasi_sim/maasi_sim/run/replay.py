@@ -9,8 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import NodePlan
-from maasi_sim.run.processes import Domain, NodeProcess, find_executable, stop
+from maasi_sim.run.processes import NodeProcess, find_executable, stop
 from maasi_sim.run.recording import FILTER, Recording, plain, read_recording
 from maasi_sim.run.replay_node import ReplayNode
 from maasi_sim.run.run_folder import make_folder, write_text
@@ -93,7 +94,7 @@ def _process(facts: dict[str, Any], namespace: str, folder: Path) -> NodeProcess
     write_text(parameters, plan.parameter_text())
     executable = find_executable(plan.package, plan.executable)
     log = folder / f'{plan.file_name}.log'
-    return NodeProcess(plan.full_name, plan.command(executable, parameters), log)
+    return NodeProcess(plan.full_name, plan.command(executable, parameters), log, plan.package)
 
 
 def _feed(

@@ -3,46 +3,42 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import sys
 
 from maasi_sim.run.ending import NOT_WRITTEN, WRONG_INPUT
 from maasi_sim.run.interruption import Interruption
+from maasi_sim.run.node_server import start_server
 from maasi_sim.run.run_options import parse
-
-# One thread for each linear algebra library: there is a process for each node already.
-_NODE_ENVIRONMENT = {
-    'PYTHONUNBUFFERED': '1',
-    'OMP_NUM_THREADS': '1',
-    'OPENBLAS_NUM_THREADS': '1',
-    'MKL_NUM_THREADS': '1',
-}
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     interruption = Interruption()
-    for key, value in _NODE_ENVIRONMENT.items():
-        os.environ.setdefault(key, value)
     # ROS has its logs there.
     os.environ.setdefault('HOME', os.path.abspath(os.path.expanduser('~')))
     options = parse(arguments)
-    # NumPy reads the environment when it is imported.
+    # Nodes load what they share while this process loads what is its own.
+    start_server()
+    gc.disable()
     from maasi_sim.run.bag import BagError, BagWriteError
+    from maasi_sim.run.domain import DomainError
     from maasi_sim.run.processes import ProcessError
+    from maasi_sim.run.replay import replay
     from maasi_sim.run.run_folder import ResultsError
     from maasi_sim.run.scenario_run import ScenarioRun
     from maasi_sim.scenario.layering import ScenarioError
 
+    # Modules are never garbage.
+    gc.freeze()
+    gc.enable()
     try:
         if options.replay is not None:
-            # rclpy starts threads, which a scenario run must not have yet.
-            from maasi_sim.run.replay import replay
-
             stop_asked = interruption.__bool__
             return replay(options.replay, options.out, options.domain_id, stop_asked)
         return ScenarioRun(options, interruption).execute()
-    except (ScenarioError, ProcessError, BagError, ResultsError) as error:
+    except (ScenarioError, DomainError, ProcessError, BagError, ResultsError) as error:
         with contextlib.suppress(OSError):
             for line in str(error).splitlines():
                 print(f'error: {line}', file=sys.stderr)

@@ -7,10 +7,11 @@ import signal
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import BagError
+from maasi_sim.run.domain import Domain
 from maasi_sim.run.ending import DONE, NODE_FAILED, NOT_ALL_FOUND, NOT_WRITTEN
 from maasi_sim.run.interruption import Interruption
 from maasi_sim.run.node_plan import (
@@ -20,21 +21,19 @@ from maasi_sim.run.node_plan import (
     with_followed_clock,
     with_saved_state,
 )
-from maasi_sim.run.processes import Domain
+from maasi_sim.run.node_server import wait_for_server
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.report_files import StoredReport, store_report
 from maasi_sim.run.run_folder import ResultsError, make_folder, write_text
 from maasi_sim.run.run_options import Options, ViewOptions
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.rviz_view import view_text
+from maasi_sim.run.session import Session
 from maasi_sim.run.supervisor import Supervisor
 from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning
 from maasi_sim.view.live_view import RunPage
 from maasi_sim.view.messages import read_events
 from maasi_sim.view.page_file import REPLAY, write_replay
-
-if TYPE_CHECKING:
-    from maasi_sim.run.session import Session
 
 
 class ScenarioRun:
@@ -94,9 +93,6 @@ class ScenarioRun:
             )
             for text in self._doubts:
                 self.display.say(f'warning: {text}')
-            # An interruption here is reported once `Session` starts.
-            with self.interruption.at_once():
-                self.supervisor.load(self.mission.warm_up)
             return self._execute(domain)
 
     def _plan(self) -> list[NodePlan]:
@@ -117,19 +113,18 @@ class ScenarioRun:
         session: Session | None = None
         page: RunPage | None = None
         try:
-            # First, while this process has a single thread.
-            if not self.interruption:
-                self.supervisor.start()
             if self.options.view is not None:
                 page = self._page(self.options.view, domain.number)
-            # rclpy starts threads when it is imported, and a process with threads is not forked.
-            from maasi_sim.run.session import Session
-
             session = Session(
                 self.mission, self.supervisor, self.options, self.interruption, self.display
             )
             session.listener = None if page is None else page.put
             session.open(domain.number, self.folder)
+            # At once: the session reports it.
+            with self.interruption.at_once():
+                wait_for_server()
+            if not self.interruption:
+                self.supervisor.start()
             session.run()
             if session.is_followed:
                 session.close_bag()

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from maasi_sim.run.ending import NODE_FAILED, Ending
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.node_watch import NodeWatch
 from maasi_sim.run.processes import NodeProcess, find_executable, stop
 from maasi_sim.run.progress import ProgressDisplay
+from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.run_folder import ResultsError, write_text
 from maasi_sim.run.run_options import Options
 from maasi_sim.scenario.base import BaseScenario
-from maasi_sim.warm_up import main_of, prepare_copies
-
-if TYPE_CHECKING:
-    from maasi_sim.run.recorder_node import Recorder
 
 # Wall time between two checks of the processes, where steps come in quick succession [s].
 _CHECK_PERIOD = 0.05
@@ -90,20 +87,6 @@ class Supervisor:
         self.processes = {
             plan.full_name: _process(plan, parameters, folder, options.log_level) for plan in plans
         }
-
-    def load(self, warm_up: Callable[[], None]) -> None:
-        """Import and compile the shared code once, for nodes that are forked from this process.
-
-        Parameters
-        ----------
-        warm_up : callable
-            Compiles the kernels of the mission, or loads them.
-        """
-        for plan in self.plans:
-            self.processes[plan.full_name].main = main_of(plan.package, plan.executable)
-        if any(process.main is not None for process in self.processes.values()):
-            warm_up()
-            prepare_copies()
 
     def start(self) -> None:
         """Start all nodes."""
@@ -254,4 +237,4 @@ def _process(plan: NodePlan, parameters: Path, folder: Path, level: str | None) 
     path = parameters / f'{plan.file_name}.yaml'
     write_text(path, plan.parameter_text())
     command = plan.command(find_executable(plan.package, plan.executable), path, level)
-    return NodeProcess(plan.full_name, command, folder / f'{plan.file_name}.log')
+    return NodeProcess(plan.full_name, command, folder / f'{plan.file_name}.log', plan.package)

@@ -23,7 +23,6 @@ from maasi_sim.targets.observer import TargetObserver
 from maasi_sim.targets.report import build_report, summary
 from maasi_sim.targets.tables import csv_text, found_rows, geojson_text
 from maasi_sim.targets.tally import TargetRecord
-from maasi_sim.warm_up import warm_up_search
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,10 +44,6 @@ class TargetMission:
     def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
         """See `Mission.plan_nodes`."""
         return plan_nodes(self.scenario, run)
-
-    def warm_up(self) -> None:
-        """See `Mission.warm_up`."""
-        warm_up_search()
 
     def cameras(self) -> list[str]:
         """See `Mission.cameras`."""

@@ -1,8 +1,10 @@
-"""What killed processes leave in shared memory goes; what a live one uses, or owns, stays."""
+"""ROS domains of runs; of shared memory, what killed processes leave goes, and the rest stays."""
 
 import mmap
 import os
 import re
+import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -11,9 +13,8 @@ from pathlib import Path
 import pytest
 from waiting import PATIENCE, wait_until
 
-from maasi_sim.run import shared_memory
-from maasi_sim.run.processes import Domain
-from maasi_sim.run.shared_memory import remove_dead
+from maasi_sim.run import domain as domain_module
+from maasi_sim.run.domain import Domain, DomainError, remove_dead
 
 SHARED = Path('/dev/shm')
 NODE = """
@@ -148,10 +149,106 @@ def test_what_another_user_put_there_is_left(folder, monkeypatch):
     os.mkfifo(folder / 'fastrtps_port7413')
     assert remove_dead(folder=folder) == []
     write(folder, 'fastrtps_port7415')
-    monkeypatch.setattr(shared_memory.os, 'getuid', lambda: -1)
+    monkeypatch.setattr(domain_module.os, 'getuid', lambda: -1)
     assert remove_dead(folder=folder) == []
     assert len(list(folder.iterdir())) == 4
 
 
 def test_there_may_be_no_shared_memory(folder):
     assert remove_dead(folder / 'missing') == []
+
+
+def test_domains_are_not_shared(monkeypatch):
+    profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+    monkeypatch.delenv(profiles, raising=False)
+    with Domain() as first, Domain() as second:
+        assert first.number != second.number
+        assert 1 <= first.number <= 101
+        variables = first.environment()
+        assert Path(variables.pop(profiles)).exists()
+        assert variables == {
+            'ROS_DOMAIN_ID': str(first.number),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        }
+        monkeypatch.setenv(profiles, 'of the user')
+        assert profiles not in first.environment()
+
+
+def test_a_domain_that_was_asked_for_is_given_once(tmp_path):
+    with Domain(57, str(tmp_path)) as domain:
+        assert domain.number == 57
+        with pytest.raises(DomainError, match='57 is used by another run'):
+            Domain(57, str(tmp_path))
+    Domain(57, str(tmp_path)).release()
+
+
+def test_runs_of_several_teams_share_a_domain_where_they_follow_its_clock(tmp_path):
+    with Domain(57, str(tmp_path), team='team_a'):
+        with Domain(57, str(tmp_path), team='team/b', shared=True) as second:
+            assert second.number == 57
+            with pytest.raises(DomainError, match='namespace /team/b in 57 is used by another'):
+                Domain(57, str(tmp_path), team='team/b', shared=True)
+            with pytest.raises(DomainError, match='namespace /team_a in 57 is used by another'):
+                Domain(57, str(tmp_path), team='team_a', shared=True)
+            with pytest.raises(DomainError, match='domain id: 57 is used by another run'):
+                Domain(57, str(tmp_path), team='team_c')
+        Domain(57, str(tmp_path), team='team/b', shared=True).release()
+
+
+@pytest.mark.parametrize('number', [-1, 102])
+def test_domains_that_do_not_exist_are_refused(number):
+    with pytest.raises(DomainError, match='0 to 101'):
+        Domain(number)
+
+
+def test_a_domain_with_other_nodes_is_left_to_them():
+    with Domain() as domain:
+        number = domain.number
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(('', 7400 + 250 * number))
+        with Domain() as domain:
+            assert domain.number != number
+
+
+def test_the_lock_ends_with_the_process(tmp_path):
+    code = (
+        'import os, sys\nfrom maasi_sim.run.domain import Domain\n'
+        'Domain(33, sys.argv[1])\nos.kill(os.getpid(), 9)\n'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code, str(tmp_path)], check=False, timeout=PATIENCE
+    )
+    assert done.returncode == -signal.SIGKILL
+    Domain(33, str(tmp_path)).release()
+
+
+def test_a_domain_is_locked_without_a_file():
+    """In a shared folder another user could have put a link in the place of one."""
+    code = (
+        'import os, sys\n'
+        'from maasi_sim.run.domain import Domain\n'
+        'def note(event, words):\n'
+        "    made = event == 'open' and isinstance(words[2], int) and words[2] & os.O_CREAT\n"
+        "    if made or event in ('os.mkdir', 'os.chmod', 'os.link', 'os.symlink'):\n"
+        '        print(event, *words)\n'
+        'sys.addaudithook(note)\nDomain().release()\n'
+    )
+    done = subprocess.run(
+        [sys.executable, '-B', '-c', code],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert done.stdout == ''
+
+
+def test_a_run_says_that_the_loopback_interface_is_down():
+    code = 'from maasi_sim.run.run_scenario import main; raise SystemExit(main(["mambo"]))'
+    # A network namespace of its own has a loopback interface that is down.
+    alone = ['unshare', '--map-root-user', '--net']
+    if subprocess.run([*alone, 'true'], capture_output=True).returncode:
+        pytest.skip('no network namespaces here')
+    done = subprocess.run([*alone, sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert 'error: the loopback interface cannot be used' in done.stderr

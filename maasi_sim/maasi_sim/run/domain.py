@@ -1,0 +1,218 @@
+"""ROS domains of runs, and the shared memory that processes with Fast DDS leave in them."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import re
+import signal
+import socket
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+from maasi_filter.ros.loopback import loopback_fault
+
+# Domains whose ports lie below the ephemeral ports of Linux (from 32768).
+DOMAINS = range(0, 102)
+# Environment variable of the profiles of Fast DDS.
+_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+# A port or a segment, its locks, and the semaphore under which a port is opened (Fast DDS 2.14).
+_NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
+# Ports of the RTPS specification: this many for each domain, from this one.
+FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
+# First word of a memory that its creator has made ready (Boost.Interprocess).
+_READY = (2).to_bytes(4, sys.byteorder)
+
+
+class DomainError(RuntimeError):
+    """No domain is free, or it cannot be used."""
+
+
+class Domain:
+    """A ROS domain that no other run on this host uses, until `release`.
+
+    A domain, and a namespace in it, is locked by the name of an abstract Unix socket: it is valid
+    for all users, makes no file, and ends with the process.
+
+    Parameters
+    ----------
+    number : int, optional
+        The domain to use; the first free one from 1 if not given (0 is the ROS default).
+    purpose : str
+        Locks of different purposes are independent.
+    team : str
+        Namespace of the run.
+    shared : bool
+        Whether other runs, in other namespaces, may use it as well.
+
+    Raises
+    ------
+    DomainError
+        If the requested one is used by another run or not from 0 to 101, if none is free, or if
+        the loopback interface, through which nodes discover each other, is down.
+    """
+
+    def __init__(
+        self,
+        number: int | None = None,
+        purpose: str = 'run',
+        *,
+        team: str = '',
+        shared: bool = False,
+    ) -> None:
+        if fault := loopback_fault():
+            raise DomainError(fault)
+        self._purpose = purpose
+        self._shared = shared
+        self._locks: list[socket.socket] = []
+        if number is not None and number not in DOMAINS:
+            raise DomainError(f'domain id: read {number}, allowed are 0 to {DOMAINS[-1]}')
+        for candidate in DOMAINS[1:] if number is None else [number]:
+            # A requested domain may be in use by other nodes.
+            if number is None and _port_used(FIRST_PORT + PORTS_PER_DOMAIN * candidate):
+                continue
+            problem = self._take(candidate, team, shared)
+            if not problem:
+                self.number = candidate
+                self._remove_dead()
+                return
+            if number is not None:
+                raise DomainError(f'domain id: {problem} is used by another run')
+        raise DomainError(f'no ROS domain from 1 to {DOMAINS[-1]} is free')
+
+    def _take(self, number: int, team: str, shared: bool) -> str:
+        """Lock a domain and a namespace in it; return the name of a taken one, else empty."""
+        wanted = {} if shared else {f'{number}': f'{number}'}
+        wanted[f'{number} {team}'] = f'namespace /{team} in {number}'
+        for name, words in wanted.items():
+            lock = self._lock(name)
+            if lock is None:
+                self._unlock()
+                return words
+            self._locks.append(lock)
+        return ''
+
+    def _lock(self, name: str) -> socket.socket | None:
+        # A digest, as the names of sockets are short.
+        digest = hashlib.sha256(f'{self._purpose} {name}'.encode()).hexdigest()
+        lock = socket.socket(socket.AF_UNIX)
+        try:
+            lock.bind(f'\0maasi {digest}')
+        except OSError:
+            lock.close()
+            return None
+        return lock
+
+    def environment(self) -> dict[str, str]:
+        """Return the variables that keep nodes in this domain, and on this host.
+
+        Without a profile of the user for Fast DDS, one with faster discovery is set.
+        """
+        variables = {
+            'ROS_DOMAIN_ID': str(self.number),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        }
+        if _PROFILES not in os.environ:
+            variables[_PROFILES] = str(Path(__file__).with_name('discovery.xml'))
+        return variables
+
+    def release(self) -> None:
+        """Release the domain; what killed nodes left in shared memory goes before."""
+        self._remove_dead()
+        self._unlock()
+
+    def _remove_dead(self) -> None:
+        # Nodes of other runs may be starting in a shared domain.
+        remove_dead(None if self._shared else self.number)
+
+    def _unlock(self) -> None:
+        while self._locks:
+            self._locks.pop().close()
+
+    def __enter__(self) -> Domain:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release it."""
+        self.release()
+
+
+def _port_used(port: int) -> bool:
+    """Return whether some process on this host listens on a UDP port."""
+    for table in ('/proc/net/udp', '/proc/net/udp6'):
+        try:
+            lines = Path(table).read_text().splitlines()[1:]
+        except OSError:
+            continue
+        if any(int(line.split()[1].rpartition(':')[2], 16) == port for line in lines):
+            return True
+    return False
+
+
+def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> list[str]:
+    """Remove segments and ports of this user that no process has open; return the removed files.
+
+    They fill the memory, and a process that opens a port whose creator died before it was ready
+    waits for ever, on this host in all domains.
+
+    Parameters
+    ----------
+    domain : int, optional
+        Domain that no process uses, of which all ports are removed; of others only those that were
+        never ready. New processes use the names of ports again, some of them in all domains: who
+        opens a port while it is removed shares it with nobody.
+    folder : Path
+        Where Fast DDS keeps them.
+    """
+    parts: dict[str, list[Path]] = defaultdict(list)
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if match := _NAME.fullmatch(path.name):
+            parts[match[1]].append(path)
+    removed = []
+    for name, paths in parts.items():
+        # Not the lock alone: without it Fast DDS takes the port of a dead reader for a live one.
+        if all(map(_is_unused, paths)) and _may_go(folder / name, domain):
+            for path in paths:
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                    removed.append(path.name)
+    return removed
+
+
+def _may_go(path: Path, domain: int | None) -> bool:
+    """Return whether no process can be about to open an unused port or segment again."""
+    number = path.name.removeprefix('fastrtps_port')
+    if number == path.name:
+        return True
+    if domain is not None and (int(number) - FIRST_PORT) // PORTS_PER_DOMAIN == domain:
+        return True
+    with contextlib.suppress(OSError), path.open('rb') as file:
+        return file.read(4) != _READY
+    return False
+
+
+def _is_unused(path: Path) -> bool:
+    """Return whether no process, of any container, has this user's file open or mapped.
+
+    Owners keep their locks open and their memory mapped while they live, also in creation. Linux
+    grants a lease for writing on a file only that is not open elsewhere.
+    """
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        if os.fstat(file).st_uid != os.getuid():
+            return False
+        # Who opens it meanwhile causes this signal, which is ignored by default, not SIGIO.
+        fcntl.fcntl(file, fcntl.F_SETSIG, signal.SIGURG)
+        fcntl.fcntl(file, fcntl.F_SETLEASE, fcntl.F_WRLCK)
+    except OSError:
+        return False
+    finally:
+        os.close(file)
+    return True
