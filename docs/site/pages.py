@@ -61,7 +61,6 @@ PARSERS = [
     'maasi_sim.view.view_run',
     'maasi_sim.experiments.reproduce',
     'maasi_sim.experiments.compare',
-    'maasi_sim.chaos.campaign',
     'maasi_planner.search_command',
     'maasi_drivers.robot_command',
     'maasi_drivers.calibrate_sensor',

@@ -1,9 +1,9 @@
 """Numbers on command lines: what is wrong is said in words, with what is allowed."""
 
+import campaign
 import pytest
 
 from maasi_sim.arguments import LARGEST, positive, whole
-from maasi_sim.chaos import campaign
 from maasi_sim.experiments import reproduce
 from maasi_sim.run import run_options
 

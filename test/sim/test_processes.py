@@ -186,7 +186,7 @@ def test_a_dead_server_is_started_again(tmp_path):
     assert os.getsid(server) == server
     os.kill(server, signal.SIGKILL)
     wait_until(lambda: not process.running)
-    assert not alive(process.pid)
+    wait_until(lambda: not alive(process.pid))
     assert ended(python(tmp_path, 'print(1)')).code == 0
 
 

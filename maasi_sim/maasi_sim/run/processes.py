@@ -75,6 +75,9 @@ class NodeProcess:
         ProcessError
             If it cannot be.
         """
+        # The node itself opens it.
+        with contextlib.suppress(OSError):
+            self.log.touch()
         environment = {**os.environ, **self.environment}
         self._process = node_process(self.package, self.command, self.log, environment)
         try:

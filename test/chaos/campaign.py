@@ -16,10 +16,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from chaos_cases import Case, all_cases
+from chaos_execution import execute
+from chaos_verdict import judge
+
 from maasi_sim.arguments import Parser, count, whole
-from maasi_sim.chaos.cases import Case, all_cases
-from maasi_sim.chaos.execution import execute
-from maasi_sim.chaos.verdict import judge
 
 PASSED, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 _SEED = 1

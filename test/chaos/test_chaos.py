@@ -4,20 +4,14 @@ import json
 import subprocess
 import sys
 
+import campaign
 import numpy as np
 import pytest
+from campaign import PASSED, WRONG_INPUT, Result, chosen_cases, main, summary
+from chaos_cases import SEARCH_NODES, Case, all_cases
+from chaos_execution import Outcome
+from chaos_verdict import judge
 
-from maasi_sim.chaos.campaign import (
-    PASSED,
-    WRONG_INPUT,
-    Result,
-    chosen_cases,
-    main,
-    summary,
-)
-from maasi_sim.chaos.cases import SEARCH_NODES, Case, all_cases
-from maasi_sim.chaos.execution import Outcome
-from maasi_sim.chaos.verdict import judge
 from maasi_sim.run.bag import BagWriter, TopicQos, load_types
 
 pytestmark = pytest.mark.system
@@ -33,7 +27,7 @@ def test_a_selection_of_the_campaign_passes(tmp_path):
     file = tmp_path / 'results.json'
     done = subprocess.run(
         [
-            *(sys.executable, '-m', 'maasi_sim.chaos.campaign', '--case', *SELECTION),
+            *(sys.executable, campaign.__file__, '--case', *SELECTION),
             *('--jobs', '3', '--json', str(file), '--out', str(tmp_path / 'runs')),
         ],
         stdout=subprocess.PIPE,

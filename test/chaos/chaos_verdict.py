@@ -6,10 +6,10 @@ import json
 import math
 
 import numpy as np
+from chaos_cases import SIM, Case
+from chaos_execution import Outcome
 from numpy.typing import NDArray
 
-from maasi_sim.chaos.cases import SIM, Case
-from maasi_sim.chaos.execution import Outcome
 from maasi_sim.run.bag import Bag, BagError
 
 FloatArray = NDArray[np.float64]

@@ -12,7 +12,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from maasi_sim.chaos.cases import PAUSE, Case
+from chaos_cases import PAUSE, Case
+
 from maasi_sim.scenario.layering import to_yaml
 
 # Longest wait for the moment of the fault, and for the end of the run after it [s].
