@@ -157,7 +157,7 @@ def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
     Raises
     ------
     ScenarioError
-        If it cannot be loaded. Another process tries: rclpy starts threads, and this one forks.
+        If it cannot be loaded; tried in another process, as a node would.
     """
     if driver in DRIVERS.own:
         return ()

@@ -115,7 +115,7 @@ class RunPage:
     ) -> None:
         self._control = None
         if options.control:
-            # rclpy starts threads when it is imported.
+            # Only this part of the view needs ROS.
             from maasi_sim.view.control_node import Control
 
             self._control = Control(domain, namespace)
