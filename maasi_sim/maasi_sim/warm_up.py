@@ -30,7 +30,7 @@ _MESSAGES = (
 def warm_up() -> None:
     """Compile, or load from the cache, the kernels of simulations."""
     _play_robots()
-    mission_of(load_cuboid_scenario('buildings_four')).run(1)
+    warm_up_buildings()
 
 
 def _play_robots() -> None:

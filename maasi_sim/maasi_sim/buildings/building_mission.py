@@ -10,7 +10,7 @@ from maasi_filter.ros.parameters import flatten
 from maasi_planner.buildings.settings import CuboidPlannerSettings, box_numbers, face_words
 from maasi_sim.buildings.observer import CuboidObserver, CuboidRecord
 from maasi_sim.buildings.report import build_cuboid_report, cuboid_summary
-from maasi_sim.buildings.scenario import CuboidScenario, warm_up_buildings
+from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
 
 if TYPE_CHECKING:
