@@ -11,7 +11,8 @@ import pytest
 from node_kinds import KINDS
 from waiting import PATIENCE, wait_until
 
-from maasi_sim.run.processes import NodeProcess, ProcessError, find_executable, stop
+from maasi_sim.run.node_server import ProcessError
+from maasi_sim.run.processes import NodeProcess, find_executable, stop
 
 READY = 'print("ready", flush=True)\n'
 WAIT = 'import signal\n' + READY + 'signal.pause()\n'
@@ -27,6 +28,7 @@ IGNORE_ALL = IGNORE_INTERRUPT.replace(
 RUN = """
 import signal, sys
 from pathlib import Path
+from maasi_sim.run.node_server import ProcessError
 from maasi_sim.run.processes import NodeProcess
 if __name__ == '__main__':
     nodes = [

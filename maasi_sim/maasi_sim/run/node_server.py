@@ -38,12 +38,16 @@ _ENVIRONMENT = {
 _context = multiprocessing.get_context('forkserver')
 
 
+class ProcessError(RuntimeError):
+    """A process cannot be started."""
+
+
 def start_server() -> None:
     """Start the server, which loads what nodes share while the caller goes on.
 
     Raises
     ------
-    OSError
+    ProcessError
         If it cannot be started.
     """
     _context.set_forkserver_preload([__name__])
@@ -55,15 +59,26 @@ def start_server() -> None:
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         forkserver.ensure_running()
+    except OSError as error:
+        raise ProcessError(f'the server of the nodes cannot be started: {error}') from error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         del os.environ[_STARTED_BY]
 
 
 def wait_for_server() -> None:
-    """Return once the server has loaded what nodes share."""
+    """Return once the server has loaded what nodes share.
+
+    Raises
+    ------
+    ProcessError
+        If it has ended instead.
+    """
     process = _context.Process(target=int)
-    process.start()
+    try:
+        process.start()
+    except (OSError, EOFError) as error:
+        raise ProcessError('the server of the nodes has ended: its error is above') from error
     process.join()
 
 

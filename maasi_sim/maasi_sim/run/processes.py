@@ -14,11 +14,7 @@ from pathlib import Path
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 from maasi_sim.run.domain import remove_dead
-from maasi_sim.run.node_server import node_process, start_server
-
-
-class ProcessError(RuntimeError):
-    """A process cannot be started."""
+from maasi_sim.run.node_server import ProcessError, node_process, start_server
 
 
 def find_executable(package: str, executable: str) -> Path:

@@ -9,7 +9,7 @@ import sys
 
 from maasi_sim.run.ending import NOT_WRITTEN, WRONG_INPUT
 from maasi_sim.run.interruption import Interruption
-from maasi_sim.run.node_server import start_server
+from maasi_sim.run.node_server import ProcessError, start_server
 from maasi_sim.run.run_options import parse
 
 
@@ -20,11 +20,14 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault('HOME', os.path.abspath(os.path.expanduser('~')))
     options = parse(arguments)
     # Nodes load what they share while this process loads what is its own.
-    start_server()
+    try:
+        start_server()
+    except ProcessError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return WRONG_INPUT
     gc.disable()
     from maasi_sim.run.bag import BagError, BagWriteError
     from maasi_sim.run.domain import DomainError
-    from maasi_sim.run.processes import ProcessError
     from maasi_sim.run.replay import replay
     from maasi_sim.run.run_folder import ResultsError
     from maasi_sim.run.scenario_run import ScenarioRun
