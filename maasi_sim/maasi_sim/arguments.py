@@ -24,13 +24,7 @@ class Parser(ArgumentParser):
 
 
 def whole(text: str, least: int = 0, most: int = LARGEST) -> int:
-    """Return a whole number of a command line.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If it is none, or not within the limits.
-    """
+    """Return a whole number of a command line."""
     # No sign, underscore or digits of another alphabet.
     number = int(text) if text.isascii() and text.isdecimal() and len(text) < 40 else -1
     if not least <= number <= most:

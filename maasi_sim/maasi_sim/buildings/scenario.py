@@ -111,13 +111,7 @@ def check_cuboid_scenario(
 def load_cuboid_scenario(
     path: str | Path, overrides: Mapping[str, tuple[Key, Any]] | None = None
 ) -> CuboidScenario:
-    """Read a scenario file of a search of buildings, as `load_scenario` does.
-
-    Raises
-    ------
-    ScenarioError
-        With file, line, key, what was read and what is allowed.
-    """
+    """Read a scenario file of a search of buildings, as `load_scenario` does."""
     layer = read_scenario(path)
     if not is_cuboid_scenario(layer):
         raise ScenarioError(f"{path}: planner.name: allowed is '{NAME}'")

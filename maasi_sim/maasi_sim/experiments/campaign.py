@@ -133,13 +133,6 @@ def carry_out(
 
     `advance` is called after each run. With a `machine`, all must have been made on it, also by
     workers that join later.
-
-    Raises
-    ------
-    NoRoom
-        If a run cannot be written; earlier ones are kept.
-    WorkersLost
-        If the workers are lost.
     """
     problems = []
     for task, run in workers.make(execute, work.tasks):

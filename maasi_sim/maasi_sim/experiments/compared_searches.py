@@ -104,11 +104,6 @@ def compared(
 
     `planners` and `filters` are values of `planner.name` and `filter.method`; without any, the
     scenario's own. `time_limit` is instead of the scenario's [s].
-
-    Raises
-    ------
-    ScenarioError
-        As `load_scenario`; and if the search cannot run in one process.
     """
     path = find_scenario(scenario)
     if is_cuboid_scenario(read_scenario(path)):

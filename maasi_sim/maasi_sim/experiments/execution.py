@@ -84,11 +84,6 @@ def carry_out_all(
     `workers` and `cluster` are those of `make_workers`; `mixed` allows runs of different
     processors or versions. `finished` is called when the runs of a campaign are done, and returns
     a line to print, '' for none.
-
-    Raises
-    ------
-    MixedWorkers, NoRoom, WorkersLost
-        See `one_machine` and `carry_out`; also if the cluster cannot be reached.
     """
     for work in campaigns:
         for complaint in work.complaints.values():

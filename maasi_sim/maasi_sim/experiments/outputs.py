@@ -71,13 +71,7 @@ def configuration_text(results: Results, seed: int) -> str:
 
 
 def write_outputs(folder: RunFolder, results: Results, seed: int) -> None:
-    """Write raw runs, tables, figure and configuration.
-
-    Raises
-    ------
-    NoRoom
-        If one cannot be written; the runs are stored already.
-    """
+    """Write raw runs, tables, figure and configuration."""
     experiment = results.experiment
     parts = [
         f'# {experiment.name}: {experiment.title}\n',
@@ -212,11 +206,6 @@ def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) ->
 
     Figures and tables are written to `reproduction/` beside the page; experiments and cases
     without runs keep theirs.
-
-    Raises
-    ------
-    NoRoom
-        If something cannot be written.
     """
     sections, shown = {}, []
     for name, experiment in experiments().items():

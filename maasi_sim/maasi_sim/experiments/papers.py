@@ -62,13 +62,7 @@ def experiments() -> dict[str, Experiment]:
 
 
 def find(name: str) -> Experiment:
-    """Return an experiment by its name.
-
-    Raises
-    ------
-    UnknownExperiment
-        Names the nearest ones.
-    """
+    """Return an experiment by its name."""
     known = experiments()
     if name in known:
         return known[name]

@@ -30,13 +30,7 @@ class NoRoom(OSError):
 
 
 def run_of(experiment: str, case: Case, number: int, seed: int, outcome: Outcome) -> Run:
-    """Return an outcome as a run on this machine.
-
-    Raises
-    ------
-    ValueError
-        If the columns differ in length.
-    """
+    """Return an outcome as a run on this machine."""
     columns = {name: np.asarray(values, float) for name, values in outcome.columns.items()}
     lengths = {len(values) for values in columns.values()}
     if len(lengths) > 1:
@@ -62,13 +56,7 @@ def to_text(run: Run) -> str:
 
 
 def load_run(path: Path) -> Run:
-    """Return the run in a file.
-
-    Raises
-    ------
-    DamagedRun
-        If anything is missing or changed.
-    """
+    """Return the run in a file."""
     try:
         content = json.loads(path.read_bytes())
         checksum, facts = content['sha256'], content['run']
@@ -85,13 +73,7 @@ def _checksum(facts: str) -> str:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file atomically: afterwards it is complete, or as before.
-
-    Raises
-    ------
-    NoRoom
-        If the disk is full or the folder is not writable.
-    """
+    """Write a file atomically: afterwards it is complete, or as before."""
     data = content.encode() if isinstance(content, str) else content
     draft = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
@@ -126,13 +108,7 @@ class RunFolder:
         return max((int(path.stem.rsplit('-', 1)[1]) for path in files), default=-1) + 1
 
     def load(self, case: Case, number: int, seed: int) -> Run | None:
-        """Return a stored run, None if there is none with these settings and seed.
-
-        Raises
-        ------
-        DamagedRun
-            If its file is damaged.
-        """
+        """Return a stored run, None if there is none with these settings and seed."""
         path = self.file(case, number)
         if not path.exists():
             return None

@@ -54,13 +54,7 @@ class Workers:
     def make(
         self, function: Callable[[Item], Any], items: Sequence[Item]
     ) -> Iterator[tuple[Item, Any]]:
-        """Yield each item with its result, in the order of completion.
-
-        Raises
-        ------
-        WorkersLost
-            If a worker died.
-        """
+        """Yield each item with its result, in the order of completion."""
         left = list(reversed(items))
         waiting: dict[Future[Any], Item] = {}
         try:
@@ -76,13 +70,7 @@ class Workers:
 
 
 def make_workers(number: int, wanted: int | None = None, cluster: str | None = None) -> Workers:
-    """Return workers for `number` runs: at most the wanted processes, or those of a Dask cluster.
-
-    Raises
-    ------
-    WorkersLost
-        If the cluster has no scheduler or no workers.
-    """
+    """Return workers for `number` runs: at most the wanted processes, or a Dask cluster's."""
     if cluster is not None:
         return _of_cluster(cluster)
     processes = min(wanted or os.cpu_count() or 1, number)

@@ -54,7 +54,6 @@ class Arming:
         ----------
         ready : collection of str
             Nodes that take part, with namespace.
-
         """
         if not self._clients:
             return

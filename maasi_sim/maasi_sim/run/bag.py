@@ -80,13 +80,7 @@ class TopicQos:
 
 
 def interface_folder(package: str) -> Path:
-    """Return the folder of a package's `.msg` files, installed or in this repository.
-
-    Raises
-    ------
-    BagError
-        If the package is in neither.
-    """
+    """Return the folder of a package's `.msg` files, installed or in this repository."""
     places = [Path(__file__).resolve().parents[3] / package / 'msg']
     try:
         from ament_index_python.packages import get_package_share_directory
@@ -173,13 +167,7 @@ class BagWriter:
         self._thread.start()
 
     def add_topic(self, topic: str, type_name: str, qos: TopicQos | None = None) -> None:
-        """Announce a topic, which is in the recording even without messages.
-
-        Raises
-        ------
-        BagError
-            If the type is unknown: neither Jazzy's nor one of the packages loaded.
-        """
+        """Announce a topic, which is in the recording even without messages."""
         if type_name not in self._types.fielddefs:
             raise BagError(f'topic {topic}: unknown message type {type_name}')
         self._topics[topic] = (type_name, qos or TopicQos())
@@ -340,13 +328,7 @@ class Bag(BagReader):
     """Reads the recording of a run, also one whose end is missing."""
 
     def scenario(self) -> dict[str, Any]:
-        """Return scenario, seed and the parameters of each node of the run.
-
-        Raises
-        ------
-        BagError
-            If the recording does not have them.
-        """
+        """Return scenario, seed and the parameters of each node of the run."""
         for item in self.messages([SCENARIO_TOPIC]):
             content = yaml.safe_load(item.message.data)
             if isinstance(content, dict):

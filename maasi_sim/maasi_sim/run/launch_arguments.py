@@ -33,13 +33,7 @@ _ENDINGS = {
 
 
 def is_true(given: Mapping[str, str], name: str) -> bool:
-    """Return an argument that is true or false.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
+    """Return an argument that is true or false."""
     text = given[name].strip().lower()
     if text not in ('true', 'false'):
         raise ValueError(f"{name}: read '{given[name]}', allowed are true and false")
@@ -50,11 +44,6 @@ def scenario_options(given: Mapping[str, str]) -> list[str]:
     """Return the command line of `run_scenario` for the arguments of a launch.
 
     The nodes are in the ROS domain of the launch, so that other tools see them.
-
-    Raises
-    ------
-    ValueError
-        If an argument is neither true nor false. All others are checked by `run_scenario`.
     """
     options = [given['scenario'].strip()]
     # Joined by '=': a value that begins with '-' stays a value.

@@ -95,22 +95,10 @@ class Mission(Protocol[Record]):
         """The scenario with all layers."""
 
     def prepare(self) -> None:
-        """Assign addresses on this host to simulated robots.
-
-        Raises
-        ------
-        OSError
-            If there are none.
-        """
+        """Assign addresses on this host to simulated robots."""
 
     def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
-        """Return the nodes to start.
-
-        Raises
-        ------
-        ScenarioError
-            If a link cannot keep this pace.
-        """
+        """Return the nodes to start."""
 
     def cameras(self) -> list[str]:
         """Return the robots whose images are shown."""

@@ -43,13 +43,7 @@ class ProcessError(RuntimeError):
 
 
 def start_server() -> None:
-    """Start the server, which loads what nodes share while the caller goes on.
-
-    Raises
-    ------
-    ProcessError
-        If it cannot be started.
-    """
+    """Start the server, which loads what nodes share while the caller goes on."""
     _context.set_forkserver_preload([__name__])
     resource_tracker.ensure_running()
     for key, value in _ENVIRONMENT.items():
@@ -67,13 +61,7 @@ def start_server() -> None:
 
 
 def wait_for_server() -> None:
-    """Return once the server has loaded what nodes share.
-
-    Raises
-    ------
-    ProcessError
-        If it has ended instead.
-    """
+    """Return once the server has loaded what nodes share."""
     process = _context.Process(target=int)
     try:
         process.start()

@@ -18,13 +18,7 @@ from maasi_sim.run.node_server import ProcessError, node_process, start_server
 
 
 def find_executable(package: str, executable: str) -> Path:
-    """Return the file that `ros2 run package executable` would run.
-
-    Raises
-    ------
-    ProcessError
-        If the package is not installed or has no such executable.
-    """
+    """Return the file that `ros2 run package executable` would run."""
     try:
         folder = Path(get_package_prefix(package)) / 'lib' / package
     except PackageNotFoundError:
@@ -64,13 +58,7 @@ class NodeProcess:
     _process: BaseProcess | None = None
 
     def start(self) -> None:
-        """Start it.
-
-        Raises
-        ------
-        ProcessError
-            If it cannot be.
-        """
+        """Start it."""
         # The node itself opens it.
         with contextlib.suppress(OSError):
             self.log.touch()

@@ -51,13 +51,7 @@ class Recording:
 
 
 def read_recording(path: Path) -> Recording:
-    """Return the contents of a recording for a replay.
-
-    Raises
-    ------
-    BagError
-        If it is none, or lacks measurements that the filter processed.
-    """
+    """Return the contents of a recording for a replay."""
     with Bag(path) as bag:
         recording = Recording(bag.scenario())
         team = recording.facts.get('namespace', '')

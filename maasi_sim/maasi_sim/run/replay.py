@@ -55,11 +55,6 @@ def replay(
 
     Logs and parameters of the nodes are written to a folder, `interrupted` returns true after an
     interruption.
-
-    Raises
-    ------
-    BagError
-        If the recording cannot be replayed.
     """
     recording = read_recording(path)
     folder = make_folder(out, '_replay')

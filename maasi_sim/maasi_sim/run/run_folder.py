@@ -20,15 +20,7 @@ class ResultsError(RuntimeError):
 
 
 def make_folder(out: Path | None, suffix: str = '') -> Path:
-    """Return a new folder of a run: `out`, or one named by the time in `runs`.
-
-    Raises
-    ------
-    ScenarioError
-        If it cannot be made, or holds a run already.
-    ResultsError
-        If the disk is full.
-    """
+    """Return a new folder of a run: `out`, or one named by the time in `runs`."""
     try:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
@@ -50,13 +42,7 @@ def make_folder(out: Path | None, suffix: str = '') -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file of the run.
-
-    Raises
-    ------
-    ResultsError
-        If it cannot be written; nothing of it is left.
-    """
+    """Write a file of the run."""
     try:
         write_whole(path, lambda file: file.write_text(text, encoding='utf-8'))
     except OSError as error:

@@ -91,13 +91,7 @@ class Layer:
 
 
 def read_layer(path: Path) -> Layer:
-    """Read a YAML file whose top is a mapping.
-
-    Raises
-    ------
-    ScenarioError
-        If it cannot be read, is not YAML, has a key twice, or its top is no mapping.
-    """
+    """Read a YAML file whose top is a mapping."""
     try:
         text = path.read_text(encoding='utf-8')
     except FileNotFoundError:
@@ -245,13 +239,7 @@ def override(layer: Layer, key: Key, value: Any, origin: str) -> None:
 
 
 def validate(model: type[Model], layer: Layer) -> Model:
-    """Return the settings of a tree, strictly by type.
-
-    Raises
-    ------
-    ScenarioError
-        One line for each key that is wrong.
-    """
+    """Return the settings of a tree, strictly by type."""
     try:
         return model.model_validate(layer.data, strict=True)
     except ValidationError as error:

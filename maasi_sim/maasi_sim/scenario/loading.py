@@ -33,13 +33,7 @@ from maasi_sim.scenario.visibility import covering_grid
 
 
 def config_folder() -> Path:
-    """Return the folder of `robots/` and `scenarios/`: of ROS, of pip, or of this repository.
-
-    Raises
-    ------
-    ScenarioError
-        If it is in none of them.
-    """
+    """Return the folder of `robots/` and `scenarios/`: of ROS, of pip, or of this repository."""
     places = []
     try:
         from ament_index_python.packages import get_package_share_directory
@@ -62,13 +56,7 @@ def config_folder() -> Path:
 
 
 def find_scenario(name: str | Path) -> Path:
-    """Return the file of a scenario: a path, or the name of one in `config/scenarios`.
-
-    Raises
-    ------
-    ScenarioError
-        If there is none; the known ones are named.
-    """
+    """Return the file of a scenario: a path, or the name of one in `config/scenarios`."""
     path = Path(name)
     if path.exists() or path.suffix or len(path.parts) > 1:
         return path
@@ -93,23 +81,12 @@ def load_scenario(
         Scenario file, or the name of one in `config/scenarios`.
     overrides : mapping, optional
         Values that win over the file's: where each comes from (for messages), key and value.
-
-    Raises
-    ------
-    ScenarioError
-        With file, line, key, what was read and what is allowed.
     """
     return check_scenario(read_scenario(path), overrides)
 
 
 def read_scenario(path: str | Path) -> Layer:
-    """Return the values of a scenario file with its layers, not checked yet.
-
-    Raises
-    ------
-    ScenarioError
-        If a file cannot be read, or a robot's type is not known.
-    """
+    """Return the values of a scenario file with its layers, not checked yet."""
     path = find_scenario(path)
     layer = read_layer(path)
     _lay_types_under(layer, path)
@@ -153,11 +130,6 @@ def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
     """Return the scenario of values as a scenario file has them: types come from config/robots.
 
     What a program made gets no warnings.
-
-    Raises
-    ------
-    ScenarioError
-        As `load_scenario`.
     """
     layer = Layer(deepcopy(values), {(): origin})
     _lay_types_under(layer, config_folder() / 'scenarios' / origin)
@@ -165,13 +137,7 @@ def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
 
 
 def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
-    """Return the scenario of values with all layers merged, as from `Scenario.content`.
-
-    Raises
-    ------
-    ScenarioError
-        As `load_scenario`.
-    """
+    """Return the scenario of values with all layers merged, as from `Scenario.content`."""
     return _without_warnings(Layer(content, {(): origin}))
 
 
@@ -254,13 +220,7 @@ def _robot_layer(path: Path, own: Layer, key: Key) -> Layer:
 
 
 def robot_type(name: str) -> RobotSettings:
-    """Return a robot of a type in `config/robots`, on its own.
-
-    Raises
-    ------
-    ScenarioError
-        If there is no such type, or its file is wrong.
-    """
+    """Return a robot of a type in `config/robots`, on its own."""
     content = {
         'type': name,
         'start': [0.0, 0.0, 0.0],

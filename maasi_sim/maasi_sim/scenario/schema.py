@@ -147,13 +147,7 @@ class Scenario(BaseScenario):
         return {'': self.names()}
 
     def check_pace(self, lockstep: bool, rate: float | None) -> None:
-        """Check that it can be run in lockstep, or at a rate (simulated over wall time).
-
-        Raises
-        ------
-        ScenarioError
-            If it cannot: links other than topics run in real time.
-        """
+        """Check that it can be run in lockstep, or at a rate (simulated over wall time)."""
         for name in self.names():
             link = self.robots[name].link
             if link != 'topics' and (lockstep or rate not in (None, 1.0)):

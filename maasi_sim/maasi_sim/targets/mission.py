@@ -99,13 +99,7 @@ class TargetMission:
 
 
 def plan_nodes(scenario: Scenario, run: RunSettings) -> list[NodePlan]:
-    """Return the simulation, drivers and guards, filters and planners.
-
-    Raises
-    ------
-    ScenarioError
-        If a link cannot keep this pace.
-    """
+    """Return the simulation, drivers and guards, filters and planners."""
     scenario.check_pace(run.lockstep, run.rate)
     common = run.common(scenario)
     plans = [sim_plan('sim_node', scenario, run)]
@@ -152,13 +146,7 @@ def _team_plans(
 
 
 def _plugin(name: str, driver: str, scenario: Scenario) -> tuple[str, ...]:
-    """Return the arguments of `plugin_driver` for a driver of a user's own.
-
-    Raises
-    ------
-    ScenarioError
-        If it cannot be loaded; tried in another process, as a node would.
-    """
+    """Return the arguments of `plugin_driver` for a driver of a user's own."""
     if driver in DRIVERS.own:
         return ()
     arguments = (driver, *scenario.plugin_path)

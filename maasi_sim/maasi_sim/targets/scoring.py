@@ -20,11 +20,6 @@ def matching_radius(removal_distance: float, truth: ArrayLike) -> float:
 
     Three times T_z, at most half the smallest distance between two targets, so that none can
     be matched with its neighbour. `removal_distance` is T_z [m], `truth` the true positions [m].
-
-    Raises
-    ------
-    ValueError
-        If T_z is not a finite number above 0, or two targets are at the same place.
     """
     if not (math.isfinite(removal_distance) and removal_distance > 0.0):
         raise ValueError(

@@ -298,11 +298,6 @@ def read_events(path: Path, progress: Callable[[float], None] | None = None) -> 
     """Return the event log of a recording, or of the run whose folder holds one.
 
     `progress` is called now and then with the share that is read.
-
-    Raises
-    ------
-    BagError
-        If it cannot be read, or shows no search.
     """
     with Bag(path) as bag:
         shown = {topic: kind for topic, kind in bag.types.items() if is_shown(topic, kind)}

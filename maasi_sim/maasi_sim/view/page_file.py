@@ -46,13 +46,7 @@ def replay_page(log: EventLog, largest: int = LARGEST) -> str:
 
 
 def write_replay(log: EventLog, path: Path, largest: int = LARGEST) -> None:
-    """Write the page with a run inside, thinned to a size [characters].
-
-    Raises
-    ------
-    ResultsError
-        If it cannot be written; nothing of it is left.
-    """
+    """Write the page with a run inside, thinned to a size [characters]."""
     write_text(path, replay_page(log, largest))
 
 

@@ -58,13 +58,7 @@ def scene_of(name: str, scenario: BaseScenario, seed: int | None = None) -> Scen
 
 
 def scene_of_facts(facts: Mapping[str, Any]) -> Scene:
-    """Return the scene of what a recording says of its run; of another version, what is known.
-
-    Raises
-    ------
-    ValueError
-        If its scenario is none of this version.
-    """
+    """Return the scene of what a recording says of its run; of another version, what is known."""
     content = facts['scenario']
     buildings = content.get('planner', {}).get('name') == BUILDINGS
     model: type[BaseScenario] = CuboidScenario if buildings else Scenario

@@ -94,13 +94,7 @@ class Moments:
 
 
 def write_video(log: EventLog, path: Path, speed: float = 5.0) -> None:
-    """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; nothing of it is left.
-    """
+    """Write a run as FILE.mp4 or FILE.gif, `speed` times as fast."""
     pictures = _pictures(log, speed)
     write = _write_gif if path.suffix == '.gif' else _write_mp4
     # Keep the suffix: it tells the type of the file.

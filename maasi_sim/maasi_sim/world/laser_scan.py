@@ -126,7 +126,6 @@ class LaserScanner:
         ndarray, shape (beams,), float32
             Anticlockwise from straight ahead [m]; infinite without a return, minus infinite below
             the minimum range (REP 117).
-
         """
         settings = self.settings
         circles = np.concatenate([self._circles, _circles(centres, radii)])

@@ -28,12 +28,6 @@ def noise_stream(
     -------
     numpy.random.Generator
         Independent of the streams of other keys; equal for equal keys, in every process.
-
-    Raises
-    ------
-    ValueError
-        If seed or step is negative.
-
     """
     for name, value in (('seed', seed), ('step', step)):
         if value < 0:

@@ -136,7 +136,6 @@ class OdometryModel:
             True state.
         step : int
             Discrete step, which keys the noise.
-
         """
         settings = self.settings
         generator = noise_stream(self.seed, self.robot, step, 'odometry')

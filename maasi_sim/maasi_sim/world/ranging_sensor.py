@@ -66,7 +66,6 @@ class RangingSensor:
             Range [m], bearing from the map's x axis and, in 3D, elevation [rad], in random order.
         causes : ndarray of int, shape (m,)
             Index of the target; -1: clutter.
-
         """
         dimension = self.sensor.dimension
         generator = noise_stream(self.seed, self.robot, step, 'ranging')

@@ -194,12 +194,6 @@ class SimulatedRobot:
         ----------
         velocity : array_like, shape (4,)
             vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
-
         """
         self._command = check_command(velocity)
 

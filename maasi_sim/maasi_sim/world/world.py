@@ -128,15 +128,7 @@ class World:
     def from_settings(
         cls, environment: EnvironmentSettings, targets: TargetSettings, seed: int, step: float = 1.0
     ) -> World:
-        """
-        Build the world of a run: the same for the same seed; `step` is its length [s].
-
-        Raises
-        ------
-        ValueError
-            If targets lie outside the bounds, or do not fit.
-
-        """
+        """Build the world of a run: the same for the same seed; `step` is its length [s]."""
         bounds = environment.array()
         obstacles = Obstacles.from_settings(environment.obstacles)
         if targets.positions is not None:
@@ -164,15 +156,7 @@ def labels_of(targets: TargetSettings, count: int) -> tuple[Label, ...]:
 
 
 def check_positions(positions: ArrayLike, bounds: Array) -> Array:
-    """
-    Return given target positions as an (n, d) array.
-
-    Raises
-    ------
-    ValueError
-        If one has not as many coordinates as the bounds, or lies outside them.
-
-    """
+    """Return given target positions as an (n, d) array."""
     rows = [np.asarray(row, dtype=float) for row in np.asarray(positions, dtype=object)]
     for index, row in enumerate(rows):
         if row.shape != (len(bounds),):
@@ -211,12 +195,6 @@ def draw_targets(
     -------
     ndarray, shape (count, d)
         [m].
-
-    Raises
-    ------
-    ValueError
-        If they do not fit: the margin leaves no room, or the separation is too large.
-
     """
     count = settings.count or 0
     low, high = bounds[:, 0] + settings.margin, bounds[:, 1] - settings.margin
