@@ -36,6 +36,8 @@ service.include_launch_description(LaunchDescription([
     IncludeLaunchDescription(AnyLaunchDescriptionSource(path), launch_arguments=given)]))
 sys.exit(service.run())
 """
+# Longer than the address of a socket may be.
+TEMPORARY = 'temporary' * 12
 DEFAULTS = {name: default for name, (default, _) in ARGUMENTS.items()}
 
 pytestmark = pytest.mark.system
@@ -44,7 +46,7 @@ pytestmark = pytest.mark.system
 @pytest.fixture
 def launch(tmp_path):
     """Start a launch with arguments, in a free domain, with an empty folder for temporary files."""
-    temporary = tmp_path / 'temporary'
+    temporary = tmp_path / TEMPORARY
     temporary.mkdir()
 
     def start(**arguments):
@@ -114,7 +116,7 @@ def test_a_launch_records_reports_and_ends_with_the_run(launch, tmp_path):
         assert bag.counts['/found_targets'] > 0
         assert bag.scenario()['nodes']['/planner_node']['parameters']['planner.name'] == 'lawnmower'
     assert '[INFO]' not in (tmp_path / 'run' / 'filter_node.log').read_text()
-    assert list((tmp_path / 'temporary').iterdir()) == []
+    assert list((tmp_path / TEMPORARY).iterdir()) == []
 
 
 def test_an_interrupted_launch_ends_the_run(launch, tmp_path):

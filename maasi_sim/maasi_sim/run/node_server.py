@@ -13,8 +13,9 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 from collections.abc import Mapping
-from multiprocessing import forkserver, resource_tracker
+from multiprocessing import forkserver, resource_tracker, util
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -35,6 +36,8 @@ _ENVIRONMENT = {
     'OPENBLAS_NUM_THREADS': '1',
     'MKL_NUM_THREADS': '1',
 }
+# Addresses of Unix sockets have at most 107 bytes; multiprocessing adds 32 to the folder.
+_LONGEST_FOLDER = 75
 _context = multiprocessing.get_context('forkserver')
 
 
@@ -52,12 +55,24 @@ def start_server() -> None:
     # Ctrl-C in the terminal must not reach the server before it has a session of its own.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
+        _make_folder()
         forkserver.ensure_running()
     except OSError as error:
         raise ProcessError(f'the server of the nodes cannot be started: {error}') from error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         del os.environ[_STARTED_BY]
+
+
+def _make_folder() -> None:
+    """Make the folder of the server's socket, in one whose path is not too long for an address."""
+    folder = tempfile.gettempdir()
+    if len(os.fsencode(folder)) > _LONGEST_FOLDER:
+        tempfile.tempdir = '/tmp'
+    try:
+        util.get_temp_dir()
+    finally:
+        tempfile.tempdir = folder
 
 
 def wait_for_server() -> None:
