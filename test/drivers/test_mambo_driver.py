@@ -350,6 +350,8 @@ def test_a_cancelled_goal_has_it_hover_then_land(fly):
     flight.until(lambda: flight.speed < 0.05)
     assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
     flight.until(lambda: flight.flying_state == FlyingState.LANDED)
+    # The driver hears of it a little later.
+    flight.until(lambda: UNTIL_ARM in flight.reason)
     assert UNTIL_ARM in flight.team.refused(GOAL)
 
 

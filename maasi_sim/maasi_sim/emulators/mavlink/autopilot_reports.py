@@ -14,7 +14,8 @@ from maasi_drivers.links.mavlink.firmware import PX4_COPTER
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_sim.emulators.mavlink.autopilot_settings import FIRMWARES, AutopilotSettings
+from maasi_sim.emulators.mavlink.autopilot_parameters import FIRMWARES
+from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,9 @@ from maasi_drivers.links.mavlink.firmware import ARDUCOPTER, ARDUSUB, PX4_COPTER
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
+from maasi_sim.emulators.mavlink.autopilot_parameters import PARAMETERS, WHOLE_NUMBERS
 from maasi_sim.emulators.mavlink.autopilot_reports import AutopilotReports, AutopilotState
-from maasi_sim.emulators.mavlink.autopilot_settings import (
-    PARAMETERS,
-    WHOLE_NUMBERS,
-    AutopilotSettings,
-)
+from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 
 # ArduCopter disarms on the ground after so long [s].
 _DISARM_DELAY = 10.0

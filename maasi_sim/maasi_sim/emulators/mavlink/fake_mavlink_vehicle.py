@@ -17,7 +17,8 @@ from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
-from maasi_sim.emulators.mavlink.autopilot_settings import FIRMWARES, AutopilotSettings
+from maasi_sim.emulators.mavlink.autopilot_parameters import FIRMWARES
+from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
 from maasi_sim.scenario.schema import RobotSettings
 
