@@ -70,7 +70,7 @@ def noise(name: str) -> Change:
 
 
 def clutter(per_scan: float, told: bool) -> Change:
-    """False detections, of which the filter is told or not."""
+    """False detections, which the filter knows of or not."""
     believed = robots('sensor', clutter=per_scan / SPACE)
     return both(simulated(clutter_per_scan=per_scan), *([believed] if told else []))
 

@@ -15,7 +15,7 @@ class Tree(NamedTuple):
     """Nodes of the search, best bound first, in arrays that are reused.
 
     bound, reward (n,): lower bound of the objective, and the reward of the visits made; cost (n,
-    3): of each axis; dirty (n,): bit mask of the axes that have to be solved anew; closed (n,):
+    3): of each axis; dirty (n,): bit mask of the axes that have to be solved again; closed (n,):
     whether no further visits are made; visits, number (n, V): the visits made; low, high (n, 3, T +
     2): bounds of the positions P_0 to P_T and, last, of the way to brake [m]; values (n, 3, m): of
     the rows; heap, spare (n,): nodes by bound, and nodes that are free; counts (6,): sizes of

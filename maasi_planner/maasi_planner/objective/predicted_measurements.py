@@ -49,7 +49,7 @@ class Timing(NamedTuple):
     """When a robot measures on a trajectory.
 
     First after `phase` steps, then every `period` steps, and with `arrival` at the end; with
-    `extend` it goes on there until `horizon` (000, section 6: appended constant states), which
+    `extend` it continues there until `horizon` (000, section 6: appended constant states), which
     others see in e but it does not count for itself.
     """
 

@@ -120,7 +120,7 @@ class ScenarioRun:
             )
             session.listener = None if page is None else page.put
             session.open(domain.number, self.folder)
-            # At once: the session reports it.
+            # Ctrl-C ends the wait at once; the run reports it.
             with self.interruption.at_once():
                 wait_for_server()
             if not self.interruption:

@@ -25,7 +25,7 @@ _PERIOD = 0.05
 class Portion:
     """What a browser gets next.
 
-    `scene` is JSON where the browser is to begin anew, else empty; `events` is a JSON list;
+    `scene` is JSON where the browser is to start over, else empty; `events` is a JSON list;
     `generation` and `position` say where the next portion begins, `closed` that nothing follows.
     """
 
@@ -39,7 +39,7 @@ class Portion:
 class Hub:
     """Keeps the events of a run; nothing that puts an event waits for a browser.
 
-    With more than `most` events those that change gradually are thinned, and browsers begin anew.
+    With more than `most` events those that change gradually are thinned, and browsers start over.
     """
 
     def __init__(self, scene: Scene, most: int = MOST_EVENTS) -> None:

@@ -27,7 +27,7 @@ _MARKERS = 'visualization_msgs/msg/MarkerArray'
 
 
 class LiveView:
-    """Serve the page of a run that goes on; address and commands as of `ViewServer`."""
+    """Serve the page of a run in progress; address and commands as of `ViewServer`."""
 
     def __init__(
         self,
