@@ -22,7 +22,7 @@ from maasi_filter.ros.conversions import MOST_DETECTIONS
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
-from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
 from maasi_msgs.msg import (
     BatchMember,
     Detection,
@@ -179,7 +179,7 @@ def test_detections_that_do_not_fit_are_said_in_log_and_diagnostics(world):
     _, team, until = world
     reports, lines = [], []
     team.node.create_subscription(DiagnosticArray, '/diagnostics', reports.append, 10)
-    team.node.create_subscription(Log, '/rosout', lines.append, 100)
+    team.node.create_subscription(Log, '/rosout', lines.append, LATCHED_ALL)
     until(lambda: team.node.count_publishers('/rosout') >= 2)
     generator = np.random.default_rng(1)
     for number in range(1, 41):

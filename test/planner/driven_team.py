@@ -25,7 +25,7 @@ from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.parameters import flatten
-from maasi_filter.ros.qos import LATCHED, RELIABLE
+from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import AgentState, FilterUpdate, PlanDecision
 from maasi_planner.motion import RobotState, make_motion
@@ -118,7 +118,7 @@ class World:
         self.robots = {name: Robot(self.node, name) for name in ROBOTS}
         self.logs, self.status, self.decisions = [], {}, []
         node = self.node
-        node.create_subscription(Log, '/rosout', self._take_log, 50)
+        node.create_subscription(Log, '/rosout', self._take_log, LATCHED_ALL)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, 10)
         node.create_subscription(PlanDecision, 'decisions', self.decisions.append, RELIABLE)
         self.updates = node.create_publisher(FilterUpdate, 'filter_update', LATCHED)

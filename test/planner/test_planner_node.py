@@ -18,7 +18,7 @@ from waiting import wait_until
 
 from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.parameters import flatten
-from maasi_filter.ros.qos import RELIABLE, UPDATES
+from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, UPDATES
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,
@@ -105,7 +105,7 @@ class Team:
         self.steps = node.create_publisher(LockstepStep, 'lockstep/step', RELIABLE)
         self.done = []
         node.create_subscription(LockstepDone, 'lockstep/done', self.done.append, RELIABLE)
-        node.create_subscription(Log, '/rosout', self._take_log, 50)
+        node.create_subscription(Log, '/rosout', self._take_log, LATCHED_ALL)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, 10)
 
     def _take_goal(self, name, goal):

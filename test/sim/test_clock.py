@@ -21,7 +21,7 @@ from rosgraph_msgs.msg import Clock
 from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
-from maasi_filter.ros.qos import RELIABLE
+from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 
@@ -42,7 +42,9 @@ class World(Node):
         self.stamps = {}
         self.statuses, self.commands, self.states, self.logs = [], [], [], []
         self.create_subscription(DiagnosticArray, '/diagnostics', self.take, 10)
-        self.create_subscription(Log, '/rosout', lambda item: self.logs.append(item.msg), 50)
+        self.create_subscription(
+            Log, '/rosout', lambda item: self.logs.append(item.msg), LATCHED_ALL
+        )
         self.create_subscription(TwistStamped, '/rover/cmd_vel', self.commands.append, RELIABLE)
         self.create_subscription(AgentState, '/rover/state', self.states.append, RELIABLE)
         self.odometry = self.create_publisher(Odometry, '/rover/odom', RELIABLE)
