@@ -1,7 +1,7 @@
 """State estimation of the team: sensors, exploration, filters and found targets."""
 
 from maasi_filter.ic_phd.filter import IcPhdFilter
-from maasi_filter.make_filter import load_filter, make_filter
+from maasi_filter.make_filter import load_filter, make_filter, warm_up
 from maasi_filter.metrics import (
     Gospa,
     Match,
@@ -37,7 +37,6 @@ from maasi_filter.settings import (
 )
 from maasi_filter.state_file import StateFileError
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_filter.warm_up import warm_up
 
 __all__ = [
     'AgentMeasurement',

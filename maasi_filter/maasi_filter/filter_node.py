@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from functools import partial
 from pathlib import Path
@@ -10,19 +11,21 @@ from typing import Any
 import numpy as np
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
 
-from maasi_filter import warm_up
-from maasi_filter.make_filter import load_filter, make_filter
+from maasi_filter.make_filter import FilterMemory, Progress, load_filter, make_filter, warm_up
 from maasi_filter.measurement_check import FOUND, REPEATED
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch
-from maasi_filter.node.filter_memory import FilterMemory, Progress
 from maasi_filter.node.found_target_exchange import KeptFoundTargets, SharedFoundTargets
-from maasi_filter.node.views import FilterViews
 from maasi_filter.ros.conversions import (
+    MarkerBoard,
     cluster_to_ros,
+    filter_markers,
     found_target_from_ros,
     found_target_to_ros,
+    particles_to_ros,
     stamp_to_ros,
 )
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
@@ -39,6 +42,52 @@ from maasi_msgs.msg import (
     FoundTargetArray,
     MeasurementBatch,
 )
+
+
+class FilterViews:
+    """Particles and markers.
+
+    Publishes
+    ---------
+    `particles` (sensor_msgs/PointCloud2), `markers` (visualization_msgs/MarkerArray)
+
+    Parameters
+    ----------
+    node : LockstepLifecycleNode
+        The filter node.
+    """
+
+    def __init__(self, node: LockstepLifecycleNode[FilterNodeSettings]) -> None:
+        self._node = node
+        bounds = node.settings.environment.array()
+        self._size = 0.01 * float((bounds[:, 1] - bounds[:, 0]).max())
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._board = MarkerBoard()
+        self._particles_at = self._markers_at = -math.inf
+
+    def set_up(self) -> None:
+        """Create the publishers."""
+        self._particles = self._node.create_publisher(PointCloud2, 'particles', 2)
+        self._markers = self._node.create_publisher(MarkerArray, 'markers', 10)
+
+    def publish(self, search: SearchFilter, header: Header, now: float) -> None:
+        """Publish what is due at the time `now` [s]."""
+        settings = self._node.settings
+        if _is_due(settings.particles_rate, now, self._particles_at):
+            self._particles_at = now
+            self._particles.publish(particles_to_ros(search.particles, search.weights, header))
+        if _is_due(settings.markers_rate, now, self._markers_at):
+            self._markers_at = now
+            markers = filter_markers(header, search.clusters, search.found_targets, self._size)
+            self._markers.publish(self._board.replace(markers))
+
+
+def _is_due(rate: float, now: float, last: float) -> bool:
+    return rate > 0.0 and abs(now - last) >= 1.0 / rate
+
 
 _TIMEOUT_PERIOD = 0.05
 # Upper bound on predicted steps: a day at 10 steps per second.

@@ -10,10 +10,9 @@ import numpy as np
 
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.models.detection import BoxDetection
-from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
-from maasi_filter.records import AgentMeasurement, FoundTarget
+from maasi_filter.records import AgentMeasurement, FoundTarget, Label
 from maasi_filter.settings import FilterSettings
 
 # Default position error of a robot with a box-shaped field of view, as a share of its half size:

@@ -6,9 +6,41 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class Label:
+    """Class and identity of a detection or a found target.
+
+    Parameters
+    ----------
+    class_id : str
+        Name of the class; empty: not known.
+    score : float
+        Confidence in the class, 0 to 1; 0: not known.
+    identity : str
+        What tells this target from all others, such as the id of a marker; empty: not known.
+
+    Raises
+    ------
+    ValueError
+        If the score is not from 0 to 1.
+    """
+
+    class_id: str = ''
+    score: float = 0.0
+    identity: str = ''
+
+    def __post_init__(self) -> None:
+        # Negated, so that NaN is refused too.
+        if not 0.0 <= self.score <= 1.0:
+            raise ValueError(f'score: got {self.score}, allowed is 0 to 1')
+
+
+#: Of a detection about which nothing is known but its position.
+UNLABELLED = Label()
 
 
 @dataclass

@@ -12,9 +12,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from waiting import wait_until
 
-from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import NodeSettings
+from maasi_filter.ros.run_node import executor_of
 from maasi_sim.run.domain import Domain
 
 

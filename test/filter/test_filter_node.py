@@ -19,10 +19,10 @@ from waiting import PATIENCE, wait_until
 from maasi_filter import FilterSettings, make_filter
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.conversions import MOST_DETECTIONS
-from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, UPDATES
+from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.msg import (
     BatchMember,
     Detection,

@@ -3,7 +3,7 @@
 import pytest
 from test_filter_node import running, seen_from_a
 
-from maasi_filter.node.filter_memory import FilterMemory
+from maasi_filter.make_filter import FilterMemory
 from maasi_filter.node.found_target_exchange import KeptFoundTargets
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTargetArray

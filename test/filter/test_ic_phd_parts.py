@@ -9,13 +9,14 @@ from maasi_filter import ExponentialDetection, Pose, Sensor
 from maasi_filter.found_targets import FoundTargets
 from maasi_filter.ic_phd.births import (
     gaussian_births,
+    jittered,
     measurement_births,
     noise_in_space,
+    resample,
     uniform_births,
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.filter import kept_measurements
-from maasi_filter.ic_phd.resampling import jittered, resample
 from maasi_filter.records import FoundTarget
 
 POSE = Pose.from_yaw([40.0, 50.0, 45.0], 0.3)

@@ -11,7 +11,7 @@ from numba import njit
 from pydantic import BaseModel
 
 from maasi_filter.make_filter import load_filter, make_filter
-from maasi_filter.models import custom_kernel
+from maasi_filter.models import detection
 from maasi_filter.models.detection import ExponentialDetection
 from maasi_filter.models.own_detection import OwnDetection
 from maasi_filter.models.pose import Pose
@@ -113,14 +113,14 @@ def test_a_saved_filter_goes_on_in_another_process(method, monkeypatch, tmp_path
     search.save(tmp_path / 'state')
     wanted = step(search, sensor, 3).clusters
     # As in another process, where the function is elsewhere.
-    moved = custom_kernel._blocks.copy()
-    custom_kernel._retired.extend(custom_kernel._blocks.values())
-    monkeypatch.setattr(custom_kernel, '_blocks', {})
+    moved = detection._blocks.copy()
+    detection._retired.extend(detection._blocks.values())
+    monkeypatch.setattr(detection, '_blocks', {})
     if method == 'pmb':
         with pytest.raises(StateFileError, match='make the sensors'):
             load_filter(tmp_path / 'state')
     again = Sensor.ranging('a', Compiled(Width(width=4.0), 0.9, 2), np.diag([0.01, 0.01]))
-    assert again.detection.kernel()[1][custom_kernel.ADDRESS] not in [
+    assert again.detection.kernel()[1][detection.ADDRESS] not in [
         block.entries.ctypes.data for block in moved.values()
     ]
     found = step(load_filter(tmp_path / 'state'), again, 3).clusters

@@ -9,11 +9,11 @@ from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, 
 
 from maasi_filter import FilterSettings, Pose, UnexploredMap, wrap_angle
 from maasi_filter.measurement_check import check_measurements
-from maasi_filter.models.label import Label
 from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.pmb.births import draw_births
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.pmb.learnt import PRIOR_SCANS, ClutterEstimate
+from maasi_filter.records import Label
 
 TARGET = np.array([[60.0, 45.0]])
 # Where the robot measures from, in turn.

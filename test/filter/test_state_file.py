@@ -8,7 +8,7 @@ from searches import CUBE, cube_sensor, observe, same, wander
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose, StateFileError, load_filter
 from maasi_filter.make_filter import make_filter
-from maasi_filter.models.label import Label
+from maasi_filter.records import Label
 from maasi_filter.state_file import SavedState, write_state
 
 PHD = FilterSettings()

@@ -23,9 +23,9 @@ from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
-from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE
+from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import AgentState, FilterUpdate, PlanDecision
 from maasi_planner.motion import RobotState, make_motion

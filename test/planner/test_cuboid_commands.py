@@ -12,9 +12,9 @@ from std_srvs.srv import Trigger
 from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import RELIABLE
+from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
 from maasi_planner.buildings.cuboid_planner_node import CuboidPlannerNode
 from maasi_planner.buildings.settings import CuboidPlannerSettings

@@ -16,9 +16,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from waiting import wait_until
 
-from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, UPDATES
+from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.action import GoToWaypoint, SearchTargets
 from maasi_msgs.msg import (
     AgentState,

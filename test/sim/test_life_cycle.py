@@ -10,7 +10,7 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from waiting import wait_until
 
-from maasi_filter.ros.executor import executor_of
+from maasi_filter.ros.run_node import executor_of
 from maasi_sim.run.domain import Domain
 
 CYCLES = 20

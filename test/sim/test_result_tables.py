@@ -14,8 +14,7 @@ import pytest
 import yaml
 from small_field import SMALL_FIELD
 
-from maasi_filter.models.label import Label
-from maasi_filter.records import FoundTarget
+from maasi_filter.records import FoundTarget, Label
 from maasi_sim.run import report_schema
 from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.scenario.base import OriginSettings

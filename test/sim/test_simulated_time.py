@@ -13,8 +13,8 @@ from test_life_cycle import in_graph, made_by
 from waiting import PATIENCE, wait_until
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_filter.ros.executor import executor_of
 from maasi_filter.ros.qos import RELIABLE, UPDATES
+from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.msg import AgentState, BatchMember, FilterUpdate, MeasurementBatch, PlanDecision
 from maasi_sim.run.domain import Domain
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Label
 
 
 @dataclass(frozen=True)

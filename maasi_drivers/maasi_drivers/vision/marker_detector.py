@@ -15,9 +15,9 @@ from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.detector import Blobs, Detector
 from maasi_drivers.vision.segmentation import segment
 from maasi_filter.arrays import FloatArray, ImageArray
-from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import Label
 
 # A bearing that says nothing is uniform over the circle: variance pi^2 / 3.
 _BEARING_VARIANCE_LIMIT = np.pi**2 / 3.0

@@ -17,13 +17,14 @@ from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
     MeasurementBirths,
     gaussian_births,
+    jittered,
     measurement_births,
     noise_in_space,
+    resample,
     uniform_births,
 )
 from maasi_filter.ic_phd.clusters import clusters_of, kmeans
 from maasi_filter.ic_phd.corrector import make_scan, phd_correct
-from maasi_filter.ic_phd.resampling import jittered, resample
 from maasi_filter.measurement_check import (
     FOUND,
     CheckedMeasurement,
@@ -33,9 +34,15 @@ from maasi_filter.measurement_check import (
     count_unexplained,
     within_range,
 )
-from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.models.sensor import LEAST_PER_SCAN
-from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
+from maasi_filter.records import (
+    UNLABELLED,
+    AgentMeasurement,
+    Cluster,
+    FilterResult,
+    FoundTarget,
+    Label,
+)
 from maasi_filter.search_filter import FilterState
 from maasi_filter.settings import FilterSettings, IcPhdNumbers
 from maasi_filter.state_file import write_state

@@ -11,8 +11,15 @@ from numba import njit
 from pydantic import BaseModel
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.custom_kernel import ADDRESS, CUSTOM, NUMBER, REACH, register
-from maasi_filter.models.detection import PARAMETERS, DetectionModel
+from maasi_filter.models.detection import (
+    ADDRESS,
+    CUSTOM,
+    NUMBER,
+    PARAMETERS,
+    REACH,
+    DetectionModel,
+    register,
+)
 from maasi_filter.plugins import PluginError
 
 # Cells from the robot to the reach, on each axis, by dimension.

@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.models.label import Label, LabelTally
-from maasi_filter.pmb.component import Component
+from maasi_filter.pmb.component import Component, LabelTally
+from maasi_filter.records import Label
 
 ITERATIONS = 500
 TOLERANCE = 1e-9

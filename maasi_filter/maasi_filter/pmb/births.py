@@ -17,8 +17,8 @@ from maasi_filter.pmb.factors import (
     MOST_PROBABLE,
     SCALE,
     TERMS,
+    Scan,
 )
-from maasi_filter.pmb.scan import Scan
 from maasi_filter.unexplored_map import UnexploredMap
 
 # Fewest effective draws that stand for a density.

@@ -1,22 +1,123 @@
-"""Bernoulli components: potential targets with existence probabilities."""
+"""Bernoulli components: potential targets, whether they exist, and how often they answer."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.found_targets import SAME_TARGET, distance
-from maasi_filter.models.label import LabelTally
-from maasi_filter.pmb.answers import RATES, add_look
 from maasi_filter.pmb.births import LEAST_SUPPORT, Births
 from maasi_filter.pmb.density import Density
-from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
-from maasi_filter.pmb.scan import Scan
-from maasi_filter.records import FoundTarget
+from maasi_filter.pmb.factors import MISS, SCALE, Scan, likelihoods, log_factor
+from maasi_filter.records import FoundTarget, Label
 from maasi_filter.vector_math import squared_distance
+
+# Shares of the believed pi with which a place may answer.
+RATES = np.array([1.0, 0.7, 0.5, 0.35, 0.2])
+# Those with which all targets may, if pi is not as believed, and their probabilities beforehand.
+COMMON = RATES[:3]
+PRIOR = np.array([0.9, 0.05, 0.05])
+# A reflection answers at most this often, compared with a target.
+MOST_OF_REFLECTION = 0.5
+# Probability beforehand that a place that answers is one.
+REFLECTIONS = 0.1
+
+# By the rate of targets and that of a place: weights of what a place is.
+_TARGET = (1.0 - REFLECTIONS) * np.eye(len(COMMON), len(RATES))
+_RARE = MOST_OF_REFLECTION * COMMON[:, None] >= RATES
+_REFLECTION = REFLECTIONS * _RARE / _RARE.sum(axis=1, keepdims=True)
+
+
+@njit(cache=True, error_model='numpy')
+def add_look(answers, detected, missed):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Add the log likelihood of a look with each rate to `answers` (k,).
+
+    `detected` is p_D as it is believed, `missed` the probability that the place did not answer.
+    """
+    for k in range(len(RATES)):
+        answers[k] += missed * math.log1p(-RATES[k] * detected)
+        answers[k] += (1.0 - missed) * math.log(RATES[k])
+
+
+def rate_of_targets(answers: Sequence[FloatArray], existence: Sequence[float]) -> FloatArray:
+    """Return the probabilities of COMMON, from the answers of all places that may be targets."""
+    if not len(answers):
+        return PRIOR
+    logs = np.array(answers)
+    peaks = logs.max(axis=1, keepdims=True)
+    fits = np.log(np.exp(logs - peaks) @ (_TARGET + _REFLECTION).T)
+    sums = np.array(existence) @ fits + np.log(PRIOR)
+    weights = np.exp(sums - sums.max())
+    return np.asarray(weights / weights.sum())
+
+
+@njit(cache=True, error_model='numpy')
+def reflects(answers, rates):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Return the probability that a place is a reflection, from its answers and those of all."""
+    peak = answers.max()
+    target = 0.0
+    reflection = 0.0
+    for k in range(len(answers)):
+        likelihood = math.exp(answers[k] - peak)
+        for c in range(len(rates)):
+            target += rates[c] * _TARGET[c, k] * likelihood
+            reflection += rates[c] * _REFLECTION[c, k] * likelihood
+    return reflection / (target + reflection)
+
+
+@dataclass
+class LabelTally:
+    """What is known of the class and identity of one potential target.
+
+    Parameters
+    ----------
+    identity : str
+        Empty: not known.
+    classes : dict
+        Sum of the scores of its detections, by class.
+    """
+
+    identity: str = ''
+    classes: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, label: Label) -> LabelTally:
+        """Return the tally of one label."""
+        tally = cls(label.identity)
+        tally.add(label, 1.0)
+        return tally
+
+    def add(self, label: Label, share: float) -> None:
+        """Count the class of a detection that this target caused with probability `share`.
+
+        A score that is not known counts as 1.
+        """
+        if label.class_id:
+            weight = share * (label.score or 1.0)
+            self.classes[label.class_id] = self.classes.get(label.class_id, 0.0) + weight
+
+    def merge(self, other: LabelTally) -> None:
+        """Add what is known of the same target."""
+        self.identity = self.identity or other.identity
+        for name, score in other.classes.items():
+            self.classes[name] = self.classes.get(name, 0.0) + score
+
+    @property
+    def label(self) -> Label:
+        """The class of the largest sum, with its share of all sums, and the identity."""
+        if not self.classes:
+            return Label(identity=self.identity)
+        # Of equal sums the first by name: the order of detections does not matter.
+        best = min(self.classes, key=lambda name: (-self.classes[name], name))
+        total = sum(self.classes[name] for name in sorted(self.classes))
+        score = self.classes[best] / total if total > 0.0 else 0.0
+        return Label(best, min(score, 1.0), self.identity)
+
 
 # Gate of a detection, in standard deviations and root mean square radii.
 GATE = 6.0

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.custom_kernel import renew_addresses
+from maasi_filter.models.detection import renew_addresses
 from maasi_filter.pmb.factors import (
     CARTESIAN,
     CENTRE,

@@ -28,8 +28,6 @@ from maasi_filter.measurement_check import (
     without_repeats,
 )
 from maasi_filter.models.detection import BoxDetection
-from maasi_filter.models.label import LabelTally
-from maasi_filter.pmb.answers import PRIOR, RATES, rate_of_targets, reflects
 from maasi_filter.pmb.association import (
     Marginals,
     associate,
@@ -40,18 +38,23 @@ from maasi_filter.pmb.association import (
 from maasi_filter.pmb.births import Births, born, draw_births
 from maasi_filter.pmb.component import (
     LEAST_HITS,
+    PRIOR,
+    RATES,
     Component,
+    LabelTally,
     View,
     can_be_found,
     is_known,
     merge,
     nearest,
+    rate_of_targets,
+    reflects,
     views,
 )
 from maasi_filter.pmb.density import Density
+from maasi_filter.pmb.factors import Scan, make_scan
 from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
-from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.search_filter import FilterState
 from maasi_filter.settings import FilterSettings

@@ -16,10 +16,9 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.label import UNLABELLED, Label
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor, is_covariance
-from maasi_filter.records import AgentMeasurement, Cluster, FoundTarget
+from maasi_filter.records import UNLABELLED, AgentMeasurement, Cluster, FoundTarget, Label
 from maasi_msgs.msg import Cluster as ClusterMessage
 from maasi_msgs.msg import Detection, DetectionArray, RangeMeasurement
 from maasi_msgs.msg import FoundTarget as FoundTargetMessage

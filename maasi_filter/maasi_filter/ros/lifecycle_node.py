@@ -21,11 +21,16 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from maasi_filter.ros.clocks import ClockWatch, stamp_problem
-from maasi_filter.ros.executor import NodeEntities, survive_bad_requests
+from maasi_filter.ros.entities import (
+    NodeEntities,
+    Unconnected,
+    subscribers_connected,
+    survive_bad_requests,
+    unpublished_topics,
+)
 from maasi_filter.ros.loopback import loopback_fault
 from maasi_filter.ros.node_parameters import NodeParameters, SettingsError, SettingsT
 from maasi_filter.ros.qos import LATCHED, RELIABLE
-from maasi_filter.ros.readiness import Unconnected, subscribers_connected, unpublished_topics
 from maasi_msgs.msg import LockstepDone, LockstepStep
 
 __all__ = ['LockstepLifecycleNode', 'SettingsError']

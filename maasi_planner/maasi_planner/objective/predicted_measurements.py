@@ -10,10 +10,11 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_filter.models.custom_kernel import CUSTOM, REACH
 from maasi_filter.models.detection import (
     BOX,
+    CUSTOM,
     PARAMETERS,
+    REACH,
     DetectionModel,
     detection_probability_at,
     fill_probabilities,

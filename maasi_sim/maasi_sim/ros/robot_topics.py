@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 from maasi_drivers.agent.sensor_reading import Sweep
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_filter.models.label import UNLABELLED
+from maasi_filter.records import UNLABELLED
 from maasi_msgs.msg import RangeArray, RangeMeasurement
 from maasi_sim.scenario.schema import steps_of
 from maasi_sim.world.laser_scan import LaserSettings

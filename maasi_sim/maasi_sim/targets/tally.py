@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.label import Label
 from maasi_filter.models.pose import Pose
-from maasi_filter.records import FoundTarget
+from maasi_filter.records import FoundTarget, Label
 from maasi_sim.run.run_record import RunRecord
 from maasi_sim.run.topics import seconds
 from maasi_sim.scenario.schema import Scenario

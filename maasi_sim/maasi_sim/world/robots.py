@@ -12,9 +12,9 @@ from pydantic import Field
 from maasi_drivers.agent.sensor_reading import Sweep
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
-from maasi_filter.models.label import UNLABELLED
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
+from maasi_filter.records import UNLABELLED
 from maasi_filter.settings import Settings
 from maasi_planner.motion import Body, RobotState, make_motion
 from maasi_planner.motion.base import check_command

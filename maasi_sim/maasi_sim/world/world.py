@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from maasi_filter.models.label import Label
+from maasi_filter.records import Label
 from maasi_filter.settings import EnvironmentSettings, Finite, Settings
 from maasi_planner.obstacles import Obstacles
 from maasi_sim.world.noise_streams import noise_stream
