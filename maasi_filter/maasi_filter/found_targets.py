@@ -40,10 +40,6 @@ class FoundTargets:
         self.last_id += 1
         return self.last_id
 
-    def own(self) -> list[FoundTarget]:
-        """Return the targets that this filter found itself."""
-        return [target for target in self.targets if not target.origin]
-
     def take_over(
         self, robot: str, targets: Sequence[FoundTarget]
     ) -> tuple[list[FoundTarget], list[FoundTarget]]:

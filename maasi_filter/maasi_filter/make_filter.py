@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_filter.ic_phd.filter import IcPhdFilter, IcPhdState
+from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.models.detection import PARAMETERS, detection_probability
 from maasi_filter.models.pose import Pose
-from maasi_filter.pmb.filter import PmbFilter, PmbState
+from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.records import AgentMeasurement
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import (
@@ -65,10 +65,7 @@ def filter_of(saved: SavedState) -> SearchFilter:
     StateFileError
         If something is missing, or has a wrong type, shape or number.
     """
-    with saved.named():
-        if PmbState.method in saved:
-            return PmbFilter.from_state(saved.read(PmbState.method, PmbState))
-        return IcPhdFilter.from_state(saved.read(IcPhdState.method, IcPhdState))
+    return PmbFilter.of(saved) if PmbFilter.method in saved else IcPhdFilter.of(saved)
 
 
 def warm_up() -> None:
@@ -129,8 +126,7 @@ class FilterMemory:
     def save(self, search: SearchFilter, progress: Progress) -> None:
         """Save both; OSError if the file cannot be written: the old one is kept."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        state = search.state()
-        write_state(self.path, {state.method: state, 'progress': progress}, durable=False)
+        write_state(self.path, {**search.state(), 'progress': progress}, durable=False)
 
     def load(self) -> tuple[SearchFilter, Progress] | None:
         """Return the saved filter and progress, or None without a file."""

@@ -1,59 +1,22 @@
-"""Interface of a search filter for nodes, planners and searches in one process."""
+"""Interface of a search filter for nodes, planners and searches in one process; what all share."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
+from typing_extensions import Self
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.found_targets import FoundTargets
+from maasi_filter.measurement_check import check_taken
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
+from maasi_filter.state_file import SavedState, write_state
 from maasi_filter.unexplored_map import UnexploredMap
-
-
-@dataclass
-class FilterState:
-    """What the saved states of all filters have."""
-
-    settings: FilterSettings
-    bounds: FloatArray
-    generator: np.random.Generator
-    exploration: FloatArray
-    clusters: list[Cluster]
-    #: Name of the filter, under which its state is saved.
-    method: ClassVar[str]
-
-    def check(self, found: Sequence[FoundTarget]) -> None:
-        """Refuse clusters and found targets that a filter cannot continue from.
-
-        Raises
-        ------
-        ValueError
-            Naming what was read and what is allowed.
-        """
-        d = len(self.bounds)
-        items: list[Cluster | FoundTarget] = [*self.clusters, *found]
-        for item in items:
-            shapes = item.position.shape, item.covariance.shape
-            # A cluster of equal particles has zero covariance.
-            if (
-                shapes != ((d,), (d, d))
-                or not (np.isfinite(item.position).all() and np.isfinite(item.covariance).all())
-                or not np.allclose(item.covariance, item.covariance.T)
-                or (np.diagonal(item.covariance) < 0.0).any()
-            ):
-                raise ValueError(
-                    f'{type(item).__name__}: got {item.position.tolist()} with covariance '
-                    f'{item.covariance.tolist()}, allowed are finite numbers of {d} dimensions '
-                    'and a symmetric matrix with a diagonal from 0'
-                )
-        ids = [target.id for target in found]
-        if min(ids, default=1) < 1 or len(set(ids)) < len(ids):
-            raise ValueError(f'found targets: got ids {ids}, allowed are different ones from 1')
 
 
 class SearchFilter(Protocol):
@@ -155,5 +118,82 @@ class SearchFilter(Protocol):
         The file is replaced atomically: a crash leaves the old one or the new one.
         """
 
-    def state(self) -> FilterState:
-        """Return the whole state, random generator included, for `write_state`."""
+    def state(self) -> dict[str, dict[str, Any]]:
+        """Return the whole state, random generator included, by the method, for `write_state`."""
+
+
+class FilterBase:
+    """What the filters share: exploration, found targets from elsewhere, and the saved state."""
+
+    method: ClassVar[str]
+    #: Types of what is saved of one method only, by attribute.
+    saved: ClassVar[dict[str, Any]]
+
+    def __init__(
+        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+    ) -> None:
+        self.settings = settings
+        self.exploration = UnexploredMap(bounds, settings.exploration_spacing)
+        self.bounds = self.exploration.bounds
+        self.dimension = self.exploration.dimension
+        self.generator = generator
+        self.clusters: list[Cluster] = []
+
+    def register(self) -> FoundTargets:
+        """Return the found targets with the ids given so far."""
+        raise NotImplementedError
+
+    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
+        """Take found targets into the state, of which some are new or changed."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Refuse a loaded state that a step cannot continue from (ValueError)."""
+        raise NotImplementedError
+
+    def own_found_targets(self) -> list[FoundTarget]:
+        """Return the found targets that this filter found itself."""
+        return [target for target in self.register().targets if not target.origin]
+
+    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
+        """Merge targets found by the filter of another robot; return whether anything changed."""
+        check_taken(robot, targets, self.dimension)
+        found = self.register()
+        added, changed = found.take_over(robot, targets)
+        self.place(found, added + changed)
+        return bool(added or changed)
+
+    def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
+        """Add targets that were found before this filter was created; return the new ones."""
+        check_taken('kept', targets, self.dimension)
+        found = self.register()
+        added = found.keep(targets)
+        self.place(found, added)
+        return added
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the whole state, random generator included, to one file."""
+        write_state(path, self.state())
+
+    def state(self) -> dict[str, dict[str, Any]]:
+        """Return the whole state, random generator included, by the method."""
+        state = {name: getattr(self, name) for name in ('settings', 'bounds', 'generator')}
+        state['exploration'] = self.exploration.values
+        names = ('clusters', *self.saved)
+        return {self.method: state | {name.lstrip('_'): getattr(self, name) for name in names}}
+
+    @classmethod
+    def of(cls, saved: SavedState) -> Self:
+        """Return the filter of a file; it continues bit for bit as the saved one would have."""
+        kinds: dict[str, Any] = {'settings': FilterSettings, 'generator': np.random.Generator}
+        kinds |= {'bounds': FloatArray, 'exploration': FloatArray}
+        own = {'clusters': list[Cluster], **cls.saved}
+        kinds |= {name.lstrip('_'): kind for name, kind in own.items()}
+        state = saved.read(cls.method, kinds)
+        with saved.named():
+            search = cls(state['settings'], state['bounds'], state['generator'])
+            search.exploration.restore(state['exploration'])
+            for name in own:
+                setattr(search, name, state[name.lstrip('_')])
+            search.check()
+        return search

@@ -263,13 +263,7 @@ class UnexploredMap:
         return 1.0 - float((volumes * self.values).sum() / volumes.sum())
 
     def restore(self, values: FloatArray) -> None:
-        """Put saved values in place of e.
-
-        Raises
-        ------
-        ValueError
-            If they do not fit the nodes, or are not from 0 to 1.
-        """
+        """Put saved values in place of e; ValueError if they do not fit the nodes or [0, 1]."""
         if values.shape != self.values.shape:
             raise ValueError(
                 f'exploration: got shape {values.shape}, allowed is {self.values.shape}'

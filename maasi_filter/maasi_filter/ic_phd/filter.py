@@ -6,8 +6,7 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +28,6 @@ from maasi_filter.measurement_check import (
     FOUND,
     CheckedMeasurement,
     check_measurements,
-    check_taken,
     count_dropped,
     count_unexplained,
     within_range,
@@ -38,15 +36,12 @@ from maasi_filter.models.sensor import LEAST_PER_SCAN
 from maasi_filter.records import (
     UNLABELLED,
     AgentMeasurement,
-    Cluster,
     FilterResult,
     FoundTarget,
     Label,
 )
-from maasi_filter.search_filter import FilterState
+from maasi_filter.search_filter import FilterBase
 from maasi_filter.settings import FilterSettings, IcPhdNumbers
-from maasi_filter.state_file import write_state
-from maasi_filter.unexplored_map import UnexploredMap
 
 # Particle sets below this size are faster on one thread.
 PARALLEL_PARTICLES = 65_536
@@ -54,36 +49,28 @@ PARALLEL_PARTICLES = 65_536
 LEAST_BIRTHS = 20
 
 
-@dataclass
-class IcPhdState(FilterState):
-    """The whole state of the filter."""
-
-    particles: FloatArray
-    weights: FloatArray
-    centres: FloatArray
-    found_targets: list[FoundTarget]
-    method: ClassVar[str] = 'ic_phd'
-
-
-class IcPhdFilter:
+class IcPhdFilter(FilterBase):
     """Particle PHD filter with an iterated corrector, K-means, and removal of found targets.
 
     Settings that are None have the value of the preset. Everything is as of `SearchFilter`.
     """
 
+    method = 'ic_phd'
+    saved: ClassVar[dict[str, Any]] = {
+        'particles': FloatArray,
+        'weights': FloatArray,
+        '_centres': FloatArray,
+        'found_targets': list[FoundTarget],
+    }
+
     def __init__(
         self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
     ) -> None:
-        self.settings = settings
+        super().__init__(settings, bounds, generator)
         self._settings = settings.resolved()
         self._numbers = IcPhdNumbers.of(self._settings)
-        self.exploration = UnexploredMap(bounds, settings.exploration_spacing)
-        self.bounds = self.exploration.bounds
-        self.dimension = self.exploration.dimension
-        self.generator = generator
         self.particles: FloatArray = np.empty((0, self.dimension))
         self.weights: FloatArray = np.empty(0)
-        self.clusters: list[Cluster] = []
         self._found = FoundTargets()
         self._centres: FloatArray = np.empty((0, self.dimension))
         self._pool: ThreadPoolExecutor | None = None
@@ -92,6 +79,10 @@ class IcPhdFilter:
     def found_targets(self) -> list[FoundTarget]:
         """Targets found so far, in the order of being found."""
         return self._found.targets
+
+    @found_targets.setter
+    def found_targets(self, targets: list[FoundTarget]) -> None:
+        self._found = FoundTargets(targets)
 
     @property
     def expected_number(self) -> float:
@@ -272,70 +263,26 @@ class IcPhdFilter:
             self._pool = ThreadPoolExecutor(threads)
         return self._pool
 
-    # Found targets of other filters.
+    def register(self) -> FoundTargets:
+        """Return the found targets with the ids given so far."""
+        return self._found
 
-    def own_found_targets(self) -> list[FoundTarget]:
-        """Return the found targets that this filter found itself."""
-        return self._found.own()
-
-    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Merge targets found by the filter of another robot; return whether anything changed."""
-        check_taken(robot, targets, self.dimension)
-        added, changed = self._found.take_over(robot, targets)
-        self._forget(added)
-        return bool(added or changed)
-
-    def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before this filter was created; return the new ones."""
-        check_taken('kept', targets, self.dimension)
-        added = self._found.keep(targets)
-        self._forget(added)
-        return added
-
-    def _forget(self, targets: Sequence[FoundTarget]) -> None:
-        """Delete the particles that found targets explain: those within T_z."""
-        for target in targets:
+    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
+        """Delete the particles that new found targets explain: those within T_z."""
+        for target in changed:
             offset = self.particles - target.position
             keep = (offset * offset).sum(axis=1) > self._numbers.removal_distance**2
             self.particles, self.weights = self.particles[keep], self.weights[keep]
 
-    # Saved state.
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the whole state, random generator included, to one file."""
-        write_state(path, {IcPhdState.method: self.state()})
-
-    def state(self) -> IcPhdState:
-        """Return the whole state, random generator included, for `write_state`."""
-        return IcPhdState(
-            self.settings,
-            self.bounds,
-            self.generator,
-            self.exploration.values,
-            self.clusters,
-            self.particles,
-            self.weights,
-            self._centres,
-            self.found_targets,
-        )
-
-    @classmethod
-    def from_state(cls, state: IcPhdState) -> IcPhdFilter:
-        """Return the filter of a state; it continues bit for bit as the saved one would have."""
-        search = cls(state.settings, state.bounds, state.generator)
-        search.exploration.restore(state.exploration)
-        state.check(state.found_targets)
-        n, d = len(state.weights), search.dimension
-        if state.particles.shape != (n, d) or state.centres.shape[1:] != (d,):
-            raise ValueError(f'particles: got shape {state.particles.shape}, allowed is {(n, d)}')
-        if not (np.isfinite(state.particles).all() and np.isfinite(state.weights).all()):
+    def check(self) -> None:
+        """Refuse a loaded state whose particles or weights are not usable."""
+        n, d = len(self.weights), self.dimension
+        if self.particles.shape != (n, d) or self._centres.shape[1:] != (d,):
+            raise ValueError(f'particles: got shape {self.particles.shape}, allowed is {(n, d)}')
+        if not (np.isfinite(self.particles).all() and np.isfinite(self.weights).all()):
             raise ValueError('particles, weights: got a number that is not finite')
-        if (state.weights < 0.0).any():
-            raise ValueError(f'weights: got {state.weights.min()}, allowed are numbers from 0')
-        search.particles, search.weights = state.particles, state.weights
-        search.clusters, search._centres = state.clusters, state.centres
-        search._found = FoundTargets(state.found_targets)
-        return search
+        if (self.weights < 0.0).any():
+            raise ValueError(f'weights: got {self.weights.min()}, allowed are numbers from 0')
 
 
 def _nearest_member(

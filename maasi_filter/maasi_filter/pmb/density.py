@@ -279,25 +279,19 @@ class Density:
         self.grid = np.empty((0, 0, 0))
 
     def restore(self, frame: FloatArray, grid: tuple[int, ...]) -> None:
-        """Check a saved density, whose grid has this shape if any, and let it share the frame."""
+        """Share a filter's frame; refuse what kernels would read beyond the end of its arrays."""
         n, d = len(self.weights), int((frame[1] > frame[0]).sum())
-        shapes = {
-            'particles': (self.particles.shape, (n, d)),
-            'heads': (self.heads.shape, (max(len(self.heads), 1), HEAD)),
-            'terms': (self.terms.shape, (len(self.terms), TERM)),
-            'grid': (self.grid.shape, grid if self.grid.size else (0, 0, 0)),
-        }
-        for name, (shape, allowed) in shapes.items():
-            if shape != allowed:
-                raise ValueError(f'{name}: got shape {shape}, allowed is {allowed}')
-        for name, array in {'particles': self.particles, 'terms': self.terms}.items():
-            if not np.isfinite(array).all():
-                raise ValueError(f'{name}: got a number that is not finite')
-        if n < 1 or ((self.weights < 0.0) | (self.weights > 1.0)).any():
-            raise ValueError('weights: got a number that is not from 0 to 1')
+        shapes = [item.shape for item in (self.particles, self.heads, self.terms, self.grid)]
+        allowed = [(n, d), (len(self.heads), HEAD), (len(self.terms), TERM), grid]
+        if self.grid.size == 0:
+            allowed[3] = (0, 0, 0)
         first, number = self.heads[:, FIRST], self.heads[:, TERMS]
-        if ((first < 0) | (number < 0) | (first + number > len(self.terms))).any():
-            raise ValueError('heads: got terms that are not there')
+        beyond = (first < 0) | (number < 0) | (first + number > len(self.terms))
+        if shapes != allowed or n < 1 or not len(self.heads) or beyond.any():
+            raise ValueError(f'density: got arrays of shapes {shapes}, allowed are {allowed}')
+        usable = np.isfinite(self.particles).all() and np.isfinite(self.terms).all()
+        if not usable or ((self.weights < 0.0) | (self.weights > 1.0)).any():
+            raise ValueError('density: got numbers that are not finite, or weights not from 0 to 1')
         renew_addresses(self.heads[:, KIND], self.heads[:, MODEL:])
         self.frame = frame
 

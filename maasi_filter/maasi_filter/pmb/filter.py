@@ -8,10 +8,9 @@ in `docs/filter.md`.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +20,6 @@ from maasi_filter.found_targets import FoundTargets
 from maasi_filter.measurement_check import (
     CheckedMeasurement,
     check_measurements,
-    check_taken,
     count_unexplained,
     pose_error_of,
     within_range,
@@ -56,10 +54,8 @@ from maasi_filter.pmb.factors import Scan, make_scan
 from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
-from maasi_filter.search_filter import FilterState
+from maasi_filter.search_filter import FilterBase
 from maasi_filter.settings import FilterSettings
-from maasi_filter.state_file import write_state
-from maasi_filter.unexplored_map import UnexploredMap
 
 LEAST_EXISTENCE = 1e-4
 # Least existence probability of a cluster that is published.
@@ -76,38 +72,30 @@ SAME_PLACE = 6.0
 CERTAIN = 0.999
 
 
-@dataclass
-class PmbState(FilterState):
-    """The whole state of the filter."""
-
-    components: list[Component]
-    learnt: Learnt
-    offsets: Offsets
-    scans: int
-    last_id: int
-    last_time: float | None
-    method: ClassVar[str] = 'pmb'
-
-
-class PmbFilter:
+class PmbFilter(FilterBase):
     """Poisson multi-Bernoulli filter for a set M_k of measuring robots.
 
     Settings that are None are derived from the measuring sensor. `components` are the potential
     targets, including found ones; everything else is as of `SearchFilter`.
     """
 
+    method = 'pmb'
+    saved: ClassVar[dict[str, Any]] = {
+        'components': list[Component],
+        '_learnt': Learnt,
+        '_offsets': Offsets,
+        '_scans': int,
+        '_last_id': int,
+        '_last_time': float | None,
+    }
+
     def __init__(
         self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
     ) -> None:
-        self.settings = settings
+        super().__init__(settings, bounds, generator)
         self._numbers = settings.resolved()
         self._expected_targets = self._numbers.expected_targets
-        self.exploration = UnexploredMap(bounds, settings.exploration_spacing)
-        self.bounds = self.exploration.bounds
-        self.dimension = self.exploration.dimension
-        self.generator = generator
         self.components: list[Component] = []
-        self.clusters: list[Cluster] = []
         self._learnt = Learnt()
         self._offsets = Offsets(self._numbers.pmb.offset, self.dimension)
         self._rates: FloatArray = PRIOR
@@ -378,32 +366,14 @@ class PmbFilter:
         error = pose_error_of(member.sensor, self._numbers, self.dimension)
         return FOUND_RADIUS_DEVIATIONS * math.sqrt(member.sensor.covariance[0, 0] + error**2)
 
-    # Found targets of other filters.
+    def register(self) -> FoundTargets:
+        """Return the found targets with the ids given so far."""
+        return FoundTargets(self.found_targets, self._last_id)
 
-    def own_found_targets(self) -> list[FoundTarget]:
-        """Return the found targets that this filter found itself."""
-        return [target for target in self.found_targets if not target.origin]
-
-    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Merge targets found by the filter of another robot; return whether anything changed."""
-        check_taken(robot, targets, self.dimension)
-        found = FoundTargets(self.found_targets, self._last_id)
-        added, changed = found.take_over(robot, targets)
-        self._place(added + changed, found.last_id)
-        return bool(added or changed)
-
-    def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before this filter was created; return the new ones."""
-        check_taken('kept', targets, self.dimension)
-        found = FoundTargets(self.found_targets, self._last_id)
-        added = found.keep(targets)
-        self._place(added, found.last_id)
-        return added
-
-    def _place(self, targets: Sequence[FoundTarget], last_id: int) -> None:
+    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
         """Mark components, or new ones, as found targets."""
-        self._last_id = last_id
-        for target in targets:
+        self._last_id = found.last_id
+        for target in changed:
             same = [item for item in self.components if item.target and item.target.id == target.id]
             item = same[0] if same else nearest(target, self.components)
             density = Density.normal(
@@ -420,44 +390,12 @@ class PmbFilter:
             item.pose_error = 0.0
             item.labels = LabelTally.of(target.label)
 
-    # Saved state.
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the whole state, random generator included, to one file."""
-        write_state(path, {PmbState.method: self.state()})
-
-    def state(self) -> PmbState:
-        """Return the whole state, random generator included, for `write_state`."""
-        return PmbState(
-            self.settings,
-            self.bounds,
-            self.generator,
-            self.exploration.values,
-            self.clusters,
-            self.components,
-            self._learnt,
-            self._offsets,
-            self._scans,
-            self._last_id,
-            self._last_time,
-        )
-
-    @classmethod
-    def from_state(cls, state: PmbState) -> PmbFilter:
-        """Return the filter of a state; it continues bit for bit as the saved one would have."""
-        search = cls(state.settings, state.bounds, state.generator)
-        search.exploration.restore(state.exploration)
-        for item in state.components:
-            item.density.restore(search._frame, search.exploration.kernel()[0].shape)
+    def check(self) -> None:
+        """Refuse a loaded state whose components are not usable."""
+        for item in self.components:
+            item.density.restore(self._frame, self.exploration.kernel()[0].shape)
             if not 0.0 <= item.existence <= 1.0 or item.answers.shape != (len(RATES),):
                 raise ValueError(
                     f'component: got existence {item.existence} and {len(item.answers)} answers, '
                     f'allowed are 0 to 1 and {len(RATES)}'
                 )
-        search.components, search.clusters = state.components, state.clusters
-        state.check(search.found_targets)
-        search._learnt, search._offsets = state.learnt, state.offsets
-        search._offsets.check()
-        search._scans, search._last_id = state.scans, state.last_id
-        search._last_time = state.last_time
-        return search

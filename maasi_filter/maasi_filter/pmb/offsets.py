@@ -52,16 +52,6 @@ class Offsets:
     #: Way of each robot on the level since its first scan, metres.
     way: dict[str, float] = field(default_factory=dict)
 
-    def check(self) -> None:
-        """Refuse saved offsets that do not fit each other."""
-        size = self.dimension * len(self.keys)
-        shapes = self.mean.shape, self.covariance.shape
-        if shapes != ((size,), (size, size)) or len(set(self.keys)) < len(self.keys):
-            raise ValueError(f'offsets: got {str(self.keys)[:100]}, allowed is one for each offset')
-        robots = [key for key in self.keys if isinstance(key, str)]
-        if not robots == list(self.last) == list(self.way):
-            raise ValueError(f'offsets: got ways of {list(self.way)}, allowed are {robots}')
-
     @property
     def active(self) -> bool:
         """Whether the settings say that errors last."""
