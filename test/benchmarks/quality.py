@@ -28,7 +28,7 @@ from scipy.stats import binomtest, chi2
 from maasi_filter import warm_up
 from maasi_filter.metrics import match_targets, restricted_mean
 from maasi_filter.vector_math import squared_distance
-from maasi_sim.experiments.execution import run_command
+from maasi_sim.experiments.campaign import run_command
 from maasi_sim.experiments.statistics import paired_difference
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario

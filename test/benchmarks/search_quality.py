@@ -16,10 +16,9 @@ from pathlib import Path
 from quality_conditions import SEEDS
 from search_regimes import KINDS, REGIMES, prepared
 
-from maasi_sim.experiments.campaign import plan
-from maasi_sim.experiments.compared_searches import comparison_of, search_settings
-from maasi_sim.experiments.execution import carry_out_all, run_command
+from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
 from maasi_sim.experiments.experiment import Case, Experiment, Results
+from maasi_sim.experiments.searches import comparison_of, search_settings
 from maasi_sim.experiments.tables import compared_markdown
 
 # What differences are to.

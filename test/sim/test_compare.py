@@ -11,7 +11,7 @@ import pytest
 import yaml
 from small_field import SMALL_FIELD
 
-from maasi_sim.experiments import campaign, compare, compared_searches
+from maasi_sim.experiments import campaign, compare, searches
 
 PLANNERS = ['nearest_widest', 'lawnmower']
 
@@ -108,7 +108,7 @@ def test_other_settings_and_other_code_are_noticed(
     assert command(scenario, out, '--time-limit', '5', seeds=1) == 2
     said = capsys.readouterr().err
     assert '2 searches there are of other settings' in said and '--again' in said
-    monkeypatch.setattr(compared_searches, 'code_digest', lambda: 'another')
+    monkeypatch.setattr(searches, 'code_digest', lambda: 'another')
     assert command(scenario, out, seeds=1) == 2
     assert not executed
     assert command(scenario, out, '--again', seeds=1) == 0
@@ -118,10 +118,10 @@ def test_other_settings_and_other_code_are_noticed(
 
 
 def test_worker_of_other_code_is_noticed(scenario, tmp_path, monkeypatch):
-    work = campaign.plan(compared_searches.compared(scenario, PLANNERS), tmp_path, 1)
+    work = campaign.plan(searches.compared(scenario, PLANNERS), tmp_path, 1)
     # What a cluster sends.
     task = pickle.loads(pickle.dumps(work.tasks[0]))
-    monkeypatch.setattr(compared_searches, 'code_digest', lambda: 'another')
+    monkeypatch.setattr(searches, 'code_digest', lambda: 'another')
     assert 'another version of the code' in campaign.execute(task)
 
 
@@ -148,7 +148,7 @@ def test_planner_of_ones_own_is_compared_and_its_changes_are_noticed(
 
 
 def test_filters_are_compared_with_each_planner(scenario):
-    cases = compared_searches.compared(scenario, PLANNERS, ['pmb', 'ic_phd'], 4.0).cases(False)
+    cases = searches.compared(scenario, PLANNERS, ['pmb', 'ic_phd'], 4.0).cases(False)
     assert [case.name for case in cases] == [
         f'{planner}, {method}' for method in ('pmb', 'ic_phd') for planner in PLANNERS
     ]

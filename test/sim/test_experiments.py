@@ -13,8 +13,8 @@ import pytest
 import yaml
 
 from maasi_sim import machine
-from maasi_sim.experiments import campaign, execution, papers, reproduce, runs, tables, workers
-from maasi_sim.experiments.campaign import carry_out, plan
+from maasi_sim.experiments import campaign, papers, reproduce, runs, tables
+from maasi_sim.experiments.campaign import Workers, make_workers, plan
 from maasi_sim.experiments.experiment import (
     Case,
     Comparison,
@@ -23,7 +23,6 @@ from maasi_sim.experiments.experiment import (
     Published,
     Quantity,
 )
-from maasi_sim.experiments.workers import Workers
 
 STEPS = Quantity('steps', 'steps', '', 'restricted')
 ERROR = Quantity('error', 'error', 'm')
@@ -231,7 +230,7 @@ def test_outputs_hold_what_was_run(toy, tmp_path):
 
 def test_table_compares_with_the_paper_and_in_pairs(toy, tmp_path):
     work = plan(toy, tmp_path, 4)
-    carry_out(work, Workers())
+    work.carry_out(Workers())
     got = work.results()
     table = {(row.case, row.quantity.name): row for row in tables.rows(got)}
     row = table['first', 'steps']
@@ -328,7 +327,7 @@ def test_names_are_unique_and_listed(capsys):
 
 
 def test_cluster_that_does_not_answer_is_said(monkeypatch, capsys, tmp_path, toy):
-    monkeypatch.setattr(workers, 'PATIENCE', 1.0)
+    monkeypatch.setattr(campaign, 'PATIENCE', 1.0)
     assert command(tmp_path, '--cluster', 'tcp://127.0.0.1:1') == 3
     assert 'no scheduler answers' in capsys.readouterr().err
 
@@ -337,11 +336,11 @@ def test_workers_of_a_cluster_say_on_what_they_run(toy, tmp_path):
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, processes=False, dashboard_address=None) as local:
-        team = workers.make_workers(3, cluster=local.scheduler_address)
+        team = make_workers(3, cluster=local.scheduler_address)
         try:
             assert len(team.machines) == 2
             work = plan(toy, tmp_path, 1)
-            assert carry_out(work, team, machine=campaign.one_machine(team, [work])) == []
+            assert work.carry_out(team, machine=campaign.one_machine(team, [work])) == []
             assert len(work.done) == 3
         finally:
             team.close()
@@ -352,9 +351,9 @@ def _die(number):
 
 
 def test_worker_that_dies_is_said():
-    team = workers.make_workers(2, 2)
+    team = make_workers(2, 2)
     try:
-        with pytest.raises(workers.WorkersLost, match='a worker died'):
+        with pytest.raises(campaign.WorkersLost, match='a worker died'):
             list(team.make(_die, [1, 2]))
     finally:
         team.close()
@@ -376,7 +375,7 @@ def elsewhere(monkeypatch):
                 yield task, run
 
         team.make = make
-        monkeypatch.setattr(execution, 'make_workers', lambda *_: team)
+        monkeypatch.setattr(campaign, 'make_workers', lambda *_: team)
 
     return use
 

@@ -14,12 +14,11 @@ import pytest
 import yaml
 from waiting import wait_until
 
-from maasi_sim.experiments import reproduce, searches, terrain
-from maasi_sim.experiments.campaign import carry_out, plan
+from maasi_sim.experiments import reproduce, searches
+from maasi_sim.experiments.campaign import Workers, plan
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.papers import experiments
 from maasi_sim.experiments.runs import load_run
-from maasi_sim.experiments.workers import Workers
 
 KNOWN = experiments()
 
@@ -28,13 +27,13 @@ KNOWN = experiments()
 def test_small_version_writes_what_makes_sense(name, tmp_path):
     experiment = KNOWN[name]
     work = plan(experiment, tmp_path, 1, small=True)
-    assert carry_out(work, Workers()) == []
-    write_outputs(work.folder, work.results(), 1)
+    assert work.carry_out(Workers()) == []
+    write_outputs(work, 1)
     folder = tmp_path / name
     assert not plan(experiment, tmp_path, 1, small=True).tasks
 
     for case in work.cases.values():
-        run = load_run(work.folder.file(case, 0))
+        run = load_run(work.file(case.name, 0))
         assert run.seed == experiment.seed(0) and run.columns
         if 'mission' in case.settings:
             check_mission(experiment, run, case.settings)
@@ -183,20 +182,20 @@ def test_robot_that_leaves_measures_no_more():
 
 def test_terrain_is_self_affine():
     # The mean square difference grows with the distance to the power 2 H.
-    heights = terrain.self_affine_map(np.random.default_rng(4), 512)
+    heights = searches.self_affine_map(np.random.default_rng(4), 512)
     assert heights.mean() == pytest.approx(0.0, abs=1e-9)
     assert heights.std() == pytest.approx(1.0)
     lags = np.array([2, 4, 8, 16])
     squares = [((np.roll(heights, lag, 0) - heights) ** 2).mean() for lag in lags]
     slope = np.polyfit(np.log(lags), np.log(squares), 1)[0]
-    assert slope == pytest.approx(2.0 * terrain.HURST, abs=0.15)
+    assert slope == pytest.approx(2.0 * searches.HURST, abs=0.15)
 
 
 def test_litter_lies_low_and_high():
     generator = np.random.default_rng(5)
     bounds = np.array([[-30.0, 250.0], [-30.0, 250.0]])
-    heights = terrain.chunk(generator, 280.0, 57)
-    targets = terrain.littered(heights, bounds, 14, 15.0, 10.0, generator)
+    heights = searches.chunk(generator, 280.0, 57)
+    targets = searches.littered(heights, bounds, 14, 15.0, 10.0, generator)
     assert targets.shape == (14, 2)
     assert (targets >= -20.0).all() and (targets <= 240.0).all()
     index = np.round((targets + 30.0) / 5.0).astype(int)

@@ -8,7 +8,7 @@ import pytest
 import search_quality
 import search_regimes
 
-from maasi_sim.experiments.compared_searches import find_times
+from maasi_sim.experiments.searches import find_times
 
 
 def test_find_times():

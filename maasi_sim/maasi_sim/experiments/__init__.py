@@ -1,5 +1,5 @@
 """The papers' experiments, and comparisons of searches.
 
 `experiment` defines what an experiment is, `papers` reads those of the papers, `campaign` makes
-their runs by `workers`, and `runs` stores them; `tables`, `figures` and `outputs` show them.
+and keeps their runs (`runs`); `tables`, `figures` and `outputs` show them.
 """

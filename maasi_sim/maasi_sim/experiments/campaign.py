@@ -1,4 +1,4 @@
-"""Runs the cases of experiments on their maps, and keeps the runs.
+"""Makes the runs of experiments, keeps them, and what the commands that do so share.
 
 The seed of a run is that of the map and does not depend on the worker. Stored runs are not
 repeated. Another processor or other versions may change the last bits of numbers, so that runs of
@@ -7,16 +7,137 @@ different machines are mixed only on request (docs/repeatability.md).
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, TypeVar
 
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from maasi_sim.arguments import count
 from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Results, Run
-from maasi_sim.experiments.runs import DamagedRun, RunFolder, run_of
-from maasi_sim.experiments.workers import Workers
-from maasi_sim.machine import code_digest, machine_difference
+from maasi_sim.experiments.runs import DamagedRun, NoRoom, load_run, run_of, to_text, write_file
+from maasi_sim.machine import code_digest, machine_difference, this_machine
+
+Item = TypeVar('Item')
+
+DONE, SOME_FAILED, WRONG_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
+EXIT_CODES = (
+    'Exit codes: 0 all runs are there, 1 some failed, 2 wrong input, 3 stopped: no room on the '
+    'disk, or the workers are gone, 130 interrupted.'
+)
+# Longest wait for the scheduler of a cluster and for its first worker [s].
+PATIENCE = 20.0
+# One thread for each worker; the number of workers sets the load.
+_ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS')
+# Wall time between two lines of progress without a terminal [s].
+_QUIET_PERIOD = 10.0
+
+
+class WorkersLost(RuntimeError):
+    """The workers are lost; their finished runs are kept."""
+
+
+class MixedWorkers(ValueError):
+    """Processors or versions differ, and mixing was not requested."""
+
+
+@dataclass
+class Workers:
+    """An executor of runs, or none: this process; `machines` are those of the workers by name."""
+
+    executor: Executor | None = None
+    number: int = 1
+    machines: dict[str, dict[str, str]] = field(
+        default_factory=lambda: {'this machine': this_machine()}
+    )
+    close: Callable[[], None] = lambda: None
+
+    def make(
+        self, function: Callable[[Item], Any], items: Sequence[Item]
+    ) -> Iterator[tuple[Item, Any]]:
+        """Yield each item with its result, in the order of completion."""
+        if self.executor is None:
+            yield from ((item, function(item)) for item in items)
+            return
+        try:
+            waiting = {self.executor.submit(function, item): item for item in items}
+            for future in as_completed(waiting):
+                yield waiting.pop(future), future.result()
+        except Exception as error:
+            reason = str(error) or type(error).__name__
+            raise WorkersLost(f'a worker died: {reason}') from None
+
+
+def make_workers(number: int, wanted: int | None = None, cluster: str | None = None) -> Workers:
+    """Return workers for `number` runs: at most the wanted processes, or a Dask cluster's."""
+    if cluster is not None:
+        return _of_cluster(cluster)
+    processes = min(wanted or os.cpu_count() or 1, number)
+    return _processes(processes) if processes > 1 else Workers()
+
+
+def _begin() -> None:
+    # The main process handles Ctrl-C and shuts down its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _processes(number: int) -> Workers:
+    # Spawned: a fresh interpreter on every system.
+    pool = ProcessPoolExecutor(number, multiprocessing.get_context('spawn'), _begin)
+    before = dict(os.environ)
+    os.environ.update(dict.fromkeys(_ONE_THREAD, '1'))
+
+    def close() -> None:
+        workers = list((pool._processes or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            with contextlib.suppress(OSError, ValueError):
+                worker.terminate()
+        os.environ.clear()
+        os.environ.update(before)
+
+    return Workers(pool, number, close=close)
+
+
+def _of_cluster(address: str) -> Workers:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise WorkersLost("a cluster needs the package 'dask[distributed]'") from None
+    try:
+        client: Any = Client(address, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise WorkersLost(f'cluster: no scheduler answers at {address}: {error}') from None
+    try:
+        client.wait_for_workers(1, timeout=PATIENCE)
+        machines = dict(sorted(client.run(this_machine).items()))
+    except TimeoutError:
+        client.close()
+        raise WorkersLost(f'cluster: the scheduler at {address} has no workers') from None
+    except Exception as error:
+        client.close()
+        raise WorkersLost(f'cluster: {type(error).__name__}: {error}') from None
+    # One retry if a worker is lost; not pure, so that equal tasks are not merged.
+    executor = client.get_executor(pure=False, retries=1)
+    return Workers(executor, sum(client.nthreads().values()), machines, client.close)
 
 
 @dataclass(frozen=True)
@@ -29,10 +150,6 @@ class Task:
     seed: int
     run: Callable[[dict[str, Any], int], Outcome]
     code: str
-
-
-class MixedWorkers(ValueError):
-    """Processors or versions differ, and mixing was not requested."""
 
 
 def execute(task: Task) -> Run | str:
@@ -58,14 +175,14 @@ class Campaign:
 
     experiment: Experiment
     cases: dict[str, Case]
-    folder: RunFolder
+    folder: Path
     done: dict[tuple[str, int], Run] = field(default_factory=dict)
     tasks: list[Task] = field(default_factory=list)
     complaints: dict[Path, str] = field(default_factory=dict)
 
     def file(self, case: str, number: int) -> Path:
         """Return the file of a run."""
-        return self.folder.file(self.cases[case], number)
+        return self.folder / 'runs' / f'{self.cases[case].slug}-{number:04d}.json'
 
     def results(self) -> Results:
         """Return the stored runs."""
@@ -73,6 +190,39 @@ class Campaign:
         for (name, _), run in sorted(self.done.items(), key=lambda item: item[0][1]):
             runs[name].append(run)
         return Results(self.experiment, list(self.cases.values()), runs)
+
+    def carry_out(
+        self,
+        workers: Workers,
+        advance: Callable[[Task], None] = lambda task: None,
+        machine: dict[str, str] | None = None,
+    ) -> list[str]:
+        """Make the missing runs, store each when it is done, and return the errors.
+
+        `advance` is called after each run. With a `machine`, all must have been made on it, also
+        by workers that join later.
+        """
+        problems = []
+        for task, run in workers.make(execute, self.tasks):
+            problem = run if isinstance(run, str) else ''
+            if not problem and machine is not None:
+                difference = machine_difference(machine, run.machine)
+                problem = difference and f'not kept, made by a different worker: {difference}'
+            if problem:
+                problems.append(
+                    f'{task.experiment}, {task.case.name}, map {task.number}: {problem}'
+                )
+            else:
+                write_file(self.file(task.case.name, task.number), to_text(run))
+                self.done[task.case.name, task.number] = run
+            advance(task)
+        return problems
+
+
+def maps_in(folder: Path) -> int:
+    """Return the largest number of a map with runs in the folder of an experiment, plus one."""
+    files = (folder / 'runs').glob('*-[0-9][0-9][0-9][0-9].json')
+    return max((int(path.stem.rsplit('-', 1)[1]) for path in files), default=-1) + 1
 
 
 def plan(
@@ -88,21 +238,22 @@ def plan(
     Wanted are `runs` maps from number `first`, with the seed of the campaign.
     """
     cases = {case.name: case for case in experiment.cases(small)}
-    result = Campaign(experiment, cases, RunFolder(out / experiment.name, experiment.name))
+    result = Campaign(experiment, cases, out / experiment.name)
     for number in range(first, first + runs):
         for case in cases.values():
             if number - first >= experiment.maps_of(case, runs):
                 continue
-            map_seed = experiment.seed(number, seed)
+            wanted = experiment.name, case.name, number, experiment.seed(number, seed)
+            file = result.file(case.name, number)
             try:
-                run = result.folder.load(case, number, map_seed)
+                run = load_run(file) if file.exists() else None
             except DamagedRun as error:
-                result.complaints[result.folder.file(case, number)] = str(error)
+                result.complaints[file] = str(error)
                 run = None
-            if run is not None:
+            if run is not None and run.identity() == (*wanted, case.digest()):
                 result.done[case.name, number] = run
             else:
-                task = Task(experiment.name, case, number, map_seed, experiment.run, code_digest())
+                task = Task(wanted[0], case, number, wanted[3], experiment.run, code_digest())
                 result.tasks.append(task)
     return result
 
@@ -123,27 +274,112 @@ def one_machine(workers: Workers, campaigns: Sequence[Campaign]) -> dict[str, st
     return machine
 
 
-def carry_out(
-    work: Campaign,
-    workers: Workers,
-    advance: Callable[[Task], None] = lambda task: None,
-    machine: Mapping[str, str] | None = None,
-) -> list[str]:
-    """Make the missing runs of a campaign, store each when it is done, and return the errors.
+# Of the commands.
 
-    `advance` is called after each run. With a `machine`, all must have been made on it, also by
-    workers that join later.
+
+def add_worker_options(parser: argparse.ArgumentParser, cluster: str) -> None:
+    """Add the options of `carry_out_all`; `cluster` is the name of that of a Dask cluster."""
+    parser.add_argument(
+        '--workers', type=count, metavar='N', help='processes (default: one for each core)'
+    )
+    parser.add_argument(
+        cluster, dest='cluster', metavar='ADDRESS', help='scheduler of a Dask cluster'
+    )
+    parser.add_argument(
+        '--mixed-workers',
+        action='store_true',
+        help='mix runs of different processors or versions, which may differ in the last bits',
+    )
+
+
+def run_command(command: Callable[[], int], *wrong_input: type[Exception]) -> int:
+    """Run a command that can be interrupted, and return its exit code; errors are printed."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        return command()
+    except wrong_input as error:
+        text, code = str(error), WRONG_INPUT
+    except MixedWorkers as error:
+        text, code = f'{error}; --mixed-workers allows it', WRONG_INPUT
+    except (NoRoom, WorkersLost) as error:
+        text, code = f'{error}; the runs until now are kept', STOPPED
+    except KeyboardInterrupt:
+        text, code = 'interrupted; the same command resumes', INTERRUPTED
+    for line in text.splitlines():
+        print(f'error: {line}', file=sys.stderr)
+    return code
+
+
+def carry_out_all(
+    campaigns: list[Campaign],
+    workers: int | None = None,
+    cluster: str | None = None,
+    mixed: bool = False,
+    finished: Callable[[Campaign], str] = lambda work: '',
+) -> list[str]:
+    """Make the missing runs of all campaigns, print a summary, and return the errors.
+
+    `workers` and `cluster` are those of `make_workers`; `mixed` allows runs of different
+    processors or versions. `finished` is called when the runs of a campaign are done, and returns
+    a line to print, '' for none.
     """
-    problems = []
-    for task, run in workers.make(execute, work.tasks):
-        problem = run if isinstance(run, str) else ''
-        if not problem and machine is not None:
-            difference = machine_difference(machine, run.machine)
-            problem = difference and f'not kept, made by a different worker: {difference}'
-        if problem:
-            problems.append(f'{task.experiment}, {task.case.name}, map {task.number}: {problem}')
-        else:
-            work.folder.write(task.case, run)
-            work.done[task.case.name, task.number] = run
-        advance(task)
+    for work in campaigns:
+        for complaint in work.complaints.values():
+            print(f'warning: {complaint}; this run is repeated', file=sys.stderr)
+    number = sum(len(work.tasks) for work in campaigns)
+    problems: list[str] = []
+    team = Workers()
+    begin = time.monotonic()
+    try:
+        if number:
+            team = make_workers(number, workers, cluster)
+        machine = one_machine(team, campaigns) if number and not mixed else None
+        with _progress(number) as (advance, say):
+            for work in campaigns:
+                problems += work.carry_out(team, advance, machine)
+                say(finished(work))
+    finally:
+        team.close()
+    used = f' by {team.number} workers in {time.monotonic() - begin:.0f} s' if number else ''
+    kept = sum(len(work.done) for work in campaigns)
+    print(f'{number - len(problems)} runs made{used}; {kept} there in all')
+    for problem in problems:
+        print(f'error: {problem}', file=sys.stderr)
     return problems
+
+
+@contextlib.contextmanager
+def _progress(total: int) -> Iterator[tuple[Callable[[Task], None], Callable[[str], None]]]:
+    """Yield functions that count a run, and that print a line: beside a bar on a terminal."""
+    bar = Progress(
+        *(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn()),
+        *(TimeElapsedColumn(), TextColumn('left'), TimeRemainingColumn()),
+        console=Console(stderr=True, soft_wrap=True),
+        disable=not (sys.stderr.isatty() and total),
+    )
+    shown = bar.add_task('', total=total)
+    begin = last = time.monotonic()
+    made = 0
+
+    def say(text: str) -> None:
+        if text:
+            bar.console.print(text, markup=False, highlight=False)
+
+    def advance(task: Task) -> None:
+        nonlocal made, last
+        made += 1
+        what = f'{task.experiment} {task.case.name}'
+        bar.update(shown, completed=made, description=what)
+        now = time.monotonic()
+        if bar.disable and now - last >= _QUIET_PERIOD:
+            last = now
+            left = (now - begin) * (total - made) / made
+            say(f'{made} of {total} runs, about {left:.0f} s left ({what})')
+
+    with bar:
+        yield advance, say

@@ -11,20 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from maasi_sim.arguments import Parser, count, positive, whole
-from maasi_sim.experiments.campaign import Campaign, plan
-from maasi_sim.experiments.compared_searches import compared
-from maasi_sim.experiments.execution import (
+from maasi_sim.experiments.campaign import (
     DONE,
     EXIT_CODES,
     SOME_FAILED,
+    Campaign,
     add_worker_options,
     carry_out_all,
+    plan,
     run_command,
 )
 from maasi_sim.experiments.experiment import Results
-from maasi_sim.experiments.figures import draw_comparison
-from maasi_sim.experiments.outputs import as_png
+from maasi_sim.experiments.figures import as_png, draw_comparison
 from maasi_sim.experiments.runs import runs_text, write_file
+from maasi_sim.experiments.searches import compared
 from maasi_sim.experiments.tables import compared_facts, compared_page, compared_text, verdicts
 from maasi_sim.scenario.layering import ScenarioError
 
@@ -160,12 +160,11 @@ def _new_folder() -> Path:
 
 def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
     """Refuse a folder with whole searches of the same names and seeds but other settings."""
-    missing = [
-        (work, work.folder.file(task.case, task.number))
+    other = sum(
+        file.exists() and file not in work.complaints
         for work in campaigns
-        for task in work.tasks
-    ]
-    other = sum(file.exists() and file not in work.complaints for work, file in missing)
+        for file in (work.file(task.case.name, task.number) for task in work.tasks)
+    )
     if other:
         raise WrongRequest(
             f'--out: {out}: {other} searches there are of other settings, or of another version '

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from operator import getitem
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,19 @@ _COMPARED = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9', '#D55E00', '
 _LINES = ('-', '--', '-.', ':')
 _FEWEST_SHADED = 4
 _TRUE, _FOUND, _PALE = '#222222', '#D62728', '#9A9A9A'
+
+
+def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
+    """Return a figure, drawn by a function, as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 5.0), layout='constrained')
+    FigureCanvasAgg(figure)
+    draw(figure)
+    stream = io.BytesIO()
+    figure.savefig(stream, dpi=dpi, format='png')
+    return stream.getvalue()
 
 
 def _found_over(run: Run, grid: FloatArray, by: str) -> FloatArray:

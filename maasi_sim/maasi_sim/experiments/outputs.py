@@ -2,43 +2,26 @@
 
 from __future__ import annotations
 
-import io
 import json
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
 
-from maasi_sim.experiments.campaign import plan
+from maasi_sim.experiments.campaign import Campaign, maps_in, plan
 from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
+from maasi_sim.experiments.figures import as_png
 from maasi_sim.experiments.papers import experiments, introduction, title_of
-from maasi_sim.experiments.runs import RunFolder, runs_text, steps_text, write_file
+from maasi_sim.experiments.runs import runs_text, steps_text, write_file
 from maasi_sim.experiments.tables import by_case, markdown_table, table_cells, table_text
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _PICTURE_DPI = 130
 _COLUMNS = 118
 EARLIER = ', from an earlier campaign'
 EARLIER_ROW = ' (earlier)'
-
-
-def as_png(draw: Callable[[Figure], None], dpi: int = 110) -> bytes:
-    """Return a figure, drawn by a function, as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 5.0), layout='constrained')
-    FigureCanvasAgg(figure)
-    draw(figure)
-    stream = io.BytesIO()
-    figure.savefig(stream, dpi=dpi, format='png')
-    return stream.getvalue()
 
 
 def picture(results: Results, dpi: int = 110) -> bytes:
@@ -70,20 +53,23 @@ def configuration_text(results: Results, seed: int) -> str:
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
 
 
-def write_outputs(folder: RunFolder, results: Results, seed: int) -> None:
+def write_outputs(work: Campaign, seed: int) -> None:
     """Write raw runs, tables, figure and configuration."""
-    experiment = results.experiment
+    experiment, results = work.experiment, work.results()
     parts = [
         f'# {experiment.name}: {experiment.title}\n',
         *_described(experiment, table_cells(results)),
         listed(experiment.choices),
     ]
-    write_file(folder.path / 'steps.csv', steps_text(results.every()))
-    write_file(folder.path / 'runs.csv', runs_text(results.every()))
-    write_file(folder.path / 'table.csv', table_text(results))
-    write_file(folder.path / 'table.md', '\n'.join(filter(None, parts)))
-    write_file(folder.path / 'configuration.yaml', configuration_text(results, seed))
-    write_file(folder.path / 'figure.png', picture(results))
+    for name, content in (
+        ('steps.csv', steps_text(results.every())),
+        ('runs.csv', runs_text(results.every())),
+        ('table.csv', table_text(results)),
+        ('table.md', '\n'.join(filter(None, parts))),
+        ('configuration.yaml', configuration_text(results, seed)),
+        ('figure.png', picture(results)),
+    ):
+        write_file(work.folder / name, content)
 
 
 def _described(experiment: Experiment, tables: list[list[list[str]]]) -> list[str]:
@@ -212,8 +198,7 @@ def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) ->
         image = file.parent / 'reproduction' / f'{name}.png'
         store = image.with_suffix('.json')
         earlier = Section(**json.loads(store.read_text())) if store.exists() else None
-        maps = RunFolder(out / name, name).maps()
-        results = plan(experiment, out, maps, seed, small).results()
+        results = plan(experiment, out, maps_in(out / name), seed, small).results()
         every = len(results.names()) == len(results.cases)
         if results.names():
             shown.append(name)

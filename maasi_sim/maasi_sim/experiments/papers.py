@@ -16,37 +16,29 @@ from typing import Any
 
 import yaml
 
-from maasi_sim.experiments import building_figures, building_runs, figures, searches
-from maasi_sim.experiments.building_runs import run_mission, run_timing
+from maasi_sim.experiments import buildings, figures, searches
 from maasi_sim.experiments.experiment import Case, Comparison, Experiment, OpenPoint, Published
-from maasi_sim.experiments.searches import (
-    merged,
-    run_among_obstacles,
-    run_exploring,
-    run_search,
-    search_case,
-)
-from maasi_sim.experiments.terrain import run_on_terrain
+from maasi_sim.experiments.searches import merged, search_case
 
-QUANTITIES = {item.name: item for item in (*searches.QUANTITIES, *building_runs.QUANTITIES)}
+QUANTITIES = {item.name: item for item in (*searches.QUANTITIES, *buildings.QUANTITIES)}
 RUNS = {
-    'search': run_search,
-    'exploring': run_exploring,
-    'among_obstacles': run_among_obstacles,
-    'on_terrain': run_on_terrain,
-    'mission': run_mission,
-    'timing': run_timing,
+    'search': searches.run_search,
+    'exploring': searches.run_exploring,
+    'among_obstacles': searches.run_among_obstacles,
+    'on_terrain': searches.run_on_terrain,
+    'mission': buildings.run_mission,
+    'timing': buildings.run_timing,
 }
 FIGURES: dict[str, Callable[..., None]] = {
     'curves': figures.draw_curves,
     'paths': figures.draw_paths,
     'against': figures.draw_against,
     'table': figures.draw_table,
-    'missions': building_figures.draw_missions,
-    'batteries_and_ranges': building_figures.draw_batteries_and_ranges,
-    'visits_over_time': building_figures.draw_visits_over_time,
-    'mission_times': building_figures.draw_mission_times,
-    'decision_times': building_figures.draw_decision_times,
+    'missions': buildings.draw_missions,
+    'batteries_and_ranges': buildings.draw_batteries_and_ranges,
+    'visits_over_time': buildings.draw_visits_over_time,
+    'mission_times': buildings.draw_mission_times,
+    'decision_times': buildings.draw_decision_times,
 }
 PAPERS = ('000', '001', '002', '003', '004')
 _FOLDER = Path(__file__).with_name('papers')

@@ -8,13 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from maasi_sim.arguments import Parser, count, whole
-from maasi_sim.experiments.campaign import Campaign, plan
-from maasi_sim.experiments.execution import (
+from maasi_sim.experiments.campaign import (
     DONE,
     EXIT_CODES,
     SOME_FAILED,
+    Campaign,
     add_worker_options,
     carry_out_all,
+    plan,
     run_command,
 )
 from maasi_sim.experiments.experiment import Experiment
@@ -118,8 +119,8 @@ def _run(wanted: Sequence[Experiment], options: argparse.Namespace) -> list[str]
         campaigns.append(work)
 
     def finished(work: Campaign) -> str:
-        write_outputs(work.folder, work.results(), options.seed)
-        return f'{work.experiment.name}: {work.folder.path}/table.md'
+        write_outputs(work, options.seed)
+        return f'{work.experiment.name}: {work.folder}/table.md'
 
     return carry_out_all(
         campaigns, options.workers, options.cluster, options.mixed_workers, finished

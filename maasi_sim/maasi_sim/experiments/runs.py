@@ -91,37 +91,6 @@ def write_file(path: Path, content: str | bytes) -> None:
         raise NoRoom(error.errno, f'{path}: cannot be written: {reason}') from None
 
 
-class RunFolder:
-    """The folder of an experiment's runs, created with the first one."""
-
-    def __init__(self, path: Path, experiment: str) -> None:
-        self.path = path
-        self.experiment = experiment
-
-    def file(self, case: Case, number: int) -> Path:
-        """Return the file of a run."""
-        return self.path / 'runs' / f'{case.slug}-{number:04d}.json'
-
-    def maps(self) -> int:
-        """Return the largest number of a map with runs, plus one."""
-        files = (self.path / 'runs').glob('*-[0-9][0-9][0-9][0-9].json')
-        return max((int(path.stem.rsplit('-', 1)[1]) for path in files), default=-1) + 1
-
-    def load(self, case: Case, number: int, seed: int) -> Run | None:
-        """Return a stored run, None if there is none with these settings and seed."""
-        path = self.file(case, number)
-        if not path.exists():
-            return None
-        run = load_run(path)
-        wanted = (self.experiment, case.name, number, seed, case.digest())
-        found = (run.experiment, run.case, run.number, run.seed, run.digest)
-        return run if found == wanted else None
-
-    def write(self, case: Case, run: Run) -> None:
-        """Write the file of a run."""
-        write_file(self.file(case, run.number), to_text(run))
-
-
 def csv_text(rows: Iterable[Iterable[Any]]) -> str:
     """Return rows as CSV; None and non-finite numbers become empty cells."""
     out = io.StringIO()

@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import inspect
+import pkgutil
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_sim.experiments.experiment import Case, Outcome, Quantity
-from maasi_sim.scenario.loading import scenario_from_content, scenario_from_values
-from maasi_sim.search import search
+from maasi_planner.settings import PLANNERS
+from maasi_sim.buildings.scenario import is_cuboid_scenario
+from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Quantity
+from maasi_sim.experiments.figures import draw_comparison
+from maasi_sim.machine import code_digest
+from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.scenario.loading import (
+    find_scenario,
+    load_scenario,
+    read_scenario,
+    scenario_from_content,
+    scenario_from_values,
+)
+from maasi_sim.scenario.schema import Scenario
+from maasi_sim.search import leaving, search
 from maasi_sim.search_result import SearchResult
+from maasi_sim.world.noise_streams import noise_stream
 
 QUANTITIES = (
     Quantity('measurements_to_find_all', 'measurements to find all', '', 'restricted', 'limit'),
@@ -32,6 +51,12 @@ QUANTITIES = (
 # Measurements, and particles, of a small case.
 _SMALL = 12
 _SMALL_PARTICLES = 1000
+# Self-affine with Hurst's exponent of real terrain, about 0.8 (a fractal dimension of 2.2); the
+# deviation of heights over the whole map is that of hills.
+HURST = 0.8
+MAP_SIZE = 12_000.0
+MAP_NODES = 1024
+DEVIATION = 150.0
 
 
 def merged(*layers: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,3 +192,183 @@ def run_among_obstacles(settings: dict[str, Any], seed: int) -> Outcome:
         ]
     outcome.summary['clearance'] = min(nearest) if nearest else None
     return outcome
+
+
+# Random terrain with the statistics of real terrain, as that of the paper is not available.
+
+
+def self_affine_map(
+    generator: np.random.Generator, nodes: int = MAP_NODES, hurst: float = HURST
+) -> FloatArray:
+    """Return heights of a periodic map, (nodes, nodes), with mean 0 and deviation 1.
+
+    The power of a wave number k falls with k^-(2 H + 2), so that the mean square difference of
+    two heights grows with their distance to the power 2 H.
+    """
+    spectrum = np.fft.rfft2(generator.standard_normal((nodes, nodes)))
+    waves = np.hypot(np.fft.fftfreq(nodes)[:, None], np.fft.rfftfreq(nodes)[None, :])
+    waves[0, 0] = np.inf
+    heights = np.fft.irfft2(spectrum * waves ** -(hurst + 1.0), s=(nodes, nodes))
+    return np.asarray((heights - heights.mean()) / heights.std())
+
+
+def chunk(generator: np.random.Generator, size: float, nodes: int) -> FloatArray:
+    """Return the heights of an area of `size` metres in a map of 12 km, (nodes, nodes) [m]."""
+    heights = DEVIATION * self_affine_map(generator)
+    corner = generator.uniform(0.0, MAP_NODES, size=2)
+    along = np.linspace(0.0, size * MAP_NODES / MAP_SIZE, nodes)
+    places = np.meshgrid(corner[0] + along, corner[1] + along, indexing='ij')
+    return np.asarray(ndimage.map_coordinates(heights, places, order=3, mode='grid-wrap'))
+
+
+def littered(
+    heights: FloatArray,
+    bounds: FloatArray,
+    number: int,
+    spread: float,
+    margin: float,
+    generator: np.random.Generator,
+) -> FloatArray:
+    """Return targets in two clusters: around the lowest and around the highest place.
+
+    Of ten places drawn around each, with deviation `spread`, the lowest (highest) one is taken, one
+    target after the other, at least `margin` from the bounds.
+    """
+    nodes = heights.shape[0]
+    low, high = bounds[:, 0] + margin, bounds[:, 1] - margin
+    sides = [np.linspace(bounds[axis, 0], bounds[axis, 1], nodes) for axis in (0, 1)]
+    inside = ((sides[0] >= low[0]) & (sides[0] <= high[0]))[:, None] & (
+        (sides[1] >= low[1]) & (sides[1] <= high[1])
+    )[None, :]
+    targets = []
+    for sign in (1.0, -1.0):
+        signed = np.where(inside, sign * heights, np.inf)
+        row, column = np.unravel_index(int(np.argmin(signed)), signed.shape)
+        centre = np.array([sides[0][row], sides[1][column]])
+        for _ in range(number // 2):
+            places = centre + generator.normal(0.0, spread, (10, 2))
+            # Reflected at the bounds, so that targets do not accumulate along them.
+            places = np.where(places < low, 2.0 * low - places, places)
+            places = np.where(places > high, 2.0 * high - places, places)
+            places = np.clip(places, low, high)
+            index = (places - bounds[:, 0]) / (bounds[:, 1] - bounds[:, 0]) * (nodes - 1)
+            found = ndimage.map_coordinates(heights, index.T, order=1)
+            targets.append(places[int(np.argmin(sign * found))])
+    return np.array(targets)
+
+
+def run_on_terrain(settings: dict[str, Any], seed: int) -> Outcome:
+    """Run a search for 14 targets at a low and a high place of terrain made from the seed."""
+    generator = noise_stream(seed, purpose='terrain')
+    bounds = np.array(settings['scenario']['environment']['bounds'], float)
+    heights = chunk(generator, float(bounds[0, 1] - bounds[0, 0]), 57)
+    targets = littered(heights, bounds, 14, 15.0, 10.0, generator)
+    content = deepcopy(settings)
+    content['scenario']['targets'] = {'positions': targets.tolist()}
+    outcome = run_search(content, seed)
+    outcome.details['heights'] = heights[::2, ::2].round(2).tolist()
+    return outcome
+
+
+# Comparisons of planners and filters on the same seeds.
+
+
+def comparison_of(name: str, cases: Sequence[Case]) -> Experiment:
+    """Return searches as an experiment; differences are to the first case.
+
+    The cases have settings from `search_settings`.
+    """
+    return Experiment(
+        name=name,
+        title='Searches on the same seeds',
+        cases=lambda small: list(cases),
+        run=run_compared,
+        quantities=(),
+        draw=lambda figure, results: draw_comparison(figure, [results]),
+        compared=True,
+    )
+
+
+def search_settings(scenario: Scenario, planner: str | None = None) -> dict[str, Any]:
+    """Return the settings of a case.
+
+    `planner` is a function to make planners, as of `search`, as `module:function`; None: the
+    scenario's planner.
+    """
+    return {'scenario': scenario.content(), 'planner': planner, 'code': code_of(scenario)}
+
+
+def code_of(scenario: Scenario) -> str:
+    """Return a hash of the code of a search, including the file of a user's own planner."""
+    name = scenario.planner.name
+    if name in PLANNERS.own:
+        return code_digest()
+    file = inspect.getsourcefile(PLANNERS.load(name))
+    own = Path(file).read_bytes() if file is not None else b''
+    return f'{code_digest()} {hashlib.sha256(own).hexdigest()[:16]}'
+
+
+def run_compared(settings: dict[str, Any], seed: int) -> Outcome:
+    """Run a search of a case; RuntimeError if the code differs from that of the settings."""
+    scenario = scenario_from_content(settings['scenario'], 'settings')
+    if settings['code'] != code_of(scenario):
+        raise RuntimeError('this worker has another version of the code')
+    limit = scenario.limits.time
+    planner = settings['planner'] and pkgutil.resolve_name(settings['planner'])
+    result = search(scenario, seed, planner=planner)
+    outcome = outcome_of(result, None, limit)
+    times = find_times(result, limit)
+    complete = outcome.summary['time_to_find_all']
+    outcome.summary['complete'] = complete is not None
+    outcome.summary['time'] = limit if complete is None else complete
+    outcome.summary['mean_time'] = float(times.mean()) if len(times) else None
+    outcome.timing['slowest_decision'] = max(result.planning_times, default=0.0)
+    return outcome
+
+
+def find_times(result: SearchResult, limit: float) -> FloatArray:
+    """Return when the first, second and so on of the true targets was found, (n,) [s].
+
+    A target that was not found counts with the limit.
+    """
+    times = np.full(len(result.truth), limit)
+    for item in reversed(result.progress):
+        times[: item.true_found] = np.minimum(times[: item.true_found], item.time)
+    return times
+
+
+def compared(
+    scenario: str | Path,
+    planners: Sequence[str] = (),
+    filters: Sequence[str] = (),
+    time_limit: float | None = None,
+) -> Experiment:
+    """Return the comparison of planners and filters in a scenario.
+
+    `planners` and `filters` are values of `planner.name` and `filter.method`; without any, the
+    scenario's own. `time_limit` is instead of the scenario's [s].
+    """
+    path = find_scenario(scenario)
+    if is_cuboid_scenario(read_scenario(path)):
+        raise ScenarioError(f'{path}: is a search of buildings, allowed are searches for targets')
+    cases = []
+    for method in filters or (None,):
+        for planner in planners or (None,):
+            # Many searches run in parallel; results do not depend on the number of threads.
+            overrides: dict[str, tuple[Key, Any]] = {'one process': (('filter', 'threads'), 1)}
+            if planner is not None:
+                overrides['--planners'] = ('planner', 'name'), planner
+            if method is not None:
+                overrides['--filters'] = ('filter', 'method'), method
+            if time_limit is not None:
+                overrides['--time-limit'] = ('limits', 'time'), time_limit
+            loaded = load_scenario(path, overrides)
+            try:
+                leaving(loaded)
+            except ValueError as error:
+                raise ScenarioError(f'{path}: {error}') from None
+            names = [planner or loaded.planner.name]
+            if len(filters) > 1:
+                names.append(str(method))
+            cases.append(Case(', '.join(names), search_settings(loaded)))
+    return comparison_of(path.stem, cases)

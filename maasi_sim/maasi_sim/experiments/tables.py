@@ -28,6 +28,7 @@ from maasi_sim.machine import code_digest, this_machine
 VERSION = 1
 # Bootstrap intervals of fewer pairs are too narrow.
 FEWEST = 10
+_NONE = mean_interval([])
 
 
 def interval(results: Results, case: str, quantity: Quantity) -> Interval:
@@ -59,10 +60,10 @@ def markdown_table(rows: Iterable[Sequence[str]]) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One number of ours beside the paper's.
+    """One number of ours beside the paper's, or a paired difference on the same maps.
 
     `finished` of the `runs` have the quantity; `median` counts the others as longest, and is nan
-    if they are half or more. `difference` is ours minus the paper's.
+    if they are half or more. `difference` is ours minus the paper's, or first minus second.
     """
 
     case: str
@@ -75,16 +76,6 @@ class Row:
     paper: Interval | None
     difference: Interval | None
     note: str
-
-
-@dataclass(frozen=True)
-class Paired:
-    """A paired difference on the same maps."""
-
-    first: str
-    second: str
-    quantity: Quantity
-    difference: Interval
 
 
 def rows(results: Results) -> list[Row]:
@@ -117,7 +108,7 @@ def _row(
     return Row(case, preset, quantity, len(values), finished, ours, middle, paper, difference, note)
 
 
-def paired_rows(results: Results) -> list[Paired]:
+def paired_rows(results: Results) -> list[Row]:
     """Return the paired differences of the experiment's comparisons."""
     table = []
     for item in results.experiment.comparisons:
@@ -126,10 +117,12 @@ def paired_rows(results: Results) -> list[Paired]:
         if not len(both[0]):
             continue
         if quantity.kind == 'restricted':
-            limits = results.pairs(item.first, item.second, quantity.limit)
-            limit = float(np.min(limits))
+            limit = float(np.min(results.pairs(item.first, item.second, quantity.limit)))
             both = [np.minimum(np.where(np.isnan(one), limit, one), limit) for one in both]
-        table.append(Paired(item.first, item.second, quantity, paired_difference(*both)))
+        gap, who = paired_difference(*both), f'{item.first} minus {item.second}'
+        note = 'paired on the same maps'
+        row = Row(who, 'paired', quantity, gap.number, gap.number, _NONE, math.nan, None, gap, note)
+        table.append(row)
     return table
 
 
@@ -167,9 +160,9 @@ def table_cells(results: Results) -> list[list[list[str]]]:
         gap = shown(row.difference, sign=True)
         cases.append([name, row.quantity.title(), runs, ours, paper, gap])
     pairs = [['paired on the same maps', 'measured', 'maps', 'difference']]
-    for pair in paired_rows(results):
-        who, maps = f'{pair.first} minus {pair.second}', str(pair.difference.number)
-        pairs.append([who, pair.quantity.title(), maps, shown(pair.difference, sign=True)])
+    for row in paired_rows(results):
+        gap = shown(row.difference, sign=True)
+        pairs.append([row.case, row.quantity.title(), str(row.runs), gap])
     return [table for table in (cases, pairs) if len(table) > 1]
 
 
@@ -199,14 +192,12 @@ def table_text(results: Results) -> str:
 
     head = 'case preset quantity unit runs finished ours ours_95 ours_median paper paper_95'
     table: list[list[object]] = [[*head.split(), 'difference', 'difference_95', 'note']]
-    for row in rows(results):
+    for row in [*rows(results), *paired_rows(results)]:
         first = [row.case, row.preset, row.quantity.name, row.quantity.unit, row.runs, row.finished]
+        if row.preset == 'paired':
+            first[0], first[-1] = row.case.replace(' minus ', ' - '), None
         cells = [*pair(row.ours), row.median, *pair(row.paper), *pair(row.difference)]
         table.append([*first, *cells, row.note])
-    for item in paired_rows(results):
-        first = [f'{item.first} - {item.second}', 'paired', item.quantity.name, item.quantity.unit]
-        cells = [item.difference.number, *[None] * 6, *pair(item.difference)]
-        table.append([*first, *cells, 'paired on the same maps'])
     return csv_text(table)
 
 
