@@ -139,6 +139,8 @@ class Sim(Fake):
             self.timer = self.create_timer(0.1, self.look)
         else:
             self.timer = self.create_timer(0.02, self.tick)
+        # The recorder hears by it that this node knows the recorder.
+        self.ready.publish(LockstepDone(node=self.full_name))
 
     def on_ready(self, message):
         if message.node in self.waiting:

@@ -1,5 +1,10 @@
 """The recorder: what it writes down, and with which time."""
 
+import signal
+import subprocess
+import sys
+import time
+
 import pytest
 import rclpy
 import yaml
@@ -185,3 +190,40 @@ def test_a_publisher_that_is_known_but_not_connected_is_named(session):
     session.until(lambda: session.recorder.unmatched() == ['/rover/odom'])
     session.node.destroy_publisher(other)
     session.until(lambda: session.recorder.unmatched() == [])
+
+
+PEER = """
+import rclpy
+from maasi_filter.ros.qos import LATCHED, RELIABLE
+from maasi_msgs.msg import AgentState, LockstepDone
+rclpy.init()
+node = rclpy.create_node('peer')
+states = node.create_publisher(AgentState, '/rover/state', RELIABLE)
+ready = node.create_publisher(LockstepDone, '/lockstep/ready', LATCHED)
+ready.publish(LockstepDone(node='/peer'))
+rclpy.spin(node)
+"""
+
+
+def test_a_node_that_does_not_know_the_recorder_yet_is_waited_for(session):
+    recorder = session.recorder
+    peer = subprocess.Popen([sys.executable, '-c', PEER])
+    try:
+        wait_until(
+            lambda: (
+                '/peer' in recorder.take_ready() and recorder.node.count_publishers('/rover/state')
+            )
+        )
+        # It learns of no subscription that is made from now on, as on a busy machine.
+        peer.send_signal(signal.SIGSTOP)
+        session.until(lambda: not recorder.missing(['/rover/state']))
+        assert recorder.unmatched() == []
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            assert recorder.unanswered(['/peer']) == ['/peer']
+            session.turn()
+        peer.send_signal(signal.SIGCONT)
+        session.until(lambda: not recorder.unanswered(['/peer']))
+    finally:
+        peer.kill()
+        peer.wait()

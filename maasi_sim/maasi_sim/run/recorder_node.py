@@ -152,6 +152,9 @@ class Recorder:
         self._hold_began = 0.0
         self._last_done: deque[bytes] = deque(maxlen=100)
         self.ready: set[str] = set()
+        # Nodes that answered the newest reader of READY, and the number of others at that time.
+        self._answered: set[str] = set()
+        self._asked_with = 0
         self._finished = False
         self._last_step = -1
         self.complaints: list[str] = []
@@ -248,8 +251,24 @@ class Recorder:
     def take_ready(self) -> set[str]:
         """Return the names of the nodes that have reported ready."""
         for data in _take(self._ready_subscription):
-            self.ready.add(deserialize_message(data, LockstepDone).node)
+            self._answered.add(deserialize_message(data, LockstepDone).node)
+        self.ready |= self._answered
         return self.ready
+
+    def unanswered(self, nodes: Collection[str]) -> list[str]:
+        """Return the nodes that may not send to all subscriptions of the recorder yet.
+
+        A publisher that the recorder is connected to may not know the recorder, and drops what it
+        publishes. Nodes learn of subscriptions in the order in which these were made: one that
+        answers a new subscription, with its latched report of being ready, knows all before it.
+        """
+        if self._asked_with != len(self._subscriptions):
+            self._asked_with = len(self._subscriptions)
+            self._answered = set()
+            self.node.destroy_subscription(self._ready_subscription)
+            self._ready_subscription = self._subscribe(READY, LockstepDone, LATCHED_ALL)
+        self.take_ready()
+        return [name for name in nodes if name not in self._answered]
 
     def publish_ready(self) -> None:
         """Report that the recorder is ready."""

@@ -212,6 +212,7 @@ class Session:
         patience = _START_PATIENCE
         self._name_external_robots()
         expected = [plan.full_name for plan in supervisor.plans if plan.says_ready]
+        senders = [*expected, *sorted(supervisor.clocks)]
         needed = [topic for plan in supervisor.plans for topic in plan.topics]
         complete: float | None = None
         while True:
@@ -226,19 +227,23 @@ class Session:
             self._arming.call(ready)
             late = [name for name in expected if name not in ready]
             missing = recorder.missing(needed)
+            unanswered: list[str] = []
             if not late and not missing:
                 complete = complete or time.monotonic()
                 unmatched = recorder.unmatched()
                 if not unmatched or time.monotonic() - complete > _CONNECTION_PATIENCE:
-                    break
+                    unanswered = recorder.unanswered(senders)
+                    if not unanswered:
+                        break
             waited = time.monotonic() - begin
             what = ', '.join(
                 [f'{name} is not ready' for name in late]
                 or [f'nobody publishes {topic}' for topic in missing]
+                or [f'{name} does not know the recorder' for name in unanswered]
                 or [f'{topic} has a publisher that is not connected' for topic in unmatched]
             )
             if waited > self._limits.start:
-                supervisor.failed.update(late)
+                supervisor.failed.update(late or unanswered)
                 return Ending('not_ready', NODE_FAILED, f'{what} after {self._limits.start:g} s')
             if waited > patience:
                 self._display.say(f'waiting: {what}')
