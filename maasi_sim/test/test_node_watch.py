@@ -3,7 +3,7 @@
 import os
 import time
 
-from maasi_sim.run.node_watch import NodeWatch, waited_for_processor
+from maasi_sim.run.supervisor import NodeWatch, waited_for_processor
 
 
 def watch(waited=lambda pid: 0.0):

@@ -52,6 +52,7 @@ class Fake(Node):
         self.fault = self.value('fault', 'none')
         self.fault_step = self.value('fault_step', 0)
         self.said = self.value('said', '')
+        self.marker = self.value('marker', '')
         self.full_name = self.get_fully_qualified_name()
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self.beat)
@@ -91,18 +92,12 @@ class Fake(Node):
 
     def misbehave(self, step):
         """Do what the script says at this step; a restarted process behaves."""
-        marker = (
-            self.value('marker', '')
-            if not self.has_parameter('marker')
-            else (self.get_parameter('marker').value)
-        )
         if self.fault == 'none' or step != self.fault_step:
             return False
-        if marker and os.path.exists(marker):
+        if self.marker and os.path.exists(self.marker):
             return False
-        if marker:
-            with open(marker, 'w'):
-                pass
+        if self.marker:
+            open(self.marker, 'w').close()
         if self.fault == 'die':
             os.kill(os.getpid(), signal.SIGKILL)
         if self.fault == 'raise':

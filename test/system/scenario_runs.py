@@ -11,7 +11,7 @@ from report_check import check_report
 from waiting import wait_until
 
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.recording import plain
+from maasi_sim.run.replay_node import plain
 
 # Far more than any of the runs takes, for a machine that is busy with something else.
 PATIENCE = 400.0

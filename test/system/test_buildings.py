@@ -11,7 +11,7 @@ from scenario_runs import PATIENCE, command, of_topic, processes_with, run_scena
 
 from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.recording import plain
+from maasi_sim.run.replay_node import plain
 
 pytestmark = pytest.mark.system
 

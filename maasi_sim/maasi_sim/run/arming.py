@@ -17,17 +17,7 @@ _PERIOD = 2.0
 
 
 class Arming:
-    """
-    Calls the service `arm` of drivers until they take part in the run.
-
-    Parameters
-    ----------
-    context : Context
-        Of rclpy.
-    robots : collection of str
-        Simulated robots that take off, with the namespace of their team.
-
-    """
+    """Calls the service `arm` of drivers until their robots, full names, take part in the run."""
 
     def __init__(self, context: Context, robots: Collection[str]) -> None:
         self._clients: dict[str, Client] = {}
@@ -47,14 +37,7 @@ class Arming:
         self._clients = {name: self._node.create_client(Trigger, f'/{name}/arm') for name in robots}
 
     def call(self, ready: Collection[str]) -> None:
-        """
-        Call the services that are due.
-
-        Parameters
-        ----------
-        ready : collection of str
-            Nodes that take part, with namespace.
-        """
+        """Call the services that are due; `ready` are the nodes that take part already."""
         if not self._clients:
             return
         now = time.monotonic()

@@ -1,18 +1,26 @@
-"""Write and read rosbag2 recordings (MCAP) from serialised messages, without ROS."""
+"""Write and read rosbag2 recordings (MCAP) from serialised messages, without ROS.
+
+The writer of `rosbags`, extended: it writes by time, with type hashes and the distribution's name.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import queue
 import threading
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from time import monotonic
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 import yaml
 from rosbags.interfaces import (
     Connection,
+    ConnectionExtRosbag2,
     Qos,
     QosDurability,
     QosHistory,
@@ -20,11 +28,23 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2.storage_mcap import (
+    Channel,
+    McapWriter,
+    write_channel,
+    write_string,
+)
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from maasi_drivers.calibration.bag_reader import BagError, BagMessage, BagReader
-from maasi_sim.run.mcap_writer import FLUSH_PERIOD, BagFile
+from maasi_drivers.calibration.bag_reader import (
+    BagError,
+    BagMessage,
+    BagReader,
+    whole_length,
+    write_end,
+)
 
 __all__ = [
     'Bag',
@@ -45,6 +65,10 @@ ImageFormat = Literal['jpeg', 'png', 'raw']
 
 # Encodings that are compressed, with their number of channels.
 _CHANNELS = {'bgr8': 3, 'rgb8': 3, 'mono8': 1, '8UC1': 1, '8UC3': 3}
+ROS_DISTRO = 'jazzy'
+# Latest time after which written messages are in the file [s of wall time].
+FLUSH_PERIOD = 0.5
+_FOREIGN_DISTRO, _OWN_DISTRO = 'ros_distro: rosbags', f'ros_distro: {ROS_DISTRO}'
 # Shortest wait for a message, against busy waiting while a chunk is due [s].
 _LEAST_WAIT = 0.01
 # Marks the announcement of a topic instead of a message.
@@ -105,6 +129,92 @@ def load_types(packages: Collection[str] = ('maasi_msgs',)) -> Typestore:
             )
         store.register(types)
     return store
+
+
+class FlushingStorage(McapWriter):
+    """An MCAP file that loses at most the last moments when its writer is killed."""
+
+    _flushed = 0.0
+
+    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
+        """Add a topic, with the hash of its type as rosbag2 stores it."""
+        metadata = BytesIO()
+        for text in (
+            'offered_qos_profiles',
+            offered_qos_profiles,
+            'topic_type_hash',
+            connection.digest,
+        ):
+            write_string(metadata, text)
+        extension = cast('ConnectionExtRosbag2', connection.ext)
+        self.channels.append(
+            Channel(
+                connection.id,
+                connection.msgtype,
+                connection.topic,
+                extension.serialization_format,
+                metadata.getvalue(),
+            )
+        )
+        self.channel_stats[connection.id] = 0
+        write_channel(self.chunk.bio, self.channels[-1], self.schemas)
+
+    def flush(self, now: float) -> float:
+        """Write the chunk to the file if it is due; return the time until it is [s]."""
+        if not self.chunk.msgs:
+            self._flushed = now
+        elif now >= self._flushed + FLUSH_PERIOD:
+            self.close_chunk()
+            self.bio.flush()
+            self._flushed = now
+        return max(0.0, self._flushed + FLUSH_PERIOD - now)
+
+    def close(self, version: int, metadata: str) -> None:
+        """Write index and end."""
+        super().close(version, metadata.replace(_FOREIGN_DISTRO, _OWN_DISTRO))
+
+
+class BagFile(Writer):
+    """A recording in the format of rosbag2, version 9, MCAP with compressed chunks.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder; must not exist.
+    """
+
+    STORAGE_PLUGINS: ClassVar[Mapping[StoragePlugin, type[FlushingStorage]]] = {  # type: ignore[misc, assignment]
+        StoragePlugin.MCAP: FlushingStorage
+    }
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        self.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+
+    def flush(self) -> float:
+        """Write due chunks to the file; return the time until the next [s]."""
+        assert isinstance(self.storage, FlushingStorage)
+        return self.storage.flush(monotonic())
+
+    def close(self) -> None:
+        """Write the index and `metadata.yaml`."""
+        super().close()
+        text = self.metapath.read_text(encoding='utf-8')
+        copy = self.metapath.with_suffix('.yaml.tmp')
+        copy.write_text(text.replace(_FOREIGN_DISTRO, _OWN_DISTRO), encoding='utf-8')
+        copy.replace(self.metapath)
+
+    def give_up(self) -> None:
+        """Close after a failed write: complete records stay readable, without an index."""
+        file = self.path / f'{self.path.name}.mcap'
+        self.metapath.with_suffix('.yaml.tmp').unlink(missing_ok=True)
+        with contextlib.suppress(Exception):
+            self.abort()
+        with contextlib.suppress(Exception):
+            length = whole_length(file)
+            os.truncate(file, length)
+            with file.open('ab') as end:
+                write_end(end)
 
 
 class BagWriter:

@@ -1,10 +1,15 @@
-"""How a run ends: the reason, and the exit code of `run_scenario`."""
+"""How a run ends: the reason with its exit code, and signals as a condition that a run polls."""
 
 from __future__ import annotations
 
+import contextlib
+import signal
+from collections.abc import Iterator
 from dataclasses import dataclass
+from types import FrameType
 
 DONE, NOT_ALL_FOUND, WRONG_INPUT, NODE_FAILED, NOT_WRITTEN, INTERRUPTED = 0, 1, 2, 3, 4, 130
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True)
@@ -14,3 +19,32 @@ class Ending:
     reason: str
     code: int
     text: str = ''
+
+
+class Interruption:
+    """Handles SIGINT, SIGTERM and SIGHUP; true once one of them has arrived."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._at_once: tuple[signal.Signals, ...] = ()
+        for number in _SIGNALS:
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+        if number in self._at_once:
+            raise KeyboardInterrupt
+
+    @contextlib.contextmanager
+    def at_once(self, *signals: signal.Signals) -> Iterator[None]:
+        """End the context at one of `signals` (none: any): for what needs no clean-up."""
+        self._at_once = signals or _SIGNALS
+        with contextlib.suppress(KeyboardInterrupt):
+            try:
+                yield
+            finally:
+                self._at_once = ()
+
+    def __bool__(self) -> bool:
+        """Whether a signal has arrived."""
+        return self.count > 0

@@ -8,6 +8,7 @@ import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
+from functools import cache
 from typing import Any
 
 import rclpy
@@ -25,22 +26,10 @@ from rclpy.subscription import Subscription
 
 from maasi_filter.ros.conversions import stamp_of_step
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, reader_of
-from maasi_msgs.msg import (
-    AgentState,
-    CuboidDecision,
-    DetectionArray,
-    FilterUpdate,
-    LockstepDone,
-    LockstepStep,
-    MeasurementBatch,
-    PlanDecision,
-    SearchLink,
-    SearchLinkArray,
-)
+from maasi_msgs.msg import LockstepDone, LockstepStep
 from maasi_sim.run.bag import BagError, BagWriter, TopicQos
 from maasi_sim.run.mission import Observer
-from maasi_sim.run.serialised import message_class, stamp_of, time_at
-from maasi_sim.run.topics import CLOCK, STEP, within
+from maasi_sim.run.topics import CLOCK, STEP, message_class, stamp_of, time_at, within
 from maasi_sim.view.messages import is_shown
 
 NAME = 'recorder'
@@ -54,18 +43,6 @@ _SKIPPED = ('/parameter_events', READY)
 _KEPT = '/found_targets/kept'
 # Topics still recorded during shutdown.
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
-_WITH_STEP = (
-    AgentState,
-    CuboidDecision,
-    DetectionArray,
-    FilterUpdate,
-    LockstepDone,
-    LockstepStep,
-    MeasurementBatch,
-    PlanDecision,
-    SearchLink,
-    SearchLinkArray,
-)
 # A message with a stamp in the future is held until that time, so that no stamp is later than its
 # log time. Longest hold [s of wall time], and the lead above which a stamp is assumed to come from
 # another clock [ns].
@@ -433,7 +410,7 @@ class Recorder:
                 continue
             if stamp_of(topic, kind, data) > end:
                 continue
-            if kind in _WITH_STEP and deserialize_message(data, kind).step > step:
+            if _has_step(kind) and deserialize_message(data, kind).step > step:
                 continue
             kept.append((topic, data))
         return kept
@@ -493,6 +470,13 @@ class Recorder:
         if self.context.ok():
             self.node.destroy_node()
             rclpy.shutdown(context=self.context)
+
+
+@cache
+def _has_step(kind: Any) -> bool:
+    """Return whether messages of a type name the step that they belong to."""
+    # In other packages it is something else: the length of an image's row.
+    return kind.__module__.startswith('maasi_msgs.') and 'step' in kind.get_fields_and_field_types()
 
 
 def _take(subscription: Subscription) -> list[bytes]:

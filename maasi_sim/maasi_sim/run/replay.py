@@ -12,8 +12,7 @@ from typing import Any
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import NodeProcess, find_executable, stop
-from maasi_sim.run.recording import FILTER, Recording, plain, read_recording
-from maasi_sim.run.replay_node import ReplayNode
+from maasi_sim.run.replay_node import FILTER, Recording, ReplayNode, plain, read_recording
 from maasi_sim.run.run_folder import make_folder, write_text
 from maasi_sim.run.topics import within
 

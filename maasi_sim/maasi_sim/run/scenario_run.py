@@ -12,8 +12,7 @@ from typing import Any
 from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import BagError
 from maasi_sim.run.domain import Domain
-from maasi_sim.run.ending import DONE, NODE_FAILED, NOT_ALL_FOUND, NOT_WRITTEN
-from maasi_sim.run.interruption import Interruption
+from maasi_sim.run.ending import DONE, NODE_FAILED, NOT_ALL_FOUND, NOT_WRITTEN, Interruption
 from maasi_sim.run.node_plan import (
     NodePlan,
     RunSettings,
@@ -34,6 +33,7 @@ from maasi_sim.scenario.layering import Key, ScenarioError, ScenarioWarning
 from maasi_sim.view.live_view import RunPage
 from maasi_sim.view.messages import read_events
 from maasi_sim.view.page_file import REPLAY, write_replay
+from maasi_sim.view.scene import scene_of
 
 
 class ScenarioRun:
@@ -173,7 +173,8 @@ class ScenarioRun:
     def _page(self, options: ViewOptions, domain: int) -> RunPage | None:
         """Serve the page of the run; an error does not end the run."""
         try:
-            page = RunPage(self.mission, options, domain, self.options.namespace)
+            scene = scene_of(self.mission.name, self.mission.scenario)
+            page = RunPage(scene, options, domain, self.options.namespace)
         except OSError as error:
             self.display.say(f'warning: no view: {options.host}: {error.strerror or error}')
             return None

@@ -18,8 +18,8 @@ from maasi_sim.run.ending import (
     NOT_ALL_FOUND,
     NOT_WRITTEN,
     Ending,
+    Interruption,
 )
-from maasi_sim.run.interruption import Interruption
 from maasi_sim.run.mission import Mission
 from maasi_sim.run.progress import ProgressDisplay, Status
 from maasi_sim.run.recorder_node import Recorder

@@ -9,7 +9,6 @@ from typing import Any
 from rosbags.typesys.store import Typestore
 
 from maasi_sim.run.bag import load_types
-from maasi_sim.run.mission import Mission
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.view.event_log import Scene
 from maasi_sim.view.event_maker import EventMaker
@@ -108,30 +107,31 @@ class MessageFeed:
 
 
 class RunPage:
-    """Serves the page of a running scenario, with the messages of its recorder."""
+    """Serves the page of a scene with serialised messages; OSError if it cannot be served.
+
+    `waits`: as of `MessageFeed`; the page of a run says when that has ended.
+    """
 
     def __init__(
-        self, mission: Mission[Any], options: ViewOptions, domain: int, namespace: str
+        self, scene: Scene, options: ViewOptions, domain: int, team: str, waits: bool = True
     ) -> None:
         self._control = None
         if options.control:
             # Only this part of the view needs ROS.
             from maasi_sim.view.control_node import Control
 
-            self._control = Control(domain, namespace)
-        scene = scene_of(mission.name, mission.scenario)
+            self._control = Control(domain, team)
+        self._waits = waits
         self.view = LiveView(scene, options.port, options.host, self._control)
-        self._feed = MessageFeed(self.view, load_types())
-
-    def put(self, topic: str, type_name: str, data: bytes) -> None:
-        """Queue a message; never blocks."""
-        self._feed.put(topic, type_name, data)
+        self._feed = MessageFeed(self.view, load_types(), waits)
+        self.put = self._feed.put
 
     def close(self) -> None:
         """Show the queued messages, and stop serving."""
         self._feed.close()
-        self.view.maker.end()
-        self.view.end('the run has ended')
+        if self._waits:
+            self.view.maker.end()
+        self.view.end('the run has ended' if self._waits else 'the view was closed')
         if self._control is not None:
             self._control.close()
 

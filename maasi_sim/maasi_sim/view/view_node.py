@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -11,15 +10,16 @@ from functools import partial
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy
 from rclpy.utilities import remove_ros_args
 
+from maasi_filter.ros.qos import reader_of
 from maasi_sim.missions import load_mission
-from maasi_sim.run.bag import load_types
-from maasi_sim.run.run_options import add_view_options
+from maasi_sim.run.run_options import add_view_options, view_options
+from maasi_sim.run.topics import message_class
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.view.event_log import Scene
-from maasi_sim.view.live_view import LiveView, MessageFeed
+from maasi_sim.view.live_view import RunPage
 from maasi_sim.view.messages import is_shown
 from maasi_sim.view.scene import empty_scene, scene_of
 
@@ -54,23 +54,11 @@ class ViewNode(Node):
             if not offers:
                 continue
             self._known.add(topic)
-            reliable = all(item.reliability == ReliabilityPolicy.RELIABLE for item in offers)
-            latched = all(item.durability == DurabilityPolicy.TRANSIENT_LOCAL for item in offers)
-            qos = QoSProfile(
-                # A bounded history: no publisher waits for the page.
-                history=HistoryPolicy.KEEP_LAST,
-                depth=1000,
-                reliability=(
-                    ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-                ),
-                durability=(
-                    DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-                ),
-            )
-            package, _, kind = types[0].split('/')
-            message = getattr(importlib.import_module(f'{package}.msg'), kind)
+            qos = reader_of(offers)
+            # A bounded history: no publisher waits for the page.
+            qos.history = HistoryPolicy.KEEP_LAST
             self.create_subscription(
-                message, topic, partial(self._put, topic, types[0]), qos, raw=True
+                message_class(types[0]), topic, partial(self._put, topic, types[0]), qos, raw=True
             )
 
 
@@ -94,7 +82,6 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     options = build_parser().parse_args(remove_ros_args(['', *given])[1:])
     scene: Scene = empty_scene('live')
-    control = None
     if options.scenario:
         try:
             mission = load_mission(options.scenario)
@@ -103,29 +90,22 @@ def main(arguments: list[str] | None = None) -> int:
             return WRONG_INPUT
         scene = scene_of(mission.name, mission.scenario)
     rclpy.init(args=given)
-    if options.control:
-        from maasi_sim.view.control_node import Control
-
-        control = Control(rclpy.get_default_context().get_domain_id(), options.namespace)
+    domain = rclpy.get_default_context().get_domain_id()
     try:
-        view = LiveView(scene, options.port, options.host, control)
+        page = RunPage(scene, view_options(options), domain, options.namespace, waits=False)
     except OSError as error:
         print(f'error: {options.host}: {error.strerror or error}', file=sys.stderr)
         rclpy.try_shutdown()
         return WRONG_INPUT
-    feed = MessageFeed(view, load_types(), waits=False)
-    node = ViewNode(feed.put)
-    view.announce(partial(print, flush=True))
+    node = ViewNode(page.put)
+    page.view.announce(partial(print, flush=True))
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         node.destroy_node()
-        feed.close()
-        view.end('the view was closed')
-        if control is not None:
-            control.close()
+        page.close()
         rclpy.try_shutdown()
     return DONE
 
