@@ -5,14 +5,19 @@ import subprocess
 import sys
 
 import campaign
-import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from campaign import PASSED, WRONG_INPUT, Result, chosen_cases, main, summary
 from chaos_cases import SEARCH_NODES, Case, all_cases
 from chaos_execution import Outcome
 from chaos_verdict import judge
+from geometry_msgs.msg import TwistStamped
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
 
-from maasi_sim.run.bag import BagWriter, TopicQos, load_types
+from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_msgs.msg import FoundTarget, FoundTargetArray
+from maasi_sim.run.bag import BagWriter, load_types
 
 pytestmark = pytest.mark.system
 
@@ -20,6 +25,7 @@ SELECTION = [
     'search-free-respawn-kill-middle-filter_node',
     'search-free-end-hang-middle-turtlebot_driver',
     'search-lockstep-respawn-kill-middle-filter_node+planner_node',
+    'search-lockstep-respawn-kill-middle-mambo_driver',
 ]
 
 
@@ -87,24 +93,15 @@ class Recording:
     def __init__(self, folder):
         folder.mkdir()
         self.folder = folder
-        self.types = load_types()
-        self.bag = BagWriter(folder / 'bag', self.types)
+        self.bag = BagWriter(folder / 'bag', load_types())
         (folder / 'report.json').write_text(json.dumps({'end_reason': 'time_limit'}))
 
-    def write(self, topic, name, time, **fields):
-        kind = self.types.types[name]
-        self.bag.add_topic(topic, name, TopicQos())
-        self.bag.write(topic, round(1e9 * time), self.types.serialize_cdr(kind(**fields), name))
-
-    def twist(self, speed):
-        vector = self.types.types['geometry_msgs/msg/Vector3']
-        twist = self.types.types['geometry_msgs/msg/Twist']
-        return twist(linear=vector(x=speed, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
-
-    def header(self, time):
-        stamp = self.types.types['builtin_interfaces/msg/Time']
-        header = self.types.types['std_msgs/msg/Header']
-        return header(stamp=stamp(sec=int(time), nanosec=round(time % 1.0 * 1e9)), frame_id='map')
+    def write(self, topic, time, message):
+        if hasattr(message, 'header'):
+            message.header.stamp = stamp_to_ros(round(time * 1e9))
+        package = type(message).__module__.partition('.')[0]
+        self.bag.add_topic(topic, f'{package}/msg/{type(message).__name__}')
+        self.bag.write(topic, round(1e9 * time), serialize_message(message))
 
     def judge(self, case, code=3, output='/filter_node', left=()):
         self.bag.close()
@@ -117,9 +114,8 @@ KILLED = Case('kill', ('/filter_node',), 'middle', False, False)
 @pytest.fixture
 def recording(tmp_path):
     made = Recording(tmp_path / 'run')
-    time = made.types.types['builtin_interfaces/msg/Time']
     for second in range(20):
-        made.write('/clock', 'rosgraph_msgs/msg/Clock', second, clock=time(sec=second, nanosec=0))
+        made.write('/clock', second, Clock(clock=Time(sec=second)))
     return made
 
 
@@ -137,44 +133,17 @@ def test_a_wrong_ending_is_found(recording):
 
 
 def test_lost_targets_are_found(recording):
-    targets = []
-    for number in (1, 2):
-        vector = recording.types.types['geometry_msgs/msg/Point']
-        targets.append(
-            recording.types.types['maasi_msgs/msg/FoundTarget'](
-                id=number,
-                position=vector(x=0.0, y=0.0, z=0.0),
-                covariance=np.zeros(9),
-                robot='mambo',
-                measurement=1,
-                batch_id=1,
-                stamp=recording.header(1.0).stamp,
-                class_id='',
-                score=0.0,
-                identity='',
-            )
-        )
+    targets = [FoundTarget(id=number) for number in (1, 2)]
     for second, found in ((1, targets), (2, targets[1:])):
-        recording.write(
-            '/found_targets',
-            'maasi_msgs/msg/FoundTargetArray',
-            second,
-            header=recording.header(second),
-            batch_id=second,
-            targets=found,
-        )
+        recording.write('/found_targets', second, FoundTargetArray(targets=found))
     assert recording.judge(KILLED) == ['found_targets: without [1] that were found']
 
 
 def test_a_robot_that_is_left_moving_is_found(recording):
     for second, speed in ((1.0, 0.0), (2.0, 0.2)):
-        recording.write(
-            '/turtlebot/cmd_vel',
-            'geometry_msgs/msg/TwistStamped',
-            second,
-            header=recording.header(second),
-            twist=recording.twist(speed),
-        )
+        command = TwistStamped()
+        command.twist.linear.x = speed
+        recording.write('/turtlebot/cmd_vel', second, command)
     (problem,) = recording.judge(KILLED)
     assert problem.startswith('turtlebot: the last command is (0.2,')
 
@@ -187,7 +156,6 @@ def test_a_recording_or_report_that_cannot_be_read_is_found(tmp_path):
 
 
 def test_the_summary_counts_by_kind():
-
     results = [Result(KILLED, 3, 1.0, 1.0, []), Result(KILLED, 0, 1.0, 1.0, ['exit code'])]
     content = summary(results, 1, 5)
     assert content['counts'] == {'search free end kill middle one': {'passed': 1, 'failed': 1}}

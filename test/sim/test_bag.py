@@ -1,8 +1,8 @@
 """Recordings: what is written can be read, whatever happened to the writer."""
 
+import contextlib
 import json
 import multiprocessing
-import os
 import resource
 import shutil
 import time
@@ -17,23 +17,21 @@ from rosbags.rosbag2.storage_mcap import McapReader
 
 from maasi_sim.run.bag import Bag, BagError, BagWriteError, BagWriter, TopicQos, load_types
 
+LIMIT = 60.0
+
 
 @pytest.fixture(scope='module')
 def types():
     return load_types()
 
 
-def header(types, time):
-    stamp = types.types['builtin_interfaces/msg/Time'](sec=time, nanosec=0)
-    return types.types['std_msgs/msg/Header'](stamp=stamp, frame_id='map')
-
-
 def image(types, pixels, encoding, padding=0):
     height, width = pixels.shape[:2]
     rows = pixels.reshape(height, pixels[0].size if height else 48)
     rows = np.pad(rows, ((0, 0), (0, padding)))
+    stamp = types.types['builtin_interfaces/msg/Time'](sec=1, nanosec=0)
     return types.types['sensor_msgs/msg/Image'](
-        header=header(types, 1),
+        header=types.types['std_msgs/msg/Header'](stamp=stamp, frame_id='map'),
         height=height,
         width=width,
         encoding=encoding,
@@ -43,22 +41,41 @@ def image(types, pixels, encoding, padding=0):
     )
 
 
-def done(types, step):
-    return types.types['maasi_msgs/msg/LockstepDone'](node='/filter_node', step=step)
+def write_steps(writer, steps, size=0):
+    """Write a message for each step, with text of a size that cannot be compressed."""
+    text = np.random.default_rng(0).bytes(size).hex()
+    string = load_types().types['std_msgs/msg/String']
+    writer.add_topic('/text', 'std_msgs/msg/String')
+    for step in steps:
+        writer.write_message('/text', step // 10, string(data=f'{step} {text}'))
+
+
+def read_steps(bag):
+    return [int(item.message.data.split()[0]) for item in bag.messages()]
+
+
+@contextlib.contextmanager
+def in_process(target, *arguments):
+    """Run a function in a process of its own, which is killed in the end."""
+    process = multiprocessing.get_context('fork').Process(target=target, args=arguments)
+    process.start()
+    yield process
+    process.kill()
+    process.join(LIMIT)
 
 
 def test_messages_come_back_in_order_with_rising_times(types, tmp_path):
-    with BagWriter(tmp_path / 'bag', types) as writer:
-        writer.add_topic('/done', 'maasi_msgs/msg/LockstepDone')
-        for step in range(300):
-            writer.write_message('/done', 1000 * (step // 10), done(types, step))
+    with BagWriter(tmp_path / 'bag', types, backlog=100) as writer:
+        write_steps(writer, range(300))
+        writer.wait()
+        assert writer.counts == {'/text': 300}
+    writer.close()
     with Bag(tmp_path) as bag:
-        read = list(bag.messages())
-        assert [item.message.step for item in read] == list(range(300))
-        times = [item.time for item in read]
+        assert read_steps(bag) == list(range(300))
+        times = [item.time for item in bag.messages()]
         assert times == sorted(set(times))
-        assert bag.types == {'/done': 'maasi_msgs/msg/LockstepDone'}
-        assert bag.counts == {'/done': 300}
+        assert bag.types == {'/text': 'std_msgs/msg/String'}
+        assert bag.counts == {'/text': 300}
 
 
 def test_scenario_is_found_again(types, tmp_path):
@@ -125,21 +142,6 @@ def test_quality_of_service_is_kept(types, tmp_path):
     assert 'reliability: reliable' in text
 
 
-def test_closing_twice_does_nothing(types, tmp_path):
-    writer = BagWriter(tmp_path / 'bag', types)
-    writer.close()
-    writer.close()
-
-
-def test_wait_returns_when_all_is_written(types, tmp_path):
-    with BagWriter(tmp_path / 'bag', types, backlog=100) as writer:
-        writer.add_topic('/done', 'maasi_msgs/msg/LockstepDone')
-        for step in range(200):
-            writer.write_message('/done', step, done(types, step))
-        writer.wait()
-        assert writer.counts == {'/done': 200}
-
-
 def test_an_existing_folder_is_not_overwritten(types, tmp_path):
     with pytest.raises(BagError, match='exists already'):
         BagWriter(tmp_path, types)
@@ -171,73 +173,34 @@ def test_what_is_no_recording_is_refused(tmp_path, name):
         Bag(tmp_path / name)
 
 
-def _write_and_die(path):
-    types = load_types()
-    writer = BagWriter(Path(path), types)
-    writer.add_topic('/text', 'std_msgs/msg/String')
-    text = np.random.default_rng(0).bytes(30000).hex()
-    for step in range(60):
-        string = types.types['std_msgs/msg/String'](data=f'{step} {text}')
-        writer.write_message('/text', step, string)
-    writer.wait()
-    os._exit(9)
-
-
-def test_what_a_killed_writer_left_can_be_read(tmp_path):
-    process = multiprocessing.get_context('fork').Process(
-        target=_write_and_die, args=(str(tmp_path / 'bag'),)
-    )
-    process.start()
-    process.join(60)
-    assert process.exitcode == 9
-    with Bag(tmp_path) as bag:
-        steps = [int(item.message.data.split()[0]) for item in bag.messages()]
-    assert steps == list(range(len(steps)))
-    assert len(steps) > 15
-
-
-LIMIT = 60.0
-
-
-def _write_a_little_and_wait_for_the_end(path):
-    """Hand in less than a chunk, and never close."""
-    types = load_types()
-    writer = BagWriter(Path(path), types)
-    writer.add_topic('/done', 'maasi_msgs/msg/LockstepDone')
-    for step in range(10):
-        writer.write_message('/done', step, done(types, step))
+def _write_and_wait(path, number, size):
+    write_steps(BagWriter(Path(path), load_types()), range(number), size)
     time.sleep(LIMIT)
 
 
-def test_a_little_is_in_the_file_soon(tmp_path):
-    process = multiprocessing.get_context('fork').Process(
-        target=_write_a_little_and_wait_for_the_end, args=(str(tmp_path / 'bag'),)
-    )
-    process.start()
-    deadline = time.monotonic() + LIMIT
-    steps = []
-    while steps != list(range(10)):
-        assert time.monotonic() < deadline, steps
-        try:
-            with Bag(tmp_path) as bag:
-                steps = [item.message.step for item in bag.messages()]
-                assert 'the end of bag.mcap is missing' in bag.recovered
-        except BagError:
-            steps = []
-    process.kill()
-    process.join(LIMIT)
+@pytest.mark.parametrize(('number', 'size'), [(10, 0), (60, 30000)])
+def test_what_is_written_is_in_the_file_soon_also_of_a_killed_writer(tmp_path, number, size):
+    # Less than a chunk, and several.
+    steps, deadline = [], time.monotonic() + LIMIT
+    with in_process(_write_and_wait, tmp_path / 'bag', number, size):
+        while steps != list(range(number)):
+            assert time.monotonic() < deadline and steps == list(range(len(steps))), steps
+            try:
+                with Bag(tmp_path) as bag:
+                    steps = read_steps(bag)
+                    assert 'the end of bag.mcap is missing' in bag.recovered
+            except BagError:
+                steps = []
+    with Bag(tmp_path) as bag:
+        assert read_steps(bag) == steps
 
 
 @pytest.fixture(scope='module')
 def whole(types, tmp_path_factory):
     """Return a recording of several chunks."""
     folder = tmp_path_factory.mktemp('whole') / 'bag'
-    noise = np.random.default_rng(0).bytes(30000).hex()
     with BagWriter(folder, types) as writer:
-        writer.add_topic('/text', 'std_msgs/msg/String')
-        string = types.types['std_msgs/msg/String']
-        for step in range(60):
-            writer.write_message('/text', step, string(data=f'{step} {noise}'))
+        write_steps(writer, range(60), 30000)
     return folder
 
 
@@ -254,7 +217,7 @@ def test_a_recording_cut_anywhere_gives_what_is_before_the_cut(whole, tmp_path, 
         (folder / 'bag.mcap').write_bytes(data[:length])
         try:
             with Bag(folder) as bag:
-                steps = [int(item.message.data.split()[0]) for item in bag.messages()]
+                steps = read_steps(bag)
                 assert bag.recovered
         except BagError as error:
             assert length < 60 and 'no whole record' in str(error)
@@ -295,32 +258,22 @@ def test_only_metadata_is_missing(whole, tmp_path):
 def _write_until_full(path, queue):
     # More than this, and a write fails as on a full disk.
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-    types = load_types()
-    writer = BagWriter(Path(path), types, backlog=50_000)
-    writer.add_topic('/text', 'std_msgs/msg/String')
-    text = np.random.default_rng(0).bytes(4000).hex()
-    try:
-        for step in range(10**6):
-            string = types.types['std_msgs/msg/String'](data=f'{step} {text}')
-            writer.write_message('/text', step, string)
-    except BagWriteError as error:
-        queue.put(str(error))
-    try:
-        writer.close()
-    except BagWriteError as error:
-        queue.put(str(error))
+    writer = BagWriter(Path(path), load_types(), backlog=50_000)
+    for act in (lambda: write_steps(writer, range(10**6), 4000), writer.close):
+        try:
+            act()
+        except BagWriteError as error:
+            queue.put(str(error))
 
 
 def test_a_full_disk_is_said_and_what_is_whole_can_be_read(tmp_path):
-    context = multiprocessing.get_context('fork')
-    queue = context.Queue()
-    process = context.Process(target=_write_until_full, args=(str(tmp_path / 'bag'), queue))
-    process.start()
-    for _ in range(2):
-        assert 'writing failed: File too large' in queue.get(timeout=LIMIT)
-    process.join(LIMIT)
+    queue = multiprocessing.get_context('fork').Queue()
+    with in_process(_write_until_full, tmp_path / 'bag', queue) as process:
+        for _ in range(2):
+            assert 'writing failed: File too large' in queue.get(timeout=LIMIT)
+        process.join(LIMIT)
     with Bag(tmp_path) as bag:
-        steps = [int(item.message.data.split()[0]) for item in bag.messages()]
+        steps = read_steps(bag)
     assert steps == list(range(len(steps))) and steps
 
 

@@ -153,10 +153,8 @@ def test_what_another_user_put_there_is_left(folder, monkeypatch):
     monkeypatch.setattr(domain_module.os, 'getuid', lambda: -1)
     assert remove_dead(folder=folder) == []
     assert len(list(folder.iterdir())) == 4
-
-
-def test_there_may_be_no_shared_memory(folder):
-    assert remove_dead(folder / 'missing') == []
+    # There may be no shared memory.
+    assert remove_dead(folder=folder / 'missing') == []
 
 
 def test_domains_are_not_shared(monkeypatch):

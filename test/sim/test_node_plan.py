@@ -115,11 +115,21 @@ def test_a_team_in_a_namespace_has_all_of_its_nodes_and_topics_there():
             topic if topic == '/clock' else f'/north/one{topic}' for topic in plan.topics
         }
         assert in_team(plan, '') is plan
-
-
-def test_robots_that_plan_for_themselves_get_their_own_batches_in_a_team(tmp_path):
     plan = NodePlan('p', 'e', 'driver', 'a', remaps={'/measurement_batch': '/a/measurement_batch'})
     assert in_team(plan, 'team').remaps == {'/team/measurement_batch': '/team/a/measurement_batch'}
+
+
+@pytest.mark.parametrize(
+    ('namespace', 'inside', 'full'), [('mambo', '/mambo', '/mambo/driver'), ('', '/', '/driver')]
+)
+def test_command_lines_name_the_node_and_its_parameters(namespace, inside, full):
+    plan = NodePlan('maasi_drivers', 'mambo_driver', 'driver', namespace, {'a.b': 1.5})
+    command = plan.command(Path('/lib/mambo_driver'), Path('/run/p.yaml'))
+    assert command[:2] == ['/lib/mambo_driver', '--ros-args']
+    assert {'__node:=driver', f'__ns:={inside}'} <= set(command)
+    assert command[command.index('--params-file') + 1] == '/run/p.yaml'
+    assert plan.full_name == full
+    assert yaml.safe_load(plan.parameter_text()) == {'/**': {'ros__parameters': {'a.b': 1.5}}}
 
 
 def test_only_the_sim_is_told_whose_clock_it_is():
@@ -128,23 +138,6 @@ def test_only_the_sim_is_told_whose_clock_it_is():
         assert (with_followed_clock(plan) == plan) == (not plan.is_clock)
     settings, simulated = read_back(with_followed_clock(plans['/sim_node']), SimNodeSettings)
     assert settings.follow_clock and simulated
-
-
-def test_command_lines_name_the_node_and_its_parameters():
-    plan = NodePlan('maasi_drivers', 'mambo_driver', 'driver', 'mambo', {'a.b': 1.5})
-    command = plan.command(Path('/lib/mambo_driver'), Path('/run/p.yaml'))
-    assert command[:2] == ['/lib/mambo_driver', '--ros-args']
-    assert '__node:=driver' in command
-    assert '__ns:=/mambo' in command
-    assert command[command.index('--params-file') + 1] == '/run/p.yaml'
-    assert plan.full_name == '/mambo/driver'
-    assert yaml.safe_load(plan.parameter_text()) == {'/**': {'ros__parameters': {'a.b': 1.5}}}
-
-
-def test_a_node_without_namespace_is_at_the_root():
-    plan = NodePlan('maasi_filter', 'filter_node', 'filter_node')
-    assert plan.full_name == '/filter_node'
-    assert '__ns:=/' in plan.command(Path('/x'), Path('/y'))
 
 
 def test_independent_robots_have_filter_and_planner_of_their_own():

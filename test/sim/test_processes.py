@@ -16,14 +16,13 @@ from maasi_sim.run.processes import NodeProcess, find_executable, stop
 
 READY = 'print("ready", flush=True)\n'
 WAIT = 'import signal\n' + READY + 'signal.pause()\n'
-IGNORE_INTERRUPT = (
-    'import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n'
+# Ignores the signals that are named.
+DEAF = (
+    'import signal\nfor number in ({}): signal.signal(number, signal.SIG_IGN)\n'
     + READY
     + 'while True: signal.pause()\n'
 )
-IGNORE_ALL = IGNORE_INTERRUPT.replace(
-    'signal.SIG_IGN)\n', 'signal.SIG_IGN)\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n', 1
-)
+IGNORE_ALL = DEAF.format('signal.SIGINT, signal.SIGTERM')
 # A run whose nodes ignore all signals.
 RUN = """
 import signal, sys
@@ -73,15 +72,10 @@ def of_suite(tmp_path, *arguments, log='log'):
     return NodeProcess('/node', command, tmp_path / log, 'maasi_filter')
 
 
-def test_a_process_writes_its_log_and_says_how_it_ended(tmp_path):
+def test_a_process_writes_its_log_also_of_a_restart_and_says_how_it_ended(tmp_path):
     process = ended(python(tmp_path, 'print("hello"); raise SystemExit(3)'))
     assert process.code == 3
     assert process.how_it_ended() == 'exited with 3'
-    assert process.last_words() == 'hello'
-
-
-def test_a_restart_goes_on_in_the_same_log(tmp_path):
-    process = ended(python(tmp_path, 'print("hello")'))
     process.restart()
     wait_until(lambda: not process.running)
     assert process.restarts == 1
@@ -131,27 +125,23 @@ def test_a_node_of_the_suite_that_refuses_its_input_says_so(tmp_path, domain, lo
     assert log == 'full' or 'missing.yaml' in (tmp_path / 'log').read_text()
 
 
-def test_interrupt_ends_what_listens(tmp_path):
-    processes = [started(python(tmp_path, WAIT, f'/node{i}')) for i in range(2)]
-    assert stop(processes) == []
-    assert [process.code for process in processes] == [-signal.SIGINT] * 2
-
-
-def test_what_does_not_listen_is_told_again(tmp_path):
-    process = started(python(tmp_path, IGNORE_INTERRUPT))
-    assert stop([process], [(signal.SIGINT, 0.05), (signal.SIGTERM, PATIENCE)]) == []
-    assert process.how_it_ended() == 'was killed by SIGTERM'
-
-
-def test_what_listens_to_nothing_is_killed(tmp_path):
-    process = started(python(tmp_path, IGNORE_ALL))
-    ending = [(signal.SIGINT, 0.05), (signal.SIGTERM, 0.05), (signal.SIGKILL, PATIENCE)]
-    assert stop([process], ending) == ['/node']
-    assert process.how_it_ended() == 'was killed by SIGKILL'
-
-
-def test_stopping_what_has_ended_or_never_started_does_nothing(tmp_path):
-    assert stop([ended(python(tmp_path, '')), python(tmp_path, '', '/other')]) == []
+@pytest.mark.parametrize(
+    ('code', 'last', 'killed'),
+    [
+        (WAIT, signal.SIGINT, False),
+        (DEAF.format('signal.SIGINT,'), signal.SIGTERM, False),
+        (IGNORE_ALL, signal.SIGKILL, True),
+    ],
+)
+def test_signals_get_stronger_until_all_processes_have_ended(tmp_path, code, last, killed):
+    processes = [started(python(tmp_path, code, f'/node{i}')) for i in range(2)]
+    every = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+    ending = [(number, PATIENCE if number == last else 0.05) for number in every]
+    names = [process.name for process in processes]
+    assert stop(processes, ending) == (names if killed else [])
+    assert {process.how_it_ended() for process in processes} == {f'was killed by {last.name}'}
+    # What has ended, or never started.
+    assert stop([*processes, python(tmp_path, '', '/other')]) == []
 
 
 def test_signals_of_the_run_are_not_those_of_the_node(tmp_path):

@@ -8,8 +8,21 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from geometry_msgs.msg import Point
+from rclpy.serialization import serialize_message
 from report_check import check_report
 
+from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_msgs.msg import (
+    AgentState,
+    BatchMember,
+    FilterUpdate,
+    FoundTarget,
+    FoundTargetArray,
+    LockstepStep,
+    PlanDecision,
+    RobotDecision,
+)
 from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.report_files import END_REASONS, path_length, write_report
 from maasi_sim.run.run_record import RunEnd
@@ -31,7 +44,6 @@ class Run:
     """Messages of a run in which everything is put in by hand."""
 
     def __init__(self, scenario, types, sink=None, namespace='', observer=None):
-        self.types = types
         self.scenario = scenario
         self.observer = observer or TargetObserver('hand', scenario, 7, types)
         self.namespace = namespace
@@ -39,97 +51,51 @@ class Run:
         self.found = []
         self.batch = 0
 
-    def make(self, name, **fields):
-        return self.types.types[name](**fields)
-
-    def stamp(self, time):
-        nanoseconds = round(time * 1e9)
-        return self.make(
-            'builtin_interfaces/msg/Time',
-            sec=nanoseconds // 10**9,
-            nanosec=nanoseconds % 10**9,
-        )
-
-    def header(self, time):
-        return self.make('std_msgs/msg/Header', stamp=self.stamp(time), frame_id='map')
-
-    def point(self, position):
-        x, y, z = [*map(float, position), 0.0, 0.0][:3]
-        return self.make('geometry_msgs/msg/Point', x=x, y=y, z=z)
-
-    def pose(self, position):
-        orientation = self.make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
-        pose = self.make(
-            'geometry_msgs/msg/Pose', position=self.point(position), orientation=orientation
-        )
-        return self.make('geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=np.zeros(36))
-
-    def send(self, topic, name, **fields):
-        message = self.make(f'maasi_msgs/msg/{name}', **fields)
-        data = bytes(self.types.serialize_cdr(message, f'maasi_msgs/msg/{name}'))
+    def send(self, topic, message, time=None):
+        if time is not None:
+            message.header.stamp = stamp_to_ros(round(time * 1e9))
+        if hasattr(message, 'step'):
+            message.step = round((time or 0.0) / self.scenario.step)
+        data = serialize_message(message)
         self.observer.add(topic, data)
         if self.sink is not None:
-            if topic not in self.sink._topics:
-                self.sink.add_topic(topic, f'maasi_msgs/msg/{name}')
+            self.sink.add_topic(topic, f'maasi_msgs/msg/{type(message).__name__}')
             self.sink.write(topic, 0, data)
 
+    def of_team(self, topic, message, time):
+        self.send(within(self.namespace, topic), message, time)
+
     def state(self, time, robot, position, status=1, reason=''):
-        zero = self.make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
-        self.send(
-            f'/{robot}/state',
-            'AgentState',
-            header=self.header(time),
-            step=round(time / self.scenario.step),
-            robot=robot,
-            pose=self.pose(position),
-            twist=self.make('geometry_msgs/msg/Twist', linear=zero, angular=zero),
-            battery=1.0,
-            goal_id=1,
-            goal_status=status,
-            reason=reason,
-        )
+        state = AgentState(robot=robot, goal_status=status, reason=reason)
+        state.pose.pose.position = point(position)
+        self.send(f'/{robot}/state', state, time)
 
     def decide(self, time, robots, explored=0.0):
         """Publish a decision; `robots`: name to waypoint, or None for one that stays."""
         made = [
-            self.make(
-                'maasi_msgs/msg/RobotDecision',
-                robot=name,
-                decision=0,
-                chosen=-1 if waypoint is None else 0,
-                waypoint=self.point(waypoint or [0.0, 0.0]),
-                candidates=[],
-            )
-            for name, waypoint in robots.items()
+            RobotDecision(robot=name, chosen=-1 if place is None else 0, waypoint=point(place))
+            for name, place in robots.items()
         ]
-        self.send(
-            within(self.namespace, '/decisions'),
-            'PlanDecision',
-            header=self.header(time),
-            step=round(time / self.scenario.step),
-            planner='maasi',
-            batch_id=self.batch,
-            objective=0.0,
-            explored=explored,
-            reason='',
-            robots=made,
-        )
+        self.of_team('/decisions', PlanDecision(explored=explored, robots=made), time)
+
+    def give_up(self, time):
+        decision = PlanDecision(explored=0.99, reason=f'nothing left for {self.namespace}')
+        self.of_team('/decisions', decision, time)
 
     def declare(self, time, position, robot='mambo', deviation=0.01):
         """Add a found target to what the next update publishes."""
-        covariance = np.zeros((3, 3))
         size = self.scenario.dimension
+        covariance = np.zeros((3, 3))
         covariance[:size, :size] = deviation**2 * np.eye(size)
         self.found.append(
-            self.make(
-                'maasi_msgs/msg/FoundTarget',
+            FoundTarget(
                 id=len(self.found) + 1,
-                position=self.point(position),
+                position=point(position),
                 covariance=covariance.reshape(-1),
                 robot=robot,
                 measurement=3,
                 batch_id=self.batch + 1,
-                stamp=self.stamp(time),
+                stamp=stamp_to_ros(round(time * 1e9)),
                 class_id='cup',
                 score=0.8,
                 identity='tag_3',
@@ -138,43 +104,34 @@ class Run:
 
     def update(self, time, robots=('mambo',), latched=True):
         self.batch += 1
-        new = [item for item in self.found if item.batch_id == self.batch]
         if latched:
-            self.send(
-                within(self.namespace, '/found_targets'),
-                'FoundTargetArray',
-                header=self.header(time),
-                batch_id=self.batch,
-                targets=self.found,
-            )
-        member, place = 'maasi_msgs/msg/BatchMember', self.pose([0.0, 0.0, 0.0]).pose
-        self.send(
-            within(self.namespace, '/filter_update'),
-            'FilterUpdate',
-            header=self.header(time),
+            array = FoundTargetArray(batch_id=self.batch, targets=self.found)
+            self.of_team('/found_targets', array, time)
+        update = FilterUpdate(
             batch_id=self.batch,
-            step=round(time / self.scenario.step),
-            members=[
-                self.make(member, robot=name, decision=0, measurement=self.batch, pose=place)
-                for name in robots
-            ],
-            missing=[],
+            members=[BatchMember(robot=name, measurement=self.batch) for name in robots],
             expected_number=1.5,
             found=len(self.found),
-            newly_found=new,
-            clusters=[],
+            newly_found=[item for item in self.found if item.batch_id == self.batch],
         )
+        self.of_team('/filter_update', update, time)
         self.observer.settle()
 
     def step(self, time, robots):
-        self.send(
-            '/lockstep/step',
-            'LockstepStep',
-            step=round(time / self.scenario.step),
-            stamp=self.stamp(time),
-            robots=robots,
-            imaging=[],
-        )
+        stamp, step = stamp_to_ros(round(time * 1e9)), round(time / self.scenario.step)
+        message = LockstepStep(stamp=stamp, robots=robots, step=step)
+        self.observer.add('/lockstep/step', serialize_message(message))
+
+    def record(self, reason='time_limit', time=1.0, wall=1.0, events=()):
+        return self.observer.record(RunEnd(reason, time, wall, list(events)))
+
+    def report(self, *end):
+        return build_report(self.record(*end))
+
+
+def point(position):
+    x, y, z = [*map(float, [0.0, 0.0] if position is None else position), 0.0, 0.0][:3]
+    return Point(x=x, y=y, z=z)
 
 
 @pytest.fixture(scope='module')
@@ -264,7 +221,7 @@ def test_report_of_a_complete_run(run, tmp_path):
     run.declare(0.9, [1.0, 1.51])
     run.update(0.9, ['mambo'])
     assert run.observer.completed.step == 18
-    report = write(run.observer.record(RunEnd('all_found', 1.0, 0.3)), tmp_path)
+    report = write(run.record('all_found', 1.0, 0.3), tmp_path)
     table = list(csv.DictReader((tmp_path / 'found_targets.csv').open()))
     assert [(row['x'], row['target']) for row in table] == [
         ('0.51', '0'),
@@ -320,7 +277,7 @@ def test_targets_of_several_filters_count_once_whoever_speaks_first(two_filters,
         run.update(0.95, [name])
     observer = one.observer
     assert observer.end_step == 18
-    report = build_report(observer.record(RunEnd('all_found', 1.0, 0.3)))
+    report = one.report('all_found', 1.0, 0.3)
     assert [(item['id'], item['agent']) for item in report['found']] == [
         (1, 'mambo'),
         (2, 'second'),
@@ -334,57 +291,42 @@ def test_targets_of_several_filters_count_once_whoever_speaks_first(two_filters,
     assert report['measurements_to_find_all'] == 3
 
 
-def give_up(run, time):
-    run.send(
-        within(run.namespace, '/decisions'),
-        'PlanDecision',
-        header=run.header(time),
-        step=round(time / run.scenario.step),
-        planner='maas',
-        batch_id=1,
-        objective=0.0,
-        explored=0.99,
-        reason=f'nothing left for {run.namespace}',
-        robots=[],
-    )
-
-
 def test_planners_of_several_robots_are_done_together(two_filters):
     one, two = two_filters
     for run, time in ((one, 1.0), (two, 1.5)):
         assert run.observer.settled is None
-        give_up(run, time)
+        run.give_up(time)
     assert one.observer.settled == 'nothing left for second'
     assert one.observer.end_step == 30
 
 
 def test_updates_after_the_planner_is_done_do_not_count(run):
     run.update(0.9)
-    give_up(run, 1.0)
+    run.give_up(1.0)
     run.update(1.0)
     run.update(1.0 + run.scenario.step)
-    report = build_report(run.observer.record(RunEnd('planner_done', 1.0, 1.0)))
+    report = run.report('planner_done', 1.0, 1.0)
     assert report['measurements']['mambo'] == 2
 
 
 def test_planner_without_a_robot_is_not_waited_for(two_filters):
     one, two = two_filters
     one.step(0.0, ['mambo', 'second'])
-    give_up(one, 1.0)
+    one.give_up(1.0)
     one.step(1.2, ['mambo', 'second'])
     assert one.observer.settled is None
     one.step(1.5, ['mambo'])
     assert one.observer.settled == 'nothing left for mambo'
     # A robot that comes back does not take the ending back.
     one.step(2.0, ['mambo', 'second'])
-    give_up(two, 2.5)
+    two.give_up(2.5)
     assert one.observer.end_step == 30
 
 
 def test_team_without_robots_has_not_searched_everything(two_filters):
     one, _ = two_filters
     one.step(0.0, ['mambo', 'second'])
-    give_up(one, 1.0)
+    one.give_up(1.0)
     one.step(1.5, [])
     assert one.observer.settled is None
 
@@ -392,7 +334,7 @@ def test_team_without_robots_has_not_searched_everything(two_filters):
 def test_planner_of_a_robot_that_cannot_go_on_is_not_waited_for(two_filters):
     one, two = two_filters
     two.state(0.9, 'second', [0.0, 0.0])
-    give_up(one, 1.0)
+    one.give_up(1.0)
     two.state(1.5, 'second', [0.0, 0.0])
     assert one.observer.settled is None
     two.state(1.6, 'second', [0.0, 0.0], status=5, reason='its battery is empty')
@@ -410,7 +352,7 @@ def test_what_comes_after_the_end_does_not_count(run):
     run.decide(0.8, {'mambo': [2.0, 2.0]})
     run.state(0.8, 'mambo', [2.0, 2.0, 1.0])
     run.update(0.8)
-    record = run.observer.record(RunEnd('all_found', 5.0, 1.0))
+    record = run.record('all_found', 5.0, 1.0)
     report = build_report(record)
     assert len(report['found']) == 3
     assert report['measurements']['mambo'] == 3
@@ -424,7 +366,7 @@ def test_refined_positions_win_over_those_first_declared(run):
     run.update(0.5)
     run.found[0].position.x = 0.501
     run.update(0.6)
-    (found,) = run.observer.record(RunEnd('time_limit', 1.0, 1.0)).found
+    (found,) = run.record().found
     assert found.position[0] == pytest.approx(0.501)
 
 
@@ -443,7 +385,7 @@ def test_completeness_that_is_lost_again_does_not_count(types, tmp_path):
     run.update(0.6)
     run.found[0].position.x = 0.5
     run.update(0.7)
-    report = build_report(run.observer.record(RunEnd('planner_done', 1.0, 1.0)))
+    report = run.report('planner_done', 1.0, 1.0)
     assert report['measurements_to_find_all'] == 3
 
 
@@ -451,7 +393,7 @@ def test_report_without_targets(types, tmp_path):
     run = Run(scenario_of(tmp_path, []), types)
     run.decide(0.0, {'mambo': [0.5, 0.5]}, explored=0.99)
     run.update(0.5)
-    report = write(run.observer.record(RunEnd('planner_done', 1.0, 1.0)), tmp_path)
+    report = write(run.record('planner_done', 1.0, 1.0), tmp_path)
     assert report['targets'] == []
     assert report['rmse'] is None
     assert report['measurements_to_find_all'] is None
@@ -459,7 +401,7 @@ def test_report_without_targets(types, tmp_path):
 
 
 def test_report_of_a_run_in_which_nothing_happened(run, tmp_path):
-    report = write(run.observer.record(RunEnd('interrupted', 0.0, 0.0)), tmp_path)
+    report = write(run.record('interrupted', 0.0, 0.0), tmp_path)
     assert report['true_found'] == 0
     assert report['missed'] == 3
     assert report['real_time_factor'] is None
@@ -472,7 +414,7 @@ def test_robots_that_leave_and_come_back_are_events(run):
     run.step(0.1, ['second'])
     run.step(0.15, ['mambo', 'second'])
     node = {'time': 0.12, 'node': '/filter_node', 'event': 'restarted'}
-    report = build_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0, [node])))
+    report = run.report('time_limit', 1.0, 1.0, [node])
     assert report['events'] == [
         {'time': 0.05, 'agent': 'mambo', 'event': 'lost'},
         node,
@@ -485,7 +427,7 @@ def test_robots_that_say_they_cannot_go_on_are_events_without_lockstep(run):
     run.state(0.5, 'mambo', [0.5, 0.5, 1.0], status=5, reason='odometry is stale')
     run.state(0.6, 'mambo', [0.5, 0.5, 1.0], status=5, reason='odometry is stale')
     run.state(0.9, 'mambo', [0.5, 0.5, 1.0])
-    assert run.observer.record(RunEnd('time_limit', 1.0, 1.0)).events == [
+    assert run.record().events == [
         {'time': 0.5, 'agent': 'mambo', 'event': 'lost', 'reason': 'odometry is stale'},
         {'time': 0.9, 'agent': 'mambo', 'event': 'joined'},
     ]
@@ -500,7 +442,7 @@ def test_a_recording_gives_the_same_report(types, tmp_path):
             run.state(time, 'mambo', [*position, 1.0])
             run.declare(time, position)
             run.update(time)
-    live = build_report(run.observer.record(RunEnd('all_found', 1.0, 0.5)))
+    live = run.report('all_found', 1.0, 0.5)
     with Bag(tmp_path) as bag:
         observer = TargetObserver('hand', scenario, 7, types)
         for topic, _, _, data in bag.raw(observer.topics):
@@ -514,7 +456,7 @@ def test_written_files_can_be_read(run, tmp_path):
     run.declare(0.5, [0.5, 0.52])
     run.declare(0.5, [1.9, 1.9])
     run.update(0.5)
-    report = write(run.observer.record(RunEnd('time_limit', 1.0, 1.0)), tmp_path)
+    report = write(run.record(), tmp_path)
     assert json.loads((tmp_path / 'report.json').read_text()) == report
     picture = cv2.imread(str(tmp_path / 'report.png'))
     assert picture.shape[0] > 600 and picture.shape[1] > 1000
@@ -531,7 +473,7 @@ def test_picture_in_space(types, tmp_path):
         run.state(1.0, name, [100.0, 50.0, 30.0])
     run.declare(0.5, run.observer.truth[0] + 0.5, 'drone1', deviation=1.0)
     run.update(0.5, ['drone1', 'drone2'])
-    record = run.observer.record(RunEnd('time_limit', 1.0, 1.0))
+    record = run.record()
     figure = plot_report(record)
     assert {'drone1', 'drone2', 'true target', 'found target'} <= set(labels_of(figure))
     views = [(axes.get_xlabel()[:1], axes.get_ylabel()[:1]) for axes in figure.axes[:3]]
@@ -553,7 +495,7 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
     run.declare(0.5, [0.51, 0.5], deviation=1e-6)
     run.declare(0.5, [1.0, 1.0], deviation=0.1)
     run.update(0.5)
-    figure = plot_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0)))
+    figure = plot_report(run.record())
     labels = labels_of(figure)
     assert {'missed', 'false target'} <= set(labels)
     (sigma,) = [label for label in labels if 'sigma' in label]
@@ -574,7 +516,7 @@ def test_legend_of_many_robots_is_whole(types, tmp_path):
         for n in range(10)
     }
     run = Run(scenario_of(tmp_path, TARGETS, robots=robots), types)
-    labels = labels_of(plot_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0))))
+    labels = labels_of(plot_report(run.record()))
     assert set(robots) <= set(labels)
 
 
@@ -582,7 +524,7 @@ def test_picture_with_obstacles_names_them(types, tmp_path):
     obstacles = [{'centre': [1.0, 1.0], 'radius': 0.1}]
     environment = {'bounds': [[0.0, 2.0], [0.0, 2.0]], 'obstacles': obstacles}
     run = Run(scenario_of(tmp_path, TARGETS, environment=environment), types)
-    figure = plot_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0)))
+    figure = plot_report(run.record())
     assert 'obstacle' in labels_of(figure)
 
 
@@ -590,7 +532,7 @@ def test_summary_says_what_matters(run):
     run.declare(0.5, [0.5, 0.5])
     run.declare(0.5, [1.9, 1.9])
     run.update(0.5)
-    text = summary(build_report(run.observer.record(RunEnd('time_limit', 1.0, 0.5))))
+    text = summary(run.report('time_limit', 1.0, 0.5))
     assert '1 of 3 targets found, 1 false' in text
     assert END_REASONS['time_limit'] in text
     assert '2.0 times real time' in text
@@ -607,6 +549,6 @@ def test_radius_of_the_scenario_wins(types, tmp_path):
     run = Run(scenario_of(tmp_path, TARGETS, scoring={'radius': 0.3}), types)
     run.declare(0.5, [0.5, 0.75])
     run.update(0.5)
-    report = build_report(run.observer.record(RunEnd('time_limit', 1.0, 1.0)))
+    report = run.report()
     assert report['true_found'] == 1
     assert report['scoring'] == {'radius': 0.3, 'c': 0.3, 'p': 2.0}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from waiting import wait_until
 
 from maasi_sim.run.bag import Bag
 from maasi_sim.run.run_folder import make_folder
-from maasi_sim.run.run_options import Options, build_parser
+from maasi_sim.run.run_options import Options, parse
 from maasi_sim.run.scenario_run import ScenarioRun
 from maasi_sim.scenario.layering import ScenarioError
 
@@ -32,8 +33,7 @@ pytestmark = pytest.mark.system
 TARGETS = [[0.5, 0.5], [1.5, 0.5], [1.0, 1.5]]
 
 
-@pytest.fixture
-def scenario(tmp_path):
+def scenario_in(folder):
     def write(**changes):
         content = {
             'version': 1,
@@ -51,11 +51,16 @@ def scenario(tmp_path):
             'limits': {'time': 20.0, 'start': 30.0, 'silence': 5.0},
         }
         content.update(changes)
-        path = tmp_path / 'scripted.yaml'
+        path = folder / 'scripted.yaml'
         path.write_text(yaml.safe_dump(content))
         return path
 
     return write
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return scenario_in(tmp_path)
 
 
 class Run:
@@ -109,12 +114,19 @@ class Run:
         return alive
 
 
-def test_a_run_that_finds_all(tmp_path, scenario):
-    run = Run(tmp_path / 'run', scenario(), '--lockstep', '--seed', '5')
+@pytest.fixture(scope='module')
+def complete(tmp_path_factory):
+    """Return a run that finds all."""
+    folder = tmp_path_factory.mktemp('complete')
+    run = Run(folder / 'run', scenario_in(folder)(), '--lockstep', '--seed', '5')
     code, output = run.wait()
     assert code == 0, output
     assert '3 of 3 targets found' in output
-    report = run.report
+    return run
+
+
+def test_a_run_that_finds_all(complete):
+    run, report = complete, complete.report
     assert report['end_reason'] == 'all_found'
     assert report['seed'] == 5
     assert report['true_found'] == 3 and report['false_found'] == 0
@@ -137,23 +149,22 @@ def test_a_run_that_finds_all(tmp_path, scenario):
     assert run.nodes() == []
 
 
-def test_the_recording_holds_the_run_and_how_to_repeat_it(tmp_path, scenario):
-    run = Run(tmp_path / 'run', scenario(), '--lockstep')
-    code, output = run.wait()
-    assert code == 0, output
-    with Bag(run.folder) as bag:
+def test_the_recording_holds_the_run_and_how_to_repeat_it(complete):
+    with Bag(complete.folder) as bag:
         counts = bag.counts
         steps = [item.message.step for item in bag.messages(['/lockstep/step'])]
         updates = [item.message.step for item in bag.messages(['/filter_update'])]
         states = [item.message.step for item in bag.messages(['/mambo/state'])]
+        # The planner repeats what is not answered soon.
+        batches = {item.message.id for item in bag.messages(['/measurement_batch'])}
         facts = bag.scenario()
     # A step more may begin before the run ends.
     assert steps == list(range(len(steps))) and len(steps) in (21, 22)
     assert updates == [0, 10, 20]
     assert states[:21] == steps[:21]
-    assert counts['/decisions'] == counts['/measurement_batch'] == 3
+    assert counts['/decisions'] == 3 and batches == {1, 2, 3}
     assert counts['/mambo/odom'] >= 21
-    assert facts['seed'] == 1 and facts['lockstep'] is True
+    assert facts['seed'] == 5 and facts['lockstep'] is True
     assert facts['scenario']['targets']['positions'] == TARGETS
     assert facts['nodes']['/mambo/driver']['parameters']['step'] == 0.05
 
@@ -293,13 +304,22 @@ def test_the_planner_may_end_a_run(tmp_path, scenario, stop, code):
     assert run.report['end_reason'] == 'planner_done'
 
 
-@pytest.mark.parametrize('node', ['filter_node', 'mambo/driver', 'sim_node'])
-def test_a_node_that_dies_ends_the_run_and_is_named(tmp_path, scenario, node):
-    script = {node: {'fault': 'die', 'fault_step': 15}}
+@pytest.mark.parametrize(
+    ('node', 'fault', 'said'),
+    [
+        ('filter_node', 'raise', 'exited with 1'),
+        ('mambo/driver', 'die', 'was killed by SIGKILL'),
+        ('sim_node', 'die', 'was killed by SIGKILL'),
+    ],
+)
+def test_a_node_that_dies_ends_the_run_and_is_named(tmp_path, scenario, node, fault, said):
+    script = {node: {'fault': fault, 'fault_step': 15}}
     run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
     code, output = run.wait()
     assert code == 3, output
-    assert f'/{node} was killed by SIGKILL' in output
+    assert f'/{node} {said}' in output
+    # The end of its log.
+    assert fault != 'raise' or 'RuntimeError: a scripted fault' in output
     assert run.report['end_reason'] == 'node_died'
     (event,) = run.report['events']
     assert event['node'] == f'/{node}' and event['event'] == 'died'
@@ -309,15 +329,6 @@ def test_a_node_that_dies_ends_the_run_and_is_named(tmp_path, scenario, node):
         *_, last = bag.messages(['/mambo/cmd_vel'])
     # The robot of a dead driver is told to stop.
     assert node != 'mambo/driver' or last.message.twist.linear.x == 0.0
-
-
-def test_an_error_is_shown_with_the_end_of_the_log(tmp_path, scenario):
-    script = {'filter_node': {'fault': 'raise', 'fault_step': 5}}
-    run = Run(tmp_path / 'run', scenario(), '--lockstep', script=script)
-    code, output = run.wait()
-    assert code == 3, output
-    assert '/filter_node exited with 1' in output
-    assert 'RuntimeError: a scripted fault' in output
 
 
 def test_a_node_that_dies_is_started_again_where_the_scenario_says_so(tmp_path, scenario):
@@ -426,18 +437,28 @@ def test_wrong_input_is_told_before_anything_starts(tmp_path, scenario):
         (['--time-limit', 'inf'], '--time-limit'),
         (['--lockstepp'], '--lockstepp'),
         (['--lokstep'], 'unknown: --lokstep (did you mean --lockstep?)'),
+        (['--follow-clock'], '--follow-clock needs the --domain-id'),
+        (['--follow-clock', '--domain-id', '7', '--lockstep'], 'allowed without --lockstep'),
+        (['--namespace', '1a'], "read '1a', allowed are letters"),
     ],
 )
 def test_wrong_options_are_named(options, words, capsys):
     with pytest.raises(SystemExit) as caught:
-        build_parser().parse_args(['mambo', *options])
+        parse(['mambo', *options])
     assert caught.value.code == 2
     assert words in capsys.readouterr().err
 
 
-def test_a_wrong_planner_is_named_with_the_option():
-    with pytest.raises(ScenarioError, match=r"--planner: planner\.name: unknown planner 'masi'"):
-        ScenarioRun(Options('mambo', planner='masi'), interruption=False)
+@pytest.mark.parametrize(
+    ('options', 'words'),
+    [
+        ({'planner': 'masi'}, "--planner: planner.name: unknown planner 'masi'"),
+        ({'namespace': 'team/mambo'}, "read 'team/mambo', allowed is a name that is none of"),
+    ],
+)
+def test_what_does_not_fit_the_scenario_is_named_with_the_option(options, words):
+    with pytest.raises(ScenarioError, match=re.escape(words)):
+        ScenarioRun(Options('mambo', **options), interruption=False)
 
 
 def test_options_win_over_the_scenario():

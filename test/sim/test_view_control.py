@@ -1,4 +1,4 @@
-"""The commands of a page: none waits for another one."""
+"""The commands of a page: none waits for another one; the command line of the view node."""
 
 import threading
 
@@ -12,6 +12,7 @@ from maasi_sim.view import control_node
 from maasi_sim.view.control_node import Control
 from maasi_sim.view.hub import Hub
 from maasi_sim.view.server import ViewServer
+from maasi_sim.view.view_node import main
 
 
 def serve(node, names, done):
@@ -88,3 +89,14 @@ def test_a_stop_of_all_passes_what_waits_in_the_browser():
     finally:
         released.set()
         server.close()
+
+
+def test_an_address_of_another_machine_is_refused(ros, capsys):
+    rclpy.shutdown()
+    assert main(['--host', '192.0.2.1']) == 2
+    assert '192.0.2.1: Cannot assign' in capsys.readouterr().err
+
+
+def test_a_scenario_that_is_none_is_refused(capsys):
+    assert main(['--scenario', 'no_such_scenario']) == 2
+    assert 'no_such_scenario' in capsys.readouterr().err

@@ -5,11 +5,19 @@ import math
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import Point, Pose, PoseArray
 from nav_msgs.msg import OccupancyGrid
 
 from maasi_filter.ros.conversions import stamp_to_ros
-from maasi_msgs.msg import AgentState, FoundTarget, FoundTargetArray, LockstepStep, PlanDecision
+from maasi_msgs.msg import (
+    AgentState,
+    Candidate,
+    FoundTarget,
+    FoundTargetArray,
+    LockstepStep,
+    PlanDecision,
+    RobotDecision,
+)
 from maasi_sim.missions import load_mission
 from maasi_sim.search import search
 from maasi_sim.view.event_log import EventLog, line, thin
@@ -94,8 +102,6 @@ def test_a_state_that_is_not_finite_is_left_out():
 
 
 def test_candidates_that_are_not_allowed_have_no_objective():
-    from maasi_msgs.msg import Candidate, RobotDecision
-
     taken = Taken()
     candidates = [Candidate(objective=-1e30), Candidate(objective=0.5, length=7, measurements=2)]
     robot = RobotDecision(robot='rover', chosen=1, candidates=candidates)
@@ -121,8 +127,6 @@ def test_found_targets_are_scored_where_the_truth_is_known():
     scenario = load_mission('mambo_turtlebot').scenario
     taken = Taken(scene_of('demo', scenario))
     truth = PoseArray()
-    from geometry_msgs.msg import Point, Pose
-
     targets = scenario.world(scenario.seed).targets
     truth.poses = [Pose(position=Point(x=float(x), y=float(y))) for x, y in targets]
     taken.take('/ground_truth/targets', truth)
@@ -222,6 +226,9 @@ def test_scenes_are_the_same_from_a_scenario_and_from_what_a_recording_says_of_i
         assert scene == scene_of(name, scenario, 3)
         assert json.loads(line(scene)) == scene
     assert len(scene['cuboids']) == 32 and len(scene['objects']) == 2
+    # Of a planner with another objective there are no weights.
+    changes = {'planner': (('planner', 'name'), 'maas')}
+    assert 'weights' not in scene_of('maas', load_mission('mambo_turtlebot', changes).scenario)
 
 
 def test_the_scene_has_the_geofences_that_drivers_keep_to():
@@ -282,11 +289,6 @@ def test_the_objective_is_made_of_its_terms_with_the_weights_of_the_scene(result
                     assert objective == pytest.approx(expected, rel=1e-3, abs=1e-6)
                     checked += 1
     assert checked > 100
-
-
-def test_planners_with_another_objective_have_no_weights_in_the_scene():
-    changes = {'planner': (('planner', 'name'), 'maas')}
-    assert 'weights' not in scene_of('maas', load_mission('mambo_turtlebot', changes).scenario)
 
 
 def test_the_page_is_one_file_without_addresses(result):

@@ -1,6 +1,5 @@
 """Runs in which robots leave, nodes are killed and users interrupt."""
 
-import json
 import math
 import os
 import signal
@@ -80,48 +79,6 @@ def kill(folder, name):
 def _command_line(pid):
     with open(f'/proc/{pid}/cmdline', 'rb') as file:
         return file.read().decode()
-
-
-@pytest.mark.parametrize('name', ['filter_node', 'turtlebot_driver'])
-def test_a_killed_node_ends_the_run(tmp_path, name):
-    folder = tmp_path / 'run'
-    process = under_way('mambo_turtlebot', folder, '--lockstep')
-    kill(folder, name)
-    output, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 3, output
-    assert name.split('_', maxsplit=1)[0] in output
-    with Bag(folder / 'bag') as bag:
-        assert any(True for _ in bag.raw(['/clock']))
-    assert not processes_with(f'{folder}/')
-
-
-def test_killed_nodes_are_started_again_where_the_scenario_says_so(tmp_path):
-    content = load_scenario('mambo').content()
-    content['on_exit'] = 'respawn'
-    file, folder = tmp_path / 'respawn.yaml', tmp_path / 'run'
-    file.write_text(yaml.safe_dump(content))
-    process = under_way(file, folder, '--lockstep', '--time-limit', 40)
-    log = folder / 'sim_node.log'
-    names = {
-        'filter_node': '/filter_node',
-        'mambo_driver': '/mambo/driver',
-        'planner_node': '/planner_node',
-    }
-    for file, node in names.items():
-        kill(folder, file)
-        wait_for(lambda node=node: f'{node} was restarted' in log.read_text(), f'{node} is back')
-    output, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode in (0, 1), output
-    with Bag(folder / 'bag') as bag:
-        updates = [item.message.batch_id for item in bag.messages(['/filter_update'])]
-        batches = [item.message.id for item in bag.messages(['/measurement_batch'])]
-    report = json.loads((folder / 'report.json').read_text())
-    assert [event['node'] for event in report['events'] if event['event'] == 'restarted'] == list(
-        names.values()
-    )
-    # They take part again: the last batches are answered.
-    assert updates[-1] >= batches[-1] - 1 and len(batches) > 30
-    assert 'is restarted' in output
 
 
 class Watcher(Operator):
@@ -219,15 +176,3 @@ def test_ctrl_c_leaves_no_process_and_a_readable_bag(tmp_path):
     for twist in last.values():
         assert twist.linear.x == twist.linear.y == twist.linear.z == twist.angular.z == 0.0
     assert len(last) == 2
-
-
-def test_a_wrong_file_is_refused_before_anything_starts(tmp_path):
-    scenario = load_scenario('mambo_turtlebot').content()
-    scenario['planer'] = scenario.pop('planner')
-    file = tmp_path / 'wrong.yaml'
-    file.write_text(yaml.safe_dump(scenario))
-    run = run_scenario(file, tmp_path / 'run')
-    assert run.code == 2
-    assert 'planer' in run.output
-    assert str(file) in run.output
-    assert not (tmp_path / 'run').exists()

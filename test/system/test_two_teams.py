@@ -164,23 +164,3 @@ def test_the_recording_of_a_team_can_be_replayed(teams, tmp_path):
     done = replay(teams['team_b'], tmp_path)
     assert done.returncode == 0, done.stdout
     assert 'equal to the bit' in done.stdout
-
-
-@pytest.mark.parametrize(
-    'options, words',
-    [
-        (['--follow-clock'], '--follow-clock needs the --domain-id'),
-        (['--follow-clock', '--domain-id', '7', '--lockstep'], 'allowed without --lockstep'),
-        (['--namespace', '1a'], "read '1a', allowed are letters"),
-        (['--namespace', 'team/mambo'], "read 'team/mambo', allowed is a name that is none of"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(options, words, capsys):
-    from maasi_sim.run.run_scenario import main
-
-    try:
-        code = main(['mambo_turtlebot', *options])
-    except SystemExit as ended:
-        code = ended.code
-    assert code == 2
-    assert words in capsys.readouterr().err
