@@ -15,7 +15,7 @@ import yaml
 from ament_index_python.packages import get_package_share_directory
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from maasi_sim.run.bag import Bag, BagError, BagWriteError, BagWriter, TopicQos, load_types
+from maasi_sim.run.bag import Bag, BagError, BagWriteError, BagWriter, load_types, topic_qos
 
 LIMIT = 60.0
 
@@ -136,7 +136,7 @@ def test_images_that_cannot_be_compressed_are_stored_as_they_are(types, tmp_path
 
 def test_quality_of_service_is_kept(types, tmp_path):
     with BagWriter(tmp_path / 'bag', types) as writer:
-        writer.add_topic('/found', 'std_msgs/msg/String', TopicQos(latched=True))
+        writer.add_topic('/found', 'std_msgs/msg/String', topic_qos(latched=True))
     text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
     assert 'durability: transient_local' in text
     assert 'reliability: reliable' in text

@@ -100,40 +100,38 @@ def check(process, folder):
     return output
 
 
-def test_a_report_is_written_beside_a_recording_that_fills_the_disk(start, tmp_path):
-    folder = tmp_path / 'run'
-    process = start('--lockstep')
-    fill(process, folder)
-    check(process, folder)
-    report = json.loads((folder / 'report.json').read_text())
-    assert report['end_reason'] == 'not_recorded'
-    assert list((tmp_path / 'elsewhere').iterdir()) == []
-
-
-def test_a_report_is_written_elsewhere_where_its_folder_is_full(start, tmp_path):
-    folder = tmp_path / 'run'
+@pytest.mark.parametrize(
+    ('full', 'size', 'said', 'place'),
+    [
+        # Only the recording is too large.
+        ((), None, '', 'run'),
+        (
+            ('part_report.json', 'filter_node.log', 'sim_node.log'),
+            None,
+            'the report cannot be written: No space left on device',
+            'elsewhere',
+        ),
+        ((), LITTLE, 'the report cannot be written: File too large', 'nowhere'),
+    ],
+)
+def test_a_run_that_fills_its_disk_reports_where_it_can(start, tmp_path, full, size, said, place):
+    folder, elsewhere = tmp_path / 'run', tmp_path / 'elsewhere'
     folder.mkdir()
-    for name in ('part_report.json', 'filter_node.log', 'sim_node.log'):
+    for name in full:
         (folder / name).symlink_to('/dev/full')
     process = start('--lockstep')
-    fill(process, folder)
+    fill(process, folder, size)
     output = check(process, folder)
-    assert 'the report cannot be written: No space left on device' in output
-    (place,) = (tmp_path / 'elsewhere').glob('maasi_report_*')
-    assert f'report: {place}' in output
-    assert json.loads((place / 'report.json').read_text())['end_reason'] == 'not_recorded'
-    assert not (folder / 'report.json').exists()
-
-
-def test_the_summary_is_said_where_nothing_can_be_written_at_all(start, tmp_path):
-    folder = tmp_path / 'run'
-    process = start('--lockstep')
-    fill(process, folder, LITTLE)
-    output = check(process, folder)
-    assert 'the report cannot be written: File too large' in output
-    assert 'report: nowhere' in output
-    assert not (folder / 'report.json').exists()
-    assert list((tmp_path / 'elsewhere').iterdir()) == []
+    assert said in output
+    reports = [path for base in (folder, elsewhere) for path in base.rglob('report.json')]
+    if place == 'nowhere':
+        assert 'report: nowhere' in output and reports == []
+    else:
+        (report,) = reports
+        assert f'report: {"" if place == "run" else report.parent}' in output
+        assert json.loads(report.read_text())['end_reason'] == 'not_recorded'
+        assert report.relative_to(tmp_path).parts[0] == place
+    assert len(list(elsewhere.glob('*'))) == (place == 'elsewhere')
 
 
 class Witness(Operator):

@@ -10,7 +10,6 @@ import os
 import queue
 import threading
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from time import monotonic
@@ -52,9 +51,9 @@ __all__ = [
     'BagMessage',
     'BagWriteError',
     'BagWriter',
-    'TopicQos',
     'interface_folder',
     'load_types',
+    'topic_qos',
 ]
 
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
@@ -80,27 +79,19 @@ class BagWriteError(BagError):
     """A recording cannot be written: the disk is full, or fails."""
 
 
-@dataclass(frozen=True)
-class TopicQos:
-    """Quality of service of a topic, for players of the recording."""
-
-    reliable: bool = True
-    latched: bool = False
-    depth: int = 10
-
-    def profile(self) -> Qos:
-        """Return the profile as `rosbags` writes it."""
-        return Qos(
-            QosHistory.KEEP_LAST,
-            max(self.depth, 1),
-            QosReliability.RELIABLE if self.reliable else QosReliability.BEST_EFFORT,
-            QosDurability.TRANSIENT_LOCAL if self.latched else QosDurability.VOLATILE,
-            _FOREVER,
-            _FOREVER,
-            QosLiveliness.AUTOMATIC,
-            _FOREVER,
-            False,
-        )
+def topic_qos(reliable: bool = True, latched: bool = False, depth: int = 10) -> Qos:
+    """Return the quality of service of a topic, for players of the recording."""
+    return Qos(
+        QosHistory.KEEP_LAST,
+        depth,
+        QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        _FOREVER,
+        _FOREVER,
+        QosLiveliness.AUTOMATIC,
+        _FOREVER,
+        False,
+    )
 
 
 def interface_folder(package: str) -> Path:
@@ -264,7 +255,7 @@ class BagWriter:
             self._writer.open()
         except OSError as error:
             raise BagWriteError(f'{path}: cannot be written: {error.strerror}') from error
-        self._topics: dict[str, tuple[str, TopicQos]] = {}
+        self._topics: dict[str, tuple[str, Qos]] = {}
         self._connections: dict[str, Connection] = {}
         self._time = -1
         self._queue: queue.SimpleQueue[tuple[str, int, bytes] | None] = queue.SimpleQueue()
@@ -276,11 +267,11 @@ class BagWriter:
         self._thread = threading.Thread(target=self._work, name='bag writer', daemon=True)
         self._thread.start()
 
-    def add_topic(self, topic: str, type_name: str, qos: TopicQos | None = None) -> None:
+    def add_topic(self, topic: str, type_name: str, qos: Qos | None = None) -> None:
         """Announce a topic, which is in the recording even without messages."""
         if type_name not in self._types.fielddefs:
             raise BagError(f'topic {topic}: unknown message type {type_name}')
-        self._topics[topic] = (type_name, qos or TopicQos())
+        self._topics[topic] = (type_name, qos or topic_qos())
         # Announcing a topic takes a while: do it before its first message. The stored format of
         # images is not known yet.
         if type_name != IMAGE_TYPE:
@@ -305,7 +296,7 @@ class BagWriter:
     def write_scenario(self, text: str, facts: Mapping[str, str]) -> None:
         """Store the scenario: latched on topic `/scenario`, and as custom data of the recording."""
         string = self._types.types['std_msgs/msg/String']
-        self.add_topic(SCENARIO_TOPIC, 'std_msgs/msg/String', TopicQos(latched=True, depth=1))
+        self.add_topic(SCENARIO_TOPIC, 'std_msgs/msg/String', topic_qos(latched=True, depth=1))
         for key, value in facts.items():
             self._writer.set_custom_data(key, value)
         self.write_message(SCENARIO_TOPIC, 0, string(data=text))
@@ -396,7 +387,7 @@ class BagWriter:
                 name,
                 type_name,
                 typestore=self._types,
-                offered_qos_profiles=[qos.profile()],
+                offered_qos_profiles=[qos],
             )
         return self._connections[name]
 

@@ -27,7 +27,7 @@ from rclpy.subscription import Subscription
 from maasi_filter.ros.conversions import stamp_of_step
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, reader_of
 from maasi_msgs.msg import LockstepDone, LockstepStep
-from maasi_sim.run.bag import BagError, BagWriter, TopicQos
+from maasi_sim.run.bag import BagError, BagWriter, topic_qos
 from maasi_sim.run.mission import Observer
 from maasi_sim.run.topics import CLOCK, STEP, message_class, stamp_of, time_at, within
 from maasi_sim.view.messages import is_shown
@@ -182,7 +182,7 @@ class Recorder:
                 if self.bag is not None:
                     reliable = qos.reliability == ReliabilityPolicy.RELIABLE
                     latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-                    self.bag.add_topic(full, types[0], TopicQos(reliable, latched))
+                    self.bag.add_topic(full, types[0], topic_qos(reliable, latched))
             except (ImportError, AttributeError, BagError) as error:
                 self._refused.add(topic)
                 self.complaints.append(f'topic {full} is not recorded: {error}')

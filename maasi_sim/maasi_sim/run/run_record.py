@@ -7,12 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.typesys.store import Typestore
 
+from maasi_filter.arrays import FloatArray
 from maasi_sim.run.topics import seconds
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
