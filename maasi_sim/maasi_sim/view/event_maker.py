@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.arrays import FloatArray
 from maasi_sim.targets.scoring import score
@@ -257,13 +257,16 @@ class EventMaker:
         space: str,
         corner: ArrayLike,
         spacing: ArrayLike,
-        values: FloatArray,
+        values: NDArray[Any],
         explored: float | None = None,
     ) -> None:
-        """Add e on a grid: values (nx, ny) or (nx, ny, nz), 1 is unseen; the explored share."""
+        """Add e on a grid (nx, ny) or (nx, ny, nz), 1 is unseen, or its ninths as bytes.
+
+        The explored share follows from e where it is not given.
+        """
         shape = [*values.shape, 1][:3]
-        digits = np.clip(np.rint(9.0 * values), 0, 9).astype(np.uint8) + ord('0')
-        text = digits.tobytes().decode('ascii')
+        ninths = values if values.dtype == np.uint8 else np.clip(np.rint(9.0 * values), 0, 9)
+        text = (ninths.astype(np.uint8) + ord('0')).tobytes().decode('ascii')
         steps = [significant(value) for value in padded(spacing)]
         share = round(_explored(values) if explored is None else explored, 4)
         self._put(time, 'map', space, self._place(corner), steps, shape, text, share)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,9 @@ class SearchTrace:
         """Add where robots are; no more often than is shown."""
         if time - self._last_states >= STATE_PERIOD - 1e-9:
             self._last_states = time
-            self._add(_robots, time, dict(states))
+            for name, state in states.items():
+                pose = (*state.pose.position.tolist(), float(state.pose.yaw))
+                self._add(EventMaker.robot, time, name, pose)
 
     def decision(
         self, time: float, space: str, decision: Decision, exploration: UnexploredMap
@@ -70,7 +72,7 @@ class SearchTrace:
             # As coarse as it is shown.
             ninths = np.rint(9.0 * exploration.values).astype(np.uint8)
             grid = exploration.bounds[:, 0], exploration.step, ninths
-            self._add(_map, time, space, *grid, exploration.explored_fraction())
+            self._add(EventMaker.map, time, space, *grid, exploration.explored_fraction())
 
     def update(
         self,
@@ -105,24 +107,6 @@ class SearchTrace:
         write_replay(self.log(Path(path).stem), Path(path))
 
 
-def _robots(maker: EventMaker, time: float, states: Mapping[str, RobotState]) -> None:
-    for name, state in states.items():
-        pose = state.pose
-        maker.robot(time, name, (*pose.position.tolist(), float(pose.yaw)))
-
-
-def _map(
-    maker: EventMaker,
-    time: float,
-    space: str,
-    corner: FloatArray,
-    spacing: FloatArray,
-    ninths: FloatArray,
-    explored: float,
-) -> None:
-    maker.map(time, space, corner, spacing, ninths / 9.0, explored)
-
-
 def _update(
     maker: EventMaker,
     time: float,
@@ -151,18 +135,14 @@ def _plan(
     planner: str,
     explored: float,
 ) -> None:
-    reason = '' if decision.robots else decision.reason
-    choices = _choices(decision, indices)
-    maker.plan(time, space, choices, planner, explored, decision.objective, reason)
-    for name, robot in sorted(decision.robots.items()):
-        maker.way(time, name, robot.positions)
-
-
-def _choices(decision: Decision, indices: Mapping[str, int]) -> Iterator[RobotChoice]:
+    choices = []
     for name, robot in sorted(decision.robots.items()):
         terms = robot.control_cost, robot.target_refinement, robot.exploration, robot.objective
         places = robot.candidates.reshape(-1, 3)
-        rows = np.column_stack([places, *terms, robot.lengths, robot.measurements])
-        yield RobotChoice(
-            name, indices[name], robot.chosen, robot.waypoint, rows.tolist(), robot.reason
-        )
+        rows = np.column_stack([places, *terms, robot.lengths, robot.measurements]).tolist()
+        chosen = robot.chosen, robot.waypoint
+        choices.append(RobotChoice(name, indices[name], *chosen, rows, robot.reason))
+    reason = '' if decision.robots else decision.reason
+    maker.plan(time, space, choices, planner, explored, decision.objective, reason)
+    for name, robot in sorted(decision.robots.items()):
+        maker.way(time, name, robot.positions)
