@@ -10,7 +10,7 @@ import numpy as np
 
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
-from maasi_drivers.agent.sensor_reading import SensorReading, Sweep
+from maasi_drivers.agent.sensor_reading import SensorReading, Sweep, measured
 from maasi_drivers.settings.driver import RangingSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
@@ -67,10 +67,6 @@ class SensorInput(ABC, Generic[DataT]):
         """Release what is no ROS entity; may be called more than once."""
 
 
-# Variance of an angle of which nothing is known, as of the bearing of what is straight below.
-_ANY_ANGLE = np.pi**2 / 3.0
-
-
 class RangingMount:
     """Turns sweeps of a mounted sensor into measurements from the robot's position.
 
@@ -121,13 +117,7 @@ class RangingMount:
         by_turn = _cross(-arms)
         spread = spread + by_turn @ pose.covariance[3:, 3:] @ by_turn.transpose(0, 2, 1)
         positions = (pose.pose.position + arms)[:, :d]
-        values = self._model.measure(positions, pose.pose)
-        slope = self._model.jacobian(positions, pose.pose)
-        covariances = slope @ spread[:, :d, :d] @ slope.transpose(0, 2, 1)
-        unknown = np.logical_not(np.any(slope, axis=2))
-        unknown[:, 0] = False
-        index = np.nonzero(unknown)
-        covariances[index[0], index[1], index[1]] = _ANY_ANGLE
+        values, covariances = measured(self._model, positions, spread[:, :d, :d], pose.pose)
         return values, covariances, positions
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.models.measurement import MeasurementModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Label
@@ -35,6 +36,31 @@ class Sweep:
 def selected(labels: tuple[Label, ...], keep: BoolArray) -> tuple[Label, ...]:
     """Return the labels where `keep` (m,) is true."""
     return tuple(label for label, kept in zip(labels, keep.tolist()) if kept)
+
+
+# Variance of an angle of which nothing is known: uniform over the circle [rad^2].
+_ANY_ANGLE = np.pi**2 / 3.0
+
+
+def measured(
+    model: MeasurementModel, positions: FloatArray, covariances: FloatArray, pose: Pose
+) -> tuple[FloatArray, FloatArray]:
+    """Return range and angles of targets, and their covariances, to first order.
+
+    Right over a target the bearing says nothing: its variance is that of a uniform angle at most.
+
+    Shapes and units: positions (n, d) [m, map], covariances (n, d, d) [m^2]; returned the same [m,
+    rad].
+    """
+    # Straight above there is no derivative: that of a nanometre beside.
+    beside = np.array(positions)
+    beside[(beside[:, :2] == pose.position[:2]).all(axis=1), 0] += 1e-9
+    slopes = model.jacobian(beside, pose)
+    result = slopes @ covariances @ slopes.transpose(0, 2, 1)
+    known = np.sqrt(_ANY_ANGLE / np.maximum(result[:, 1, 1], _ANY_ANGLE))[:, None]
+    result[:, 1] *= known
+    result[:, :, 1] *= known
+    return model.measure(positions, pose), result
 
 
 @dataclass(frozen=True)

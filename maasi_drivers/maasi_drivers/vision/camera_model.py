@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from maasi_drivers.settings.camera import CameraSettings
@@ -15,7 +15,10 @@ from maasi_filter.models.pose import Pose
 # From optical axes (x right, y down, z forward) to REP-103 axes (x forward, y left, z up).
 _OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
-_NEWTON_STEPS = 12
+# End of the iteration that undoes a distortion: number of steps, error [px].
+_UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-13)
+# Farther than this from its pixel an undistorted point is none [px].
+_MISSED = 1e-6
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:
@@ -28,112 +31,6 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:
             [-sp, cp * sr, cp * cr],
         ]
     )
-
-
-@njit(cache=True)
-def _distort(x, y, k):
-    """Plumb-bob model at a normalised point: distorted point, Jacobian xx, yy and xy = yx."""
-    k1, k2, p1, p2, k3 = k[0], k[1], k[2], k[3], k[4]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-    return (
-        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
-        radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
-        slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
-    )
-
-
-@njit(cache=True)
-def project_points(points, centre, turn, matrix, k, largest_radius):
-    """Pixels (n, 2) of points (n, 3); turn (3, 3) from the optical frame to the map."""
-    pixels = np.full((points.shape[0], 2), np.nan)
-    for i in range(points.shape[0]):
-        dx, dy, dz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        depth = turn[0, 2] * dx + turn[1, 2] * dy + turn[2, 2] * dz
-        if not depth > 1e-9:
-            continue
-        x = (turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz) / depth
-        y = (turn[0, 1] * dx + turn[1, 1] * dy + turn[2, 1] * dz) / depth
-        if x * x + y * y >= largest_radius * largest_radius:
-            continue
-        u, v, _, _, _ = _distort(x, y, k)
-        pixels[i, 0] = matrix[0, 0] * u + matrix[0, 2]
-        pixels[i, 1] = matrix[1, 1] * v + matrix[1, 2]
-    return pixels
-
-
-@njit(cache=True)
-def _undistort(pixels, matrix, k, largest_radius):
-    """Normalised points (n, 2) of pixels, and their derivatives by the pixels (n, 2, 2)."""
-    count = pixels.shape[0]
-    points = np.full((count, 2), np.nan)
-    jacobians = np.full((count, 2, 2), np.nan)
-    for i in range(count):
-        goal_x = (pixels[i, 0] - matrix[0, 2]) / matrix[0, 0]
-        goal_y = (pixels[i, 1] - matrix[1, 2]) / matrix[1, 1]
-        x, y = goal_x, goal_y
-        error = np.inf
-        xx, yy, xy = 1.0, 1.0, 0.0
-        for _ in range(_NEWTON_STEPS):
-            u, v, xx, yy, xy = _distort(x, y, k)
-            error = abs(u - goal_x) + abs(v - goal_y)
-            determinant = xx * yy - xy * xy
-            if error < 1e-13 or determinant == 0.0:
-                break
-            x -= (yy * (u - goal_x) - xy * (v - goal_y)) / determinant
-            y -= (xx * (v - goal_y) - xy * (u - goal_x)) / determinant
-        determinant = xx * yy - xy * xy
-        if error < 1e-9 and determinant > 0.0 and x * x + y * y < largest_radius**2:
-            points[i, 0], points[i, 1] = x, y
-            jacobians[i, 0, 0] = yy / (determinant * matrix[0, 0])
-            jacobians[i, 1, 1] = xx / (determinant * matrix[1, 1])
-            jacobians[i, 0, 1] = -xy / (determinant * matrix[1, 1])
-            jacobians[i, 1, 0] = -xy / (determinant * matrix[0, 0])
-    return points, jacobians
-
-
-@njit(cache=True)
-def _to_floor(points, by_pixel, centre, turn, origin, height):
-    """Floor positions (n, 2) of ideal rays, derivatives by pixel (n, 2, 2) and by pose (n, 2, 6).
-
-    A change w of a point on the ray moves where the ray meets the plane by w_xy - slope w_z.
-    """
-    count = points.shape[0]
-    positions = np.full((count, 2), np.nan)
-    jacobian_pixel = np.full((count, 2, 2), np.nan)
-    jacobian_pose = np.full((count, 2, 6), np.nan)
-    for i in range(count):
-        u, v = points[i, 0], points[i, 1]
-        down = turn[2, 0] * u + turn[2, 1] * v + turn[2, 2]
-        scale = (height - centre[2]) / down if down != 0.0 else np.nan
-        if not (scale > 0.0 and np.isfinite(scale)):
-            continue
-        for axis in range(2):
-            ray = turn[axis, 0] * u + turn[axis, 1] * v + turn[axis, 2]
-            positions[i, axis] = centre[axis] + scale * ray
-        arm_x, arm_y = positions[i, 0] - origin[0], positions[i, 1] - origin[1]
-        arm_z = height - origin[2]
-        for axis in range(2):
-            ray = turn[axis, 0] * u + turn[axis, 1] * v + turn[axis, 2]
-            slope = ray / down
-            by_u = scale * (turn[axis, 0] - slope * turn[2, 0])
-            by_v = scale * (turn[axis, 1] - slope * turn[2, 1])
-            for column in range(2):
-                jacobian_pixel[i, axis, column] = (
-                    by_u * by_pixel[i, 0, column] + by_v * by_pixel[i, 1, column]
-                )
-            along_x, along_y = (1.0, 0.0) if axis == 0 else (0.0, 1.0)
-            jacobian_pose[i, axis, 0] = along_x
-            jacobian_pose[i, axis, 1] = along_y
-            jacobian_pose[i, axis, 2] = -slope
-            # A small rotation r of the robot moves the point by r x arm.
-            jacobian_pose[i, axis, 3] = -along_y * arm_z - slope * arm_y
-            jacobian_pose[i, axis, 4] = along_x * arm_z + slope * arm_x
-            jacobian_pose[i, axis, 5] = -along_x * arm_y + along_y * arm_x
-    return positions, jacobian_pixel, jacobian_pose
 
 
 def _largest_radius(k: FloatArray) -> float:
@@ -219,16 +116,24 @@ class Camera:
             Pixels, also outside the image; NaN for what is behind the camera or so far off its axis
             that the distortion model does not hold.
         """
-        return np.asarray(
-            project_points(
-                _points('positions', positions, 3),
-                self.centre(pose),
-                pose.rotation() @ self.rotation,
-                self.matrix,
-                self.distortion,
-                self.largest_radius,
-            )
-        )
+        points = _points('positions', positions, 3) - self.centre(pose)
+        points = points @ (pose.rotation() @ self.rotation)
+        with np.errstate(invalid='ignore', divide='ignore'):
+            x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+            seen = (points[:, 2] > 1e-9) & (x * x + y * y < self.largest_radius**2)
+        pixels = np.full((len(points), 2), np.nan)
+        pixels[seen] = self._distorted(np.stack([x[seen], y[seen]], axis=1))[0]
+        return pixels
+
+    def _distorted(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the pixels (n, 2) of normalised points (n, 2), and their derivatives (n, 2, 2)."""
+        if not len(points):
+            return np.empty((0, 2)), np.empty((0, 2, 2))
+        still = np.zeros(3)
+        rays = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
+        pixels, slopes = cv2.projectPoints(rays, still, still, self.matrix, self.distortion)
+        # By the translation along x and y, at a depth of 1.
+        return pixels.reshape(-1, 2), slopes[:, 3:5].reshape(-1, 2, 2)
 
     def undistort(self, pixels: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Invert intrinsics and distortion.
@@ -240,10 +145,22 @@ class Camera:
         jacobians : ndarray, shape (n, 2, 2)
             Derivatives of the points by the pixels [1/px].
         """
-        points, jacobians = _undistort(
-            _points('pixels', pixels, 2), self.matrix, self.distortion, self.largest_radius
-        )
-        return points, jacobians
+        given = _points('pixels', pixels, 2)
+        focal = self.matrix[[0, 1], [0, 1]]
+        if not self.distortion.any():
+            points = (given - self.matrix[:2, 2]) / focal
+            return points, np.tile(np.diag(1.0 / focal), (len(given), 1, 1))
+        points = np.empty((0, 2))
+        if len(given):
+            points = cv2.undistortPointsIter(
+                given[:, None], self.matrix, self.distortion, None, None, _UNDISTORTED
+            )[:, 0]
+        again, slopes = self._distorted(points)
+        good = (np.abs(again - given) < _MISSED).all(axis=1) & (np.linalg.det(slopes) > 0.0)
+        good &= (points * points).sum(axis=1) < self.largest_radius**2
+        jacobians = np.full(slopes.shape, np.nan)
+        jacobians[good] = np.linalg.inv(slopes[good])
+        return np.where(good[:, None], points, np.nan), jacobians
 
     def back_project(
         self, pixels: ArrayLike, pose: Pose, height: float = 0.0
@@ -268,17 +185,32 @@ class Camera:
         by_pose : ndarray, shape (n, 2, 6)
             Derivatives by x, y, z of the robot and by rotations about the map's axes [m/m, m/rad].
         """
-        rotation = pose.rotation()
         points, by_pixel = self.undistort(pixels)
-        positions, jacobian_pixel, jacobian_pose = _to_floor(
-            points,
-            by_pixel,
-            pose.position + rotation @ self.position,
-            rotation @ self.rotation,
-            pose.position,
-            float(height),
-        )
-        return positions, jacobian_pixel, jacobian_pose
+        turn, centre = pose.rotation() @ self.rotation, self.centre(pose)
+        # Directions of the rays in the map, and their way down for one metre along the axis.
+        x, y, down = (points[:, :1] * row[0] + points[:, 1:] * row[1] + row[2] for row in turn)
+        with np.errstate(invalid='ignore', divide='ignore'):
+            scale = (height - centre[2]) / down
+            scale[~((scale > 0.0) & np.isfinite(scale))] = np.nan
+            rays = np.concatenate([x, y], axis=1)
+            slopes = rays / down
+        slopes[np.isnan(scale[:, 0])] = np.nan
+        positions = centre[:2] + scale * rays
+        by_u, by_v = (scale * (turn[:2, k] - slopes * turn[2, k]) for k in (0, 1))
+        by_pixel = by_u[..., None] * by_pixel[:, None, 0] + by_v[..., None] * by_pixel[:, None, 1]
+        # A small rotation r of the robot moves a point by r x arm. A move w of a point on a ray
+        # moves where the ray meets the plane by w_xy - slope w_z.
+        arm_x, arm_y = (positions - pose.position[:2]).T
+        arm_z = height - pose.position[2]
+        by_pose = np.zeros((len(points), 2, 6))
+        by_pose[:, [0, 1], [0, 1]] = 1.0
+        by_pose[..., 2] = -slopes
+        by_pose[..., 3] = -slopes * arm_y[:, None]
+        by_pose[..., 4] = slopes * arm_x[:, None]
+        by_pose[:, 1, 3] -= arm_z
+        by_pose[:, 0, 4] += arm_z
+        by_pose[:, 0, 5], by_pose[:, 1, 5] = -arm_y, arm_x
+        return positions, by_pixel, by_pose
 
     def margin(self, positions: ArrayLike, pose: Pose) -> FloatArray:
         """Return how far inside the image positions (n, 3) are seen, shape (n,) [px].

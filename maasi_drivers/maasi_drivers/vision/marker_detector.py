@@ -5,22 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.sensor_reading import SensorReading
+from maasi_drivers.agent.sensor_reading import SensorReading, measured
 from maasi_drivers.settings.camera import DETECTORS, CameraSettings, SegmentationSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.detector import Blobs, Detector
 from maasi_drivers.vision.segmentation import segment
 from maasi_filter.arrays import FloatArray, ImageArray
+from maasi_filter.models.measurement import (
+    MeasurementModel,
+    RangeBearing,
+    RangeBearingElevation,
+)
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Label
 
-# A bearing that says nothing is uniform over the circle: variance pi^2 / 3.
-_BEARING_VARIANCE_LIMIT = np.pi**2 / 3.0
+_MODELS: dict[int, MeasurementModel] = {2: RangeBearing(), 3: RangeBearingElevation()}
 
 
 def propagate(
@@ -59,54 +62,17 @@ def range_bearing(
 
     Returned are values (n, dimension) and their covariances (n, dimension, dimension), to first
     order, from positions (n, 2) [m] and covariances (n, 2, 2) [m^2] on the floor. The bearing
-    counts from the map's x axis; right over a target it says nothing, and its variance is that of
-    a uniform angle. `floor_deviation` [m] keeps the covariance regular in 3D.
+    counts from the map's x axis. `floor_deviation` [m] keeps the covariance regular in 3D.
     """
-    if dimension not in (2, 3):
+    if dimension not in _MODELS:
         raise ValueError(f'dimension: got {dimension}, allowed 2 or 3')
-    values = np.empty((len(positions), dimension))
-    result = np.empty((len(positions), dimension, dimension))
-    _range_bearing(
-        positions, covariances, pose.position, floor_height, floor_deviation, values, result
-    )
-    return values, result
-
-
-@njit(cache=True)
-def _range_bearing(positions, covariances, origin, height, deviation, values, result):
-    dimension = values.shape[1]
-    for i in range(positions.shape[0]):
-        dx, dy = positions[i, 0] - origin[0], positions[i, 1] - origin[1]
-        horizontal = np.sqrt(dx * dx + dy * dy)
-        bearing = np.arctan2(dy, dx)
-        cosine, sine = np.cos(bearing), np.sin(bearing)
-        xx, yy = covariances[i, 0, 0], covariances[i, 1, 1]
-        xy = 0.5 * (covariances[i, 0, 1] + covariances[i, 1, 0])
-        # Variances along the line of sight and across it.
-        along = cosine * cosine * xx + 2.0 * cosine * sine * xy + sine * sine * yy
-        across = sine * sine * xx - 2.0 * cosine * sine * xy + cosine * cosine * yy
-        both = cosine * sine * (yy - xx) + (cosine * cosine - sine * sine) * xy
-        limit = np.sqrt(_BEARING_VARIANCE_LIMIT / across) if across > 0.0 else np.inf
-        per_metre = min(1.0 / horizontal, limit) if horizontal > 0.0 else min(limit, 1e9)
-        values[i, 1] = bearing
-        result[i, 1, 1] = across * per_metre * per_metre
-        if dimension == 2:
-            values[i, 0] = horizontal
-            result[i, 0, 0] = along
-            result[i, 0, 1] = result[i, 1, 0] = both * per_metre
-            continue
-        rise = height - origin[2]
-        distance = max(np.sqrt(horizontal * horizontal + rise * rise), 1e-12)
-        # Derivatives of range and elevation along the horizontal line of sight, and upwards.
-        by_along, by_up = horizontal / distance, rise / distance
-        up = deviation * deviation
-        values[i, 0] = distance
-        values[i, 2] = np.arcsin(min(max(rise / distance, -1.0), 1.0))
-        result[i, 0, 0] = by_along * by_along * along + by_up * by_up * up
-        result[i, 2, 2] = (by_up * by_up * along + by_along * by_along * up) / distance**2
-        result[i, 0, 2] = result[i, 2, 0] = by_along * by_up * (up - along) / distance
-        result[i, 0, 1] = result[i, 1, 0] = by_along * both * per_metre
-        result[i, 1, 2] = result[i, 2, 1] = -by_up / distance * both * per_metre
+    places = np.full((len(positions), 3), floor_height)
+    places[:, :2] = positions
+    spread = np.zeros((len(positions), 3, 3))
+    spread[:, :2, :2] = covariances
+    spread[:, 2, 2] = floor_deviation**2
+    used = slice(dimension)
+    return measured(_MODELS[dimension], places[:, used], spread[:, used, used], pose)
 
 
 # Part of a marker's area that must be seen where the image's border cuts it.
@@ -313,12 +279,7 @@ def warm_up() -> None:
     """Run segmentation and projection once, so that the first image is not late."""
     image = np.full((120, 160, 3), 120, dtype=np.uint8)
     image[58:63, 78:83] = (20, 40, 160)
-    # Images come as read-only views of messages too: another type to the compiler.
-    view = np.frombuffer(image.tobytes(), dtype=np.uint8).reshape(image.shape)
-    pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
     for rule in ('paper', 'robust'):
         segmentation = SegmentationSettings.model_validate({'rule': rule})
         detector = MarkerDetector(CameraSettings(segmentation=segmentation))
-        for picture in (image, view):
-            detector.detect(picture, pose)
-        detector.camera.project([[0.0, 0.0, 0.0]], pose)
+        detector.detect(image, Pose.from_yaw([0.0, 0.0, 1.0], 0.0))

@@ -35,31 +35,17 @@ def check_image(image: NDArray[np.generic]) -> ImageArray:
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
-@njit(cache=True)
-def _paper_mask(red, green, blue, limit, mask):
-    for row in range(mask.shape[0]):
-        for column in range(mask.shape[1]):
-            excess = (
-                np.int16(2) * np.int16(blue[row, column])
-                - np.int16(red[row, column])
-                - np.int16(green[row, column])
-            )
-            mask[row, column] = np.uint8(excess > limit)
-
-
 def paper_mask(image: ImageArray, threshold: float = 35.0) -> ImageArray:
     """Return 1 where B - R/2 - G/2 > threshold, else 0 (001, eq. (16)).
 
     Computed in whole numbers of half grey levels, so nothing is rounded or clipped.
     """
-    red, green, blue = _planes(check_image(image))
-    mask = np.empty(image.shape[:2], dtype=np.uint8)
-    _paper_mask(red, green, blue, np.int16(np.floor(2.0 * threshold)), mask)
-    return mask
+    red, green, blue = (plane.astype(np.int16) for plane in _planes(check_image(image)))
+    return (2 * blue - red - green > int(np.floor(2.0 * threshold))).astype(np.uint8)
 
 
 def _planes(image: ImageArray) -> list[ImageArray]:
-    # Masks are computed plane by plane, which compilers vectorise.
+    # Masks are computed plane by plane, which is faster.
     return [np.asarray(plane, dtype=np.uint8) for plane in cv2.split(image)]
 
 
@@ -122,225 +108,121 @@ def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     return blobs.select(areas >= settings.minimum_area * mask.size)
 
 
-@njit(cache=True)
-def _histogram_median(histogram):
-    """Median of counted values, interpolated within its bin; bins are centred on whole numbers."""
-    half = 0.5 * histogram.sum()
-    below = 0.0
-    for value in range(histogram.shape[0]):
-        count = histogram[value]
-        if count > 0 and below + count >= half:
-            return value - 0.5 + (half - below) / count
-        below += count
-    return float(histogram.shape[0] - 1)
+def _median(counts: NDArray[np.generic]) -> float:
+    """Return the median of counted whole numbers, interpolated within its bin."""
+    half = 0.5 * counts.sum()
+    value = int(np.flatnonzero((counts > 0) & (np.cumsum(counts) >= half))[0])
+    return value - 0.5 + float(half - counts[:value].sum()) / float(counts[value])
 
 
-@njit(cache=True)
-def _floor_statistics(image, samples):
-    """White-balance gains (3,) from the floor; median and deviation of its blueness."""
-    height, width = image.shape[0], image.shape[1]
-    stride = max(1, int(np.sqrt(height * width / samples)))
-    histograms = np.zeros((3, 256), dtype=np.int64)
-    for row in range(stride // 2, height, stride):
-        for column in range(stride // 2, width, stride):
-            for channel in range(3):
-                histograms[channel, image[row, column, channel]] += 1
-    medians = np.empty(3)
-    for channel in range(3):
-        medians[channel] = max(_histogram_median(histograms[channel]), 1.0)
-    mean = (medians[0] + medians[1] + medians[2]) / 3.0
-    gains = np.empty(3)
-    for channel in range(3):
-        # Bounded, as an image of mostly marker or coloured sheet is no reference.
-        gains[channel] = min(max(mean / medians[channel], 0.6), 1.7)
+def _blueness(balanced: FloatArray) -> FloatArray:
+    """Return (B - max(R, G)) over the mean of the channels of pixels (..., 3), -3 to 3."""
+    red, green, blue = np.moveaxis(balanced, -1, 0)
+    ratio: FloatArray = 3.0 * (blue - np.maximum(red, green)) / (red + green + blue + 3.0 * _DARK)
+    return ratio
+
+
+def _excess(balanced: FloatArray) -> FloatArray:
+    """Return the blue excess O_p of pixels (..., 3): linear in how much of each is marker."""
+    red, green, blue = np.moveaxis(balanced, -1, 0)
+    return np.asarray(blue - 0.5 * (red + green))
+
+
+def _floor_statistics(image: ImageArray) -> tuple[FloatArray, float, float]:
+    """Return white-balance gains (3,) from the floor; median and deviation of its blueness."""
+    stride = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / _FLOOR_SAMPLES)))
+    sample = image[stride // 2 :: stride, stride // 2 :: stride].reshape(-1, 3)
+    medians = np.array([max(_median(np.bincount(channel)), 1.0) for channel in sample.T])
+    # Bounded, as an image of mostly marker or coloured sheet is no reference.
+    gains = np.clip(medians.sum() / 3.0 / medians, 0.6, 1.7)
     # Blueness is between -3 and 3: bins of 1/256.
-    blueness = np.zeros(1536, dtype=np.int64)
-    for row in range(stride // 2, height, stride):
-        for column in range(stride // 2, width, stride):
-            value = _blueness(image, row, column, gains[0], gains[1], gains[2])
-            blueness[min(max(int(np.floor(value * 256.0)) + 768, 0), 1535)] += 1
-    centre = (_histogram_median(blueness) + 0.5 - 768.0) / 256.0
-    deviations = np.zeros(1536, dtype=np.int64)
-    for index in range(1536):
-        if blueness[index] > 0:
-            offset = abs((index + 0.5 - 768.0) / 256.0 - centre)
-            deviations[min(int(np.floor(offset * 256.0)), 1535)] += blueness[index]
-    deviation = 1.4826 * (_histogram_median(deviations) + 0.5) / 256.0
+    bins = np.floor(_blueness(gains * sample) * 256.0).astype(np.int64) + 768
+    counts = np.bincount(np.clip(bins, 0, 1535), minlength=1536)
+    places = (np.arange(1536) + 0.5 - 768.0) / 256.0
+    centre = (_median(counts) + 0.5 - 768.0) / 256.0
+    offsets = np.floor(np.abs(places - centre) * 256.0).astype(np.int64)
+    deviation = 1.4826 * (_median(np.bincount(offsets, weights=counts)) + 0.5) / 256.0
     return gains, centre, deviation
 
 
 @njit(cache=True)
-def _blueness(image, row, column, gain_r, gain_g, gain_b):
-    red = gain_r * image[row, column, 0]
-    green = gain_g * image[row, column, 1]
-    blue = gain_b * image[row, column, 2]
-    return 3.0 * (blue - max(red, green)) / (red + green + blue + 3.0 * _DARK)
-
-
-@njit(cache=True)
 def _robust_mask(red, green, blue, gains, threshold, mask):
-    """Set mask to 1 where the blueness exceeds the threshold (no division per pixel)."""
-    red_gain, green_gain, blue_gain = (
-        np.float32(gains[0]),
-        np.float32(gains[1]),
-        np.float32(gains[2]),
-    )
-    slope = np.float32(threshold / 3.0)
-    offset = np.float32(threshold * _DARK)
+    """Set mask to 1 where the blueness exceeds the threshold; several times as fast as NumPy."""
+    red_gain, green_gain, blue_gain = gains
+    slope, offset = np.float32(threshold / 3.0), np.float32(threshold * _DARK)
     for row in range(mask.shape[0]):
         for column in range(mask.shape[1]):
             r = red_gain * np.float32(red[row, column])
             g = green_gain * np.float32(green[row, column])
             b = blue_gain * np.float32(blue[row, column])
-            excess = b - max(r, g) - offset
-            mask[row, column] = np.uint8(excess > slope * (r + g + b))
+            # Without a division per pixel.
+            mask[row, column] = np.uint8(b - max(r, g) - offset > slope * (r + g + b))
 
 
-@njit(cache=True)
-def _excess(image, row, column, gains):
-    """Blue excess O_p of the white-balanced image: linear in how much of a pixel is marker."""
-    return gains[2] * image[row, column, 2] - 0.5 * (
-        gains[0] * image[row, column, 0] + gains[1] * image[row, column, 1]
-    )
-
-
-@njit(cache=True)
-def _shape_of(image, components, blob, gains, values):
-    """Fill `values` with the excess of each pixel; return mean, axes and peak blueness of the mask.
-
-    The lengths of the axes go as the roots of `long` and `short`, the principal second moments.
-    """
-    left, top, width, height = components.boxes[blob]
-    count = components.areas[blob]
-    sx = sy = sxx = syy = sxy = 0.0
-    peak = 0.0
-    reached = 0
-    for row in range(top, top + height):
-        for column in range(left, left + width):
-            if components.labels[row, column] != blob + 1:
-                continue
-            x, y = float(column - left), float(row - top)
-            sx += x
-            sy += y
-            sxx += x * x
-            syy += y * y
-            sxy += x * y
-            peak = max(peak, _blueness(image, row, column, gains[0], gains[1], gains[2]))
-            values[reached] = _excess(image, row, column, gains)
-            reached += 1
-    mx, my = sx / count, sy / count
+def _compact(
+    image: ImageArray, components: _Components, gains: FloatArray, gates: tuple[float, float, float]
+) -> list[int]:
+    """Return the components within the gates: least peak blueness, aspect, solidity."""
+    marked = np.flatnonzero(components.labels)
+    if not len(marked):
+        return []
+    rows, columns = np.divmod(marked, image.shape[1])
+    owners, count = components.labels[rows, columns] - 1, components.areas
+    moments = [
+        np.bincount(owners, weights=values)
+        for x, y in [(columns - components.boxes[owners, 0], rows - components.boxes[owners, 1])]
+        for values in (x, y, x * x, y * y, x * y)
+    ]
+    mx, my, xx, yy, xy = (values / count for values in moments)
     # Each pixel is a square with a second moment of 1/12.
-    vxx = sxx / count - mx * mx + 1.0 / 12.0
-    vyy = syy / count - my * my + 1.0 / 12.0
-    vxy = sxy / count - mx * my
-    middle = 0.5 * (vxx + vyy)
-    apart = np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
-    return mx, my, middle + apart, max(middle - apart, 1e-9), peak
+    vxx, vyy, vxy = xx - mx * mx + 1.0 / 12.0, yy - my * my + 1.0 / 12.0, xy - mx * my
+    middle, apart = 0.5 * (vxx + vyy), np.sqrt(0.25 * (vxx - vyy) ** 2 + vxy * vxy)
+    # The lengths of the axes go as the roots of the principal second moments.
+    long, short = middle + apart, np.maximum(middle - apart, 1e-9)
+    peaks = np.full(len(count), -np.inf)
+    np.maximum.at(peaks, owners, _blueness(gains * image[rows, columns]))
+    keep = (peaks >= gates[0]) & (long <= gates[1] * gates[1] * short)
+    # An ellipse has area 4 pi root(long short).
+    keep &= count >= gates[2] * 4.0 * np.pi * np.sqrt(long * short)
+    return [int(index) for index in np.flatnonzero(keep)]
 
 
-@njit(cache=True)
-def _surroundings(image, components, blob, gains):
-    """Mean excess and noise of the floor: the box's frame, three pixels wide, without blobs."""
-    labels = components.labels
-    height, width = labels.shape
-    left, top = components.boxes[blob, 0], components.boxes[blob, 1]
-    right, bottom = left + components.boxes[blob, 2], top + components.boxes[blob, 3]
-    around = 0
-    square = total = 0.0
-    for row in range(max(top - 3, 0), min(bottom + 3, height)):
-        for column in range(max(left - 3, 0), min(right + 3, width)):
-            frame = row < top - 1 or row > bottom or column < left - 1 or column > right
-            if frame and labels[row, column] == 0:
-                value = _excess(image, row, column, gains)
-                around += 1
-                total += value
-                square += value * value
-    background = total / around if around > 0 else 0.0
-    noise = square / around - background * background if around > 1 else 0.0
-    return background, noise
+def _weigh(
+    image: ImageArray, components: _Components, blob: int, gains: FloatArray
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """Return area, centroid and its variances (2,), by how much of each pixel is marker.
 
-
-@njit(cache=True)
-def _weigh(image, components, blob, gains, background, contrast, mean):
-    """Return sums over the blob and the ring of one pixel around it, other blobs left out.
-
-    Returns the sum of the weights, their moments about the box's corner, and the pixels' second
-    moments about `mean`.
+    None where that is much less than the pixels of the component.
     """
-    labels = components.labels
-    height, width = labels.shape
-    left, top = components.boxes[blob, 0], components.boxes[blob, 1]
-    right, bottom = left + components.boxes[blob, 2], top + components.boxes[blob, 3]
-    mx, my = mean
-    weight_sum = wx = wy = 0.0
-    spread_x = spread_y = 0.0
-    for row in range(max(top - 1, 0), min(bottom + 1, height)):
-        for column in range(max(left - 1, 0), min(right + 1, width)):
-            near = labels[row, column] == blob + 1
-            if labels[row, column] == 0:
-                for r in range(max(row - 1, 0), min(row + 2, height)):
-                    for c in range(max(column - 1, 0), min(column + 2, width)):
-                        near |= labels[r, c] == blob + 1
-            if near:
-                weight = (_excess(image, row, column, gains) - background) / contrast
-                x, y = float(column - left), float(row - top)
-                weight_sum += weight
-                wx += weight * x
-                wy += weight * y
-                spread_x += (x - mx) * (x - mx)
-                spread_y += (y - my) * (y - my)
-    return weight_sum, wx, wy, spread_x, spread_y
-
-
-class _Measures(NamedTuple):
-    """Of each blob.
-
-    Attributes
-    ----------
-    keep : ndarray of bool, shape (n,)
-        Whether it is within the gates.
-    centroids, areas : ndarray, shapes (n, 2) and (n,)
-        Weighted by the part of each pixel that is marker.
-    variances : ndarray, shape (n, 2)
-        Of the centroids, from the noise of the surroundings.
-    """
-
-    keep: BoolArray
-    centroids: FloatArray
-    areas: FloatArray
-    variances: FloatArray
-
-
-@njit(cache=True)
-def _measure_blobs(image, components, gains, gates, measures):
-    """Measure each blob; keep those within the gates: least peak blueness, aspect, solidity."""
-    boxes = components.boxes
-    for blob in range(boxes.shape[0]):
-        count = components.areas[blob]
-        measures.keep[blob] = False
-        values = np.empty(count)
-        mx, my, long, short, peak = _shape_of(image, components, blob, gains, values)
-        # An ellipse has area 4 pi root(long short).
-        if peak < gates[0] or long > gates[1] * gates[1] * short:
-            continue
-        if count < gates[2] * 4.0 * np.pi * np.sqrt(long * short):
-            continue
-        # The excess of a pixel inside a marker: the mean of the upper half of the blob.
-        upper = np.sort(values)[count // 2 :].mean()
-        background, noise = _surroundings(image, components, blob, gains)
-        contrast = max(upper - background, 1e-6)
-        weight_sum, wx, wy, spread_x, spread_y = _weigh(
-            image, components, blob, gains, background, contrast, (mx, my)
-        )
-        if weight_sum < 0.25 * count:
-            continue
-        measures.keep[blob] = True
-        measures.areas[blob] = weight_sum
-        measures.centroids[blob, 0] = boxes[blob, 0] + wx / weight_sum
-        measures.centroids[blob, 1] = boxes[blob, 1] + wy / weight_sum
-        scale = max(noise, 0.0) / (contrast * weight_sum) ** 2
-        measures.variances[blob, 0] = scale * spread_x
-        measures.variances[blob, 1] = scale * spread_y
+    left, top, width, height = components.boxes[blob].tolist()
+    # The component's box and three pixels around it.
+    first_row, first_column = max(top - 3, 0), max(left - 3, 0)
+    window = np.s_[first_row : top + height + 3, first_column : left + width + 3]
+    labels, excess = components.labels[window], _excess(gains * image[window])
+    own, floor = labels == blob + 1, labels == 0
+    # The excess of a pixel inside a marker: the mean of the upper half of the component.
+    values = np.sort(excess[own])
+    upper = float(values[len(values) // 2 :].mean())
+    around = floor.copy()
+    around[
+        max(top - 1 - first_row, 0) : top + height + 1 - first_row,
+        max(left - 1 - first_column, 0) : left + width + 1 - first_column,
+    ] = False
+    outside = excess[around]
+    background = float(outside.mean()) if len(outside) else 0.0
+    noise = float(outside.var()) if len(outside) else 0.0
+    contrast = max(upper - background, 1e-6)
+    # The component and the ring of one pixel around it, other components left out.
+    ring = cv2.dilate(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    places = np.argwhere(own | (ring & floor))
+    weights = (excess[places[:, 0], places[:, 1]] - background) / contrast
+    area = float(weights.sum())
+    if area < 0.25 * len(values):
+        return None
+    middle = np.argwhere(own).mean(axis=0)
+    variances = noise / (contrast * area) ** 2 * ((places - middle) ** 2).sum(axis=0)
+    centroid = weights @ places / area + [first_row, first_column]
+    return area, centroid[::-1], variances[::-1]
 
 
 def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
@@ -356,34 +238,30 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     Shapes and units: image (h, w, 3).
     """
     image = check_image(image)
-    gains, centre, deviation = _floor_statistics(image, _FLOOR_SAMPLES)
+    gains, centre, deviation = _floor_statistics(image)
     threshold = max(settings.saturation, centre + settings.noise_factor * deviation)
     mask = np.empty(image.shape[:2], dtype=np.uint8)
-    red, green, blue = _planes(image)
-    _robust_mask(red, green, blue, gains, threshold, mask)
+    _robust_mask(*_planes(image), gains.astype(np.float32), threshold, mask)
     components = _components(mask)
-    count = len(components.boxes)
-    measures = _Measures(
-        np.zeros(count, dtype=np.bool_), np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2))
+    gates = (
+        max(settings.peak_saturation, threshold),
+        settings.maximum_aspect,
+        settings.minimum_solidity,
     )
-    gates = np.array(
-        [
-            max(settings.peak_saturation, threshold),
-            settings.maximum_aspect,
-            settings.minimum_solidity,
-        ]
-    )
-    _measure_blobs(image, components, gains, gates, measures)
-    covariances = np.zeros((count, 2, 2))
-    covariances[:, [0, 1], [0, 1]] = measures.variances
-    blobs = Blobs(
-        measures.centroids,
-        measures.areas,
-        components.boxes[:, 2:].astype(np.float64),
-        _border_cut(components.boxes, mask.shape),
+    found = []
+    for blob in _compact(image, components, gains, gates):
+        if (measured := _weigh(image, components, blob, gains)) is not None:
+            found.append((blob, *measured))
+    boxes = components.boxes[[item[0] for item in found]]
+    covariances = np.zeros((len(found), 2, 2))
+    covariances[:, [0, 1], [0, 1]] = np.reshape([item[3] for item in found], (-1, 2))
+    return Blobs(
+        np.reshape([item[2] for item in found], (-1, 2)),
+        np.array([item[1] for item in found]),
+        boxes[:, 2:].astype(np.float64),
+        _border_cut(boxes, image.shape),
         covariances,
     )
-    return blobs.select(measures.keep)
 
 
 def segment_fiducials(image: ImageArray, settings: SegmentationSettings) -> Blobs:

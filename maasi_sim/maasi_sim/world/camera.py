@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from maasi_drivers.vision.camera_model import Camera, project_points
+from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.models.pose import Pose
 from maasi_sim.world.floor_scene import Shape
@@ -79,6 +79,26 @@ def floor_points(rays, turn, centre, floor_x, floor_y):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
+def _project(points, view):  # type: ignore[no-untyped-def]
+    """Pixels (n, 2) of points (n, 3), as `Camera.project`; in a kernel, for small images."""
+    centre, turn, matrix, k = view.centre, view.turn, view.matrix, view.distortion
+    pixels = np.full((points.shape[0], 2), np.nan)
+    for i in range(points.shape[0]):
+        dx, dy, dz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        depth = turn[0, 2] * dx + turn[1, 2] * dy + turn[2, 2] * dz
+        x = (turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz) / max(depth, 1e-9)
+        y = (turn[0, 1] * dx + turn[1, 1] * dy + turn[2, 1] * dz) / max(depth, 1e-9)
+        r2 = x * x + y * y
+        if depth > 1e-9 and r2 < view.largest_radius * view.largest_radius:
+            radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+            u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
+            v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
+            pixels[i, 0] = matrix[0, 0] * u + matrix[0, 2]
+            pixels[i, 1] = matrix[1, 1] * v + matrix[1, 2]
+    return pixels
+
+
+@njit(cache=True)
 def place(shapes, rims, floor_x, floor_y, view, motion, margin, boxes, drift):  # type: ignore[no-untyped-def]
     """Find the pixels that each shape may touch, and how far it moves during the exposure.
 
@@ -124,9 +144,7 @@ def place(shapes, rims, floor_x, floor_y, view, motion, margin, boxes, drift):  
             drift[i, 1] = -exposure_time * (moved_y + (y - centre[1]) / centre[2] * moved_z)
             move = np.sqrt(drift[i, 0] ** 2 + drift[i, 1] ** 2)
             spread = move * max(matrix[0, 0], matrix[1, 1]) / centre[2]
-        pixels = project_points(
-            rims[i], centre, view.turn, matrix, view.distortion, view.largest_radius
-        )
+        pixels = _project(rims[i], view)
         low_x = low_y = np.inf
         high_x = high_y = -np.inf
         lost = False
