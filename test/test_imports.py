@@ -47,7 +47,7 @@ ROS_FILES = (
     'watchdog.py',
     # Of the simulation.
     'arming.py',
-    'external_robot.py',
+    'sim_topics.py',
 )
 # Not ament_index_python, which looks up where files are installed.
 ROS_PACKAGES = ('*_msgs', '*_interfaces', 'rcl*', 'rosidl*', 'std_srvs', 'tf2_*')

@@ -23,9 +23,6 @@ from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, sensor_reader, sensor_wr
 from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.emulators.linked_robots import LinkedRobot, linked_robot
-from maasi_sim.ros.connections import Connections
-from maasi_sim.ros.ground_truth import publish_truth
-from maasi_sim.ros.robot_topics import RobotTopics
 from maasi_sim.scenario.layering import Key
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import (
@@ -33,7 +30,7 @@ from maasi_sim.scenario.schema import (
     ScenarioError,
 )
 from maasi_sim.sim_settings import SimNodeSettings
-from maasi_sim.world.external_robot import ExternalRobot
+from maasi_sim.sim_topics import Connections, ExternalRobot, RobotTopics, publish_truth
 from maasi_sim.world.simulation import Simulation
 
 RECORDER = 'recorder'

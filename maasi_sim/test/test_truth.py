@@ -11,9 +11,9 @@ from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 from maasi_sim.world.odometry import OdometryModel, OdometrySettings
-from maasi_sim.world.ranging_sensor import RangingSensor
+from maasi_sim.world.robots import SimulatedSettings
+from maasi_sim.world.sensors import RangingSensor
 from maasi_sim.world.simulation import Simulation
-from maasi_sim.world.truth import SimulatedSettings
 from maasi_sim.world.world import World
 
 CUBE = np.array([[0.0, 260.0]] * 3)

@@ -10,8 +10,7 @@ from pydantic import ValidationError
 from scipy.spatial.distance import pdist
 
 from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.world.noise_streams import noise_stream
-from maasi_sim.world.world import TargetSettings, World
+from maasi_sim.world.world import TargetSettings, World, noise_stream
 
 FLOOR = {'bounds': [[-0.3, 2.4], [-0.3, 2.4]]}
 CUBE = {'bounds': [[0, 260], [0, 260], [0, 260]]}
@@ -116,7 +115,7 @@ def test_noise_streams_are_keyed_by_each_part():
 
 def test_noise_streams_are_the_same_in_another_process():
     code = (
-        'from maasi_sim.world.noise_streams import noise_stream as n;'
+        'from maasi_sim.world.world import noise_stream as n;'
         "print(n(3, 'mambo', 17, 'camera').random().hex())"
     )
     environment = {'PYTHONHASHSEED': '99', 'PYTHONPATH': ':'.join(sys.path)}

@@ -14,8 +14,7 @@ from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose
 from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor_scene import scene_of
-from maasi_sim.world.render_settings import RenderSettings
+from maasi_sim.world.floor import RenderSettings, scene_of
 from maasi_sim.world.world import TargetSettings, World
 
 

@@ -34,7 +34,7 @@ from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
 from maasi_sim.targets.scoring import scoring_radius
-from maasi_sim.world.ranging_sensor import RangingSensor
+from maasi_sim.world.sensors import RangingSensor
 
 METHODS = ('ic_phd', 'pmb')
 CUBE = 'ranging_drone_3d'

@@ -25,8 +25,7 @@ from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor_scene import scene_of
-from maasi_sim.world.render_settings import RenderSettings
+from maasi_sim.world.floor import RenderSettings, scene_of
 from maasi_sim.world.world import TargetSettings, World
 
 BOX = 0.2

@@ -36,8 +36,7 @@ from maasi_msgs.msg import (
 )
 from maasi_planner.motion import RobotState, make_motion
 from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor_scene import scene_of
-from maasi_sim.world.render_settings import RenderSettings
+from maasi_sim.world.floor import RenderSettings, scene_of
 from maasi_sim.world.world import TargetSettings, World
 
 STEP = 0.05

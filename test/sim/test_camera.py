@@ -10,10 +10,8 @@ from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_filter.settings import EnvironmentSettings
 from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor_scene import disc, draw_distractors, scene_of
-from maasi_sim.world.noise_streams import noise_stream
-from maasi_sim.world.render_settings import RenderSettings
-from maasi_sim.world.world import TargetSettings, World
+from maasi_sim.world.floor import RenderSettings, disc, draw_distractors, scene_of
+from maasi_sim.world.world import TargetSettings, World, noise_stream
 
 IDEAL = RenderSettings.ideal()
 DOWN = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)

@@ -15,9 +15,9 @@ from maasi_sim.emulators.mambo.firmware import (
     MamboFirmware,
 )
 from maasi_sim.scenario.schema import RobotSettings, Scenario
-from maasi_sim.world.external_robot import ExternalRobot
-from maasi_sim.world.noise_streams import noise_stream
+from maasi_sim.sim_topics import ExternalRobot
 from maasi_sim.world.robots import Leader
+from maasi_sim.world.world import noise_stream
 
 # Hover height after take-off relative to the height at which the search starts [1].
 _TAKE_OFF_SHARE = 0.8

@@ -25,11 +25,10 @@ from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSet
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import ScenarioError
-from maasi_sim.world.laser_scan import LaserSettings
+from maasi_sim.world.floor import RenderSettings
 from maasi_sim.world.odometry import OdometrySettings
-from maasi_sim.world.render_settings import RenderSettings
-from maasi_sim.world.robots import BatterySettings
-from maasi_sim.world.truth import SimulatedSettings
+from maasi_sim.world.robots import BatterySettings, SimulatedSettings
+from maasi_sim.world.sensors import LaserSettings
 from maasi_sim.world.world import TargetSettings, World
 
 

@@ -20,9 +20,8 @@ from numpy.typing import ArrayLike
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.arrays import FloatArray, ImageArray
 from maasi_filter.models.pose import Pose
-from maasi_sim.world.floor_scene import Shape
-from maasi_sim.world.noise_streams import noise_stream
-from maasi_sim.world.render_settings import RenderSettings
+from maasi_sim.world.floor import RenderSettings, Shape
+from maasi_sim.world.world import noise_stream
 
 DISC, RECTANGLE = 0, 1
 _MAXIMUM_SUBSAMPLES = 33

@@ -6,15 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, inverse
 from maasi_filter.settings import Settings
 from maasi_planner.motion import RobotState
-from maasi_sim.world.noise_streams import noise_stream
+from maasi_sim.world.world import noise_stream
 
-Array = NDArray[np.float64]
 # Reported variances stay positive: consumers invert them.
 _LEAST_VARIANCE = 1e-12
 
@@ -52,46 +51,24 @@ class OdometrySettings(Settings):
 
 @dataclass(frozen=True)
 class OdometryReading:
-    """
-    Odometry of one step, as in ``nav_msgs/Odometry``.
+    """Odometry of one step, as in ``nav_msgs/Odometry``.
 
-    Attributes
-    ----------
-    pose : Pose
-        In the odometry frame: the frame of the robot at the start.
-    covariance : ndarray, shape (6, 6)
-        Of the pose [m, rad].
-    velocity, angular_velocity : ndarray, shape (3,)
-        The robot's frame [m/s, rad/s].
-
+    The pose is in the frame of the robot at the start, with its covariance (6, 6) [m, rad]; the
+    velocities are in the robot's frame [m/s, rad/s].
     """
 
     pose: Pose
-    covariance: Array
-    velocity: Array
-    angular_velocity: Array
+    covariance: FloatArray
+    velocity: FloatArray
+    angular_velocity: FloatArray
 
 
 class OdometryModel:
-    """
-    A robot's odometry.
+    """A robot's odometry, which stands at zero at its start.
 
     Height, roll and pitch are measured absolutely and have noise at most; x, y and heading are
-    integrated, and drift.
-
-    Parameters
-    ----------
-    settings : OdometrySettings
-        Noise and drift.
-    start : Pose
-        True pose when the odometry stands at zero; level.
-    seed : int
-        Of the run.
-    robot : str
-        Name of the robot.
-    reported : OdometrySettings, optional
-        Errors that the covariance describes; none: `settings`.
-
+    integrated, and drift. The covariance describes the errors of `reported`, by default those of
+    `settings`.
     """
 
     def __init__(
@@ -127,16 +104,7 @@ class OdometryModel:
         self._drift = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def step(self, state: RobotState, step: int) -> OdometryReading:
-        """
-        Return the odometry of the next true state.
-
-        Parameters
-        ----------
-        state : RobotState
-            True state.
-        step : int
-            Discrete step, which keys the noise.
-        """
+        """Return the odometry of the next true state; the discrete step keys the noise."""
         settings = self.settings
         generator = noise_stream(self.seed, self.robot, step, 'odometry')
         dx, dy, dh, nx, ny, nz, nh, *twist_noise = generator.standard_normal(13).tolist()
@@ -179,7 +147,7 @@ class OdometryModel:
             np.array([v + angular * n for v, n in zip(turning, twist_noise[3:])]),
         )
 
-    def _drawn_offset(self, axes: int) -> Array:
+    def _drawn_offset(self, axes: int) -> FloatArray:
         """Return the constant error of the position, (3,) [m]."""
         offset = np.zeros(3)
         if self.settings.position_offset > 0.0:
@@ -222,7 +190,7 @@ class OdometryModel:
             hh + way * self.reported.heading_drift**2,
         )
 
-    def _covariance(self) -> Array:
+    def _covariance(self) -> FloatArray:
         covariance = self._noise_covariance.copy()
         xx, xy, yy, xh, yh, hh = self._drift
         covariance[0, 0] += xx

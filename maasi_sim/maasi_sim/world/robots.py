@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,22 +13,70 @@ from pydantic import Field
 from maasi_drivers.agent.sensor_reading import Sweep
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import UNLABELLED
-from maasi_filter.settings import Settings
+from maasi_filter.settings import NoiseSettings, SensorSettings, Settings
 from maasi_planner.motion import Body, RobotState, make_motion
 from maasi_planner.motion.base import check_command
 from maasi_planner.settings import MotionSettings
 from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor_scene import scene_of
-from maasi_sim.world.laser_scan import LaserScanner, LaserSettings
+from maasi_sim.world.floor import RenderSettings, scene_of
 from maasi_sim.world.odometry import OdometryModel, OdometryReading, OdometrySettings
-from maasi_sim.world.ranging_sensor import RangingSensor
-from maasi_sim.world.render_settings import RenderSettings
+from maasi_sim.world.sensors import LaserScanner, LaserSettings, RangingSensor
 from maasi_sim.world.world import World
 
-Array = NDArray[np.float64]
+
+class SimulatedSettings(Settings):
+    """True parameters of a robot, where they differ from its other settings.
+
+    The sensor's part is for ranging sensors; a camera has its own true settings.
+    """
+
+    noise: NoiseSettings | None = Field(
+        default=None, description="True noise of its sensor; none: the sensor's"
+    )
+    noise_factor: float = Field(
+        default=1.0, gt=0.0, le=1000.0, description='Factor on the true deviations [1]'
+    )
+    probability_factor: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=100.0,
+        description='Factor on the true probability of detection, which is at most 1 [1]',
+    )
+    clutter_per_scan: float | None = Field(
+        default=None,
+        ge=0.0,
+        le=1e4,
+        description='True mean number of false detections in a scan; none: as in the sensor [1]',
+    )
+    odometry: OdometrySettings | None = Field(
+        default=None,
+        description='True noise, drift and offset of its odometry, while the covariance it reports '
+        'is that of `odometry`; none: they are the same',
+    )
+
+    def sensor(self, believed: SensorSettings, name: str, bounds: FloatArray) -> Sensor:
+        """Return the true ranging sensor; its clutter is within the diagonal of the bounds."""
+        dimension = len(bounds)
+        noise = self.noise or believed.noise
+        detection = believed.detection.model_copy(
+            update={
+                'probability': min(believed.detection.probability * self.probability_factor, 1.0)
+            }
+        )
+        true = believed.model_copy(update={'noise': noise, 'detection': detection})
+        sensor = true.build(name, dimension)
+        sensor.covariance = sensor.covariance * self.noise_factor**2
+        if self.clutter_per_scan is not None:
+            size = bounds[:, 1] - bounds[:, 0]
+            reach = min(math.sqrt(float((size * size).sum())), sensor.maximum_range)
+            space = reach * 2.0 * math.pi * (math.pi if dimension == 3 else 1.0)
+            sensor.clutter = self.clutter_per_scan / space
+        return sensor
+
 
 # Sink rate of a flying robot with an empty battery [m/s].
 _SINKING = 0.3
@@ -64,28 +113,10 @@ class Battery:
 
 @dataclass(frozen=True)
 class Equipment:
-    """
-    Body and sensors of a simulated robot.
+    """Body and sensors of a simulated robot.
 
-    Attributes
-    ----------
-    motion : MotionSettings
-        Its body.
-    radius : float
-        Of a circle around it that hits obstacles [m].
-    camera : CameraSettings or None
-        True camera.
-    sensor : Sensor or None
-        Ranging sensor.
-    laser : LaserSettings or None
-        Laser scanner.
-    odometry : OdometrySettings
-        Noise and drift, as it reports them.
-    true_odometry : OdometrySettings or None
-        True noise and drift, if different.
-    battery : BatterySettings
-        Capacity and drain.
-
+    `radius` is that of a circle around it that hits obstacles [m]; `odometry` is what its odometry
+    reports of its errors, `true_odometry` what they are, if different.
     """
 
     motion: MotionSettings
@@ -107,32 +138,10 @@ class Leader(Protocol):
 
 
 class SimulatedRobot:
-    """
-    A simulated robot.
+    """A simulated robot; its name keys its noise.
 
     A command holds until the next one, as on a robot without a watchdog. A robot stops before it
     hits an obstacle; with an empty battery it stops, or sinks to the floor.
-
-    Parameters
-    ----------
-    name : str
-        Keys its noise.
-    equipment : Equipment
-        Body and sensors.
-    start : Pose
-        In the map; the odometry starts at zero there.
-    world : World
-        Targets and obstacles.
-    floor : RenderSettings
-        Rendering of camera images.
-    seed : int
-        Of the run.
-
-    Raises
-    ------
-    ValueError
-        If it starts inside an obstacle.
-
     """
 
     def __init__(
@@ -187,13 +196,9 @@ class SimulatedRobot:
             self.ranging = RangingSensor(equipment.sensor, world.targets_3d, seed, name, reach)
 
     def command(self, velocity: ArrayLike) -> None:
-        """
-        Set the velocity command, which holds until the next one.
+        """Set the velocity command (4,), which holds until the next one.
 
-        Parameters
-        ----------
-        velocity : array_like, shape (4,)
-            vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+        vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
         """
         self._command = check_command(velocity)
 
@@ -279,6 +284,6 @@ class SimulatedRobot:
         self._body = self._motion.body(RobotState(Pose.from_yaw(pose.position, pose.yaw)))
         self.state = self._body.robot_state()
 
-    def _hits(self, position: Array) -> bool:
+    def _hits(self, position: FloatArray) -> bool:
         distances = self.world.obstacles.distances(position)
         return bool(len(distances) and distances.min() < self.equipment.radius)

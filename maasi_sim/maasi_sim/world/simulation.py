@@ -21,19 +21,7 @@ _TOLERANCE = 1e-6
 class SimulatedTeam:
     """Robots of a scenario on one clock, from step 0, with events applied.
 
-    Parameters
-    ----------
-    scenario : BaseScenario
-        With all layers.
-    robots : dict
-        By name, in name order.
-
-    Attributes
-    ----------
-    step : int
-        Discrete step k.
-    away : set of str
-        Robots that have left: they stand still and are silent.
+    `away` are those that have left: they stand still and are silent.
     """
 
     def __init__(self, scenario: BaseScenario, robots: dict[str, Any]) -> None:
@@ -73,25 +61,7 @@ class SimulatedTeam:
 
 
 class Simulation(SimulatedTeam):
-    """The robots of a search for targets.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        With all layers.
-    seed : int
-        Of the run.
-
-    Attributes
-    ----------
-    world : World
-        The truth.
-
-    Raises
-    ------
-    ValueError
-        If a robot starts inside an obstacle.
-    """
+    """The robots of a search for targets."""
 
     scenario: Scenario
     robots: dict[str, SimulatedRobot]

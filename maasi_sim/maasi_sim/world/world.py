@@ -1,20 +1,35 @@
-"""The true world: bounds, targets, obstacles."""
+"""The true world: bounds, targets, obstacles; and the streams of random numbers in it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
+from zlib import crc32
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from maasi_filter.arrays import FloatArray
 from maasi_filter.records import Label
 from maasi_filter.settings import EnvironmentSettings, Finite, Settings
 from maasi_planner.obstacles import Obstacles
-from maasi_sim.world.noise_streams import noise_stream
 
-Array = NDArray[np.float64]
+
+def noise_stream(
+    seed: int, robot: str = '', step: int = 0, purpose: str = ''
+) -> np.random.Generator:
+    """Return the generator of one robot's noise for one purpose, as 'camera', at one step.
+
+    Independent of the streams of other keys, and equal for equal keys, in every process. Noise of
+    the world has no robot.
+    """
+    for name, value in (('seed', seed), ('step', step)):
+        if value < 0:
+            raise ValueError(f'{name}: got {value}, allowed are whole numbers of at least 0')
+    key = (seed, crc32(robot.encode()), step, crc32(purpose.encode()))
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
+
 
 # Draws for one target before the space counts as full.
 _ATTEMPTS = 1000
@@ -68,8 +83,7 @@ class TargetSettings(Settings):
 
 @dataclass(frozen=True)
 class World:
-    """
-    The true world.
+    """The true world.
 
     Attributes
     ----------
@@ -85,16 +99,15 @@ class World:
         Of the walk.
     labels : tuple of Label
         Label that sensors report for each target; empty: none.
-
     """
 
-    bounds: Array
-    targets: Array
+    bounds: FloatArray
+    targets: FloatArray
     obstacles: Obstacles = field(default_factory=Obstacles.none)
     walk: float = 0.0
     seed: int = 0
     labels: tuple[Label, ...] = ()
-    _way: list[Array] = field(default_factory=list, compare=False, repr=False)
+    _way: list[FloatArray] = field(default_factory=list, compare=False, repr=False)
 
     @property
     def dimension(self) -> int:
@@ -102,11 +115,11 @@ class World:
         return len(self.bounds)
 
     @property
-    def targets_3d(self) -> Array:
+    def targets_3d(self) -> FloatArray:
         """Targets with three coordinates, shape (n, 3); those of a floor have z = 0 [m]."""
         return self.targets_3d_at(0)
 
-    def targets_at(self, step: int) -> Array:
+    def targets_at(self, step: int) -> FloatArray:
         """Return target positions at a discrete step, (n, d) [m], reflected at the bounds."""
         if self.walk == 0.0:
             return self.targets
@@ -120,7 +133,7 @@ class World:
             self._way.append(np.where(moved > high, 2.0 * high - moved, moved))
         return self._way[step]
 
-    def targets_3d_at(self, step: int) -> Array:
+    def targets_3d_at(self, step: int) -> FloatArray:
         """Return the same with three coordinates, (n, 3)."""
         return np.pad(self.targets_at(step), ((0, 0), (0, 3 - self.dimension)))
 
@@ -155,7 +168,7 @@ def labels_of(targets: TargetSettings, count: int) -> tuple[Label, ...]:
     )
 
 
-def check_positions(positions: ArrayLike, bounds: Array) -> Array:
+def check_positions(positions: ArrayLike, bounds: FloatArray) -> FloatArray:
     """Return given target positions as an (n, d) array."""
     rows = [np.asarray(row, dtype=float) for row in np.asarray(positions, dtype=object)]
     for index, row in enumerate(rows):
@@ -173,29 +186,11 @@ def check_positions(positions: ArrayLike, bounds: Array) -> Array:
 
 def draw_targets(
     settings: TargetSettings,
-    bounds: Array,
+    bounds: FloatArray,
     generator: np.random.Generator,
     obstacles: Obstacles | None = None,
-) -> Array:
-    """
-    Draw target positions.
-
-    Parameters
-    ----------
-    settings : TargetSettings
-        Count, distribution, separation and margin.
-    bounds : ndarray, shape (d, 2)
-        [m].
-    generator : numpy.random.Generator
-        Source of random numbers.
-    obstacles : Obstacles, optional
-        No target lies inside one, nor within ``margin`` of one.
-
-    Returns
-    -------
-    ndarray, shape (count, d)
-        [m].
-    """
+) -> FloatArray:
+    """Draw target positions (count, d) [m], each at least ``margin`` outside of all obstacles."""
     count = settings.count or 0
     low, high = bounds[:, 0] + settings.margin, bounds[:, 1] - settings.margin
     if np.any(low > high):
@@ -216,11 +211,11 @@ def draw_targets(
 def _draw(
     settings: TargetSettings,
     count: int,
-    low: Array,
-    high: Array,
+    low: FloatArray,
+    high: FloatArray,
     generator: np.random.Generator,
     obstacles: Obstacles,
-) -> Array | None:
+) -> FloatArray | None:
     centres = np.empty((0, len(low)))
     spread = settings.spread or float((high - low).mean()) / 15.0
     if settings.distribution == 'clustered':

@@ -1,4 +1,4 @@
-"""A simulated planar laser scanner: rays against circles and the walls of the environment."""
+"""Simulated sensors of ranges: range, bearing and elevation of targets, and a laser scanner."""
 
 from __future__ import annotations
 
@@ -9,11 +9,71 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.models.measurement import wrap_angle
 from maasi_filter.models.pose import Pose
+from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import Settings
-from maasi_sim.world.noise_streams import noise_stream
+from maasi_sim.world.world import noise_stream
 
-Array = NDArray[np.float64]
+
+class RangingSensor:
+    """A robot's ranging sensor (000, eq. (3) to (9)); seed, robot and step key its random numbers.
+
+    Shapes and units: targets (n, 2 or 3), true positions [m, map]; reach [m], of clutter.
+    """
+
+    def __init__(
+        self, sensor: Sensor, targets: FloatArray, seed: int, robot: str, reach: float = 0.0
+    ) -> None:
+        self.sensor = sensor
+        self.targets = np.asarray(targets, dtype=float)
+        self.seed = seed
+        self.robot = robot
+        self.reach = min(reach, sensor.maximum_range)
+        self._spread = np.linalg.cholesky(sensor.covariance)
+
+    def measure(
+        self, pose: Pose, step: int, targets: FloatArray | None = None
+    ) -> tuple[FloatArray, IntArray]:
+        """Return one sweep in random order, and the index of each return's target, -1 for clutter.
+
+        Shapes and units: targets (n, 2 or 3) [m, map], where they have moved; returned (m, d) [m,
+        rad], bearings from the map's x axis, and (m,).
+        """
+        dimension = self.sensor.dimension
+        generator = noise_stream(self.seed, self.robot, step, 'ranging')
+        count = len(self.targets)
+        # The number of draws does not depend on detections: targets do not affect each other.
+        chance = generator.random(count)
+        noise = generator.standard_normal((count, dimension))
+        positions = (self.targets if targets is None else targets)[:, :dimension]
+        values = self.sensor.measurement.measure(positions, pose)
+        seen = chance < self.sensor.detection.probability(positions, pose)
+        seen &= values[:, 0] <= self.sensor.maximum_range
+        # Summed in a fixed order: the result must not depend on the linear algebra library.
+        errors = np.zeros((count, dimension))
+        for column in range(dimension):
+            errors += noise[:, column, None] * self._spread[:, column]
+        returns, causes = (values + errors)[seen], np.flatnonzero(seen)
+        if self.sensor.clutter > 0.0 and self.reach > 0.0:
+            clutter = self._clutter(generator, dimension)
+            returns = np.concatenate([returns, clutter])
+            causes = np.concatenate([causes, np.full(len(clutter), -1)])
+        order = generator.permutation(len(returns))
+        returns, causes = returns[order], causes[order]
+        returns[:, 0] = np.maximum(returns[:, 0], 1e-6)
+        returns[:, 1] = wrap_angle(returns[:, 1])
+        if dimension == 3:
+            returns[:, 2] = np.clip(returns[:, 2], -0.5 * math.pi, 0.5 * math.pi)
+        return returns, causes
+
+    def _clutter(self, generator: np.random.Generator, dimension: int) -> FloatArray:
+        """Draw false returns, uniform in range and angles."""
+        low = np.array([0.0, -math.pi, -0.5 * math.pi][:dimension])
+        high = np.array([self.reach, math.pi, 0.5 * math.pi][:dimension])
+        count = generator.poisson(self.sensor.clutter * float(np.prod(high - low)))
+        return generator.uniform(low, high, size=(count, dimension))
 
 
 class LaserSettings(Settings):
@@ -69,30 +129,15 @@ def _cast(x, y, yaw, count, circles, walls, ranges):  # type: ignore[no-untyped-
 
 
 class LaserScanner:
-    """
-    One robot's laser scanner, at its origin, first beam straight ahead.
+    """One robot's laser scanner, at its origin, first beam straight ahead; walls around the bounds.
 
-    Parameters
-    ----------
-    settings : LaserSettings
-        Beams, limits, noise.
-    bounds : ndarray, shape (d, 2)
-        Of the environment; its walls stand ``wall_margin`` outside [m].
-    centres : array_like, shape (n, 2) or (n, 3)
-        Of the obstacles [m].
-    radii : array_like, shape (n,)
-        [m].
-    seed : int
-        Of the run.
-    robot : str
-        Name of the robot.
-
+    Shapes and units: bounds (d, 2); centres (n, 2 or 3) and radii (n,) of the obstacles [m].
     """
 
     def __init__(
         self,
         settings: LaserSettings,
-        bounds: Array,
+        bounds: FloatArray,
         centres: ArrayLike,
         radii: ArrayLike,
         seed: int,
@@ -109,23 +154,10 @@ class LaserScanner:
     def scan(
         self, pose: Pose, step: int, centres: ArrayLike = (), radii: ArrayLike = ()
     ) -> NDArray[np.float32]:
-        """
-        Return the ranges of one turn.
+        """Return the ranges of one turn (beams,), anticlockwise from straight ahead [m].
 
-        Parameters
-        ----------
-        pose : Pose
-            True pose of the robot in the map frame.
-        step : int
-            Discrete step, which keys the noise.
-        centres, radii : array_like, shapes (n, 2) and (n,)
-            Further circles: the other robots [m].
-
-        Returns
-        -------
-        ndarray, shape (beams,), float32
-            Anticlockwise from straight ahead [m]; infinite without a return, minus infinite below
-            the minimum range (REP 117).
+        Infinite without a return, minus infinite below the minimum range (REP 117). `centres` and
+        `radii` are those of further circles: the other robots.
         """
         settings = self.settings
         circles = np.concatenate([self._circles, _circles(centres, radii)])
@@ -139,7 +171,7 @@ class LaserScanner:
         return ranges.astype(np.float32)
 
 
-def _circles(centres: ArrayLike, radii: ArrayLike) -> Array:
+def _circles(centres: ArrayLike, radii: ArrayLike) -> FloatArray:
     radius = np.asarray(radii, dtype=float).reshape(-1)
     centre = np.asarray(centres, dtype=float)
     centre = centre.reshape(len(radius), centre.shape[-1] if centre.ndim > 1 else 2)

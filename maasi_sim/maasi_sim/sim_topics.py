@@ -1,27 +1,44 @@
-"""The topics that one simulated robot publishes."""
+"""What the simulation node publishes: topics of robots, the truth; and who receives it."""
 
 from __future__ import annotations
 
 import array
 import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import BatteryState, CameraInfo, Image, LaserScan
 from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_drivers.agent.sensor_reading import Sweep
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
+from maasi_filter.models.pose import Pose
 from maasi_filter.records import UNLABELLED
-from maasi_msgs.msg import RangeArray, RangeMeasurement
+from maasi_filter.ros.conversions import (
+    MarkerBoard,
+    colour,
+    point_to_ros,
+    pose_from_ros,
+    pose_to_ros,
+    sphere_marker,
+)
+from maasi_filter.ros.qos import LATCHED
+from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
+from maasi_planner.motion import RobotState
 from maasi_sim.scenario.schema import steps_of
-from maasi_sim.world.laser_scan import LaserSettings
 from maasi_sim.world.robots import SimulatedRobot
+from maasi_sim.world.sensors import LaserSettings
 from maasi_sim.world.simulation import Simulation
+from maasi_sim.world.world import World
 
 # Period of battery messages [s of simulated time].
 _BATTERY_PERIOD = 1.0
@@ -29,20 +46,7 @@ _LEAST_VARIANCE = 1e-12
 
 
 class RobotTopics:
-    """
-    Publish the data of one robot; messages are reused, as creating them takes longer.
-
-    Parameters
-    ----------
-    node : Node
-        Whose publishers they are.
-    simulation : Simulation
-        Where the robot is.
-    name : str
-        Of the robot.
-    qos : QoSProfile
-        Of all topics.
-    """
+    """Publish the data of one robot; messages are reused, as creating them takes longer."""
 
     def __init__(self, node: Node, simulation: Simulation, name: str, qos: QoSProfile) -> None:
         self.name = name
@@ -193,3 +197,115 @@ def scan_message(settings: LaserSettings, frame: str) -> LaserScan:
         range_min=settings.minimum_range,
         range_max=settings.maximum_range,
     )
+
+
+def publish_truth(node: Node, world: World, frame: str) -> list[Publisher]:
+    """Publish `ground_truth/targets` and `ground_truth/markers` once, and return the publishers."""
+    header = Header(frame_id=frame)
+    targets = node.create_publisher(PoseArray, 'ground_truth/targets', LATCHED)
+    markers = node.create_publisher(MarkerArray, 'ground_truth/markers', LATCHED)
+    targets.publish(
+        PoseArray(header=header, poses=[pose_to_ros(Pose(target)) for target in world.targets_3d])
+    )
+    size = 0.01 * float((world.bounds[:, 1] - world.bounds[:, 0]).max())
+    shapes = [
+        sphere_marker(header, 'truth', number, target, size, colour(0.0, 0.3, 1.0, 0.7))
+        for number, target in enumerate(world.targets_3d, start=1)
+    ]
+    obstacles = world.obstacles
+    for number, (centre, radius, sphere) in enumerate(
+        zip(obstacles.centres, obstacles.radii, obstacles.spheres), start=1
+    ):
+        shape = sphere_marker(
+            header, 'obstacles', number, centre, 2.0 * float(radius), colour(0.3, 0.3, 0.3)
+        )
+        if not sphere:
+            shape.type = Marker.CYLINDER
+            low, high = world.bounds[2] if world.dimension == 3 else (0.0, float(radius))
+            shape.pose.position = point_to_ros([*centre[:2], 0.5 * (low + high)])
+            shape.scale.z = float(high - low)
+        shapes.append(shape)
+    markers.publish(MarkerBoard().replace(MarkerArray(markers=shapes)))
+    return [targets, markers]
+
+
+class Connections:
+    """Tells whether expected nodes would receive what is published now.
+
+    `expected` are topics that each node subscribes to, by its full name.
+    """
+
+    def __init__(self, node: Node, expected: Mapping[str, Sequence[str]]) -> None:
+        self._node = node
+        self._expected = expected
+        self._endpoints: dict[tuple[str, str], set[bytes]] = {}
+
+    def unheard(self, name: str) -> list[str]:
+        """Return the topics without a subscription of a node since `remember`."""
+        return [
+            topic
+            for topic in self._expected[name]
+            if not self._subscriptions(name, topic) - self._endpoints.get((name, topic), set())
+        ]
+
+    def unmatched(self, entities: Iterable[Any]) -> list[str]:
+        """Return the topics of publishers with a known subscription that is not connected yet."""
+        return [
+            publisher.topic_name
+            for publisher in entities
+            if isinstance(publisher, Publisher)
+            and publisher.get_subscription_count()
+            < len(self._node.get_subscriptions_info_by_topic(publisher.topic_name))
+        ]
+
+    def remember(self) -> None:
+        """Remember all subscriptions: a restarted node has others."""
+        for name, topics in self._expected.items():
+            for topic in topics:
+                self._endpoints[name, topic] = self._subscriptions(name, topic)
+
+    def _subscriptions(self, name: str, topic: str) -> set[bytes]:
+        return {
+            bytes(info.endpoint_gid)
+            for info in self._node.get_subscriptions_info_by_topic(topic)
+            if f'{info.node_namespace.rstrip("/")}/{info.node_name}' == name
+        }
+
+
+class ExternalRobot:
+    """A robot moved by another program: an autopilot's simulator, or a real vehicle.
+
+    Its state is what its driver publishes; simulated sensors measure from there.
+    """
+
+    def __init__(self, start: Pose) -> None:
+        self._state = RobotState(start)
+
+    @property
+    def state(self) -> RobotState:
+        """The last published state, in the map."""
+        return self._state
+
+    @property
+    def obeys(self) -> bool:
+        """False: the simulation does not wait for it at shutdown."""
+        return False
+
+    def take(self, message: AgentState) -> None:
+        """Store the newest state."""
+        linear, angular = message.twist.linear, message.twist.angular
+        try:
+            self._state = RobotState(
+                pose_from_ros(message.pose.pose),
+                np.array([linear.x, linear.y, linear.z]),
+                np.array([angular.x, angular.y, angular.z]),
+            )
+        except ValueError:
+            # Not finite: keep the last valid pose.
+            return
+
+    def cut(self, cut: bool = True) -> None:
+        """Do nothing: its link is not simulated."""
+
+    def close(self) -> None:
+        """Do nothing."""

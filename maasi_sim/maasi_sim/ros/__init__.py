@@ -1,1 +1,0 @@
-"""What the simulation node publishes, beside time and steps."""
