@@ -225,11 +225,11 @@ def test_the_nodes_of_the_field_become_active_with_their_file(domain, tmp_path):
     from waiting import wait_until
 
     started = {
-        '/turtlebot/driver': 'maasi_drivers.turtlebot_driver',
-        '/turtlebot/guard': 'maasi_drivers.guard_node',
-        '/drone/driver': 'maasi_drivers.mavlink_camera_driver',
-        '/filter_node': 'maasi_filter.filter_node',
-        '/planner_node': 'maasi_planner.planner_node',
+        '/turtlebot/driver': 'turtlebot_driver',
+        '/turtlebot/guard': 'guard_node',
+        '/drone/driver': 'mavlink_camera_driver',
+        '/filter_node': 'filter_node',
+        '/planner_node': 'planner_node',
     }
     processes = []
     heard = {}
@@ -244,14 +244,14 @@ def test_the_nodes_of_the_field_become_active_with_their_file(domain, tmp_path):
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     try:
-        for name, module in started.items():
+        for name, executable in started.items():
             namespace = name.rpartition('/')[0] or '/'
             file = f'{name.strip("/").replace("/", "_")}.yaml'
             words = ['--ros-args', '-r', f'__ns:={namespace}', '--params-file', file]
-            with (tmp_path / module).open('w') as log:
+            with (tmp_path / executable).open('w') as log:
                 processes.append(
                     subprocess.Popen(
-                        [sys.executable, '-m', module, *words],
+                        [executable, *words],
                         cwd=EXAMPLES / 'field_team',
                         stdout=log,
                         stderr=log,

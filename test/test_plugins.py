@@ -386,8 +386,7 @@ def test_driver_of_ones_own_is_tried_before_anything_starts(folder):
     with pytest.raises(ScenarioError, match=r"robots\.rover\.driver: .*'nowhere_too'"):
         plan_nodes(scenario, run)
     (folder / 'mine.py').write_text(
-        'from maasi_drivers.ranging_driver import RangingDriver\n'
-        'class Driver(RangingDriver):\n    pass\n'
+        'from maasi_drivers.drivers import RangingDriver\nclass Driver(RangingDriver):\n    pass\n'
     )
     (plan,) = [plan for plan in plan_nodes(scenario, run) if plan.drives]
     assert plan.command(Path('x'), Path('y'))[:3] == ['x', 'mine:Driver', str(folder)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -222,7 +221,7 @@ def process(context, tmp_path):
         file = tmp_path / 'parameters.yaml'
         flat = flatten(DriverSettings.model_validate(TURTLEBOT | changes))
         file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-        command = [sys.executable, '-m', 'maasi_drivers.turtlebot_driver', '--ros-args']
+        command = ['turtlebot_driver', '--ros-args']
         command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
         running.append(subprocess.Popen(command, env=os.environ | (environment or {})))
         return running[-1]

@@ -13,11 +13,9 @@ from sensor_msgs.msg import BatteryState, CameraInfo, Image
 from std_srvs.srv import Trigger
 from waiting import wait_until
 
+from maasi_drivers.drivers import MamboDriver, RangingDriver, TurtlebotDriver
 from maasi_drivers.guard_node import GuardNode
-from maasi_drivers.mambo_driver import MamboDriver
-from maasi_drivers.ranging_driver import RangingDriver
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros

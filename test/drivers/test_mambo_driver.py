@@ -4,7 +4,6 @@ import math
 import os
 import signal
 import subprocess
-import sys
 from types import SimpleNamespace
 
 import cv2
@@ -21,11 +20,10 @@ from waiting import wait_until
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.agent.watchdog import PERIOD as WATCH_PERIOD
+from maasi_drivers.drivers import MamboDriver, TurtlebotDriver
 from maasi_drivers.links.mambo.mambo_robot_link import _POLL_PERIOD
-from maasi_drivers.mambo_driver import MamboDriver
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import MamboSettings
-from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.detector import Blobs
 from maasi_drivers.vision.measurement_feed import FeedPacket
@@ -84,7 +82,7 @@ def process(context, tmp_path):
         file = tmp_path / 'parameters.yaml'
         flat = flatten(DriverSettings.model_validate(flight.settings))
         file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-        command = [sys.executable, '-m', 'maasi_drivers.mambo_driver', '--ros-args']
+        command = ['mambo_driver', '--ros-args']
         command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
         driver = subprocess.Popen(command, env=os.environ)
         started.extend([driver, flight])

@@ -12,10 +12,10 @@ from robot_team import MAMBO, Team, parameters_of
 from waiting import wait_until
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
+from maasi_drivers.drivers import MamboOnboardDriver
 from maasi_drivers.links.mambo.onboard_link import Order, OrderError, OrderKind
 from maasi_drivers.links.mambo.onboard_link import decode as decode_order
 from maasi_drivers.links.mambo.onboard_link import encode as encode_order
-from maasi_drivers.mambo_onboard_driver import MamboOnboardDriver
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.measurement_feed import FeedError, FeedPose, FeedState, decode, encode
 from maasi_filter.models.pose import Pose, compose

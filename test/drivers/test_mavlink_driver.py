@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -23,12 +22,10 @@ from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
 from maasi_drivers.agent import battery
 from maasi_drivers.agent.agent_driver import STOPPED as STOPPED_BY_SERVICE
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
+from maasi_drivers.drivers import MavlinkCameraDriver, MavlinkDriver, TurtlebotDriver
 from maasi_drivers.links.mavlink.mavlink_robot_link import _POLL_PERIOD
-from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
-from maasi_drivers.mavlink_driver import MavlinkDriver
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import MavlinkSettings
-from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.models.pose import Pose, compose
 from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.parameters import flatten
@@ -555,7 +552,7 @@ def test_a_driver_that_ends_or_is_killed(context, tmp_path, number):
     file = tmp_path / 'parameters.yaml'
     flat = flatten(DriverSettings.model_validate(settings))
     file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-    command = [sys.executable, '-m', 'maasi_drivers.mavlink_driver', '--ros-args']
+    command = ['mavlink_driver', '--ros-args']
     command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
     driver = subprocess.Popen(command, env=os.environ.copy())
     values = {'estimator_time': 0.2, 'parameters': {'FS_GCS_TIMEOUT': 3}}

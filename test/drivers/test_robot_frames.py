@@ -18,8 +18,8 @@ from tf2_msgs.msg import TFMessage
 
 from maasi_drivers.agent.odometry import PoseSpeed
 from maasi_drivers.agent.transform_buffer import TransformBuffer
+from maasi_drivers.drivers import TurtlebotDriver
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros

@@ -18,8 +18,8 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers, parameters_of, start_guard
 from sensor_msgs.msg import LaserScan
 
+from maasi_drivers.drivers import TurtlebotDriver
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState

@@ -19,8 +19,8 @@ from std_srvs.srv import Trigger
 from test_planner_node import ROBOTS, SETTINGS, START
 from waiting import wait_until
 
+from maasi_drivers.drivers import TurtlebotDriver
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_filter.ros.parameters import flatten

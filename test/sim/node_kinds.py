@@ -1,18 +1,21 @@
 """Every type of node, with settings that it starts with, in the namespace of its robot."""
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
 import yaml
 from rclpy.parameter import Parameter
 
+from maasi_drivers.drivers import (
+    MamboDriver,
+    MavlinkCameraDriver,
+    MavlinkDriver,
+    RangingDriver,
+    TurtlebotDriver,
+)
 from maasi_drivers.guard_node import GuardNode
-from maasi_drivers.mambo_driver import MamboDriver
-from maasi_drivers.mavlink_camera_driver import MavlinkCameraDriver
-from maasi_drivers.mavlink_driver import MavlinkDriver
-from maasi_drivers.ranging_driver import RangingDriver
 from maasi_drivers.settings.driver import DriverSettings, GuardSettings
-from maasi_drivers.turtlebot_driver import TurtlebotDriver
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
@@ -60,24 +63,24 @@ BUILDING = {
 
 @dataclass(frozen=True)
 class Kind:
-    """A type of node: class, module to start it by, settings, namespace."""
+    """A type of node: class, executable, settings, namespace."""
 
     made: Any
     settings: Any
     namespace: str = ''
 
     @property
-    def module(self):
-        return self.made.__module__
+    def executable(self):
+        return re.sub('(?<!^)(?=[A-Z])', '_', self.made.__name__).lower()
 
     @property
     def name(self):
         """Of the node."""
-        module = self.module.rpartition('.')[2]
+        executable = self.executable
         known = {'guard_node': 'guard', 'cuboid_planner_node': 'cuboid_planner'}
-        if module.endswith('_driver'):
+        if executable.endswith('_driver'):
             return 'driver'
-        return known.get(module, module.removeprefix('cuboid_'))
+        return known.get(executable, executable.removeprefix('cuboid_'))
 
     def parameters(self, **changes):
         model = type(self.settings)

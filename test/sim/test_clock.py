@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
@@ -109,7 +108,7 @@ def start(tmp_path):
         made, file = KINDS[kind], tmp_path / f'{kind}.yaml'
         made.write(file, **changes)
         namespace = namespace or made.namespace or '/'
-        command = [sys.executable, '-m', made.module, '--ros-args', '--params-file', str(file)]
+        command = [made.executable, '--ros-args', '--params-file', str(file)]
         command += ['-p', 'use_sim_time:=true', '-r', f'__ns:={namespace}']
         running.append(subprocess.Popen(command, env=os.environ, stderr=subprocess.PIPE, text=True))
         return running[-1]

@@ -64,7 +64,7 @@ class World:
             self.names[kind] = f'{namespace}/{made.name}'
             file = folder / f'{kind}.yaml'
             made.write(file, **CHANGES.get(kind, {}))
-            package, *_, executable = made.module.split('.')
+            package, executable = made.made.__module__.partition('.')[0], made.executable
             words = ['--ros-args', '--remap', f'__ns:={namespace}']
             self.processes[kind] = NodeProcess(
                 kind,

@@ -26,7 +26,7 @@ DRIVERS = PluginGroup(
     'driver',
     'maasi_drivers.agent.agent_driver:AgentDriver',
     {
-        name: f'maasi_drivers.{name}:main'
+        name: f'maasi_drivers.drivers:{name}'
         for name in (
             'mambo_driver',
             'turtlebot_driver',

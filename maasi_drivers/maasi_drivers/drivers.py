@@ -1,0 +1,93 @@
+"""The drivers of the suite, each a link to its robot and a sensor; executables by their names.
+
+A link to vehicles is imported by the driver that uses it: MAVLink needs an extra of the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pkgutil import resolve_name
+from typing import Any
+
+from maasi_drivers.agent.agent_driver import AgentDriver
+from maasi_drivers.agent.robot_link import RobotLink
+from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.sensor_input import RangingInput
+from maasi_drivers.links.topic_link import TopicLink
+from maasi_drivers.vision.camera_input import CameraInput
+from maasi_filter.ros.lifecycle_node import SettingsError
+from maasi_filter.ros.run_node import run
+
+
+def _link(name: str) -> Callable[[RobotNode], RobotLink]:
+    """Return what makes the link of a class, `module:Class` in the folder of the links."""
+
+    def make(driver: RobotNode) -> RobotLink:
+        try:
+            link: RobotLink = resolve_name(f'maasi_drivers.links.{name}')(driver)
+        except ModuleNotFoundError as error:
+            raise SettingsError(
+                f'parameter link: read {driver.settings.link!r}, which needs {error.name}, of an '
+                'extra of the package (docs/install.md)'
+            ) from error
+        return link
+
+    return make
+
+
+_MAMBO = _link('mambo.mambo_robot_link:MamboRobotLink')
+_MAVLINK = _link('mavlink.mavlink_robot_link:MavlinkRobotLink')
+
+
+class MamboDriver(AgentDriver):
+    """A quadrotor with a camera that looks down; see `MamboRobotLink` and `CameraInput`."""
+
+    def __init__(self, **options: Any) -> None:
+        links = {'topics': TopicLink, 'mambo_wifi': _MAMBO, 'mambo_ble': _MAMBO}
+        super().__init__(links, CameraInput, **options)
+
+
+class MamboOnboardDriver(AgentDriver):
+    """A drone with a program of its own; see `OnboardLink` and docs/measurement_feed.md."""
+
+    def __init__(self, **options: Any) -> None:
+        links = {'mambo_feed': _link('mambo.onboard_link:OnboardLink')}
+        super().__init__(links, CameraInput, **options)
+
+
+class MavlinkDriver(AgentDriver):
+    """A vehicle with a ranging sensor; see `MavlinkRobotLink` and `RangingInput`."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__({'topics': TopicLink, 'mavlink': _MAVLINK}, RangingInput, **options)
+
+
+class MavlinkCameraDriver(AgentDriver):
+    """A vehicle with a camera; see `MavlinkRobotLink` and `CameraInput`."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__({'topics': TopicLink, 'mavlink': _MAVLINK}, CameraInput, **options)
+
+
+class RangingDriver(AgentDriver):
+    """A robot with topics and a ranging sensor; see `TopicLink` and `RangingInput`."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__({'topics': TopicLink}, RangingInput, **options)
+
+
+class TurtlebotDriver(AgentDriver):
+    """A ground robot with a camera; see `TurtlebotLink` and `CameraInput`."""
+
+    def __init__(self, **options: Any) -> None:
+        link = _link('turtlebot_link:TurtlebotLink')
+        super().__init__({'topics': link}, CameraInput, **options)
+
+
+mambo_driver = partial(run, MamboDriver)
+mambo_onboard_driver = partial(run, MamboOnboardDriver)
+mavlink_driver = partial(run, MavlinkDriver)
+mavlink_camera_driver = partial(run, MavlinkCameraDriver)
+ranging_driver = partial(run, RangingDriver)
+turtlebot_driver = partial(run, TurtlebotDriver)
