@@ -35,11 +35,10 @@ ROS_FILES = (
     'search_command.py',
     # Of the drivers.
     '*_link.py',
-    '*_topic.py',
     'camera_input.py',
     'goal_server.py',
     'measurement_responder.py',
-    'battery.py',
+    'robot_topics.py',
     'robot_command.py',
     'robot_frames.py',
     'scan_input.py',

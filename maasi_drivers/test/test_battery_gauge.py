@@ -1,10 +1,14 @@
 """The charge of a battery, in the unit that its robot reports it in."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import BatteryState
+from std_msgs.msg import Header
 
-from maasi_drivers.agent.battery import BatteryReadings, charge_of
+from maasi_drivers.agent.robot_topics import BatteryTopic, charge_of
 
 
 @pytest.mark.parametrize(
@@ -33,10 +37,20 @@ def test_per_cent_are_no_fraction():
 
 @pytest.mark.parametrize('order', [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
 def test_in_lockstep_a_reading_counts_from_the_step_after_its_own(order):
-    readings = BatteryReadings()
-    for index in order:
-        readings.add(10 * index, 1.0 - 0.1 * index)
-    assert readings.before(0) == []
-    assert readings.before(10) == [1.0]
-    assert readings.before(10) == []
-    assert readings.before(25) == [0.9, 0.8]
+    waiting = [
+        BatteryState(percentage=1.0 - 0.25 * index, header=Header(stamp=Time(sec=index)))
+        for index in order
+    ]
+    handle = SimpleNamespace(take_message=lambda *_: (waiting.pop(),) if waiting else None)
+    taken = []
+    topic = BatteryTopic(
+        SimpleNamespace(
+            settings=SimpleNamespace(lockstep=True, battery_unit='fraction'),
+            create_subscription=lambda *_: SimpleNamespace(handle=handle),
+            take_charge=taken.append,
+        )
+    )
+    for second, expected in ((0.0, []), (1.0, [1.0]), (1.0, []), (2.5, [0.75, 0.5])):
+        taken.clear()
+        topic.take_before(round(second * 1e9))
+        assert taken == expected

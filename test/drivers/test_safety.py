@@ -218,7 +218,7 @@ def test_a_goal_before_any_odometry_is_refused(play, capfd):
 
 
 def test_a_minimum_without_a_charge_is_warned_of(play, monkeypatch):
-    monkeypatch.setattr('maasi_drivers.agent.battery._PATIENCE', 0.3)
+    monkeypatch.setattr('maasi_drivers.agent.watchdog._CHARGE_PATIENCE', 0.3)
     driver, team = play(battery_minimum=0.2)
     team.until(lambda: team.move() or 'battery' in driver._warned)
     # An unknown charge does not end what a low one began.

@@ -9,23 +9,25 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
-from maasi_drivers.agent.battery import BatteryWatch
 from maasi_drivers.agent.goal_server import GoalServer
 from maasi_drivers.agent.measurement_responder import MeasurementResponder
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
-from maasi_drivers.agent.pose_topic import PoseTopic
 from maasi_drivers.agent.robot_frames import RobotFrames
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import FROZEN_POSE, ODOMETRY, STOP, RobotNode
+from maasi_drivers.agent.robot_topics import PoseTopic
 from maasi_drivers.agent.sensor_input import SensorInput
-from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
+from maasi_drivers.agent.watchdog import PERIOD, BatteryWatch, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import stamp_from_ros
-from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
+from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_filter.ros.run_node import run as run_node
 from maasi_msgs.msg import LockstepStep
 from maasi_planner.motion import RobotState
+
+# Reason in `state` while the robot is stopped by the service.
+STOPPED = 'stopped by the service stop, until the service release is called'
 
 MakeLink = Callable[[RobotNode], RobotLink]
 MakeSensor = Callable[[RobotNode], SensorInput]
@@ -78,7 +80,8 @@ class AgentDriver(RobotNode):
         # What has to be closed.
         self._opened: list[RobotLink | SensorInput] = []
         self._goals: GoalServer | None = None
-        self._stop_latch = RobotStop(self._on_stop, self._on_release)
+        # Outlives *cleanup* and *configure*, but not the process.
+        self._stop_latched = False
 
     # ---- life cycle --------------------------------------------------------------------------
 
@@ -109,7 +112,7 @@ class AgentDriver(RobotNode):
         self._awaited: int | None = None
         self._answered: int | None = None
         self._unusable: int | None = None
-        if self._stop_latch.latched:
+        if self._stop_latched:
             self.health.begin(STOP, STOPPED)
 
     @property
@@ -130,7 +133,8 @@ class AgentDriver(RobotNode):
         self._opened.append(self.link)
         self.link.connect()
         self.goals.offer()
-        self._stop_latch.offer(self)
+        self.offer_service('stop', self._stop)
+        self.offer_service('release', self._release)
         self._frames.set_up()
         if settings.poses == 'pose':
             PoseTopic(self, partial(self._take_localised, 'pose'))
@@ -295,18 +299,25 @@ class AgentDriver(RobotNode):
 
     # ---- the services stop and release -------------------------------------------------------
 
-    def _on_stop(self) -> None:
-        if not self.configured:
-            return
-        if self.health.begin(STOP, STOPPED):
-            self.get_logger().warning(STOPPED)
-        if self.active and not self.settings.lockstep:
-            self.link.hold()
-        self.link.latch_stop()
+    def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._stop_latched = True
+        if self.configured:
+            if self.health.begin(STOP, STOPPED):
+                self.get_logger().warning(STOPPED)
+            if self.active and not self.settings.lockstep:
+                self.link.hold()
+            self.link.latch_stop()
+        response.success = True
+        response.message = 'the robot is stopped; it takes no goals until release'
+        return response
 
-    def _on_release(self) -> None:
+    def _release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        was, self._stop_latched = self._stop_latched, False
         if self.configured and self.health.end(STOP):
             self.get_logger().info('released: goals are accepted')
+        response.success = True
+        response.message = 'the robot takes goals' if was else 'the robot was not stopped'
+        return response
 
 
 def run(
@@ -325,38 +336,3 @@ def run(
     """
     links = link if isinstance(link, Mapping) else {'topics': link}
     return run_node(lambda: AgentDriver(links, sensor), arguments, AgentDriver)
-
-
-# Reason in `state` while it is latched.
-STOPPED = 'stopped by the service stop, until the service release is called'
-
-
-class RobotStop:
-    """A latched stop.
-
-    It outlives *cleanup* and *configure* of its node, but not its process.
-    """
-
-    def __init__(self, on_stop: Callable[[], None], on_release: Callable[[], None]) -> None:
-        self.latched = False
-        self._on_stop = on_stop
-        self._on_release = on_release
-
-    def offer(self, node: LockstepLifecycleNode[Any]) -> None:
-        """Offer the services `stop` and `release` (std_srvs/Trigger) of a node."""
-        node.offer_service('stop', self._stop)
-        node.offer_service('release', self._release)
-
-    def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.latched = True
-        self._on_stop()
-        response.success = True
-        response.message = 'the robot is stopped; it takes no goals until release'
-        return response
-
-    def _release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = True
-        response.message = 'the robot takes goals' if self.latched else 'the robot was not stopped'
-        self.latched = False
-        self._on_release()
-        return response

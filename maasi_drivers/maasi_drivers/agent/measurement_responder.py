@@ -27,16 +27,9 @@ DataT = TypeVar('DataT')
 
 @dataclass(frozen=True)
 class MeasurementRequest:
-    """A measurement that a robot is to take.
+    """A measurement that a robot is to take: batch, its index, and the stamp [ns].
 
-    Attributes
-    ----------
-    batch : int
-        Id of the batch.
-    stamp : int
-        The first image stamped at or after it is used [ns].
-    measurement : int
-        Index of this robot's measurement.
+    The first image stamped at or after it is used.
     """
 
     batch: int

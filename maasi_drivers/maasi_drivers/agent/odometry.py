@@ -136,13 +136,7 @@ def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedP
 
 
 class PoseHistory:
-    """A robot's latest poses, to look up its pose when an image was taken.
-
-    Parameters
-    ----------
-    length : int
-        How many are kept.
-    """
+    """A robot's latest poses, to look up its pose when an image was taken."""
 
     def __init__(self, length: int = 512) -> None:
         if length < 2:

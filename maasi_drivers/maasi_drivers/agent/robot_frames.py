@@ -35,17 +35,7 @@ _NOWHERE = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class FixedFrame:
-    """A frame that is fixed on a robot.
-
-    Attributes
-    ----------
-    parent, name : str
-        Names of the frames.
-    position : tuple of 3 floats
-        Of the frame in its parent [m].
-    rpy : tuple of 3 floats
-        Roll, pitch, yaw about fixed axes of the parent [rad].
-    """
+    """A frame that is fixed on a robot: its place in its parent [m], turned by `rpy` [rad]."""
 
     parent: str
     name: str

@@ -89,32 +89,13 @@ class SensorReading:
 
     @classmethod
     def of_sweep(cls, sweep: Sweep, sensor: Sensor, pose: Pose) -> SensorReading:
-        """Return the detections of a ranging sensor that are in its field of view.
-
-        Parameters
-        ----------
-        sweep : Sweep
-            From the robot on the map's axes.
-        sensor : Sensor
-            Of the robot.
-        pose : Pose
-            Of the robot in the map.
-        """
+        """Return the detections of a sweep, on the map's axes, that are in the field of view."""
         positions = sensor.measurement.inverse(sweep.values, pose)
         reading = cls(sweep.values, None, positions, {}, sweep.labels)
         return reading.in_field_of_view(sensor, pose)
 
     def in_field_of_view(self, sensor: Sensor, pose: Pose) -> SensorReading:
-        """
-        Return the detections with pi(x, q) > 0 and within the maximum range; the rest is counted.
-
-        Parameters
-        ----------
-        sensor : Sensor
-            Its detection model and maximum range.
-        pose : Pose
-            q, of the robot in the map.
-        """
+        """Return the detections with pi(x, q) > 0 within the maximum range; the rest is counted."""
         if not len(self.values):
             return self
         inside = sensor.detection.probability(self.positions, pose) > 0.0

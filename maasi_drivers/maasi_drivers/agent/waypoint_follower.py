@@ -56,19 +56,9 @@ class Goal:
 
 
 class WaypointFollower:
-    """Steers a robot to its waypoints and holds it there.
+    """Steers a robot to its waypoints and holds it there; `goal` is the last that took effect.
 
     Without a goal a ground robot stands still; the controller of a flying one holds its position.
-
-    Parameters
-    ----------
-    motion : MotionModel
-        The controller.
-
-    Attributes
-    ----------
-    goal : Goal or None
-        The last one that took effect.
     """
 
     def __init__(self, motion: MotionModel) -> None:
@@ -117,21 +107,10 @@ class WaypointFollower:
         return math.hypot(*offset[:2]) if self.on_ground else math.hypot(*offset)
 
     def update(self, state: RobotState, step: int | None = None) -> tuple[FloatArray, Goal | None]:
-        """Do one control step.
+        """Return the command (4,) of a control step, and the goal that is reached in it.
 
-        Parameters
-        ----------
-        state : RobotState
-            The robot's.
-        step : int, optional
-            Discrete step, for goals that act from a step on; none: each acts at once.
-
-        Returns
-        -------
-        command : ndarray, shape (4,)
-            vx, vy, vz [m/s, body], yaw rate [rad/s].
-        reached : Goal or None
-            The goal that is reached in this step.
+        vx, vy, vz [m/s, body], yaw rate [rad/s]. With a step a goal acts from the one after its
+        own, else at once.
         """
         position = state.pose.position
         if self._next is not None and (step is None or step > self._next.step):

@@ -24,15 +24,7 @@ _ROUNDS = 3
 
 @dataclass(frozen=True)
 class Observation:
-    """What a sensor saw at one instant.
-
-    Attributes
-    ----------
-    pose : Pose
-        Of the robot, in the map.
-    values : ndarray, shape (m, d)
-        Range [m], bearing and, in 3D, elevation [rad] of what it saw.
-    """
+    """What a sensor saw at one instant: values (m, d) [m, rad] from a pose in the map."""
 
     pose: Pose
     values: FloatArray

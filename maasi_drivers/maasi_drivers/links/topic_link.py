@@ -11,12 +11,11 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from maasi_drivers.agent.battery import BatteryTopic
 from maasi_drivers.agent.flight_rules import fence_problem, make_vehicle_fence
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.pose_topic import OdometryTopic
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.robot_topics import BatteryTopic, OdometryTopic
 from maasi_drivers.settings.driver import CommandType
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.qos import COMMANDS, RELIABLE

@@ -54,18 +54,8 @@ def _points(name: str, values: ArrayLike, columns: int) -> FloatArray:
 class Camera:
     """A calibrated camera mounted on a robot.
 
-    Attributes
-    ----------
-    width, height : int
-        Image size [px].
-    matrix : ndarray, shape (3, 3)
-        Intrinsic matrix, the left part of C in 001, eq. (18) [px].
-    distortion : ndarray, shape (5,)
-        Plumb-bob coefficients k1, k2, p1, p2, k3.
-    position : ndarray, shape (3,)
-        Optical centre in the robot's frame [m].
-    rotation : ndarray, shape (3, 3)
-        From the optical frame to the robot's.
+    `matrix` (3, 3) is the left part of C in 001, eq. (18) [px], `distortion` (5,) has the plumb-bob
+    coefficients k1, k2, p1, p2, k3; optical centre and rotation of the optical frame are in the robot's frame [m].
     """
 
     width: int
@@ -101,20 +91,10 @@ class Camera:
         return np.asarray(pose.position) + pose.rotation() @ self.position
 
     def project(self, positions: ArrayLike, pose: Pose) -> FloatArray:
-        """Project positions in the map frame to pixels (001, eq. (17)).
+        """Return the pixels (n, 2) of positions (n, 3) in the map (001, eq. (17)) [m].
 
-        Parameters
-        ----------
-        positions : array_like, shape (n, 3)
-            Map frame [m].
-        pose : Pose
-            Of the robot in the map frame.
-
-        Returns
-        -------
-        ndarray, shape (n, 2)
-            Pixels, also outside the image; NaN for what is behind the camera or so far off its axis
-            that the distortion model does not hold.
+        Also outside the image; not a number for what is behind the camera or so far off its axis
+        that the distortion model does not hold.
         """
         points = _points('positions', positions, 3) - self.centre(pose)
         points = points @ (pose.rotation() @ self.rotation)
@@ -136,14 +116,9 @@ class Camera:
         return pixels.reshape(-1, 2), slopes[:, 3:5].reshape(-1, 2, 2)
 
     def undistort(self, pixels: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Invert intrinsics and distortion.
+        """Return the ideal rays (n, 2) of pixels, and their derivatives (n, 2, 2) [1/px].
 
-        Returns
-        -------
-        points : ndarray, shape (n, 2)
-            Normalised image coordinates of ideal rays; NaN where the distortion has no inverse.
-        jacobians : ndarray, shape (n, 2, 2)
-            Derivatives of the points by the pixels [1/px].
+        In normalised coordinates; not a number where the distortion has no inverse.
         """
         given = _points('pixels', pixels, 2)
         focal = self.matrix[[0, 1], [0, 1]]
@@ -165,25 +140,11 @@ class Camera:
     def back_project(
         self, pixels: ArrayLike, pose: Pose, height: float = 0.0
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Back-project pixels to the plane z = height (001, eq. (17) with z_w known).
+        """Return where pixels are on the plane z = height [m, map] (001, eq. (17) with z_w known).
 
-        Parameters
-        ----------
-        pixels : array_like, shape (n, 2)
-            (column, row) [px].
-        pose : Pose
-            Of the robot in the map frame.
-        height : float
-            Of the plane in the map frame [m].
-
-        Returns
-        -------
-        positions : ndarray, shape (n, 2)
-            In the map frame [m]; NaN where the ray does not meet the plane.
-        by_pixel : ndarray, shape (n, 2, 2)
-            Derivatives by the pixel [m/px].
-        by_pose : ndarray, shape (n, 2, 6)
-            Derivatives by x, y, z of the robot and by rotations about the map's axes [m/m, m/rad].
+        Positions (n, 2), not a number where a ray does not meet the plane; derivatives by the pixel
+        (n, 2, 2) [m/px], and (n, 2, 6) by x, y, z of the robot and by rotations about the axes of
+        the map [m/m, m/rad].
         """
         points, by_pixel = self.undistort(pixels)
         turn, centre = pose.rotation() @ self.rotation, self.centre(pose)

@@ -105,17 +105,7 @@ class ImageSourceError(ValueError):
 
 @dataclass(frozen=True)
 class VideoFrame:
-    """One image.
-
-    Attributes
-    ----------
-    image : ndarray, shape (h, w, 3), uint8
-        R, G, B.
-    received : float
-        Time of arrival, monotonic clock [s].
-    number : int
-        Of the frames of this source, from 1.
-    """
+    """One image (h, w, 3) in R, G, B; when it came, monotonic clock [s]; its number, from 1."""
 
     image: ImageArray
     received: float

@@ -81,22 +81,10 @@ _LEAST_CUT = 0.4
 
 @dataclass(frozen=True)
 class MarkerDetections:
-    """Markers seen in one image.
+    """Markers seen in one image, and what was left out: reason to count.
 
-    Attributes
-    ----------
-    values : ndarray, shape (n, d)
-        Range [m], bearing from the map's x axis [rad], in 3D elevation [rad].
-    covariances : ndarray, shape (n, d, d)
-        Of the values, from pixel noise and the pose's covariance.
-    positions : ndarray, shape (n, 2)
-        On the floor, map frame [m].
-    position_covariances : ndarray, shape (n, 2, 2)
-        [m^2].
-    blobs : Blobs
-        Where they are in the image.
-    dropped : dict
-        Blobs left out: reason to count.
+    Values (n, d) and their covariances [m, rad], from pixel noise and that of the pose; positions
+    (n, 2) on the floor [m, map] and their covariances; blobs in the image.
     """
 
     values: FloatArray
@@ -168,13 +156,7 @@ class MarkerDetector:
         return self.locate(self.segment(image), pose, pose_covariance)
 
     def segment(self, image: ImageArray) -> Blobs:
-        """Return where markers are in an image, by the rule of the settings.
-
-        Raises
-        ------
-        ValueError
-            If the image has another size than the calibrated one.
-        """
+        """Return where markers are in an image, by the rule of the settings."""
         self.check_size(image)
         if self._own is not None:
             return self._own.detect(image)
@@ -192,13 +174,7 @@ class MarkerDetector:
     def locate(
         self, blobs: Blobs, pose: Pose, pose_covariance: ArrayLike | None = None
     ) -> MarkerDetections:
-        """Find the markers that blobs in an image are; pose and covariance as in `detect`.
-
-        Raises
-        ------
-        ValueError
-            If the covariance is not finite.
-        """
+        """Find the markers that blobs in an image are; pose and covariance as in `detect`."""
         camera, settings = self.camera, self.settings
         if pose_covariance is None:
             pose_covariance = self._pose_covariance
@@ -244,25 +220,10 @@ class MarkerDetector:
 def read_markers(
     picture: ImageArray | Blobs, pose: StampedPose, detector: MarkerDetector, sensor: Sensor
 ) -> SensorReading:
-    """Return the markers in a decoded image: segmentation, projection, field of view.
+    """Return the markers in a decoded image, or blobs: segmentation, projection, field of view.
 
-    Driver and in-process search call this same function.
-
-    Parameters
-    ----------
-    picture : ndarray, shape (h, w, 3), uint8, or Blobs
-        R, G, B; or what was segmented on board.
-    pose : StampedPose
-        Of the robot when the image was taken; an all-zero covariance is unknown.
-    detector : MarkerDetector
-        Camera and segmentation.
-    sensor : Sensor
-        Field of view and maximum range.
-
-    Raises
-    ------
-    ValueError
-        If the image has another size than the calibrated one.
+    Driver and in-process search call this same function. An all-zero covariance of the pose is
+    unknown. `ValueError` for an image of another size than the calibrated one.
     """
     if not isinstance(picture, Blobs):
         picture = detector.segment(picture)

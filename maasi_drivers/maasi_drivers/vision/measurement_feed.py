@@ -57,16 +57,9 @@ class FeedState(IntEnum):
 class FeedPose:
     """The robot's own estimate of its pose when the image was taken.
 
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        From where it took off: forward, left, up, axes of the heading then [m].
-    roll, pitch, yaw : float
-        Right-handed about forward, left and up; yaw from the heading at take-off [rad].
-    battery : float
-        Charge, 0 to 1; negative: not known.
-    state : FeedState
-        What it does.
+    `position` is from where it took off: forward, left, up, axes of the heading then [m]. Angles
+    are right-handed about these, yaw from the heading at take-off [rad]. A negative charge is not
+    known.
     """
 
     position: np.ndarray
@@ -79,21 +72,7 @@ class FeedPose:
 
 @dataclass(frozen=True)
 class FeedPacket:
-    """What was seen in one image.
-
-    Attributes
-    ----------
-    sequence : int
-        Of the image, counted up by the sender, 0 to 2^32 - 1.
-    age : float
-        From the middle of the exposure to the sending [s].
-    width, height : int
-        Of the image [px].
-    blobs : Blobs
-        In that image.
-    pose : FeedPose, optional
-        Of the robot then; none: it does not send it.
-    """
+    """What was seen in one image: its number, counted up, its age when sent [s], its size [px]."""
 
     sequence: int
     age: float

@@ -52,16 +52,7 @@ def _planes(image: ImageArray) -> list[ImageArray]:
 class _Components(NamedTuple):
     """The 8-connected components of a mask (h, w), in the order of rows.
 
-    Attributes
-    ----------
-    labels : ndarray, shape (h, w)
-        Component plus one; 0: background.
-    boxes : ndarray, shape (n, 4)
-        Left, top, width, height.
-    areas : ndarray, shape (n,)
-        Pixels.
-    centroids : ndarray, shape (n, 2)
-        Means of columns and rows.
+    Labels are component plus one, 0: background; boxes (n, 4): left, top, width, height.
     """
 
     labels: NDArray[np.int32]
@@ -316,18 +307,5 @@ RULES: dict[str, Callable[[ImageArray, SegmentationSettings], Blobs]] = {
 
 
 def segment(image: ImageArray, settings: SegmentationSettings) -> Blobs:
-    """Find marker blobs by the rule that the settings name.
-
-    Parameters
-    ----------
-    image : ndarray, shape (h, w, 3), uint8
-        R, G, B.
-    settings : SegmentationSettings
-        Rule and its numbers.
-
-    Raises
-    ------
-    ValueError
-        If the image has another shape or type.
-    """
+    """Find marker blobs in an image (h, w, 3), uint8, by the rule that the settings name."""
     return RULES[settings.rule](image, settings)

@@ -10,9 +10,9 @@ import numpy as np
 
 from maasi_drivers.agent.flight_rules import fence_problem, make_fence
 from maasi_drivers.agent.odometry import StampedPose
-from maasi_drivers.agent.pose_topic import OdometryTopic, PoseTopic
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
+from maasi_drivers.agent.robot_topics import OdometryTopic, PoseTopic
 from maasi_drivers.agent.waypoint_follower import Goal
 from maasi_drivers.links.mambo.link import MamboLink, MamboLinkError
 from maasi_drivers.links.mambo.pilot import MamboPilot, Phase, tilt_limit

@@ -1,16 +1,18 @@
-"""Poses of a robot from its odometry or from a localiser, by topics."""
+"""What a robot says on topics: poses by odometry or a localiser, and the charge."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from sensor_msgs.msg import BatteryState
 
 from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
-from maasi_drivers.settings.driver import DriverSettings
+from maasi_drivers.settings.driver import BatteryUnit, DriverSettings
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import FARTHEST, FASTEST, bounded, pose_from_ros, stamp_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
@@ -103,3 +105,62 @@ class PoseTopic:
             self._node.drop('pose', f'pose: {error}')
             return
         self._on_pose(stamp_from_ros(message.header.stamp), pose)
+
+
+# A full battery may read more than 1: a TurtleBot3 with 12.6 V says 116.7 per cent, as OpenCR maps
+# 10.5 V to 12.3 V on 0 to 100 (`update_battery_status` in turtlebot3.cpp).
+_MOST = 1.5
+
+
+def charge_of(percentage: float, unit: BatteryUnit) -> float:
+    """Return the charge, 0 to 1, or -1 for what is none in this unit."""
+    charge = percentage if unit == 'fraction' else 0.01 * percentage
+    return min(charge, 1.0) if 0.0 <= charge <= _MOST else -1.0
+
+
+class BatteryTopic:
+    """Hands charges to `driver.take_charge`.
+
+    Subscribes
+    ----------
+    `battery_state` (sensor_msgs/BatteryState)
+    """
+
+    def __init__(self, driver: RobotNode) -> None:
+        self._driver = driver
+        # Of lockstep: stamp [ns] and reading.
+        self._waiting: list[tuple[int, float]] = []
+        self._subscription = driver.create_subscription(
+            BatteryState, 'battery_state', self._on_battery, sensor_reader(driver.settings.lockstep)
+        )
+
+    def _on_battery(self, message: BatteryState) -> None:
+        if self._driver.settings.lockstep:
+            self._waiting.append((stamp_from_ros(message.header.stamp), message.percentage))
+        else:
+            self._take(message.percentage)
+
+    def _take(self, percentage: float) -> None:
+        unit = self._driver.settings.battery_unit
+        charge = charge_of(percentage, unit)
+        if charge < 0.0 and not math.isnan(percentage):
+            self._driver.drop(
+                'battery',
+                f'battery_state.percentage: read {percentage:g}, allowed is '
+                f'{"0 to 1" if unit == "fraction" else "0 to 100"}, or nan: battery_unit is {unit}',
+            )
+        self._driver.take_charge(charge)
+
+    def take_before(self, stamp: int) -> None:
+        """In lockstep: take the readings of the steps before the one at `stamp` [ns].
+
+        Whether a reading arrives before the odometry of its own step depends on the scheduler; by
+        the next step it has arrived in any case.
+        """
+        handle = self._subscription.handle
+        while (taken := handle.take_message(BatteryState, False)) is not None:
+            self._on_battery(taken[0])
+        ready = sorted(item for item in self._waiting if item[0] < stamp)
+        self._waiting = [item for item in self._waiting if item[0] >= stamp]
+        for _, reading in ready:
+            self._take(reading)
