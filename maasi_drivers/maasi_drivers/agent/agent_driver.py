@@ -133,8 +133,8 @@ class AgentDriver(RobotNode):
         self._opened.append(self.link)
         self.link.connect()
         self.goals.offer()
-        self.offer_service('stop', self._stop)
-        self.offer_service('release', self._release)
+        self.offer_service('stop', self._on_stop)
+        self.offer_service('release', self._on_release)
         self._frames.set_up()
         if settings.poses == 'pose':
             PoseTopic(self, partial(self._take_localised, 'pose'))
@@ -299,7 +299,7 @@ class AgentDriver(RobotNode):
 
     # ---- the services stop and release -------------------------------------------------------
 
-    def _stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._stop_latched = True
         if self.configured:
             if self.health.begin(STOP, STOPPED):
@@ -311,7 +311,7 @@ class AgentDriver(RobotNode):
         response.message = 'the robot is stopped; it takes no goals until release'
         return response
 
-    def _release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         was, self._stop_latched = self._stop_latched, False
         if self.configured and self.health.end(STOP):
             self.get_logger().info('released: goals are accepted')

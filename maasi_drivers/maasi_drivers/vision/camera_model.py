@@ -55,7 +55,8 @@ class Camera:
     """A calibrated camera mounted on a robot.
 
     `matrix` (3, 3) is the left part of C in 001, eq. (18) [px], `distortion` (5,) has the plumb-bob
-    coefficients k1, k2, p1, p2, k3; optical centre and rotation of the optical frame are in the robot's frame [m].
+    coefficients k1, k2, p1, p2, k3. Centre and rotation of the optical frame are in the robot's
+    [m].
     """
 
     width: int
@@ -113,7 +114,7 @@ class Camera:
         rays = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
         pixels, slopes = cv2.projectPoints(rays, still, still, self.matrix, self.distortion)
         # By the translation along x and y, at a depth of 1.
-        return pixels.reshape(-1, 2), slopes[:, 3:5].reshape(-1, 2, 2)
+        return np.reshape(pixels, (-1, 2)), np.reshape(slopes[:, 3:5], (-1, 2, 2))
 
     def undistort(self, pixels: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the ideal rays (n, 2) of pixels, and their derivatives (n, 2, 2) [1/px].
@@ -127,9 +128,10 @@ class Camera:
             return points, np.tile(np.diag(1.0 / focal), (len(given), 1, 1))
         points = np.empty((0, 2))
         if len(given):
-            points = cv2.undistortPointsIter(
-                given[:, None], self.matrix, self.distortion, None, None, _UNDISTORTED
-            )[:, 0]
+            rays = cv2.undistortPointsIter(
+                given[:, None], self.matrix, self.distortion, np.eye(3), np.eye(3), _UNDISTORTED
+            )
+            points = np.asarray(rays[:, 0], dtype=np.float64)
         again, slopes = self._distorted(points)
         good = (np.abs(again - given) < _MISSED).all(axis=1) & (np.linalg.det(slopes) > 0.0)
         good &= (points * points).sum(axis=1) < self.largest_radius**2

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -99,7 +99,7 @@ def segment_paper(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     return blobs.select(areas >= settings.minimum_area * mask.size)
 
 
-def _median(counts: NDArray[np.generic]) -> float:
+def _median(counts: NDArray[Any]) -> float:
     """Return the median of counted whole numbers, interpolated within its bin."""
     half = 0.5 * counts.sum()
     value = int(np.flatnonzero((counts > 0) & (np.cumsum(counts) >= half))[0])
@@ -232,7 +232,8 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
     gains, centre, deviation = _floor_statistics(image)
     threshold = max(settings.saturation, centre + settings.noise_factor * deviation)
     mask = np.empty(image.shape[:2], dtype=np.uint8)
-    _robust_mask(*_planes(image), gains.astype(np.float32), threshold, mask)
+    red, green, blue = _planes(image)
+    _robust_mask(red, green, blue, gains.astype(np.float32), threshold, mask)
     components = _components(mask)
     gates = (
         max(settings.peak_saturation, threshold),
