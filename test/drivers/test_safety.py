@@ -62,21 +62,27 @@ def test_what_is_waited_for_is_short_enough():
     assert settings.sensor_patience + 2.0 * STEP <= LATEST
 
 
-@pytest.mark.parametrize('frozen', [False, True])
-def test_without_odometry_the_robot_is_stopped(play, frozen):
-    _, team = play(odometry_timeout=0.3)
+@pytest.mark.parametrize('fault', ['silent', 'repeats itself', 'not finite'])
+def test_without_odometry_the_robot_is_stopped(play, fault):
+    driver, team = play(odometry_timeout=0.3)
     team.move()
     _, result = team.send_accepted([1.5, 1.5, 0.0])
     team.move(20)
     assert np.any(team.command != 0.0)
 
     def stopped():
-        if frozen:
-            team.odometry.publish(team.odometry_message())
+        message = team.odometry_message()
+        if fault == 'not finite':
+            team.step += 1
+            message = team.odometry_message()
+            message.pose.pose.position.y = math.nan
+        if fault != 'silent':
+            team.odometry.publish(message)
         return team.state.goal_status == AgentState.UNAVAILABLE
 
     team.until(stopped)
     assert 'no odometry for' in team.state.reason
+    assert (driver.dropped['odometry'] > 3) == (fault == 'not finite')
     team.until(result.done)
     assert result.result().status == GoalStatus.STATUS_ABORTED
     assert 'no odometry for' in result.result().result.reason
@@ -105,33 +111,6 @@ def test_a_low_battery_ends_the_way(play):
     assert team.state.goal_status == AgentState.UNAVAILABLE
     assert 'battery at 0.10' in team.state.reason
     assert_array_equal(team.command, np.zeros(4))
-
-
-def test_a_twist_without_a_stamp_for_a_robot_that_wants_it(play):
-    _, team = play(command_type='twist')
-    team.move()
-    team.send_accepted([1.0, 1.0, 0.0])
-    team.move(3)
-    assert np.any(team.command != 0.0)
-
-
-def test_odometry_that_is_not_finite_is_no_odometry(play):
-    driver, team = play(odometry_timeout=0.3)
-    team.move()
-    _, result = team.send_accepted([1.5, 1.5, 0.0])
-    team.move(20)
-
-    def stopped():
-        team.step += 1
-        bad = team.odometry_message()
-        bad.pose.pose.position.y = math.nan
-        team.odometry.publish(bad)
-        return team.state.goal_status == AgentState.UNAVAILABLE
-
-    team.until(stopped)
-    team.until(lambda: not np.any(team.command))
-    gives_up(team, result, 'no odometry for')
-    assert driver.dropped['odometry'] > 3
 
 
 @pytest.mark.parametrize('kind', ['turtlebot', 'mambo'])
@@ -229,27 +208,28 @@ def test_a_minimum_without_a_charge_is_warned_of(play, monkeypatch):
     assert 'battery at 0.10' in team.state.reason
 
 
-def test_a_battery_in_per_cent_is_read_as_such_from_full_to_empty(play):
-    _, team = play(battery_minimum=0.2, battery_unit='percent')
+@pytest.mark.parametrize(
+    ('unit', 'readings', 'problem'),
+    [
+        ('percent', [(1.5, 0.015), (116.7, 1.0), (80.0, 0.8), (15.0, 0.15)], ''),
+        (
+            'fraction',
+            [(0.9, 0.9), (1.1, 1.0), (55.0, -1.0), (0.15, 0.15)],
+            'percentage: read 55, allowed is 0 to 1, or nan: battery_unit is fraction',
+        ),
+    ],
+)
+def test_a_battery_is_read_in_its_unit_from_full_to_empty(play, capfd, unit, readings, problem):
+    _, team = play(battery_minimum=0.2, battery_unit=unit)
     team.move()
-    for percentage, expected in ((1.5, 0.015), (116.7, 1.0), (80.0, 0.8), (15.0, 0.15)):
+    for percentage, expected in readings:
         team.battery.publish(BatteryState(percentage=percentage))
         charge = pytest.approx(expected)
         team.until(lambda charge=charge: team.move() or team.state.battery == charge)
+    assert problem in capfd.readouterr().err
     assert team.state.goal_status == AgentState.UNAVAILABLE
-    team.battery.publish(BatteryState(percentage=90.0))
+    team.battery.publish(BatteryState(percentage=readings[0][0] if unit == 'fraction' else 90.0))
     team.until(lambda: team.move() or team.state.goal_status == AgentState.IDLE)
-
-
-def test_a_battery_in_the_wrong_unit_is_said(play, capfd):
-    _, team = play(battery_minimum=0.2)
-    team.battery.publish(BatteryState(percentage=0.9))
-    team.until(lambda: team.move() or team.state.battery > 0.0)
-    team.battery.publish(BatteryState(percentage=55.0))
-    team.until(lambda: team.move() or team.state.battery == -1.0)
-    said = capfd.readouterr().err
-    assert 'battery_state.percentage: read 55, allowed is 0 to 1' in said
-    assert 'battery_unit is fraction' in said
 
 
 @pytest.mark.parametrize('frame', ['other/odom', '/other/odom'])
@@ -277,9 +257,10 @@ def test_a_flying_robot_in_the_plane_is_not_sent_to_another_height(play, height)
     assert team.takes([1.2, 1.2, 1.3], live=team.move)
 
 
-def test_the_type_of_the_commands_is_found_out(play):
+@pytest.mark.parametrize('options', [{'wants': Twist}, {'command_type': 'twist'}])
+def test_the_type_of_the_commands_is_found_out_or_given(play, options):
     """Humble's TurtleBot3 listens to Twist, Jazzy's to TwistStamped."""
-    _, team = play(wants=Twist)
+    _, team = play(**options)
     team.move()
     team.send_accepted([1.0, 1.0, 0.0])
     team.move(3)
@@ -391,15 +372,6 @@ def test_a_driver_that_is_told_to_end_leaves_zeros(process, team, number):
     assert result.result().status == GoalStatus.STATUS_ABORTED
     assert result.result().result.reason == 'the driver stops'
     team.until(lambda: not np.any(team.command))
-
-
-def test_a_battery_once_above_full_is_a_fraction_as_before(play):
-    _, team = play(battery_minimum=0.2)
-    for percentage, charge in ((0.9, 0.9), (1.1, 1.0), (0.8, 0.8)):
-        team.battery.publish(BatteryState(percentage=percentage))
-        expected = pytest.approx(charge)
-        team.until(lambda expected=expected: team.move() or team.state.battery == expected)
-    assert team.state.goal_status == AgentState.IDLE
 
 
 def test_odometry_and_batches_from_another_time_change_nothing(play):
