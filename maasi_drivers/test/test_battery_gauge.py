@@ -4,9 +4,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
-from builtin_interfaces.msg import Time
 from sensor_msgs.msg import BatteryState
-from std_msgs.msg import Header
 
 from maasi_drivers.agent.robot_topics import BatteryTopic, charge_of
 
@@ -37,10 +35,9 @@ def test_per_cent_are_no_fraction():
 
 @pytest.mark.parametrize('order', [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
 def test_in_lockstep_a_reading_counts_from_the_step_after_its_own(order):
-    waiting = [
-        BatteryState(percentage=1.0 - 0.25 * index, header=Header(stamp=Time(sec=index)))
-        for index in order
-    ]
+    waiting = [BatteryState(percentage=1.0 - 0.25 * index) for index in order]
+    for index, message in zip(order, waiting):
+        message.header.stamp.sec = index
     handle = SimpleNamespace(take_message=lambda *_: (waiting.pop(),) if waiting else None)
     taken = []
     topic = BatteryTopic(

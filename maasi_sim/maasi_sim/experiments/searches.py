@@ -32,7 +32,7 @@ from maasi_sim.scenario.loading import (
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import leaving, search
 from maasi_sim.search_result import SearchResult
-from maasi_sim.world.noise_streams import noise_stream
+from maasi_sim.world.world import noise_stream
 
 QUANTITIES = (
     Quantity('measurements_to_find_all', 'measurements to find all', '', 'restricted', 'limit'),
