@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from maasi_sim.arguments import Parser, positive, whole
@@ -147,19 +147,12 @@ def parse(arguments: list[str] | None) -> Options:
         parser.error('--follow-clock: allowed without --lockstep and --rate')
     if not options.view and (options.port is not None or options.control):
         parser.error('--port and --control need --view')
-    return Options(
-        scenario=options.scenario or '',
-        out=options.out,
-        seed=options.seed,
-        lockstep=options.lockstep,
-        rate=options.rate,
-        record=not options.no_record,
-        planner=options.planner,
-        time_limit=options.time_limit,
-        domain_id=options.domain_id,
-        log_level=options.log_level,
-        namespace=options.namespace or '',
-        follow_clock=options.follow_clock,
-        replay=options.replay,
-        view=view_options(options) if options.view else None,
-    )
+    names = {item.name for item in fields(Options)}
+    given = {name: value for name, value in vars(options).items() if name in names}
+    given |= {
+        'scenario': options.scenario or '',
+        'record': not options.no_record,
+        'namespace': options.namespace or '',
+        'view': view_options(options) if options.view else None,
+    }
+    return Options(**given)
