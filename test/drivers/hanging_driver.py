@@ -3,7 +3,7 @@
 import signal
 import sys
 
-from maasi_drivers import mambo_driver, turtlebot_driver
+from maasi_drivers.drivers import mambo_driver, turtlebot_driver
 
 
 def hang(number, frame):
@@ -14,5 +14,5 @@ def hang(number, frame):
 
 if __name__ == '__main__':
     signal.signal(signal.SIGUSR1, hang)
-    main = {'mambo': mambo_driver.main, 'turtlebot': turtlebot_driver.main}[sys.argv.pop(1)]
+    main = {'mambo': mambo_driver, 'turtlebot': turtlebot_driver}[sys.argv.pop(1)]
     raise SystemExit(main())

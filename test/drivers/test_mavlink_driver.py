@@ -19,7 +19,7 @@ from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
 
-from maasi_drivers.agent import battery
+from maasi_drivers.agent import watchdog
 from maasi_drivers.agent.agent_driver import STOPPED as STOPPED_BY_SERVICE
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.drivers import MavlinkCameraDriver, MavlinkDriver, TurtlebotDriver
@@ -494,7 +494,7 @@ def test_a_sensor_that_falls_silent(fly):
 
 
 def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
-    monkeypatch.setattr(battery, '_PATIENCE', 2.5)
+    monkeypatch.setattr(watchdog, '_CHARGE_PATIENCE', 2.5)
     flight = fly(battery_minimum=0.2, autopilot={'endurance': 1e9}).fly()
     # One that stays the same has been heard all the same.
     begin = time.monotonic()
