@@ -39,8 +39,7 @@ class Flight:
             odometry=OdometrySettings(position_noise=0.002, heading_noise=0.002),
         )
         self.fake = FakeMambo(firmware, self.address)
-        self.fake.run()
-        full_speed = GRAVITY * math.tan(MOTION['tilt']) / firmware.settings.body.drag
+        full_speed = GRAVITY * math.tan(MOTION['tilt']) / firmware.settings.drag
         link = {'arm': True, 'full_speed': full_speed, 'address': self.address}
         link |= {'port': free_port()} | (mambo or {})
         # The machine may be busy.
@@ -65,16 +64,16 @@ class Flight:
 
     @property
     def flying_state(self):
-        return self.fake.snapshot()[1]
+        return self.fake.firmware.flying_state
 
     @property
     def speed(self):
         """Over the ground [m/s]."""
-        return float(np.linalg.norm(self.fake.snapshot()[0].velocity[:2]))
+        return float(np.linalg.norm(self.fake.state.velocity[:2]))
 
     @property
     def where(self):
-        return self.fake.snapshot()[0].pose.position
+        return self.fake.state.pose.position
 
     def until(self, condition, what=''):
         self.team.until(condition, what or f'{self.flying_state!r}, {self.reason!r}')

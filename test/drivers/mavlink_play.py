@@ -14,12 +14,6 @@ FIRMWARES = ('arducopter', 'px4', 'ardusub')
 HEIGHTS = {'arducopter': 2.0, 'px4': 2.0, 'ardusub': -1.5}
 
 
-def take_mode(autopilot, name):
-    """Change the mode of a fake autopilot, as a pilot does with the remote control."""
-    autopilot.mode = next(mode for mode, known in autopilot.firmware.modes.items() if known == name)
-    autopilot._hold()
-
-
 class Wire:
     """One direction: bytes in, messages out."""
 

@@ -14,7 +14,7 @@ import zlib
 
 import numpy as np
 
-from maasi_sim.emulators.mavlink.autopilot_reports import FlightLimits, FlightModel
+from maasi_sim.emulators.mavlink.flight_model import FlightModel
 
 _STEP, _FEED_PERIOD = 0.02, 0.1
 GROUND, AIR, LANDING = range(3)
@@ -44,7 +44,7 @@ class OnboardProgram:
         self.blobs, self.count = b'', 0
         self.kinds, self.take_offs = [], 0
         self.state = GROUND
-        self.model = FlightModel(FlightLimits(speed=0.5), False, np.zeros(3), 0.0)
+        self.model = FlightModel(np.zeros(3), speed=0.5)
         self._feed = feed
         self._sequence = 0
         self._order, self._last, self._heard_at = 0, None, -math.inf

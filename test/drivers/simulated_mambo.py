@@ -17,7 +17,6 @@ from maasi_sim.emulators.mambo.firmware import (
     FlyingState,
     MamboFirmware,
     Piloting,
-    TiltBodySettings,
 )
 from maasi_sim.world.odometry import OdometrySettings
 from maasi_sim.world.robots import BatterySettings
@@ -58,9 +57,7 @@ class Flight:
         start = Pose.from_yaw([*HOME.position[:2], 0.0], HOME.yaw)
         self.firmware = MamboFirmware(
             start,
-            FirmwareSettings(
-                delay=firmware_delay, lost_link=lost_link, body=TiltBodySettings(drag=drag)
-            ),
+            FirmwareSettings(delay=firmware_delay, lost_link=lost_link, drag=drag),
             BatterySettings(charge=battery),
             OdometrySettings(position_noise=0.002, heading_noise=0.002),
         )

@@ -4,6 +4,7 @@ import math
 import os
 import signal
 import subprocess
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -178,7 +179,7 @@ def test_it_flies_by_another_system(fly, source):
     def tell():
         if not silent:
             stamp = team.get_clock().now().nanoseconds
-            state = flight.fake.snapshot()[0]
+            state = flight.fake.state
             if source == 'pose':
                 message = PoseStamped(pose=pose_to_ros(state.pose))
                 message.header.frame_id = 'map'
@@ -212,7 +213,7 @@ def test_images_of_a_topic_are_placed_where_the_drone_was(fly):
     flight.up()
     team, target = flight.team, np.array([1.03, 1.24])
     stamp = team.get_clock().now().nanoseconds
-    message = rendered(team, [target.tolist()], flight.fake.snapshot()[0].pose)
+    message = rendered(team, [target.tolist()], flight.fake.state.pose)
     message.header.stamp = stamp_to_ros(stamp)
     team.images.publish(message)
     team.ask(stamp)
@@ -238,7 +239,7 @@ def test_blobs_found_on_board_come_by_the_measurement_feed(fly):
     flight.up()
     team, target = flight.team, np.array([1.03, 1.24])
     camera = Camera.from_settings(team.settings.camera)
-    pixels = camera.project(np.array([[*target, 0.0]]), flight.fake.snapshot()[0].pose)
+    pixels = camera.project(np.array([[*target, 0.0]]), flight.fake.state.pose)
     blobs = Blobs(
         centroids=np.asarray(pixels, dtype=float).reshape(1, 2),
         areas=np.array([200.0]),
@@ -327,14 +328,14 @@ def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
     flight = fly(mambo={'land_after': 1.0})
     firmware = flight.fake.firmware
     # Not by its own watchdog: the last command would be flown for ever.
-    firmware.settings = firmware.settings.model_copy(update={'command_timeout': math.inf})
+    firmware.settings = replace(firmware.settings, command_timeout=math.inf)
     flight.on_its_way()
     assert flight.speed > 0.1
     # Nothing spins the executor meanwhile.
-    wait_until(lambda: flight.speed < 0.05, what=flight.fake.snapshot)
+    wait_until(lambda: flight.speed < 0.05, what=lambda: flight.flying_state)
     # It was told so before it lands.
     assert flight.flying_state in (FlyingState.HOVERING, FlyingState.FLYING)
-    wait_until(lambda: flight.flying_state == FlyingState.LANDED, what=flight.fake.snapshot)
+    wait_until(lambda: flight.flying_state == FlyingState.LANDED, what=lambda: flight.flying_state)
     # Once it is looked after again, it is said why it does not go on.
     flight.until(lambda: flight.status == AgentState.UNAVAILABLE and 'Mambo is' in flight.reason)
 
@@ -454,6 +455,5 @@ def test_a_drone_that_is_not_there_is_said_and_awaited(fly):
     firmware = flight.fake.firmware
     flight.fake.close()
     flight.fake = FakeMambo(firmware, address)
-    flight.fake.run()
     flight.up()
     assert firmware.take_offs == 1

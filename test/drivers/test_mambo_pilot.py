@@ -268,7 +268,7 @@ def test_it_lands_when_it_drifts_out_of_the_geofence():
 
     def landing():
         # A draught.
-        flight.firmware._body.position[0] += 0.05
+        flight.firmware.body.position[0] += 0.05
         return flight.firmware.flying_state == FlyingState.LANDING
 
     flight.until(landing)
@@ -376,7 +376,7 @@ def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
     def step():
         if flight.where[2] > 0.05:
             # Wind.
-            flight.firmware._body.velocity[0] += 0.2 * STEP
+            flight.firmware.body.velocity[0] += 0.2 * STEP
         if pose == 'pose':
             flight.pilot.take_pose(flight.time, flight.firmware.state)
         flight.step()

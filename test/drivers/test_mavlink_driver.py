@@ -14,7 +14,6 @@ import yaml
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from mavlink_play import take_mode
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
 from robot_team import STEP, TURTLEBOT, Team, parameters_of, rendered, stamped
@@ -321,7 +320,7 @@ def test_it_takes_off_each_time_that_the_service_is_called(fly, capfd):
     answer = flight.team.call('arm')
     assert (answer.success, answer.message) == (False, 'it is in the air already')
     with flight.vehicle._lock:
-        flight.vehicle.autopilot._disarm('Crash: Disarming')
+        flight.vehicle.autopilot.disarm('Crash: Disarming')
     reason = 'is disarmed: by the autopilot or the pilot ('
     flight.until(lambda: reason in flight.state.reason)
     assert 'Crash: Disarming' in flight.state.reason
@@ -342,7 +341,7 @@ def test_a_vehicle_in_the_air_is_taken_over_and_the_answer_says_so(fly):
         # A pilot has brought it there.
         autopilot.armed = True
         autopilot.body.position[2] = 1.0
-        take_mode(autopilot, 'GUIDED')
+        autopilot.take_mode('GUIDED')
     flight.until(lambda: flight.driver.link.status().get('in the air'))
     flight.until(lambda: 'it is armed in GUIDED' in flight.state.reason)
     assert flight.team.call('arm').message == 'it is in the air: it is taken over where it is'
@@ -378,7 +377,7 @@ def test_goals_that_are_not_finite_or_outside_the_geofence_are_refused(fly, capf
     flight.until(lambda: flight.driver.dropped['goal'] == 4)
     assert 'allowed are finite numbers' in capfd.readouterr().err
     assert 'the geofence' in flight.driver.goals.problem(flight.team.goal([0.0, 3.5, 0.8]))
-    assert flight.vehicle.running
+    assert not flight.vehicle.autopilot.crashed
     assert flight.team.takes([0.0, 2.5, 0.8])
 
 
@@ -437,13 +436,13 @@ def test_a_fault_ends_the_way_and_is_said(fly, capfd, firmware, fault, reason, l
         if fault == 'cut':
             vehicle.cut()
         elif fault == 'frozen':
-            autopilot.reports.freeze()
+            autopilot.freeze()
         elif fault == 'restart':
             autopilot.restart()
             # Nothing is left to stop it.
             autopilot.body.velocity[:] = 0.0
         else:
-            take_mode(autopilot, 'POSCTL')
+            autopilot.take_mode('POSCTL')
     flight.gives_up(result, reason)
     assert logged in capfd.readouterr().err
     if fault == 'restart':
@@ -507,13 +506,13 @@ def test_with_a_low_battery_it_lands(fly, monkeypatch, capfd):
     flight.until(lambda: flight.mode == 'LAND')
     # It lands again once a pilot who took it over gives it back.
     with flight.vehicle._lock:
-        take_mode(flight.vehicle.autopilot, 'LOITER')
+        flight.vehicle.autopilot.take_mode('LOITER')
     flight.until(lambda: 'the pilot has taken over' in flight.state.reason)
     begin = time.monotonic()
     flight.until(lambda: time.monotonic() - begin > 0.5)
     assert flight.mode == 'LOITER' and 'battery at 0.15' in flight.state.reason
     with flight.vehicle._lock:
-        take_mode(flight.vehicle.autopilot, 'GUIDED')
+        flight.vehicle.autopilot.take_mode('GUIDED')
     flight.until(lambda: flight.mode == 'LAND')
     flight.until(lambda: not flight.vehicle.autopilot.armed)
 

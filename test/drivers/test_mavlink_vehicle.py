@@ -1,11 +1,10 @@
 """What the driver says to an autopilot, against a fake one, in simulated time."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from mavlink_play import FIRMWARES, HEIGHTS, Play, mavlink, take_mode
+from mavlink_play import FIRMWARES, HEIGHTS, Play, mavlink
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
@@ -253,7 +252,7 @@ def test_what_a_take_off_leaves_over_is_flown_by_set_point():
 
 def test_a_vehicle_that_does_not_rise_lands_and_says_why():
     play = Play(rise_timeout=6.0)
-    play.autopilot.body.limits = replace(play.autopilot.body.limits, climb=0.0)
+    play.autopilot.body.climb = 0.0
     play.run(20.0)
     assert 'it came no nearer to its height in 6 s: at ' in play.vehicle.fault
     assert 'm of 2.0 m' in play.vehicle.fault
@@ -262,7 +261,7 @@ def test_a_vehicle_that_does_not_rise_lands_and_says_why():
 
 def test_a_take_off_that_was_accepted_is_not_asked_for_again():
     play = Play(rise_timeout=20.0)
-    play.autopilot.body.limits = replace(play.autopilot.body.limits, climb=0.03)
+    play.autopilot.body.climb = 0.03
     play.until(lambda: play.vehicle.phase is Phase.RISING)
     play.run(8.0)
     assert len(play.commands(mavlink.MAV_CMD_NAV_TAKEOFF)) == 1
@@ -272,11 +271,11 @@ def test_a_take_off_that_was_accepted_is_not_asked_for_again():
 def test_a_mode_that_was_changed_before_arming_and_is_back_lets_it_go_on():
     play = Play(autopilot={'charge': 0.01})
     play.until(lambda: play.vehicle.phase is Phase.ARMING)
-    take_mode(play.autopilot, 'LOITER')
+    play.autopilot.take_mode('LOITER')
     play.run(3.0)
     assert play.vehicle.phase is Phase.RELEASED
     play.autopilot.charge = 1.0
-    take_mode(play.autopilot, 'GUIDED')
+    play.autopilot.take_mode('GUIDED')
     play.run(10.0)
     assert 'GUIDED is back' in play.said
     assert play.vehicle.fault == f'vehicle: not armed: {UNTIL_ARM}'
@@ -302,22 +301,22 @@ def test_the_loss_of_gnss_is_seen_in_flight():
 )
 def test_a_status_that_stops_coming_does_not_count_any_more(muted, text):
     play = Play().fly().go(SPEED)
-    play.autopilot.reports.muted = {muted}
+    play.autopilot.muted = {muted}
     play.run(2.5)
     assert play.vehicle.fault == ''
     play.run(1.0)
     assert play.vehicle.fault == text
-    play.autopilot.reports.muted = set()
+    play.autopilot.muted = set()
     play.run(2.0)
     assert play.vehicle.fault == ''
 
 
 def test_a_status_that_another_program_turned_off_is_asked_for_again():
     play = Play().fly()
-    play.autopilot.reports._periods['EKF_STATUS_REPORT'] = math.inf
+    play.autopilot.periods['EKF_STATUS_REPORT'] = math.inf
     play.run(10.0)
     assert play.vehicle.fault == ''
-    assert math.isfinite(play.autopilot.reports._periods['EKF_STATUS_REPORT'])
+    assert math.isfinite(play.autopilot.periods['EKF_STATUS_REPORT'])
 
 
 def test_one_of_two_gnss_receivers_is_enough():
@@ -325,7 +324,7 @@ def test_one_of_two_gnss_receivers_is_enough():
     play.autopilot.gnss_lost_at = play.autopilot.now
     play.run(12.0)
     assert play.vehicle.fault == ''
-    play.autopilot.reports.muted = {'GPS2_RAW'}
+    play.autopilot.muted = {'GPS2_RAW'}
     play.run(4.0)
     assert play.vehicle.fault == (
         'vehicle: GNSS is lost (GPS_RAW_INT.fix_type 1, no GPS2_RAW any more)'
@@ -379,7 +378,7 @@ def test_nothing_takes_off_before_the_service_is_called(firmware):
     play.vehicle.finish('land')
     play.run(20.0)
     if firmware == 'ardusub':
-        play.autopilot._disarm('Disarming motors')
+        play.autopilot.disarm('Disarming motors')
         play.run(2.0)
     assert UNTIL_ARM in play.vehicle.fault
     assert not play.autopilot.armed
@@ -464,7 +463,7 @@ def test_a_driver_that_finds_its_vehicle_in_the_air_does_not_guess_where_it_is()
     assert 'its place in the map is not known' in play.permit()
     assert play.vehicle.estimate.telemetry is None
     # After a landing it is not at its start either.
-    take_mode(play.autopilot, 'LAND')
+    play.autopilot.take_mode('LAND')
     play.until(lambda: not play.autopilot.armed)
     play.run(3.0)
     assert 'its place in the map is not known' in play.permit()
@@ -620,13 +619,13 @@ def test_with_a_cut_link_it_stops_and_the_driver_says_so(firmware):
 
 def test_a_position_that_is_frozen_or_not_finite_is_no_news():
     play = Play().fly()
-    play.autopilot.reports.freeze()
+    play.autopilot.freeze()
     play.run(0.2)
     number = play.vehicle.estimate.telemetry.number
     play.run(AT_MOST)
     assert play.vehicle.estimate.telemetry.number == number
     assert play.vehicle.estimate.dropped['LOCAL_POSITION_NED that is frozen'] > 10
-    play.autopilot.reports.frozen = (math.nan, *[0.0] * 5)
+    play.autopilot.frozen = (math.nan, *[0.0] * 5)
     play.run(1.0)
     assert play.vehicle.estimate.telemetry.number == number
     assert play.vehicle.estimate.dropped['LOCAL_POSITION_NED that is not finite'] > 10
@@ -635,7 +634,7 @@ def test_a_position_that_is_frozen_or_not_finite_is_no_news():
 @firmwares
 def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
     play = Play(firmware).fly().go(SPEED)
-    take_mode(play.autopilot, {'px4': 'POSCTL'}.get(firmware, 'ALT_HOLD'))
+    play.autopilot.take_mode({'px4': 'POSCTL'}.get(firmware, 'ALT_HOLD'))
     play.run(AT_MOST)
     assert 'the pilot has taken over: mode' in play.vehicle.fault
     assert 'the driver lets go' in play.said
@@ -655,10 +654,10 @@ def test_when_the_pilot_takes_the_mode_the_driver_lets_go(firmware):
 
 def test_a_pilot_can_give_the_mode_back():
     play = Play().fly().go(SPEED)
-    take_mode(play.autopilot, 'LOITER')
+    play.autopilot.take_mode('LOITER')
     play.run(2.0)
     here = play.autopilot.body.position.copy()
-    take_mode(play.autopilot, 'GUIDED')
+    play.autopilot.take_mode('GUIDED')
     play.run(3.0)
     assert play.vehicle.flying
     assert 'the pilot gives GUIDED back' in play.said
@@ -685,7 +684,7 @@ def test_the_end_is_to_hold_or_to_land(firmware, ending):
 
 def test_a_vehicle_that_is_disarmed_in_the_air_is_left_alone():
     play = Play().fly().go(SPEED)
-    play.autopilot._disarm('Crash: Disarming')
+    play.autopilot.disarm('Crash: Disarming')
     play.run(AT_MOST)
     assert play.vehicle.phase is Phase.STOPPED
     assert 'by the autopilot or the pilot (Crash: Disarming)' in play.vehicle.fault
@@ -700,8 +699,7 @@ def test_a_copter_that_the_pilot_has_in_the_air_is_taken_over_without_arming():
     other = Play(arm=False, permitted=False)
     other.autopilot.armed = True
     other.autopilot.body.position = play.autopilot.body.position.copy()
-    other.autopilot.mode = ARDUCOPTER.external
-    other.autopilot._hold()
+    other.autopilot.take_mode('GUIDED')
     other.run(6.0)
     assert 'it is armed in GUIDED, not by this driver' in other.vehicle.fault
     assert not other.sent('SET_POSITION_TARGET_LOCAL_NED')

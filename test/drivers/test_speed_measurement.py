@@ -52,7 +52,7 @@ def test_a_fault_in_flight_ends_it(fault, text):
         for count, _ in enumerate(MeasuringFlight(flight, WAY, 4, lambda: flight.time).steps()):
             flight.step()
             if fault == 'draught':
-                flight.firmware._body.position[1] += 0.01
+                flight.firmware.body.position[1] += 0.01
             elif count == 200 and fault == 'battery':
                 flight.firmware.charge.charge = 0.15
             elif count == 200:
@@ -88,7 +88,6 @@ def test_what_says_too_little_or_does_not_fit_is_refused():
 @pytest.fixture
 def drone():
     fake = FakeMambo(MamboFirmware(Pose.from_yaw([0.0, 0.0, 0.0], 0.0)), free_address())
-    fake.run()
     yield fake
     fake.close()
 
@@ -104,18 +103,18 @@ def test_the_command_measures_through_pyparrot_and_lands(drone):
     output, _ = process.communicate(timeout=LIMIT)
     assert process.returncode == 0, output
     lines = dict(line.split(': ') for line in output.splitlines() if line.startswith('mambo.'))
-    drag = drone.firmware.settings.body.drag
+    drag = drone.firmware.settings.drag
     assert_allclose(float(lines['mambo.full_speed'].split()[0]), full_speed(drag), rtol=0.3)
-    assert drone.snapshot()[1] == FlyingState.LANDED and drone.firmware.take_offs == 1
+    assert drone.firmware.flying_state == FlyingState.LANDED and drone.firmware.take_offs == 1
 
 
 def test_the_command_lands_when_it_is_interrupted(drone):
     process = command(drone, '--fly')
-    wait_until(lambda: drone.snapshot()[1] == FlyingState.HOVERING)
+    wait_until(lambda: drone.firmware.flying_state == FlyingState.HOVERING)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=LIMIT)
     assert process.returncode == 1
-    assert drone.snapshot()[1] == FlyingState.LANDED
+    assert drone.firmware.flying_state == FlyingState.LANDED
 
 
 def test_the_command_says_what_it_would_do_and_what_cannot_be(capsys):

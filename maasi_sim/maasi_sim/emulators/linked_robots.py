@@ -6,60 +6,15 @@ from typing import Protocol
 
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
-from maasi_planner.motion import RobotState
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
-from maasi_sim.emulators.mambo.firmware import (
-    AIRBORNE,
-    FirmwareSettings,
-    FlyingState,
-    MamboFirmware,
-)
+from maasi_sim.emulators.mambo.firmware import FirmwareSettings, MamboFirmware
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.sim_topics import ExternalRobot
 from maasi_sim.world.robots import Leader
 from maasi_sim.world.world import noise_stream
 
-# Hover height after take-off relative to the height at which the search starts [1].
+# Hover height of a Mambo after take-off relative to the height at which the search starts [1].
 _TAKE_OFF_SHARE = 0.8
-
-
-class LinkedMambo:
-    """A Mambo that its driver reaches by pyparrot over WiFi."""
-
-    def __init__(self, name: str, robot: RobotSettings, seed: int) -> None:
-        settings = robot.mambo or MamboSettings()
-        height = robot.start[2] - settings.ground
-        firmware = MamboFirmware(
-            Pose.from_yaw([*robot.start[:2], settings.ground], robot.yaw),
-            FirmwareSettings(take_off_height=_TAKE_OFF_SHARE * height),
-            robot.battery,
-            robot.odometry,
-            seed,
-            name,
-        )
-        self.fake = FakeMambo(firmware, settings.address)
-        self.fake.run()
-
-    @property
-    def state(self) -> RobotState:
-        """True state, in the map."""
-        return self.fake.snapshot()[0]
-
-    @property
-    def obeys(self) -> bool:
-        """Whether it is in the air and not landing."""
-        flying_state = self.fake.snapshot()[1]
-        return flying_state in AIRBORNE and flying_state != FlyingState.LANDING
-
-    def cut(self, cut: bool = True) -> None:
-        """Cut the link, or restore it."""
-        self.fake.cut_up = self.fake.cut_down = cut
-
-    def close(self) -> None:
-        """Leave the network."""
-        self.fake.close()
-
-
 _LOOPBACK = '127.'
 
 
@@ -82,7 +37,16 @@ def linked_robot(name: str, robot: RobotSettings, seed: int) -> LinkedRobot:
     if robot.external:
         return ExternalRobot(Pose.from_yaw(robot.start, robot.yaw))
     if robot.link == 'mambo_wifi':
-        return LinkedMambo(name, robot, seed)
+        settings = robot.mambo or MamboSettings()
+        firmware = MamboFirmware(
+            Pose.from_yaw([*robot.start[:2], settings.ground], robot.yaw),
+            FirmwareSettings(take_off_height=_TAKE_OFF_SHARE * (robot.start[2] - settings.ground)),
+            robot.battery,
+            robot.odometry,
+            seed,
+            name,
+        )
+        return FakeMambo(firmware, settings.address)
     # Deferred: pymavlink takes long to import.
     from maasi_sim.emulators.mavlink.fake_mavlink_vehicle import vehicle_of
 

@@ -12,38 +12,36 @@ import contextlib
 import json
 import math
 import secrets
+import select
 import signal
 import socket
 import struct
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from maasi_filter.models.pose import Pose
+from maasi_planner.motion import RobotState
 from maasi_sim.arguments import whole
 from maasi_sim.emulators.mambo.firmware import (
+    AIRBORNE,
     LIMITS,
-    Estimate,
     FirmwareSettings,
+    FlyingState,
     MamboFirmware,
     Piloting,
-    TiltBodySettings,
 )
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import robot_type
 
-ACK, DATA, LOW_LATENCY, DATA_WITH_ACK = 1, 2, 3, 4
+ACK, DATA, DATA_WITH_ACK = 1, 2, 4
 _HEADER = struct.Struct('<BBBI')
-
-
-class FrameError(ValueError):
-    """Bytes that are no frame."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +60,13 @@ class Frame:
 
 
 def frames(data: bytes) -> Iterator[Frame]:
-    """Yield the frames of a datagram."""
+    """Yield the frames of a datagram; `ValueError` for bytes that are none."""
     while data:
         if len(data) < _HEADER.size:
-            raise FrameError(f'frame: got {len(data)} bytes, allowed are at least {_HEADER.size}')
+            raise ValueError(f'frame: got {len(data)} bytes, allowed are at least {_HEADER.size}')
         kind, buffer, sequence, size = _HEADER.unpack_from(data)
         if not _HEADER.size <= size <= len(data):
-            raise FrameError(
+            raise ValueError(
                 f'frame size: got {size}, allowed is {_HEADER.size} to the {len(data)} bytes there'
             )
         yield Frame(kind, buffer, sequence, data[_HEADER.size : size])
@@ -77,7 +75,9 @@ def frames(data: bytes) -> Iterator[Frame]:
 
 ALL_STATES = (0, 4, 0)
 _TAKE_OFF, _PILOTING, _LAND, _EMERGENCY = (2, 0, 1), (2, 0, 2), (2, 0, 3), (2, 0, 4)
+# Commands that set a limit, and events that tell it.
 _LIMITS = {(2, 8, 1): 'tilt', (2, 1, 0): 'climb', (2, 1, 1): 'turn'}
+_LIMIT_EVENTS = {'tilt': (2, 9, 1), 'climb': (2, 5, 0), 'turn': (2, 5, 1)}
 
 
 def obey(firmware: MamboFirmware, number: tuple[int, int, int], content: bytes) -> None:
@@ -113,17 +113,16 @@ HANDSHAKE_PORT = 44444
 #: Port of commands, announced in the handshake.
 COMMAND_PORT = 6000
 
-PING, PONG, COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 0, 1, 10, 11, 12
+PING, COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS = 0, 10, 11, 12
 EVENTS, ACKED_EVENTS = 126, 127
 _ID = struct.Struct('<BBH')
 
 _SENSOR_PERIOD, _PING_PERIOD = 0.5, 1.0
 # Period and number of retransmissions of a frame without acknowledgement.
 _RETRY_PERIOD, _RETRIES = 0.15, 5
-_POLL = 0.1
 _STEP = 0.02
-# Longest time simulated at once after the host was suspended [s].
-_CATCH_UP = 0.5
+# Longest time simulated at once after the host was suspended, and wait for a handshake [s].
+_CATCH_UP, _HANDSHAKE_TIME = 0.5, 0.5
 _TRIES = 100
 
 
@@ -149,18 +148,11 @@ def free_port() -> int:
 
 
 class FakeMambo:
-    """A Mambo on this host, which a client such as pyparrot connects to.
+    """A Mambo on this host, in real time, which a client such as pyparrot connects to.
 
-    Its time advances by calls of `advance`, or in real time after `run`.
-
-    Attributes
-    ----------
-    position_sent : str
-        'true', or for tests 'none' (no position events), 'stuck' (always the same), 'nan'.
-    cut_up, cut_down : bool
-        Whether the network loses received, and sent, datagrams.
-    refused : int
-        Number of invalid datagrams and commands.
+    For tests: `position_sent` is 'true', 'none' (no position events), 'stuck' (always the same) or
+    'nan'; `cut_up` and `cut_down` lose received, and sent, datagrams; `refused` counts what was
+    invalid, `heard` the commands by (project, class, id).
     """
 
     def __init__(
@@ -171,17 +163,16 @@ class FakeMambo:
         self.position_sent = 'true'
         self.cut_up = self.cut_down = False
         self.refused = 0
-        #: Number of received commands by (project, class, id).
-        self.heard: dict[tuple[int, int, int], int] = {}
+        self.heard: Counter[tuple[int, int, int]] = Counter()
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._controller: tuple[str, int] | None = None
-        self._sequences: dict[int, int] = {}
+        self._sequences: Counter[int] = Counter()
         # Frames that wait to be acknowledged: frame, tries left, time of the next try.
         self._unacked: dict[int, tuple[Frame, int, float]] = {}
         self._done: dict[int, int] = {}
         self._sensors_at = self._ping_at = 0.0
-        self._stuck: Estimate | None = None
+        self._stuck: Pose | None = None
         self._said: tuple[int, int] | None = None
         firmware.on_change = self._tell_state
         self._door = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -198,123 +189,116 @@ class FakeMambo:
                 f'fake Mambo at {address}: {error.strerror}; allowed is an address of this host '
                 f'with TCP port {HANDSHAKE_PORT} and UDP port {command_port} free'
             ) from error
-        self._door.settimeout(_POLL)
-        self._air.settimeout(_POLL)
+        self._door.setblocking(False)
+        self._air.setblocking(False)
         self.command_port = int(self._air.getsockname()[1])
-        self._threads = [
-            threading.Thread(target=work, name=f'fake Mambo {what}', daemon=True)
-            for what, work in (('handshake', self._answer_door), ('commands', self._listen))
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._thread = threading.Thread(target=self._live, name='fake Mambo', daemon=True)
+        self._thread.start()
 
-    def __enter__(self) -> FakeMambo:
-        """Return itself."""
-        return self
+    @property
+    def state(self) -> RobotState:
+        """True state, in the map."""
+        with self._lock:
+            return self.firmware.state
 
-    def __exit__(self, *_: object) -> None:
-        """Leave the network."""
-        self.close()
+    @property
+    def obeys(self) -> bool:
+        """Whether it is in the air and not landing."""
+        flying_state = self.firmware.flying_state
+        return flying_state in AIRBORNE and flying_state != FlyingState.LANDING
+
+    def cut(self, cut: bool = True) -> None:
+        """Cut the link, or restore it."""
+        self.cut_up = self.cut_down = cut
 
     def close(self) -> None:
         """Leave the network."""
         self._closing.set()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join()
+        self._thread.join()
         self._door.close()
         self._air.close()
 
-    def run(self) -> None:
-        """Advance in real time, in a thread, until it is closed."""
-        thread = threading.Thread(target=self._live, name='fake Mambo time', daemon=True)
-        self._threads.append(thread)
-        thread.start()
-
     def _live(self) -> None:
         last = time.monotonic()
-        while not self._closing.wait(_STEP):
-            now = time.monotonic()
-            self.advance(min(now - last, _CATCH_UP))
-            last = now
+        while not self._closing.is_set():
+            wait = max(last + _STEP - time.monotonic(), 0.0)
+            ready, _, _ = select.select([self._door, self._air], [], [], wait)
+            with self._lock:
+                # Losing the controller is no error of the simulated drone.
+                with contextlib.suppress(OSError):
+                    if self._door in ready:
+                        self._answer_door()
+                    if self._air in ready:
+                        self._listen()
+                now = time.monotonic()
+                if now - last >= _STEP:
+                    self._advance(min(now - last, _CATCH_UP))
+                    last = now
 
-    # ---- time --------------------------------------------------------------------------------
-
-    def advance(self, dt: float) -> None:
+    def _advance(self, dt: float) -> None:
         """Advance by `dt` seconds, and send due messages."""
-        with self._lock:
-            firmware = self.firmware
-            firmware.advance(dt)
-            now = firmware.time
-            if now - self._sensors_at >= _SENSOR_PERIOD - 1e-9:
-                self._send_sensors(now - self._sensors_at)
-                self._sensors_at = now
-            if now - self._ping_at >= _PING_PERIOD - 1e-9:
-                self._ping_at = now
-                self._send(DATA, PING, struct.pack('<Q', round(1e9 * now)))
-            for sequence, (frame, tries, due) in list(self._unacked.items()):
-                if now >= due:
-                    self._unacked[sequence] = (frame, tries - 1, now + _RETRY_PERIOD)
-                    if tries <= 1:
-                        del self._unacked[sequence]
-                    self._transmit(frame)
-
-    def snapshot(self) -> tuple[Any, Any, float]:
-        """Return true state in the map, flying state and charge at one instant."""
-        with self._lock:
-            firmware = self.firmware
-            return firmware.state, firmware.flying_state, firmware.charge.charge
+        firmware = self.firmware
+        firmware.advance(dt)
+        now = firmware.time
+        if now - self._sensors_at >= _SENSOR_PERIOD - 1e-9:
+            self._send_sensors(now - self._sensors_at)
+            self._sensors_at = now
+        if now - self._ping_at >= _PING_PERIOD - 1e-9:
+            self._ping_at = now
+            self._send(DATA, PING, struct.pack('<Q', round(1e9 * now)))
+        for sequence, (frame, tries, due) in list(self._unacked.items()):
+            if now >= due:
+                self._unacked[sequence] = (frame, tries - 1, now + _RETRY_PERIOD)
+                if tries <= 1:
+                    del self._unacked[sequence]
+                self._transmit(frame)
 
     # ---- sending -----------------------------------------------------------------------------
 
     def _transmit(self, frame: Frame) -> None:
-        if self._controller is None or self.cut_down:
-            return
-        # Losing the controller is no error of the simulated drone.
-        with contextlib.suppress(OSError):
-            self._air.sendto(frame.encode(), self._controller)
+        if self._controller is not None and not self.cut_down:
+            with contextlib.suppress(OSError):
+                self._air.sendto(frame.encode(), self._controller)
 
     def _send(self, kind: int, buffer: int, payload: bytes) -> Frame:
-        sequence = (self._sequences.get(buffer, -1) + 1) % 256
-        self._sequences[buffer] = sequence
-        frame = Frame(kind, buffer, sequence, payload)
+        frame = Frame(kind, buffer, self._sequences[buffer] % 256, payload)
+        self._sequences[buffer] += 1
         self._transmit(frame)
         return frame
 
-    def _event(self, number: tuple[int, int, int], payload: bytes, acked: bool = False) -> None:
-        content = _ID.pack(*number) + payload
-        if not acked:
-            self._send(DATA, EVENTS, content)
-            return
-        frame = self._send(DATA_WITH_ACK, ACKED_EVENTS, content)
+    def _event(self, number: tuple[int, int, int], payload: bytes) -> None:
+        self._send(DATA, EVENTS, _ID.pack(*number) + payload)
+
+    def _acked_event(self, number: tuple[int, int, int], payload: bytes) -> None:
+        frame = self._send(DATA_WITH_ACK, ACKED_EVENTS, _ID.pack(*number) + payload)
         self._unacked[frame.sequence] = (frame, _RETRIES, self.firmware.time + _RETRY_PERIOD)
 
     def _tell_state(self) -> None:
         state = (int(self.firmware.flying_state), self.firmware.percent)
-        before = self._said or (-1, -1)
-        self._said = state
+        before, self._said = self._said or (-1, -1), state
         if state[0] != before[0]:
-            self._event((2, 3, 1), struct.pack('<I', state[0]), acked=True)
+            self._acked_event((2, 3, 1), struct.pack('<I', state[0]))
         if state[1] != before[1]:
-            self._event((0, 5, 1), struct.pack('<B', state[1]), acked=True)
+            self._acked_event((0, 5, 1), struct.pack('<B', state[1]))
 
     def _tell_all(self) -> None:
         self._said = None
         self._tell_state()
-        for number, (name, (most, unit)) in zip(((2, 9, 1), (2, 5, 0), (2, 5, 1)), LIMITS.items()):
-            value = getattr(self.firmware.limits, name) / unit
-            self._event(number, struct.pack('<fff', value, *most))
+        for name, (most, unit) in LIMITS.items():
+            value = self.firmware.limits[name] / unit
+            self._event(_LIMIT_EVENTS[name], struct.pack('<fff', value, *most))
         self._event((0, 5, 0), b'')
 
     def _send_sensors(self, elapsed: float) -> None:
-        estimate = self.firmware.estimate()
-        stamp = round(1000.0 * self.firmware.time) % 65536
-        forward, left, up = estimate.velocity.tolist()
+        firmware, body = self.firmware, self.firmware.body
+        estimate = firmware.estimate()
+        stamp = round(1000.0 * firmware.time) % 65536
+        forward, left = body.level_speed()
         # Down and right are positive here.
-        self._event((2, 18, 1), struct.pack('<fffH', forward, -left, -up, stamp))
-        self._event((2, 18, 2), struct.pack('<fH', self.firmware.height, stamp))
+        self._event((2, 18, 1), struct.pack('<fffH', forward, -left, -body.velocity[2], stamp))
+        self._event((2, 18, 2), struct.pack('<fH', firmware.height, stamp))
         # From north-east-down at the start to forward-right-down.
-        turn = Pose.from_rpy(np.zeros(3), (estimate.roll, -estimate.pitch, -estimate.yaw))
+        turn = Pose.from_rpy(np.zeros(3), (body.roll, -body.pitch, -estimate.yaw))
         self._event((2, 18, 4), struct.pack('<ffffH', *turn.orientation, stamp))
         if self.position_sent == 'none':
             return
@@ -332,18 +316,11 @@ class FakeMambo:
     # ---- receiving ---------------------------------------------------------------------------
 
     def _answer_door(self) -> None:
-        while not self._closing.is_set():
-            try:
-                visitor, (host, _) = self._door.accept()
-            except OSError:
-                continue
-            with visitor:
-                visitor.settimeout(2.0)
-                try:
-                    answer = self._shake_hands(host, visitor.recv(4096))
-                    visitor.sendall(json.dumps(answer).encode() + b'\0')
-                except OSError:
-                    continue
+        visitor, (host, _) = self._door.accept()
+        with visitor:
+            visitor.settimeout(_HANDSHAKE_TIME)
+            answer = self._shake_hands(host, visitor.recv(4096))
+            visitor.sendall(json.dumps(answer).encode() + b'\0')
 
     def _shake_hands(self, host: str, request: bytes) -> dict[str, int]:
         try:
@@ -353,13 +330,12 @@ class FakeMambo:
         except (ValueError, KeyError, TypeError):
             self.refused += 1
             return {'status': -1, 'c2d_port': 0}
-        with self._lock:
-            self._controller = (host, port)
-            self._unacked.clear()
-            self._done.clear()
-            self._sequences.clear()
-            self._said = None
-            self.firmware.hear()
+        self._controller = (host, port)
+        self._unacked.clear()
+        self._done.clear()
+        self._sequences.clear()
+        self._said = None
+        self.firmware.hear()
         return {
             'status': 0,
             'c2d_port': self.command_port,
@@ -368,20 +344,14 @@ class FakeMambo:
         }
 
     def _listen(self) -> None:
-        while not self._closing.is_set():
-            try:
-                data, sender = self._air.recvfrom(65536)
-            except OSError:
-                continue
-            with self._lock:
-                controller = self._controller
-                if self.cut_up or controller is None or sender[0] != controller[0]:
-                    continue
-                try:
-                    for frame in frames(data):
-                        self._take(frame)
-                except FrameError:
-                    self.refused += 1
+        data, sender = self._air.recvfrom(65536)
+        if self.cut_up or self._controller is None or sender[0] != self._controller[0]:
+            return
+        try:
+            for frame in frames(data):
+                self._take(frame)
+        except ValueError:
+            self.refused += 1
 
     def _take(self, frame: Frame) -> None:
         self.firmware.hear()
@@ -398,17 +368,13 @@ class FakeMambo:
         if frame.buffer not in (COMMANDS, ACKED_COMMANDS, EMERGENCY_COMMANDS):
             return
         if len(frame.payload) < _ID.size:
-            self.refused += 1
-            return
+            raise ValueError(f'command: got {len(frame.payload)} bytes, allowed are {_ID.size}')
         number = _ID.unpack_from(frame.payload)
-        self.heard[number] = self.heard.get(number, 0) + 1
+        self.heard[number] += 1
         if number == ALL_STATES:
             self._tell_all()
-            return
-        try:
+        else:
             obey(self.firmware, number, frame.payload[_ID.size :])
-        except ValueError:
-            self.refused += 1
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -418,32 +384,28 @@ def build_parser() -> argparse.ArgumentParser:
         description='A simulated Parrot Mambo on the network of this host, for a driver with '
         'link: mambo_wifi, or for any program that uses pyparrot over WiFi.',
     )
-    parser.add_argument(
-        '--address', default='127.0.0.1', help='of this host (default: %(default)s)'
-    )
-    parser.add_argument(
-        '--type', default='mambo', metavar='NAME', help='robot type (default: %(default)s)'
-    )
-    parser.add_argument('--seed', type=whole, default=1, metavar='N', help='of the noise')
-    parser.add_argument(
-        '--charge', type=float, default=1.0, metavar='X', help='of the battery at the start, 0 to 1'
-    )
-    body, firmware = TiltBodySettings(), FirmwareSettings()
-    parser.add_argument(
-        '--drag', type=float, default=body.drag, metavar='D', help='of its body [1/s] (%(default)s)'
-    )
-    parser.add_argument(
-        '--delay',
+    settings = FirmwareSettings()
+
+    def add(name: str, help: str, **options: Any) -> None:
+        parser.add_argument(f'--{name}', help=help, **options)
+
+    add('address', 'of this host (default: %(default)s)', default='127.0.0.1')
+    add('type', 'robot type (default: %(default)s)', default='mambo', metavar='NAME')
+    add('seed', 'of the noise', type=whole, default=1, metavar='N')
+    add('charge', 'of the battery at the start, 0 to 1', type=float, default=1.0, metavar='X')
+    add('drag', 'of its body [1/s] (%(default)s)', type=float, default=settings.drag, metavar='D')
+    add(
+        'delay',
+        'from a command to its tilt set-point [s] (%(default)s)',
         type=float,
-        default=firmware.delay,
+        default=settings.delay,
         metavar='S',
-        help='from a command to its tilt set-point [s] (%(default)s)',
     )
-    parser.add_argument(
-        '--lost-link',
+    add(
+        'lost-link',
+        'behaviour when its controller is silent (%(default)s)',
         choices=('hover', 'land'),
-        default=firmware.lost_link,
-        help='behaviour when its controller is silent (%(default)s)',
+        default=settings.lost_link,
     )
     return parser
 
@@ -452,27 +414,19 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a fake Mambo until it is interrupted."""
     options = build_parser().parse_args(arguments)
     try:
-        if not 0.0 <= options.charge <= 1.0:
-            raise ScenarioError(f'--charge: read {options.charge}, allowed is 0 to 1')
+        for name, low, high in (('charge', 0.0, 1.0), ('drag', 1e-3, 20.0), ('delay', 0.0, 2.0)):
+            value = getattr(options, name)
+            if not low <= value <= high:
+                raise ScenarioError(f'--{name}: read {value}, allowed is {low:g} to {high:g}')
         robot = robot_type(options.type)
         firmware = MamboFirmware(
             Pose.from_yaw([0.0, 0.0, 0.0], 0.0),
-            FirmwareSettings(
-                delay=options.delay,
-                lost_link=options.lost_link,
-                body=TiltBodySettings(drag=options.drag),
-            ),
+            FirmwareSettings(delay=options.delay, lost_link=options.lost_link, drag=options.drag),
             battery=robot.battery.model_copy(update={'charge': options.charge}),
             odometry=robot.odometry,
             seed=options.seed,
         )
         fake = FakeMambo(firmware, options.address, COMMAND_PORT)
-    except ValidationError as error:
-        wrong = error.errors()[0]
-        print(
-            f'error: --{wrong["loc"][-1]}: read {wrong["input"]}: {wrong["msg"]}', file=sys.stderr
-        )
-        return 2
     except (ScenarioError, OSError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
@@ -480,16 +434,14 @@ def main(arguments: list[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     print(f'fake Mambo at {options.address}, TCP {HANDSHAKE_PORT}, UDP {fake.command_port}')
-    with fake:
-        fake.run()
-        said = None
-        while not ended.wait(_POLL):
-            state, flying, charge = fake.snapshot()
-            now = (flying, round(10 * charge))
-            if now != said:
-                said = now
-                place = ', '.join(f'{value:.2f}' for value in state.pose.position)
-                print(f'{flying.name.lower()} at {place} m, battery {charge:.0%}', flush=True)
+    said = None
+    while not ended.wait(0.1):
+        flying, charge = firmware.flying_state, firmware.charge.charge
+        if (flying, round(10 * charge)) != said:
+            said = flying, round(10 * charge)
+            place = ', '.join(f'{value:.2f}' for value in fake.state.pose.position)
+            print(f'{flying.name.lower()} at {place} m, battery {charge:.0%}', flush=True)
+    fake.close()
     return 0
 
 

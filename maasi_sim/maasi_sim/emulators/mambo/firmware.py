@@ -29,14 +29,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_filter.settings import Settings
 from maasi_planner.motion import RobotState
 from maasi_sim.world.odometry import OdometryModel, OdometrySettings
 from maasi_sim.world.robots import Battery, BatterySettings
@@ -44,42 +41,33 @@ from maasi_sim.world.robots import Battery, BatterySettings
 _GRAVITY = 9.81
 
 
-class TiltBodySettings(Settings):
-    """How the body of a fake Mambo answers its commands."""
+@dataclass(frozen=True)
+class FirmwareSettings:
+    """How the fake's firmware behaves, and how its body answers."""
 
-    drag: float = Field(
-        default=0.5, gt=0.0, le=20.0, description='Deceleration for each m/s of speed [1/s]'
-    )
-    tilt_time: float = Field(
-        default=0.1, gt=0.0, le=2.0, description='Time constant of the tilt [s]'
-    )
-    climb_time: float = Field(
-        default=0.2, gt=0.0, le=2.0, description='Time constant of the vertical speed [s]'
-    )
-    turn_time: float = Field(
-        default=0.1, gt=0.0, le=2.0, description='Time constant of the rotation rate [s]'
-    )
-    hover_gain: float = Field(
-        default=2.0,
-        ge=0.0,
-        le=20.0,
-        description='Deceleration for each m/s while it hovers; 0: it only levels itself, as in '
-        'the modes medium and difficult [1/s]',
-    )
+    take_off_height: float = 0.8  # at which it hovers after take-off [m]
+    command_timeout: float = 0.5  # until the last piloting command is void: hover [s]
+    delay: float = 0.1  # from a piloting command to its tilt set-point [s]
+    lost_link: Literal['hover', 'land'] = 'hover'  # when its controller is silent
+    landing_timeout: float = 3.0  # without its controller until it lands, with `land` [s]
+    critical_charge: float = 0.03  # at which it lands by itself [1]
+    drag: float = 0.5  # deceleration for each m/s of speed [1/s]
+    tilt_time: float = 0.1  # time constants of tilt, vertical speed and rotation rate [s]
+    climb_time: float = 0.2
+    turn_time: float = 0.1
+    # Deceleration for each m/s while it hovers; 0: it only levels itself, as in the modes medium
+    # and difficult [1/s].
+    hover_gain: float = 2.0
 
 
 class TiltBody:
     """A quadrotor under commanded tilts, without a floor.
 
-    Attributes
-    ----------
-    position, velocity : ndarray, shape (3,)
-        In the map [m], [m/s].
-    roll, pitch, yaw : float
-        Right-handed about forward, left and up [rad].
+    Position and velocity are in the map [m, m/s]; roll, pitch and yaw right-handed about forward,
+    left and up [rad].
     """
 
-    def __init__(self, settings: TiltBodySettings, pose: Pose) -> None:
+    def __init__(self, settings: FirmwareSettings, pose: Pose) -> None:
         self.settings = settings
         self.rest_at(pose)
 
@@ -91,6 +79,12 @@ class TiltBody:
         self.yaw = pose.yaw
         self._rates = np.zeros(3)
 
+    def level_speed(self) -> tuple[float, float]:
+        """Return its speed forward and to the left [m/s]."""
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        vx, vy, _ = self.velocity.tolist()
+        return cosine * vx + sine * vy, cosine * vy - sine * vx
+
     def step(self, command: Sequence[float], most_tilt: float, h: float) -> None:
         """Go on for `h` seconds, at most 0.05; hovering it tilts by `most_tilt` [rad] at most.
 
@@ -98,9 +92,7 @@ class TiltBody:
         speed [m/s], and the rotation rate, anticlockwise [rad/s]; without tilt it hovers.
         """
         settings = self.settings
-        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
-        vx, vy, vz = self.velocity.tolist()
-        ahead, left = cosine * vx + sine * vy, cosine * vy - sine * vx
+        ahead, left = self.level_speed()
         pitch, roll, climb, turn_rate = command
         if pitch == roll == 0.0:
             pitch, roll = (
@@ -113,7 +105,8 @@ class TiltBody:
         self.roll += roll_step
         forward = _GRAVITY * math.tan(self.pitch) - settings.drag * ahead
         leftward = -_GRAVITY * math.tan(self.roll) - settings.drag * left
-        rising = (climb - vz) * (1.0 - math.exp(-h / settings.climb_time)) / h
+        rising = (climb - self.velocity[2]) * (1.0 - math.exp(-h / settings.climb_time)) / h
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         acceleration = np.array(
             [cosine * forward - sine * leftward, sine * forward + cosine * leftward, rising]
         )
@@ -165,85 +158,13 @@ AIRBORNE = (
 )
 
 
-class FirmwareSettings(Settings):
-    """How the fake's firmware behaves."""
-
-    take_off_height: float = Field(
-        default=0.8, gt=0.0, description='At which it hovers after take-off [m]'
-    )
-    command_timeout: float = Field(
-        default=0.5, gt=0.0, description='After which the last piloting command is void: hover [s]'
-    )
-    delay: float = Field(
-        default=0.1, ge=0.0, le=2.0, description='From a piloting command to its tilt set-point [s]'
-    )
-    lost_link: Literal['hover', 'land'] = Field(
-        default='hover', description='What it does when it hears nothing from its controller'
-    )
-    landing_timeout: float = Field(
-        default=3.0,
-        gt=0.0,
-        description='Without anything from the controller until it lands, with lost_link land [s]',
-    )
-    critical_charge: float = Field(
-        default=0.03, ge=0.0, lt=1.0, description='At which it lands by itself [1]'
-    )
-    body: TiltBodySettings = Field(
-        default_factory=TiltBodySettings, description='How it answers its set-points'
-    )
-
-
-@dataclass(frozen=True)
-class Piloting:
-    """A piloting command (PCMD), each in whole per cent of the largest.
-
-    Attributes
-    ----------
-    roll, pitch, yaw, climb : int
-        To the right, forward, clockwise, up.
-    """
+class Piloting(NamedTuple):
+    """A piloting command (PCMD), whole per cent: to the right, forward, clockwise, up."""
 
     roll: int = 0
     pitch: int = 0
     yaw: int = 0
     climb: int = 0
-
-    @property
-    def moves(self) -> bool:
-        """Whether it is anything but a hover."""
-        return bool(self.roll or self.pitch or self.yaw or self.climb)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What the firmware believes of its flight.
-
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        From the take-off point, forward, left, up [m].
-    yaw : float
-        From the heading at take-off, anticlockwise [rad].
-    velocity : ndarray, shape (3,)
-        Forward, left, up, axes turned by the heading only [m/s].
-    roll, pitch : float
-        Right-handed about forward and left [rad].
-    """
-
-    position: FloatArray
-    yaw: float
-    velocity: FloatArray
-    roll: float
-    pitch: float
-
-
-@dataclass
-class Limits:
-    """What 100 per cent of a piloting command are: tilt [rad], climb [m/s], turn [rad/s]."""
-
-    tilt: float = 15.0 * _DEGREE
-    climb: float = 1.0
-    turn: float = 150.0 * _DEGREE
 
 
 @dataclass
@@ -262,10 +183,11 @@ class MamboFirmware:
         self.floor = float(self.start.position[2])
         self.time = 0.0
         self.flying_state = FlyingState.LANDED
-        self.limits = Limits()
+        #: What 100 per cent of a piloting command are [rad, m/s, rad/s].
+        self.limits = {'tilt': 15.0 * _DEGREE, 'climb': 1.0, 'turn': 150.0 * _DEGREE}
         self.charge = Battery(self.battery)
         self.take_offs = 0
-        self._body = TiltBody(self.settings.body, self.start)
+        self.body = TiltBody(self.settings, self.start)
         self._odometry = OdometryModel(self.odometry, self.start, self.seed, self.name)
         self._readings = 0
         # Piloting commands, and the time at which they take effect.
@@ -281,12 +203,17 @@ class MamboFirmware:
     @property
     def state(self) -> RobotState:
         """True state, in the map."""
-        return self._body.robot_state()
+        return self.body.robot_state()
 
     @property
     def height(self) -> float:
         """Above the floor [m]."""
-        return float(self._body.position[2]) - self.floor
+        return float(self.body.position[2]) - self.floor
+
+    def estimate(self) -> Pose:
+        """Return where it believes to be, from its take-off point; each call draws new noise."""
+        self._readings += 1
+        return self._odometry.step(self.state, self._readings).pose
 
     # ---- commands ----------------------------------------------------------------------------
 
@@ -317,7 +244,7 @@ class MamboFirmware:
     def limit(self, name: str, value: float) -> None:
         """Set what 100 per cent are, of a name in `LIMITS` and in its unit, cut to its range."""
         (low, high), unit = LIMITS[name]
-        setattr(self.limits, name, min(max(value, low), high) * unit)
+        self.limits[name] = min(max(value, low), high) * unit
 
     # ---- time --------------------------------------------------------------------------------
 
@@ -331,9 +258,13 @@ class MamboFirmware:
         self.time += h
         self._look_after()
         if self.flying_state in AIRBORNE:
-            self._body.step(self._command(), self.limits.tilt, h)
-            self.charge.drain(float(np.linalg.norm(self._body.velocity)), h)
-            self._touch()
+            self.body.step(self._command(), self.limits['tilt'], h)
+            self.charge.drain(float(np.linalg.norm(self.body.velocity)), h)
+            if self.height <= 0.0 and self.body.velocity[2] <= 0.0:
+                # It stands on the floor instead of sinking into it.
+                self._rest()
+                if self.flying_state == FlyingState.LANDING:
+                    self._set(FlyingState.LANDED)
         if self.percent != self._percent:
             self._percent = self.percent
             self.on_change()
@@ -344,19 +275,17 @@ class MamboFirmware:
 
     def _look_after(self) -> None:
         """Land, or change the flying state, without a command."""
-        state = self.flying_state
+        state, settings = self.flying_state, self.settings
         if state in (FlyingState.LANDED, FlyingState.LANDING, FlyingState.EMERGENCY):
             return
-        settings = self.settings
         silent = self.time - self._heard_at > settings.landing_timeout
         if (silent and settings.lost_link == 'land') or self._critical:
             self._set(FlyingState.LANDING)
-        elif state == FlyingState.TAKING_OFF:
-            if self.height >= settings.take_off_height:
-                self._set(FlyingState.HOVERING)
-        else:
-            moves = self._current().moves
+        elif state != FlyingState.TAKING_OFF:
+            moves = any(self._current())
             self._set(FlyingState.FLYING if moves else FlyingState.HOVERING)
+        elif self.height >= settings.take_off_height:
+            self._set(FlyingState.HOVERING)
 
     def _current(self) -> Piloting:
         piloted = self._piloted
@@ -372,46 +301,14 @@ class MamboFirmware:
             return 0.0, 0.0, _TAKE_OFF_SPEED, 0.0
         if self.flying_state == FlyingState.LANDING:
             return 0.0, 0.0, -_LANDING_SPEED, 0.0
-        piloting, limits = self._current(), self.limits
-        return (
-            0.01 * limits.tilt * piloting.pitch,
-            0.01 * limits.tilt * piloting.roll,
-            0.01 * limits.climb * piloting.climb,
-            -0.01 * limits.turn * piloting.yaw,
-        )
-
-    def _touch(self) -> None:
-        """Stand on the floor instead of sinking into it."""
-        if self.height > 0.0 or self._body.velocity[2] > 0.0:
-            return
-        landing = self.flying_state == FlyingState.LANDING
-        self._rest()
-        if landing:
-            self._set(FlyingState.LANDED)
+        roll, pitch, yaw, climb = (0.01 * share for share in self._current())
+        tilt, limits = self.limits['tilt'], self.limits
+        return tilt * pitch, tilt * roll, limits['climb'] * climb, -limits['turn'] * yaw
 
     def _rest(self) -> None:
-        position = self._body.position.copy()
-        position[2] = self.floor
-        self._body.rest_at(Pose.from_yaw(position, self._body.yaw))
+        self.body.rest_at(Pose.from_yaw([*self.body.position[:2], self.floor], self.body.yaw))
 
     def _set(self, state: FlyingState) -> None:
         if state != self.flying_state:
             self.flying_state = state
             self.on_change()
-
-    # ---- estimate ----------------------------------------------------------------------------
-
-    def estimate(self) -> Estimate:
-        """Return the estimate of the firmware; each call draws new noise."""
-        state = self.state
-        self._readings += 1
-        reading = self._odometry.step(state, self._readings)
-        cosine, sine = math.cos(self._body.yaw), math.sin(self._body.yaw)
-        vx, vy, vz = state.velocity.tolist()
-        return Estimate(
-            position=reading.pose.position,
-            yaw=reading.pose.yaw,
-            velocity=np.array([cosine * vx + sine * vy, cosine * vy - sine * vx, vz]),
-            roll=self._body.roll,
-            pitch=self._body.pitch,
-        )

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,27 +18,13 @@ from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
-from maasi_sim.emulators.mavlink.autopilot_parameters import FIRMWARES
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
-from maasi_sim.emulators.mavlink.fake_autopilot import FakeAutopilot
+from maasi_sim.emulators.mavlink.fake_autopilot import FIRMWARES, FakeAutopilot
 from maasi_sim.scenario.schema import RobotSettings
 
 _PERIOD = 0.02
 # Longest time simulated at once after a delay [s].
 _LONGEST = 0.5
-
-
-class _Gate:
-    """Passes bytes to a connection unless it is shut."""
-
-    def __init__(self, wire: Any) -> None:
-        self._wire = wire
-        self.shut = False
-
-    def write(self, data: bytes) -> None:
-        """Write."""
-        if not self.shut:
-            self._wire.write(data)
 
 
 class FakeVehicle:
@@ -48,7 +35,8 @@ class FakeVehicle:
     ) -> None:
         self._connection = open_connection(url, settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1)
         self._origin = np.array(start.position)
-        self._gate = self._connection.mav.file = _Gate(self._connection)
+        self._connection.mav.file = SimpleNamespace(write=self._send)
+        self._cut = False
         self.autopilot = FakeAutopilot(settings, self._connection.mav, start.yaw, generator)
         self._lock = threading.Lock()
         self._end = threading.Event()
@@ -75,12 +63,11 @@ class FakeVehicle:
 
     def cut(self, cut: bool = True) -> None:
         """Cut the link in both directions, or restore it."""
-        self._gate.shut = cut
+        self._cut = cut
 
-    @property
-    def running(self) -> bool:
-        """Whether the autopilot has not crashed."""
-        return not self.autopilot.crashed
+    def _send(self, data: bytes) -> None:
+        if not self._cut:
+            self._connection.write(data)
 
     def close(self) -> None:
         """Stop the thread, and close the connection."""
@@ -96,7 +83,7 @@ class FakeVehicle:
             before = now
             with self._lock:
                 while (message := self._connection.recv_msg()) is not None:
-                    if not self._gate.shut:
+                    if not self._cut:
                         self.autopilot.handle(message)
                 steps = max(1, math.ceil(late / _PERIOD - 0.5))
                 for _ in range(steps):
@@ -121,35 +108,20 @@ def build_parser() -> argparse.ArgumentParser:
         prog='fake_mavlink_vehicle',
         description='A fake vehicle that speaks MAVLink 2, to try the driver without a real one.',
     )
-    parser.add_argument(
-        '--url',
-        default='udpout:127.0.0.1:14550',
-        help='of the driver, in the form of pymavlink (default: %(default)s)',
-    )
-    parser.add_argument(
-        '--firmware',
-        choices=sorted(FIRMWARES),
-        default='arducopter',
-        help='whose behaviour it has (default: %(default)s)',
-    )
-    parser.add_argument('--system', type=int, default=1, help='system id (default: 1)')
-    parser.add_argument(
-        '--estimator-time',
-        type=float,
-        default=2.0,
-        metavar='S',
-        help='until its position estimate is ready (default: 2)',
-    )
-    parser.add_argument(
-        '--charge', type=float, default=1.0, help='of its battery, 0 to 1 (default: 1)'
-    )
-    parser.add_argument(
-        '--parameter',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='of the autopilot, as FS_GCS_ENABLE=0; may be given more than once',
-    )
+
+    def add(name: str, help: str, **options: Any) -> None:
+        parser.add_argument(f'--{name}', help=help, **options)
+
+    url, names = 'udpout:127.0.0.1:14550', sorted(FIRMWARES)
+    add('url', 'of the driver, in the form of pymavlink (default: %(default)s)', default=url)
+    behaviour = 'whose behaviour it has (default: %(default)s)'
+    add('firmware', behaviour, choices=names, default='arducopter')
+    add('system', 'system id (default: 1)', type=int, default=1)
+    ready = 'until its position estimate is ready (default: 2)'
+    add('estimator-time', ready, type=float, default=2.0, metavar='S')
+    add('charge', 'of its battery, 0 to 1 (default: 1)', type=float, default=1.0)
+    given = 'of the autopilot, as FS_GCS_ENABLE=0; may be given more than once'
+    add('parameter', given, action='append', default=[], metavar='NAME=VALUE')
     return parser
 
 
@@ -185,19 +157,16 @@ def main(arguments: list[str] | None = None) -> int:
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    shown = ''
-    try:
-        while vehicle.running and not ended.wait(0.2):
-            autopilot = vehicle.autopilot
-            text = f'{autopilot.mode_name}, {"armed" if autopilot.armed else "not armed"}'
-            if text != shown:
-                shown = text
-                position = ', '.join(f'{value:.2f}' for value in vehicle.state.pose.position)
-                print(f'{text}, at {position} m', flush=True)
-    finally:
-        vehicle.close()
-    if not vehicle.running:
-        print(f'the autopilot crashed: {vehicle.autopilot.crashed}', file=sys.stderr)
+    autopilot, shown = vehicle.autopilot, ''
+    while not autopilot.crashed and not ended.wait(0.2):
+        text = f'{autopilot.mode_name}, {"armed" if autopilot.armed else "not armed"}'
+        if text != shown:
+            shown = text
+            position = ', '.join(f'{value:.2f}' for value in vehicle.state.pose.position)
+            print(f'{text}, at {position} m', flush=True)
+    vehicle.close()
+    if autopilot.crashed:
+        print(f'the autopilot crashed: {autopilot.crashed}', file=sys.stderr)
         return 3
     return 0
 
