@@ -3,28 +3,16 @@
 import threading
 
 import pytest
-import rclpy
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import GetParameterTypes, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from waiting import wait_until
 
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.run_node import executor_of
-from maasi_sim.run.domain import Domain
-
-
-@pytest.fixture
-def context():
-    with Domain() as domain:
-        # The default context: the executor of the nodes is made for it.
-        rclpy.init(domain_id=domain.number, signal_handler_options=SignalHandlerOptions.NO)
-        yield rclpy.get_default_context()
-        rclpy.shutdown()
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The executor of a node: nothing that comes is left lying, and an error ends the node."""
 
 import pytest
-from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -14,7 +13,6 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.run_node import executor_of
-from maasi_sim.run.domain import Domain
 
 
 class Pair:
@@ -44,16 +42,12 @@ class Pair:
 
 
 @pytest.fixture
-def pair(tmp_path):
-    with Domain() as domain:
-        context = Context()
-        context.init(domain_id=domain.number)
-        made = Pair(context)
-        yield made
-        made.executor.shutdown()
-        made.listener.destroy_node()
-        made.talker.destroy_node()
-        context.try_shutdown()
+def pair(context):
+    made = Pair(context)
+    yield made
+    made.executor.shutdown()
+    made.listener.destroy_node()
+    made.talker.destroy_node()
 
 
 def test_everything_is_heard_in_the_order_of_its_topic(pair):

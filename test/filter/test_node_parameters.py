@@ -5,9 +5,7 @@ import subprocess
 import sys
 
 import pytest
-import rclpy
 import yaml
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -17,7 +15,6 @@ from waiting import PATIENCE, wait_until
 from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
-from maasi_sim.run.domain import Domain
 
 SETTINGS = FilterNodeSettings.model_validate(
     {
@@ -26,20 +23,6 @@ SETTINGS = FilterNodeSettings.model_validate(
         'robots': {'a': {}},
     }
 )
-
-
-@pytest.fixture
-def domain():
-    with Domain() as made:
-        yield made
-
-
-@pytest.fixture
-def context(domain):
-    made = Context()
-    rclpy.init(context=made, domain_id=domain.number)
-    yield made
-    rclpy.shutdown(context=made)
 
 
 @pytest.fixture

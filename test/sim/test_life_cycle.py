@@ -4,25 +4,13 @@ import time
 from collections import Counter
 
 import pytest
-import rclpy
 from node_kinds import KINDS
-from rclpy.context import Context
 from rclpy.parameter import Parameter
 from waiting import wait_until
 
 from maasi_filter.ros.run_node import executor_of
-from maasi_sim.run.domain import Domain
 
 CYCLES = 20
-
-
-@pytest.fixture
-def context():
-    with Domain() as domain:
-        made = Context()
-        rclpy.init(context=made, domain_id=domain.number)
-        yield made
-        rclpy.shutdown(context=made)
 
 
 def made_by(node):

@@ -1,20 +1,14 @@
 """RViz's files: each topic is there, and its quality of service fits the publisher's."""
 
-import os
-
 import pytest
-import rclpy
 import yaml
 from node_kinds import KINDS
-from rclpy.context import Context
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.ros.conversions import MarkerBoard
 from maasi_sim.missions import load_mission
-from maasi_sim.run.domain import Domain
 from maasi_sim.run.rviz_view import view_text
 from maasi_sim.scenario.loading import config_folder
 
@@ -37,38 +31,26 @@ def test_the_files_name_no_robot(name):
         ('buildings_one', ('cuboid_planner', 'cuboid_sim')),
     ],
 )
-def test_every_display_fits_its_publisher(monkeypatch, scenario, kinds):
+def test_every_display_fits_its_publisher(context, scenario, kinds):
     displays = topics_of(view_text(load_mission(scenario)))
-    with Domain() as domain:
-        for name, value in domain.environment().items():
-            monkeypatch.setenv(name, value)
-        context = Context()
-        rclpy.init(
-            context=context,
-            domain_id=int(os.environ['ROS_DOMAIN_ID']),
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        nodes = [KINDS[kind].make(context) for kind in kinds]
-        try:
-            assert all(node.trigger_configure().name == 'SUCCESS' for node in nodes)
-            shown = 0
-            for topic, wanted in displays.items():
-                for info in [i for node in nodes for i in publishers(node, topic)]:
-                    shown += 1
-                    offered = info.qos_profile
-                    latched = offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
-                    assert latched or wanted['Durability Policy'] == 'Volatile', topic
-                    reliable = offered.reliability == ReliabilityPolicy.RELIABLE
-                    assert reliable or wanted['Reliability Policy'] == 'Best Effort', topic
-            # Of buildings there is neither filter nor exploration.
-            missing = [t for t in displays if not any(publishers(node, t) for node in nodes)]
-            allowed = ['compressed'] if scenario == 'mambo_turtlebot' else ['particles', 'truth']
-            assert all(any(word in topic for word in allowed) for topic in missing), missing
-            assert shown >= 2
-        finally:
-            for node in nodes:
-                node.destroy_node()
-            rclpy.shutdown(context=context)
+    nodes = [KINDS[kind].make(context) for kind in kinds]
+    assert all(node.trigger_configure().name == 'SUCCESS' for node in nodes)
+    shown = 0
+    for topic, wanted in displays.items():
+        for info in [i for node in nodes for i in publishers(node, topic)]:
+            shown += 1
+            offered = info.qos_profile
+            latched = offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            assert latched or wanted['Durability Policy'] == 'Volatile', topic
+            reliable = offered.reliability == ReliabilityPolicy.RELIABLE
+            assert reliable or wanted['Reliability Policy'] == 'Best Effort', topic
+    # Of buildings there is neither filter nor exploration.
+    missing = [t for t in displays if not any(publishers(node, t) for node in nodes)]
+    allowed = ['compressed'] if scenario == 'mambo_turtlebot' else ['particles', 'truth']
+    assert all(any(word in topic for word in allowed) for topic in missing), missing
+    assert shown >= 2
+    for node in nodes:
+        node.destroy_node()
 
 
 def publishers(node, topic):

@@ -3,9 +3,7 @@
 import time
 
 import pytest
-import rclpy
 from node_kinds import KINDS
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
@@ -16,7 +14,6 @@ from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE, UPDATES
 from maasi_filter.ros.run_node import executor_of
 from maasi_msgs.msg import AgentState, BatchMember, FilterUpdate, MeasurementBatch, PlanDecision
-from maasi_sim.run.domain import Domain
 
 SECOND = 1_000_000_000
 TIMEOUT = 0.3
@@ -91,14 +88,10 @@ class World(Node):
 
 
 @pytest.fixture
-def world():
-    with Domain() as domain:
-        context = Context()
-        rclpy.init(context=context, domain_id=domain.number)
-        made = World(context)
-        yield made
-        made.close()
-        rclpy.shutdown(context=context)
+def world(context):
+    made = World(context)
+    yield made
+    made.close()
 
 
 def test_a_batch_is_given_up_in_simulated_time(world):
