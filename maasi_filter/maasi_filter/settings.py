@@ -24,6 +24,8 @@ from maasi_filter.pmb.settings import PmbSettings
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Vector2 = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
 class Settings(BaseModel):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
+from maasi_filter.settings import EnvironmentSettings, SensorSettings, Settings, Vector3
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 
 
@@ -21,7 +21,7 @@ class PlannedRobotSettings(Settings):
         default_factory=SensorSettings, description='Its sensor, as the planner believes'
     )
     radius: float = Field(default=0.1, ge=0.0, description='Of a circle around the robot [m]')
-    start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
+    start: Vector3 = Field(
         default=[0.0, 0.0, 0.0],
         description='Position at the start; its height is that of the waypoints in 2D [m, map]',
     )
@@ -31,9 +31,7 @@ class OtherRobotSettings(Settings):
     """Settings of a robot with its own planner."""
 
     radius: float = Field(default=0.1, ge=0.0, description='Of a circle around the robot [m]')
-    start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
-        description='Position at the start [m, map]'
-    )
+    start: Vector3 = Field(description='Position at the start [m, map]')
 
 
 class PlannerNodeSettings(NodeSettings):

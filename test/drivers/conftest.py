@@ -20,6 +20,7 @@ from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_drivers.vision.marker_detector import MarkerDetector
+from maasi_filter.models.measurement import RangeBearing
 from maasi_filter.models.pose import Pose, quaternion_product
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import EnvironmentSettings
@@ -28,6 +29,7 @@ from maasi_sim.world.floor import RenderSettings, scene_of
 from maasi_sim.world.world import TargetSettings, World
 
 BOX = 0.2
+MODEL = RangeBearing()
 
 
 @dataclass(frozen=True)
@@ -120,19 +122,19 @@ def score(detector: MarkerDetector, frames: Iterator[Frame], gate: float = 0.03)
         seen = detector.detect(frame.image, frame.pose)
         expected += len(frame.in_box)
         distances = np.linalg.norm(frame.targets[:, None] - seen.positions[None], axis=2)
-        nearest = distances.min(axis=0) if len(seen) else np.empty(0)
+        nearest = distances.min(axis=0) if len(seen.values) else np.empty(0)
         false += int(np.count_nonzero(nearest > gate))
         for target in frame.in_box:
-            if not len(seen):
+            if not len(seen.values):
                 continue
             errors = seen.positions - target
             best = int(np.argmin(np.linalg.norm(errors, axis=1)))
             if np.linalg.norm(errors[best]) <= gate:
                 found += 1
                 squares.append(float(errors[best] @ errors[best]))
-                if not seen.blobs.border_cut[best]:
-                    covariance = seen.position_covariances[best]
-                    nees.append(float(errors[best] @ np.linalg.solve(covariance, errors[best])))
+                expected_value = MODEL.measure(target[None], frame.pose)[0]
+                error = MODEL.residual(seen.values[best], expected_value)
+                nees.append(float(error @ np.linalg.solve(seen.covariances[best], error)))
     return Score(
         found / max(expected, 1),
         false / max(count, 1),

@@ -67,5 +67,4 @@ def test_a_floor_without_markers_shows_none(drone):
     settings = drone(segmentation={'rule': 'aruco'})
     noise = np.random.default_rng(1).integers(90, 160, (settings.height, settings.width, 3))
     seen = MarkerDetector(settings).detect(noise.astype(np.uint8), Pose([0.0, 0.0, 1.0]))
-    assert len(seen) == 0
-    assert seen.blobs.identities == ()
+    assert len(seen.values) == 0 and seen.labels == ()

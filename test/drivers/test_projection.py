@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from marker_view import sees_whole
 from numpy.testing import assert_allclose
 
+from maasi_drivers.agent.sensor_reading import measured
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera, box_view_margin, rotation_from_rpy
-from maasi_drivers.vision.marker_detector import propagate, range_bearing
+from maasi_drivers.vision.detector import blobs_at
+from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
 from maasi_filter.models.pose import Pose
 
@@ -130,74 +131,38 @@ def quaternion(matrix):
 
 
 def test_covariance_covers_the_noise_of_pixels_and_pose():
-    view = camera(distortion=DISTORTION)
+    settings = {'distortion': DISTORTION, 'pixel_noise': 0.8, 'segmentation': {'rule': 'paper'}}
+    detector = MarkerDetector(CameraSettings.model_validate(settings))
     generator = np.random.default_rng(11)
     pose_covariance = np.diag([0.01, 0.02, 0.015, 0.01, 0.02, 0.03]) ** 2
     root = np.sqrt(pose_covariance)
     true = Pose.from_yaw([1.0, -0.5, 1.1], 0.7)
-    point = np.array([[1.1, -0.4, 0.0]])
+    point = np.array([[1.3, -0.4, 0.0]])
     nees = []
     for _ in range(600):
-        pixel = view.project(point, true) + generator.normal(0.0, 0.8, (1, 2))
+        pixel = detector.camera.project(point, true) + generator.normal(0.0, 0.8, (1, 2))
         error = root @ generator.standard_normal(6)
         rotation = cv2.Rodrigues(error[3:])[0] @ true.rotation()
         believed = Pose(true.position + error[:3], quaternion(rotation))
-        position, by_pixel, by_pose = view.back_project(pixel, believed)
-        covariance = propagate(by_pixel, 0.64 * np.eye(2), by_pose, pose_covariance)
-        offset = position[0] - point[0, :2]
-        nees.append(offset @ np.linalg.solve(covariance[0], offset))
+        seen = detector.detect(blobs_at(pixel, 0.0), believed, pose_covariance)
+        expected = RangeBearing().measure(point[:, :2], believed)[0]
+        offset = RangeBearing().residual(seen.values[0], expected)
+        nees.append(offset @ np.linalg.solve(seen.covariances[0], offset))
     assert 1.75 < np.mean(nees) < 2.25
-
-
-@pytest.mark.parametrize('wrong', [np.eye(3), np.full((6, 6), np.nan), np.full((6, 6), np.inf)])
-def test_a_wrong_pose_covariance_is_refused(wrong):
-    with pytest.raises(ValueError, match='pose_covariance: got'):
-        propagate(np.zeros((1, 2, 2)), np.eye(2), np.zeros((1, 2, 6)), wrong)
-
-
-def test_positions_of_a_wrong_shape_are_refused():
-    with pytest.raises(ValueError, match='positions: got an array of shape'):
-        camera().project([[1.0, 2.0]], DOWN)
 
 
 def test_nothing_in_nothing_out():
     view = camera(distortion=DISTORTION)
     assert view.project(np.empty((0, 3)), DOWN).shape == (0, 2)
     assert view.back_project(np.empty((0, 2)), DOWN)[0].shape == (0, 2)
-    values, covariances = range_bearing(np.empty((0, 2)), np.empty((0, 2, 2)), DOWN)
-    assert values.shape == (0, 2)
-    assert covariances.shape == (0, 2, 2)
 
 
-@pytest.mark.parametrize(
-    ('dimension', 'model'), [(2, RangeBearing()), (3, RangeBearingElevation())]
-)
-def test_range_and_bearing_agree_with_the_filters_model(dimension, model):
-    generator = np.random.default_rng(1)
-    pose = tilted_pose(5)
-    positions = pose.position[:2] + generator.uniform(-0.5, 0.5, (20, 2))
-    covariances = np.repeat(np.array([[[4e-6, 1e-6], [1e-6, 9e-6]]]), 20, axis=0)
-    values, result = range_bearing(positions, covariances, pose, dimension, floor_deviation=0.004)
-    floor = np.append(positions, np.zeros((20, 1)), axis=1)[:, :dimension]
-    assert_allclose(values, model.measure(floor, pose), atol=1e-12)
-    jacobian = model.jacobian(floor, pose)
-    full = np.zeros((20, 3, 3))
-    full[:, :2, :2] = covariances
-    full[:, 2, 2] = 0.004**2
-    expected = jacobian @ full[:, :dimension, :dimension] @ jacobian.transpose(0, 2, 1)
-    assert_allclose(result, expected, rtol=1e-2, atol=1e-9)
-    assert_allclose(result, result.transpose(0, 2, 1))
-    assert (np.linalg.eigvalsh(result) > 0).all()
-
-
-@pytest.mark.parametrize('dimension', [2, 3])
+@pytest.mark.parametrize('model', [RangeBearing(), RangeBearingElevation()])
 @pytest.mark.parametrize('offset', [0.0, 1e-9, 1e-4, 1e-3, 1e-2])
-def test_right_over_a_target_the_bearing_says_nothing(dimension, offset):
+def test_right_over_a_target_the_bearing_says_nothing(model, offset):
     sigma = 0.003
-    positions = np.array([[offset, 0.0]])
-    values, covariance = range_bearing(
-        positions, sigma**2 * np.eye(2)[None], DOWN, dimension, floor_deviation=0.005
-    )
+    places = np.array([[offset, 0.0, 0.0]])[:, : model.dimension]
+    values, covariance = measured(model, places, sigma**2 * np.eye(model.dimension)[None], DOWN)
     assert np.isfinite(values).all()
     assert np.isfinite(covariance).all()
     assert (np.linalg.eigvalsh(covariance[0]) > 0).all()
@@ -205,52 +170,34 @@ def test_right_over_a_target_the_bearing_says_nothing(dimension, offset):
     assert_allclose(covariance[0, 1, 1], expected, rtol=1e-6)
 
 
-def test_a_third_kind_of_dimension_is_refused():
-    with pytest.raises(ValueError, match='dimension: got 4'):
-        range_bearing(np.zeros((1, 2)), np.eye(2)[None], DOWN, 4)
-
-
-def test_the_default_camera_sees_the_drones_box_with_whole_markers():
-    box = ([-0.2, -0.2], [0.2, 0.2])
-    assert box_view_margin(camera(), *box, 1.0, 0.015) >= 0.0
-    assert box_view_margin(camera(focal_length=[300, 300]), *box, 1.0, 0.015) < 0.0
-    # Lower down it sees less.
-    assert box_view_margin(camera(), *box, 0.9, 0.015) < 0.0
-    # Turned by a quarter, the image's width lies along the robot.
-    turned = camera(mount={'rpy': [0.0, np.pi / 2, np.pi / 2]})
-    assert_allclose(
-        box_view_margin(turned, [-0.2, -0.27], [0.2, 0.27], 1.0),
-        box_view_margin(camera(), [-0.27, -0.2], [0.27, 0.2], 1.0),
-        atol=1e-9,
-    )
-
-
-def test_a_tilted_front_camera_sees_the_ground_robots_box():
-    assert box_view_margin(camera(**TILTED), [-0.1, -0.1], [0.2, 0.2], 0.0, 0.015) >= 0.0
-    assert box_view_margin(camera(**TILTED), [-0.3, -0.1], [0.2, 0.2], 0.0, 0.015) < 0.0
-    level = camera(mount={'position': [0.05, 0.0, 0.1], 'rpy': [0.0, 0.0, 0.0]})
-    assert box_view_margin(level, [-0.1, -0.1], [0.2, 0.2], 0.0) == -np.inf
-
-
-@pytest.mark.parametrize('changes', [{}, TILTED, {'distortion': DISTORTION}])
-def test_the_margin_of_a_box_is_that_of_its_worst_marker(changes):
-    view = camera(**changes)
-    height = 0.0 if 'mount' in changes else 1.0
-    pose = Pose.from_yaw([0.3, -0.2, height], 1.1)
-    low, high = np.array([-0.1, -0.1]), np.array([0.2, 0.2])
-    margin = box_view_margin(view, low, high, height, 0.015)
-    generator = np.random.default_rng(0)
-    inside = generator.uniform(low, high, (500, 2))
-    world = pose.position[:2] + inside @ pose.rotation()[:2, :2].T
-    assert (margin >= 0) == sees_whole(view, world, pose, 0.015).all()
-
-
 @pytest.mark.parametrize(
-    ('lower', 'upper'), [([0.2, 0], [0.1, 1]), ([np.nan, 0], [1, 1]), ([0, 0], [np.inf, 1])]
+    ('changes', 'low', 'high', 'height', 'fits'),
+    [
+        ({}, [-0.215, -0.215], [0.215, 0.215], 1.0, True),
+        ({'focal_length': [300, 300]}, [-0.215, -0.215], [0.215, 0.215], 1.0, False),
+        # Lower down it sees less.
+        ({}, [-0.215, -0.215], [0.215, 0.215], 0.9, False),
+        (TILTED, [-0.115, -0.115], [0.215, 0.215], 0.0, True),
+        (TILTED, [-0.3, -0.1], [0.2, 0.2], 0.0, False),
+        (
+            {'mount': {'position': [0.05, 0.0, 0.1], 'rpy': [0, 0, 0]}},
+            [-0.1] * 2,
+            [0.2] * 2,
+            0,
+            False,
+        ),
+        ({'distortion': DISTORTION}, [-0.115, -0.115], [0.215, 0.215], 1.0, True),
+    ],
 )
-def test_a_box_without_inside_is_refused(lower, upper):
-    with pytest.raises(ValueError, match='box field of view: got'):
-        box_view_margin(camera(), lower, upper, 1.0)
+def test_the_margin_of_a_box_is_that_of_its_worst_place(changes, low, high, height, fits):
+    view = camera(**changes)
+    pose = Pose.from_yaw([0.3, -0.2, height], 1.1)
+    inside = np.random.default_rng(0).uniform(low, high, (2000, 2))
+    world = np.pad(pose.position[:2] + inside @ pose.rotation()[:2, :2].T, ((0, 0), (0, 1)))
+    worst = view.margin(world, pose).min()
+    margin = box_view_margin(view, low, high, height)
+    assert (margin >= 0) == fits
+    assert margin == worst == -np.inf or worst - 3.0 < margin <= worst
 
 
 def test_fixed_axis_angles():

@@ -165,21 +165,6 @@ def test_noise_all_over_is_no_crash(rule):
         assert len(segment(np.full((120, 160, 3), level, dtype=np.uint8), rule)) == 0
 
 
-@pytest.mark.parametrize('rule', [PAPER, ROBUST])
-@pytest.mark.parametrize(
-    'image',
-    [
-        np.zeros((4, 4), np.uint8),
-        np.zeros((4, 4, 4), np.uint8),
-        np.zeros((4, 4, 3)),
-        np.zeros((0, 4, 3), np.uint8),
-    ],
-)
-def test_what_is_no_image_is_refused(rule, image):
-    with pytest.raises(ValueError, match='image: got an array of shape'):
-        segment(image, rule)
-
-
 def test_read_only_and_strided_images_give_the_same():
     image = draw_disc(floor(), 70.3, 50.8, 4.0)
     padded = np.zeros((120, 170, 3), dtype=np.uint8)

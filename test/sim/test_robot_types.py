@@ -1,5 +1,6 @@
 """The types of robots in config/robots."""
 
+import numpy as np
 import pytest
 
 from maasi_drivers.vision.camera_model import Camera, box_view_margin
@@ -41,12 +42,12 @@ def test_a_marker_in_the_field_of_view_is_in_the_image_as_a_whole(kind):
     robot = scenario(kind, (0.0, 0.0, 1.0 if kind == 'mambo' else 0.0)).robots['rover']
     box = robot.sensor.detection
     assert robot.camera is not None
+    radius = 0.5 * robot.camera.marker_diameter
     margin = box_view_margin(
         Camera.from_settings(robot.camera),
-        box.lower,
-        box.upper,
+        np.array(box.lower) - radius,
+        np.array(box.upper) + radius,
         robot.start[2],
-        0.5 * robot.camera.marker_diameter,
     )
     assert margin > 0.0
 

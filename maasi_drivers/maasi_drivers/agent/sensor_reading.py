@@ -28,10 +28,6 @@ class Sweep:
     values: FloatArray
     labels: tuple[Label, ...] = ()
 
-    def only(self, keep: BoolArray) -> Sweep:
-        """Return a copy with some of the returns."""
-        return Sweep(self.values[keep], selected(self.labels, keep))
-
 
 def selected(labels: tuple[Label, ...], keep: BoolArray) -> tuple[Label, ...]:
     """Return the labels where `keep` (m,) is true."""

@@ -9,7 +9,7 @@ import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from maasi_filter.plugins import OwnSettings, PluginGroup
-from maasi_filter.settings import Finite, Settings
+from maasi_filter.settings import Finite, Settings, Vector2, Vector3
 
 # Of a calibration: beyond these the camera cannot be one [px, px, -].
 _LARGEST_IMAGE, _LARGEST_INTRINSIC, _LARGEST_DISTORTION = 32_768, 1e6, 1e4
@@ -112,16 +112,12 @@ class MountSettings(Settings):
     straight down, the image's top towards the robot's front.
     """
 
-    position: list[Finite] = Field(
-        default_factory=lambda: [0.0, 0.0, 0.0],
-        min_length=3,
-        max_length=3,
+    position: Vector3 = Field(
+        default=[0.0, 0.0, 0.0],
         description="Optical centre in the robot's frame [m]",
     )
-    rpy: list[Finite] = Field(
-        default_factory=lambda: [0.0, 1.5707963267948966, 0.0],
-        min_length=3,
-        max_length=3,
+    rpy: Vector3 = Field(
+        default=[0.0, 1.5707963267948966, 0.0],
         description='Roll, pitch, yaw of the camera about fixed axes of the robot [rad]',
     )
 
@@ -137,10 +133,8 @@ class CameraSettings(Settings):
 
     width: int = Field(default=160, ge=8, le=16384, description='Image width [px]')
     height: int = Field(default=120, ge=8, le=16384, description='Image height [px]')
-    focal_length: list[Finite] = Field(
-        default_factory=lambda: [260.0, 260.0],
-        min_length=2,
-        max_length=2,
+    focal_length: Vector2 = Field(
+        default=[260.0, 260.0],
         description='Focal length along image x and y (beta_x, beta_y of 001, eq. (18)) [px]',
     )
     principal_point: list[Finite] | None = Field(

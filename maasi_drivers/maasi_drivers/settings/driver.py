@@ -10,7 +10,14 @@ from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.plugins import PluginGroup
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE, NodeSettings
-from maasi_filter.settings import EnvironmentSettings, Finite, SensorSettings, Settings
+from maasi_filter.settings import (
+    EnvironmentSettings,
+    Finite,
+    SensorSettings,
+    Settings,
+    Vector2,
+    Vector3,
+)
 from maasi_planner.settings import MotionSettings
 
 BatteryUnit = Literal['fraction', 'percent']
@@ -47,16 +54,12 @@ class RangingSettings(Settings):
         "'body': both in the frame of the sensor on the robot, as real ones give them, with slant "
         'ranges',
     )
-    position: list[Finite] = Field(
-        default_factory=lambda: [0.0, 0.0, 0.0],
-        min_length=3,
-        max_length=3,
+    position: Vector3 = Field(
+        default=[0.0, 0.0, 0.0],
         description="Of the sensor in the robot's frame, with frame body [m]",
     )
-    rpy: list[Finite] = Field(
-        default_factory=lambda: [0.0, 0.0, 0.0],
-        min_length=3,
-        max_length=3,
+    rpy: Vector3 = Field(
+        default=[0.0, 0.0, 0.0],
         description='Roll, pitch, yaw of the sensor about fixed axes of the robot, with frame body '
         '[rad]',
     )
@@ -65,10 +68,8 @@ class RangingSettings(Settings):
 class ScanSettings(Settings):
     """How a ground robot keeps clear of what its laser scanner sees."""
 
-    position: list[Finite] = Field(
-        default_factory=lambda: [0.0, 0.0],
-        min_length=2,
-        max_length=2,
+    position: Vector2 = Field(
+        default=[0.0, 0.0],
         description="Of the scanner in the robot's frame, x and y [m]",
     )
     yaw: Finite = Field(default=0.0, description="Of the scanner in the robot's frame [rad]")
@@ -115,10 +116,8 @@ class DriverSettings(NodeSettings):
     mavlink: MavlinkSettings | None = Field(
         default=None, description='With link mavlink: how, and what it may be made to do'
     )
-    start: list[Finite] = Field(
-        default_factory=lambda: [0.0, 0.0, 0.0],
-        min_length=3,
-        max_length=3,
+    start: Vector3 = Field(
+        default=[0.0, 0.0, 0.0],
         description='Position in the map where its odometry is zero [m]',
     )
     yaw: Finite = Field(default=0.0, description='Heading there, from the x axis of the map [rad]')

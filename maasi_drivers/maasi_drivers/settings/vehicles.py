@@ -6,12 +6,21 @@ import math
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.settings import Finite, Settings
+from maasi_filter.settings import Finite, Settings, Vector2
 
-Interval = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+
+def _ordered(intervals: list[list[float]]) -> list[list[float]]:
+    for interval in intervals:
+        if interval[0] >= interval[1]:
+            raise ValueError(f'got {interval}, allowed is a lowest below a highest value')
+    return intervals
+
+
+# Lowest and highest x, y and z.
+Fence = Annotated[list[Vector2], Field(min_length=3, max_length=3), AfterValidator(_ordered)]
 
 
 # Tilt that a Mambo lets itself be set to [rad].
@@ -112,7 +121,7 @@ class MamboSettings(Settings):
     battery_minimum: float = Field(
         default=0.1, ge=0.0, lt=1.0, description='Charge below which it lands [1]'
     )
-    geofence: Annotated[list[Interval], Field(min_length=3, max_length=3)] | None = Field(
+    geofence: Fence | None = Field(
         default=None,
         description='Lowest and highest x, y and z of goals, and of itself with half a metre to '
         'spare; none: the environment with the radius around it, from the ground to 1 m above '
@@ -122,15 +131,6 @@ class MamboSettings(Settings):
     def pose_covariance(self) -> FloatArray:
         """Return the covariance (6, 6) of a pose, by the settings' deviations [m^2, rad^2]."""
         return np.diag([self.position_noise**2] * 3 + [self.attitude_noise**2] * 3)
-
-    @model_validator(mode='after')
-    def _consistent(self) -> MamboSettings:
-        for interval in self.geofence or []:
-            if interval[0] >= interval[1]:
-                raise ValueError(
-                    f'geofence: got {interval}, allowed is a lowest below a highest value'
-                )
-        return self
 
 
 Ending = Literal['hold', 'land']
@@ -184,7 +184,7 @@ class MavlinkSettings(Settings):
     map_yaw: Finite = Field(
         default=0.0, description='Direction of the x axis of the map, from east to the left [rad]'
     )
-    geofence: Annotated[list[Interval], Field(min_length=3, max_length=3)] | None = Field(
+    geofence: Fence | None = Field(
         default=None,
         description='Lowest and highest x, y and z that it is sent to; none: the environment with '
         'the radius around it, in 2D 1 m above and below its heights at the start; for what '
@@ -230,11 +230,6 @@ class MavlinkSettings(Settings):
 
     @model_validator(mode='after')
     def _consistent(self) -> MavlinkSettings:
-        for interval in self.geofence or []:
-            if interval[0] >= interval[1]:
-                raise ValueError(
-                    f'geofence: got {interval}, allowed is a lowest below a highest value'
-                )
         if self.own_system == self.system:
             raise ValueError(
                 f'own_system: got {self.own_system}, allowed is another one than of the vehicle'

@@ -20,7 +20,7 @@ from maasi_drivers.settings.camera import CameraSettings, load_calibration
 from maasi_drivers.vision.camera_model import box_view_margin
 from maasi_drivers.vision.detector import Blobs
 from maasi_drivers.vision.images import ImageSourceError, VideoSource, decode_image, image_to_array
-from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers, warm_up
+from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers
 from maasi_drivers.vision.measurement_feed import FeedReceiver
 from maasi_filter.arrays import ImageArray
 from maasi_filter.models.detection import BoxDetection
@@ -111,12 +111,11 @@ class CameraInput(SensorInput[Picture]):
     def set_up(self) -> None:
         """Compile and connect."""
         driver, settings = self.driver, self.driver.settings
-        warm_up()
         grey = np.full((self.camera.height, self.camera.width, 3), 120, np.uint8)
         # Images are read-only views of messages.
         view = np.frombuffer(grey.tobytes(), np.uint8).reshape(grey.shape)
         height = max(settings.start[2], 0.1)
-        self._detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0), np.zeros((6, 6)))
+        self._detector.detect(view, Pose.from_yaw([0.0, 0.0, height], 0.0))
         if settings.image_source != 'topic':
             driver.create_wall_timer(_POLL_PERIOD, self._poll_source)
         quality = sensor_reader(settings.lockstep)

@@ -41,15 +41,6 @@ def _largest_radius(k: FloatArray) -> float:
     return float(np.sqrt(real.min())) if real.size else np.inf
 
 
-def _points(name: str, values: ArrayLike, columns: int) -> FloatArray:
-    points = np.atleast_2d(np.asarray(values, dtype=np.float64))
-    if points.size == 0:
-        return np.empty((0, columns))
-    if points.ndim != 2 or points.shape[1] != columns:
-        raise ValueError(f'{name}: got an array of shape {points.shape}, allowed (n, {columns})')
-    return points
-
-
 @dataclass(frozen=True)
 class Camera:
     """A calibrated camera mounted on a robot.
@@ -97,7 +88,7 @@ class Camera:
         Also outside the image; not a number for what is behind the camera or so far off its axis
         that the distortion model does not hold.
         """
-        points = _points('positions', positions, 3) - self.centre(pose)
+        points = np.reshape(np.asarray(positions, float), (-1, 3)) - self.centre(pose)
         points = points @ (pose.rotation() @ self.rotation)
         with np.errstate(invalid='ignore', divide='ignore'):
             x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
@@ -121,7 +112,7 @@ class Camera:
 
         In normalised coordinates; not a number where the distortion has no inverse.
         """
-        given = _points('pixels', pixels, 2)
+        given = np.reshape(np.asarray(pixels, float), (-1, 2))
         focal = self.matrix[[0, 1], [0, 1]]
         if not self.distortion.any():
             points = (given - self.matrix[:2, 2]) / focal
@@ -196,36 +187,17 @@ class Camera:
         return float(1.0 / np.sqrt(np.abs(np.linalg.det(by_pixel[0]))))
 
 
-# Points on the rim of a marker.
-_RIM_POINTS = 24
-
-
 def box_view_margin(
-    camera: Camera,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    robot_height: float,
-    marker_radius: float = 0.0,
+    camera: Camera, lower: ArrayLike, upper: ArrayLike, robot_height: float
 ) -> float:
-    """Return how far inside the image a box field of view lies, markers at its rim included.
+    """Return how far inside the image a box field of view lies.
 
     The distance to the border [px] is negative where a part of the box is not seen, minus infinity
     where it lies behind the camera. `lower` and `upper` are offsets from the robot [m].
     """
-    low = np.asarray(lower, dtype=np.float64)[:2]
-    high = np.asarray(upper, dtype=np.float64)[:2]
-    if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high)):
-        raise ValueError(
-            f'box field of view: got lower {low.tolist()}, upper {high.tolist()}, '
-            'allowed finite offsets with lower below upper'
-        )
+    (left, bottom), (right, top) = (np.asarray(corner, float)[:2] for corner in (lower, upper))
+    corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
     along = np.linspace(0.0, 1.0, 33)[:, None]
-    corners = np.array([[low[0], low[1]], [high[0], low[1]], high, [low[0], high[1]]])
-    rim = np.concatenate(
-        [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0))]
-    )
-    angles = np.arange(_RIM_POINTS) * (2.0 * np.pi / _RIM_POINTS)
-    circle = marker_radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    outline = (rim[:, None, :] + circle).reshape(-1, 2)
-    outline = np.concatenate([outline, np.zeros((len(outline), 1))], axis=1)
-    return float(camera.margin(outline, Pose.from_yaw([0.0, 0.0, robot_height], 0.0)).min())
+    sides = zip(corners, np.roll(corners, -1, axis=0))
+    rim = np.pad(np.concatenate([a + along * (b - a) for a, b in sides]), ((0, 0), (0, 1)))
+    return float(camera.margin(rim, Pose.from_yaw([0.0, 0.0, robot_height], 0.0)).min())

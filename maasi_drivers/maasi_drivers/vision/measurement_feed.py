@@ -28,7 +28,7 @@ HAS_POSE = 1
 
 _HEADER = struct.Struct('<4sBBHHHII')
 _POSE = struct.Struct('<7fI')
-_BLOB = struct.Struct('<8fI')
+_BLOB = np.dtype([('numbers', '<f4', 8), ('mark', '<u4')])
 _CHECKSUM = struct.Struct('<I')
 # Images older than this are dropped [s].
 _OLDEST = 10.0
@@ -103,15 +103,11 @@ def encode(packet: FeedPacket) -> bytes:
         pose = packet.pose
         angles = pose.roll, pose.pitch, pose.yaw
         data += _POSE.pack(*pose.position, *angles, pose.battery, pose.state)
-    for index in range(len(blobs)):
-        covariance = blobs.covariances[index]
-        numbers = [
-            *blobs.centroids[index],
-            *(covariance[0, 0], covariance[0, 1], covariance[1, 1]),
-            blobs.areas[index],
-            *blobs.extents[index],
-        ]
-        data += _BLOB.pack(*numbers, BORDER_CUT if blobs.border_cut[index] else 0)
+    rows = np.zeros(len(blobs), _BLOB)
+    spread = blobs.covariances.reshape(-1, 4)[:, [0, 1, 3]]
+    rows['numbers'] = np.column_stack([blobs.centroids, spread, blobs.areas, blobs.extents])
+    rows['mark'][blobs.border_cut] = BORDER_CUT
+    data += rows.tobytes()
     data += _CHECKSUM.pack(zlib.crc32(data))
     # Raises for what a receiver would refuse.
     decode(data)
@@ -133,7 +129,7 @@ def decode(data: bytes) -> FeedPacket:
     if count > MOST:
         raise FeedError(f'count: read {count}, allowed is at most {MOST}')
     begin = _HEADER.size + (_POSE.size if flags else 0)
-    size = begin + count * _BLOB.size + _CHECKSUM.size
+    size = begin + count * _BLOB.itemsize + _CHECKSUM.size
     if len(data) != size:
         raise FeedError(f'length: read {len(data)} bytes, allowed are {size} with {count} blobs')
     (checksum,) = _CHECKSUM.unpack_from(data, size - _CHECKSUM.size)
@@ -145,9 +141,8 @@ def decode(data: bytes) -> FeedPacket:
     if age > 1e6 * _OLDEST:
         raise FeedError(f'age: read {age} us, allowed is at most {1e6 * _OLDEST:.0f} us')
     pose = _read_pose(_POSE.unpack_from(data, _HEADER.size)) if flags else None
-    rows = list(_BLOB.iter_unpack(data[begin : size - _CHECKSUM.size]))
-    numbers = np.array([row[:8] for row in rows], dtype=float).reshape(count, 8)
-    marks = np.array([row[8] for row in rows], dtype=np.int64)
+    rows = np.frombuffer(data, _BLOB, count, begin)
+    numbers, marks = rows['numbers'].astype(float), rows['mark'].astype(np.int64)
     _check(numbers, marks, width, height)
     covariances = numbers[:, [2, 3, 3, 4]].reshape(count, 2, 2)
     blobs = Blobs(

@@ -24,23 +24,12 @@ _FLOOR_SAMPLES = 4096
 _DARK = 6.0
 
 
-def check_image(image: NDArray[np.generic]) -> ImageArray:
-    """Return an image fit for segmentation."""
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-        raise ValueError(
-            f'image: got an array of shape {image.shape} and type {image.dtype}, '
-            'allowed (height, width, 3) of uint8, channels R, G, B'
-        )
-    # One memory layout: kernels are compiled for the layouts that they meet.
-    return np.ascontiguousarray(image, dtype=np.uint8)
-
-
 def paper_mask(image: ImageArray, threshold: float = 35.0) -> ImageArray:
     """Return 1 where B - R/2 - G/2 > threshold, else 0 (001, eq. (16)).
 
     Computed in whole numbers of half grey levels, so nothing is rounded or clipped.
     """
-    red, green, blue = (plane.astype(np.int16) for plane in _planes(check_image(image)))
+    red, green, blue = (plane.astype(np.int16) for plane in _planes(image))
     return (2 * blue - red - green > int(np.floor(2.0 * threshold))).astype(np.uint8)
 
 
@@ -228,7 +217,8 @@ def segment_robust(image: ImageArray, settings: SegmentationSettings) -> Blobs:
 
     Shapes and units: image (h, w, 3).
     """
-    image = check_image(image)
+    # One memory layout: kernels are compiled for the layouts that they meet.
+    image = np.ascontiguousarray(image)
     gains, centre, deviation = _floor_statistics(image)
     threshold = max(settings.saturation, centre + settings.noise_factor * deviation)
     mask = np.empty(image.shape[:2], dtype=np.uint8)

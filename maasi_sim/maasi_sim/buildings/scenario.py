@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from maasi_filter.settings import Finite, Settings
+from maasi_filter.settings import Finite, Settings, Vector3
 from maasi_planner.buildings import (
     CoveragePlan,
     CuboidSettings,
@@ -40,9 +40,7 @@ class SearchRobotSettings(Settings):
     link: Literal['topics'] = Field(
         default='topics', description='How its planner reaches it; the other end is simulated'
     )
-    start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
-        description='Position at the start, and of its station, x y z [m, map]'
-    )
+    start: Vector3 = Field(description='Position at the start, and of its station, x y z [m, map]')
     yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
     dynamics: DynamicsSettings = Field(description='Its body')
     hazard: HazardSettings = Field(

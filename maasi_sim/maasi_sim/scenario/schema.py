@@ -14,12 +14,7 @@ from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.settings.driver import DRIVERS, BatteryUnit
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.models.sensor import Sensor
-from maasi_filter.settings import (
-    FilterSettings,
-    Finite,
-    SensorSettings,
-    Settings,
-)
+from maasi_filter.settings import FilterSettings, Finite, SensorSettings, Settings, Vector3
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.settings import CandidateSettings, MotionSettings, PlannerSettings
 from maasi_sim.emulators.mavlink.autopilot_settings import AutopilotSettings
@@ -65,9 +60,7 @@ class RobotSettings(Settings):
         default_factory=AutopilotSettings,
         description='With link mavlink: its autopilot, simulated; or external: another program',
     )
-    start: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
-        description='Position at the start, x y z [m, map]'
-    )
+    start: Vector3 = Field(description='Position at the start, x y z [m, map]')
     yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
     radius: float = Field(default=0.1, gt=0.0, description='Of a circle around the robot [m]')
     candidates: CandidateSettings = Field(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from maasi_filter.settings import Finite, Settings
+from maasi_filter.settings import Settings, Vector3
 from maasi_sim.world.world import World, noise_stream
 
 
@@ -31,16 +31,12 @@ class RenderSettings(Settings):
     """Disturbances of the simulated camera: moderate by default, none with `ideal()`."""
 
     marker_diameter: float = Field(default=0.03, gt=0, description='Diameter of the markers [m]')
-    marker_colour: list[Finite] = Field(
-        default_factory=lambda: [0.08, 0.17, 0.62],
-        min_length=3,
-        max_length=3,
+    marker_colour: Vector3 = Field(
+        default=[0.08, 0.17, 0.62],
         description='Reflectance of the markers in R, G, B, 0 to 1',
     )
-    floor_colour: list[Finite] = Field(
-        default_factory=lambda: [0.47, 0.47, 0.46],
-        min_length=3,
-        max_length=3,
+    floor_colour: Vector3 = Field(
+        default=[0.47, 0.47, 0.46],
         description='Reflectance of the floor in R, G, B, 0 to 1',
     )
     floor_texture: float = Field(
