@@ -17,7 +17,7 @@ from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import FROZEN_POSE, ODOMETRY, STOP, RobotNode
 from maasi_drivers.agent.robot_topics import PoseTopic
 from maasi_drivers.agent.sensor_input import SensorInput
-from maasi_drivers.agent.watchdog import PERIOD, BatteryWatch, StatePublisher, Watchdog
+from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_filter.models.pose import Pose
 from maasi_filter.ros.conversions import stamp_from_ros
@@ -37,8 +37,8 @@ class AgentDriver(RobotNode):
     """The driver of a robot, in the robot's namespace.
 
     It is composed of a link to the robot, a sensor, and parts with one concern each: `GoalServer`
-    (action `go_to`), `MeasurementResponder`, `StatePublisher`, `Watchdog`, `BatteryWatch`,
-    `RobotFrames`; their documentation lists topics and actions.
+    (action `go_to`), `MeasurementResponder`, `StatePublisher`, `Watchdog`, `RobotFrames`; their
+    documentation lists topics and actions.
 
     Subscribes
     ----------
@@ -102,9 +102,8 @@ class AgentDriver(RobotNode):
         self._motion = self.link.make_motion()
         self.follower = WaypointFollower(self._motion)
         self._pose_speed = PoseSpeed()
-        self._battery = BatteryWatch(self)
-        self._state = StatePublisher(self, self._battery)
-        self._watchdog = Watchdog(self, self.link, self.sensor_input, self._state, self._battery)
+        self._state = StatePublisher(self)
+        self._watchdog = Watchdog(self, self.link, self.sensor_input, self._state)
         self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
         self._frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
         self._goals = GoalServer(self, self.link, self._frames)
@@ -194,7 +193,7 @@ class AgentDriver(RobotNode):
         return {
             'goal': f'{self._state.goal_id}: {self.follower.status.name}',
             'fault': self.health.text,
-            'battery': f'{self._battery.charge:.2f}',
+            'battery': f'{self._state.charge:.2f}',
             'open batches': self._responder.open_batches,
             **{f'detections left out: {key}': number for key, number in left_out.items()},
             **self.link.status(),
@@ -206,8 +205,7 @@ class AgentDriver(RobotNode):
         """Take the robot's pose, and do the control step for it."""
         self.link.observe(placed)
         self.silence.end()
-        if self.health.end(ODOMETRY):
-            self.get_logger().info(f'{self.pose_name}: received again')
+        if self.health.end(ODOMETRY, f'{self.pose_name}: received again'):
             self._watchdog.pose_is_back()
         if self.settings.lockstep:
             self.history.add(placed)
@@ -229,7 +227,7 @@ class AgentDriver(RobotNode):
 
     def take_charge(self, charge: float) -> None:
         """Take the charge of the battery, 0 to 1; anything else is unknown."""
-        self._battery.take(charge)
+        self._watchdog.take_charge(charge)
 
     def take_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
         """Take an image or sweep; see `RobotNode.take_frame`."""
@@ -302,8 +300,7 @@ class AgentDriver(RobotNode):
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._stop_latched = True
         if self.configured:
-            if self.health.begin(STOP, STOPPED):
-                self.get_logger().warning(STOPPED)
+            self.health.begin(STOP, STOPPED)
             if self.active and not self.settings.lockstep:
                 self.link.hold()
             self.link.latch_stop()
@@ -313,8 +310,8 @@ class AgentDriver(RobotNode):
 
     def _on_release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         was, self._stop_latched = self._stop_latched, False
-        if self.configured and self.health.end(STOP):
-            self.get_logger().info('released: goals are accepted')
+        if self.configured:
+            self.health.end(STOP, 'released: goals are accepted')
         response.success = True
         response.message = 'the robot takes goals' if was else 'the robot was not stopped'
         return response

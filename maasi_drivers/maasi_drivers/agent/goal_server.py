@@ -120,9 +120,17 @@ class GoalServer:
 
     def _answer(self, handle: ServerGoalHandle) -> None:
         """Take a goal, or abort it with the reason."""
-        problem = self.problem(handle.request)
+        request = handle.request
+        problem = self.problem(request)
         # After `problem`, which transforms the waypoint into the map.
-        goal = _goal_of(handle)
+        point = request.waypoint.pose.position
+        goal = Goal(
+            id=int(request.goal_id),
+            step=int(request.step),
+            waypoint=np.array([point.x, point.y, point.z]),
+            tolerance=float(request.tolerance),
+            handle=handle,
+        )
         if problem is not None:
             self._driver.drop('goal', f'go_to: {problem}')
             goal.status, goal.reason = GoalStatus.ABORTED, problem
@@ -157,15 +165,3 @@ class GoalServer:
         latest = self._driver.history.latest
         result.pose = pose_to_ros(self._driver.start_pose if latest is None else latest.pose)
         return result
-
-
-def _goal_of(handle: ServerGoalHandle) -> Goal:
-    request = handle.request
-    point = request.waypoint.pose.position
-    return Goal(
-        id=int(request.goal_id),
-        step=int(request.step),
-        waypoint=np.array([point.x, point.y, point.z]),
-        tolerance=float(request.tolerance),
-        handle=handle,
-    )

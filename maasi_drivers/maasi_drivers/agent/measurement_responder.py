@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
@@ -22,8 +22,6 @@ from maasi_filter.ros.conversions import (
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import DetectionArray, MeasurementBatch
 
-DataT = TypeVar('DataT')
-
 
 @dataclass(frozen=True)
 class MeasurementRequest:
@@ -37,16 +35,8 @@ class MeasurementRequest:
     measurement: int
 
 
-@dataclass(frozen=True)
-class Frame(Generic[DataT]):
-    """An image, or a sweep of another sensor, with its stamp [ns]."""
-
-    stamp: int
-    data: DataT
-
-
-class MeasurementQueue(Generic[DataT]):
-    """Matches requests, images and poses, in any order of arrival.
+class MeasurementQueue:
+    """Matches requests, images (or sweeps) and poses, in any order of arrival.
 
     An image answers one request at most: it is one measurement.
 
@@ -58,30 +48,26 @@ class MeasurementQueue(Generic[DataT]):
     ) -> None:
         self.history = history
         self.offset = offset
-        self._frames: deque[Frame[DataT]] = deque(maxlen=frames)
-        self._requests: deque[MeasurementRequest] = deque()
+        # Stamp [ns] and data of images.
+        self._frames: deque[tuple[int, Any]] = deque(maxlen=frames)
+        self._requests: list[MeasurementRequest] = []
         self._capacity = requests
-        self._next: MeasurementRequest | None = None
         #: Stamp of the last image [ns].
         self.latest: int | None = None
 
     def __len__(self) -> int:
         return len(self._requests)
 
-    def add_frame(self, frame: Frame[DataT]) -> None:
+    def add_frame(self, stamp: int, data: Any) -> None:
         """Add an image, later than all before."""
-        self._frames.append(frame)
-        self.latest = frame.stamp
+        self._frames.append((stamp, data))
+        self.latest = stamp
 
-    def add_request(self, request: MeasurementRequest) -> list[MeasurementRequest]:
-        """Add a request, unless it waits already; return those that are dropped for it."""
-        if request in self._requests:
-            return []
-        self._requests.append(request)
-        dropped = []
-        while len(self._requests) > self._capacity:
-            dropped.append(self._requests.popleft())
-        return dropped
+    def add_request(self, request: MeasurementRequest) -> MeasurementRequest | None:
+        """Add a request, unless it waits already; return one that is dropped for it."""
+        if request not in self._requests:
+            self._requests.append(request)
+        return self._requests.pop(0) if len(self._requests) > self._capacity else None
 
     def clear(self) -> None:
         """Discard everything, as after a jump of the clock."""
@@ -89,8 +75,8 @@ class MeasurementQueue(Generic[DataT]):
         self._requests.clear()
         self.latest = None
 
-    def next(self) -> tuple[MeasurementRequest, Frame[DataT], StampedPose] | None:
-        """Return the next request that can be answered, its image and the pose then.
+    def next(self) -> tuple[MeasurementRequest, int, Any, StampedPose] | None:
+        """Return the next request that can be answered, stamp and image for it, and the pose then.
 
         The image is taken; the request stays until `answered`, so that another image can take the
         place of one that turns out bad. None while something is awaited.
@@ -99,25 +85,21 @@ class MeasurementQueue(Generic[DataT]):
         if not self._requests or latest is None:
             return None
         # The earliest one: a request for a later time must not block others.
-        request = self._next = min(self._requests, key=lambda item: item.stamp)
+        request = min(self._requests, key=lambda item: item.stamp)
         while self._frames:
-            frame = self._frames[0]
-            if frame.stamp >= request.stamp:
-                stamp = frame.stamp + self.offset
-                if stamp > latest.stamp:
-                    return None
-                pose = self.history.at(stamp)
-                if pose is not None:
-                    self._frames.popleft()
-                    return request, frame, pose
-            # Before the request, or before the first pose: no use any more.
+            stamp, data = self._frames[0]
+            if request.stamp <= stamp and stamp + self.offset > latest.stamp:
+                return None
             self._frames.popleft()
+            pose = self.history.at(stamp + self.offset)
+            # Before the request, or before the first pose, an image is of no use any more.
+            if request.stamp <= stamp and pose is not None:
+                return request, stamp, data, pose
         return None
 
-    def answered(self) -> None:
-        """Take off the request that `next` returned."""
-        if self._next is not None and self._next in self._requests:
-            self._requests.remove(self._next)
+    def answered(self, request: MeasurementRequest) -> None:
+        """Take off a request that `next` returned."""
+        self._requests.remove(request)
 
 
 # How far stamps of images or batches may be ahead of the odometry [ns].
@@ -140,7 +122,7 @@ class MeasurementResponder:
         self._driver = driver
         self._sensor = sensor
         self._watchdog = watchdog
-        self._queue: MeasurementQueue[Any] = MeasurementQueue(driver.history, sensor.offset)
+        self._queue = MeasurementQueue(driver.history, sensor.offset)
         self._answer: DetectionArray | None = None
         self.left_out: Counter[str] = Counter()
 
@@ -181,21 +163,21 @@ class MeasurementResponder:
             )
             self._queue.clear()
         self._watchdog.note_frame(topic, repeated)
-        self._queue.add_frame(Frame(stamp, data))
+        self._queue.add_frame(stamp, data)
         self.serve()
 
     def serve(self) -> None:
         """Answer the batches whose image and pose are known."""
         while (found := self._queue.next()) is not None:
-            request, frame, pose = found
+            request, stamp, data, pose = found
             try:
-                reading = self._sensor.detect(frame.data, pose)
+                reading = self._sensor.detect(data, pose)
             except ValueError as error:
                 # No empty answer: a miss is information. The next image answers instead.
                 self._driver.drop('image', str(error))
                 continue
-            self._queue.answered()
-            self._publish(request, frame.stamp, pose, reading)
+            self._queue.answered(request)
+            self._publish(request, stamp, pose, reading)
 
     def _on_batch(self, message: MeasurementBatch) -> None:
         driver = self._driver
@@ -219,7 +201,7 @@ class MeasurementResponder:
         for member in message.members:
             if member.robot == driver.robot:
                 request = MeasurementRequest(int(message.id), stamp, int(member.measurement))
-                for old in self._queue.add_request(request):
+                if (old := self._queue.add_request(request)) is not None:
                     driver.drop('batch', f'batch {old.batch}: no image for it, too many newer ones')
                 self.serve()
                 return

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.pose import Pose, compose, inverse
+from maasi_filter.models.pose import Pose, compose, finite_vector, inverse
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,6 @@ class StampedPose:
     covariance: FloatArray
     velocity: FloatArray
     angular_velocity: FloatArray
-
-
-def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    array = np.array(value, dtype=float)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(
-            f'{name}: got {array.tolist()}, allowed are finite numbers of shape {shape}'
-        )
-    return array
 
 
 class MapOdometry:
@@ -93,21 +84,20 @@ class MapOdometry:
         if covariance is not None:
             turn = np.zeros((6, 6))
             turn[:3, :3] = turn[3:, 3:] = self._turn
-            matrix = turn @ _finite('covariance', covariance, (6, 6)) @ turn.T
+            matrix = turn @ finite_vector('covariance', np.ravel(covariance), 36).reshape(6, 6)
+            matrix = matrix @ turn.T
         placed = compose(self.map_from_odom, pose)
         return StampedPose(
             stamp,
             placed,
             matrix,
-            placed.rotation() @ _finite('velocity', velocity, (3,)),
-            _finite('angular_velocity', angular_velocity, (3,)),
+            placed.rotation() @ finite_vector('velocity', velocity, 3),
+            finite_vector('angular_velocity', angular_velocity, 3),
         )
 
 
 def interpolate(first: StampedPose, second: StampedPose, stamp: int) -> StampedPose:
     """Return the pose at a stamp between two others: position linear, orientation by slerp."""
-    if not first.stamp <= stamp <= second.stamp:
-        raise ValueError(f'stamp: got {stamp}, allowed from {first.stamp} to {second.stamp} [ns]')
     if stamp == first.stamp:
         return first
     if stamp == second.stamp:
@@ -139,8 +129,6 @@ class PoseHistory:
     """A robot's latest poses, to look up its pose when an image was taken."""
 
     def __init__(self, length: int = 512) -> None:
-        if length < 2:
-            raise ValueError(f'length: got {length}, allowed is at least 2')
         self.length = length
         self._stamps: list[int] = []
         self._poses: list[StampedPose] = []

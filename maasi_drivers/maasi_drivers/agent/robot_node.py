@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from std_srvs.srv import Trigger
 
 from maasi_drivers.agent.odometry import MapOdometry, PoseHistory, StampedPose
@@ -65,7 +66,8 @@ BATTERY, STOP = 'battery', 'stop'
 class Health:
     """The present faults of a robot; without any it can follow goals."""
 
-    def __init__(self, on_fault: Callable[[str], None]) -> None:
+    def __init__(self, logger: RcutilsLogger, on_fault: Callable[[str], None]) -> None:
+        self._logger = logger
         self._on_fault = on_fault
         self._faults: dict[str, str] = {}
 
@@ -82,16 +84,20 @@ class Health:
         return self._faults.get(kind, '')
 
     def begin(self, kind: str, text: str) -> bool:
-        """Set a fault, or the text of one that is set; return whether it is new."""
+        """Set a fault, or the text of one that is set; return whether it is new, and log it."""
         new = kind not in self._faults
         self._faults[kind] = text
         if new:
+            self._logger.warning(f'{text}: the robot takes no goals')
             self._on_fault(text)
         return new
 
-    def end(self, kind: str) -> bool:
-        """Clear a fault; return whether it was set."""
-        return self._faults.pop(kind, None) is not None
+    def end(self, kind: str, recovered: str = '') -> bool:
+        """Clear a fault; return whether it was set, and log what has recovered."""
+        was = self._faults.pop(kind, None) is not None
+        if was and recovered:
+            self._logger.info(recovered)
+        return was
 
 
 _POSE_NAMES = {'odometry': 'odometry', 'tf': 'pose on tf', 'pose': 'pose'}
@@ -152,7 +158,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         self.sensor = settings.sensor.build(self.robot, self.dimension)
         self.start_pose = Pose.from_yaw(settings.start, settings.yaw)
         self.history = PoseHistory()
-        self.health = Health(self._on_fault)
+        self.health = Health(self.get_logger(), self._on_fault)
         self.silence = Silence(self)
         self.arrivals = ArrivalClock()
         self.map_odometry: MapOdometry | None = None
@@ -253,10 +259,8 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
             Logged when the fault ends.
         """
         if problem:
-            if self.health.begin(kind, problem):
-                self.get_logger().warning(problem)
-        elif self.health.end(kind):
-            self.get_logger().info(recovered)
+            self.health.begin(kind, problem)
+        elif self.health.end(kind, recovered):
             # The position that it held is outdated.
             self.follower.stay()
 

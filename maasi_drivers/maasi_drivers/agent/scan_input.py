@@ -46,14 +46,8 @@ def scan_points(
     Shapes and units: angles [rad]; seconds_per_beam [s]; mount (3,) [m, rad].
     """
     distances = np.asarray(ranges, dtype=float)
-    fields = {
-        'angle_min': angles[0],
-        'angle_increment': angles[1],
-        'range_min': limits[0],
-        'range_max': limits[1],
-        'time_increment': seconds_per_beam,
-    }
-    for name, value in fields.items():
+    names = ('angle_min', 'angle_increment', 'range_min', 'range_max', 'time_increment')
+    for name, value in zip(names, (*angles, *limits, seconds_per_beam), strict=True):
         if not math.isfinite(value):
             raise ValueError(f'{name}: read {value}, allowed are finite numbers')
     if not len(distances):
@@ -235,9 +229,7 @@ class ScanInput:
             self._scanned_at = placed.stamp
         age = 1e-9 * (placed.stamp - self._scanned_at)
         if age > self._settings.timeout:
-            text = f'no scan for {age:.1f} s'
-            if self._driver.health.begin(_SCAN, text):
-                self._driver.get_logger().warning(f'{text}: stopping the robot')
+            self._driver.health.begin(_SCAN, f'no scan for {age:.1f} s')
 
     def is_blocked(self, placed: StampedPose) -> bool:
         """Return whether the robot has made no progress to its waypoint for `blocked_timeout`."""
@@ -292,5 +284,4 @@ class ScanInput:
             return
         self._motion.see(points)
         self._scanned_at = latest.stamp
-        if driver.health.end(_SCAN):
-            driver.get_logger().info('scan: received again')
+        driver.health.end(_SCAN, 'scan: received again')

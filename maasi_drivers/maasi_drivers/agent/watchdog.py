@@ -12,43 +12,6 @@ from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_filter.ros.qos import LIVELINESS_PERIOD, LIVELY
 from maasi_msgs.msg import AgentState
 
-# Time without a charge after which a warning says that `battery_minimum` cannot act [s].
-_CHARGE_PATIENCE = 10.0
-
-
-class BatteryWatch:
-    """Keeps the last known charge, and compares it with `battery_minimum`."""
-
-    def __init__(self, driver: RobotNode) -> None:
-        self._driver = driver
-        self.charge = -1.0
-        self._known_at = time.monotonic()
-
-    def take(self, charge: float) -> None:
-        """Take a charge, 0 to 1; anything else is unknown and leaves a fault as it is."""
-        self.charge = charge if 0.0 <= charge <= 1.0 else -1.0
-        if self.charge < 0.0:
-            return
-        self._known_at = time.monotonic()
-        minimum, health = self._driver.settings.battery_minimum, self._driver.health
-        if not minimum:
-            return
-        if self.charge >= minimum:
-            health.end(BATTERY)
-            return
-        text = f'battery at {self.charge:.2f}, below {minimum:.2f}'
-        if health.begin(BATTERY, text):
-            self._driver.get_logger().warning(f'{text}: the robot takes no goals')
-
-    def check(self, now: float) -> None:
-        """Warn where the charge has been unknown for long; `now` on the steady clock [s]."""
-        unknown = now - self._known_at
-        if self._driver.settings.battery_minimum and unknown > _CHARGE_PATIENCE:
-            self._driver.warn_throttled(
-                'battery',
-                f'no charge of the battery for {unknown:.0f} s: battery_minimum cannot act',
-            )
-
 
 class StatePublisher:
     """Publishes pose, goal and faults of a robot.
@@ -58,9 +21,10 @@ class StatePublisher:
     `state` (maasi_msgs/AgentState), with each pose; its liveliness is asserted by the executor
     """
 
-    def __init__(self, driver: RobotNode, battery: BatteryWatch) -> None:
+    def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
-        self._battery = battery
+        #: Of the battery; -1: not known.
+        self.charge = -1.0
         self._state = AgentState(robot=driver.robot, battery=-1.0)
         self._state.header.frame_id = driver.settings.frame
         self._state.pose.pose = pose_to_ros(driver.start_pose)
@@ -100,7 +64,7 @@ class StatePublisher:
         if step is not None:
             state.step = step
         goal, fault = follower.goal, self._driver.health.text
-        state.battery = self._battery.charge
+        state.battery = self.charge
         state.goal_id = 0 if goal is None else goal.id
         state.goal_status = int(follower.status)
         state.reason = '' if goal is None else goal.reason
@@ -117,34 +81,28 @@ class StatePublisher:
 PERIOD = 0.1
 # Checks per published state of a robot without odometry.
 _CHECKS_PER_STATE = 2
-# Time without a first pose after which a warning is logged [s].
-_PATIENCE = 3.0
+# Time without a first pose, or without a charge, after which a warning is logged [s].
+_PATIENCE, _CHARGE_PATIENCE = 3.0, 10.0
 # Wall time beyond its timeout after which a robot with silent odometry is stopped without a
 # fault: a simulated clock may be slow [s].
 _CLOCK_PATIENCE = 0.5
 
 
 class Watchdog:
-    """Stops a robot without odometry, with a frozen pose or with a silent sensor."""
+    """Stops a robot without odometry, with a frozen pose, a silent sensor or a low battery."""
 
     def __init__(
-        self,
-        driver: RobotNode,
-        link: RobotLink,
-        sensor: SensorInput,
-        state: StatePublisher,
-        battery: BatteryWatch,
+        self, driver: RobotNode, link: RobotLink, sensor: SensorInput, state: StatePublisher
     ) -> None:
         self._driver = driver
         self._link = link
         self._sensor = sensor
         self._state = state
-        self._battery = battery
         self.moving = False
         # Stamps of the last change of the pose, and of the pose at the last image [ns].
         self._changed_at = 0
         self._sensed_at: int | None = None
-        self._checked_at = time.monotonic()
+        self._checked_at = self._charged_at = time.monotonic()
         self._stalled = False
         self._checks = 0
 
@@ -166,7 +124,12 @@ class Watchdog:
             # This process was suspended: odometry may be waiting in the queue.
             return
         self._link.poll()
-        self._battery.check(now)
+        if driver.settings.battery_minimum and now - self._charged_at > _CHARGE_PATIENCE:
+            driver.warn_throttled(
+                'battery',
+                f'no charge of the battery for {now - self._charged_at:.0f} s: battery_minimum '
+                'cannot act',
+            )
         health, silence = driver.health, driver.silence
         age, timeout = silence.length, driver.settings.odometry_timeout
         if driver.history.latest is None and ODOMETRY not in health:
@@ -174,9 +137,7 @@ class Watchdog:
             if wall > _PATIENCE and self._link.expects_pose():
                 driver.warn_throttled('no odometry', f'no {driver.pose_name} yet, for {wall:.0f} s')
         elif age > timeout or ODOMETRY in health:
-            text = f'no {driver.pose_name} for {age:.1f} s'
-            if health.begin(ODOMETRY, text):
-                driver.get_logger().warning(f'{text}: stopping the robot')
+            if health.begin(ODOMETRY, f'no {driver.pose_name} for {age:.1f} s'):
                 self._checks = 0
             self._link.hold()
             if self._checks % _CHECKS_PER_STATE == 0:
@@ -190,6 +151,18 @@ class Watchdog:
         self._check_frozen(placed)
         self._check_sensor(placed)
 
+    def take_charge(self, charge: float) -> None:
+        """Take a charge, 0 to 1; anything else is unknown and leaves a fault as it is."""
+        self._state.charge = charge if 0.0 <= charge <= 1.0 else -1.0
+        if self._state.charge < 0.0:
+            return
+        self._charged_at = time.monotonic()
+        minimum, health = self._driver.settings.battery_minimum, self._driver.health
+        if charge < minimum:
+            health.begin(BATTERY, f'battery at {charge:.2f}, below {minimum:.2f}')
+        else:
+            health.end(BATTERY)
+
     def pose_is_back(self) -> None:
         """Begin the sensor's timeout anew: it may have been silent with the odometry."""
         self._sensed_at = None
@@ -202,24 +175,21 @@ class Watchdog:
         # A robot at rest may see the same twice; a sensor that hung has to deliver something new.
         if not repeated or not (self.moving or SENSOR in health):
             self._sensed_at = latest.stamp
-            if health.end(SENSOR):
-                self._driver.get_logger().info(f'{topic}: received again')
+            health.end(SENSOR, f'{topic}: received again')
 
     def _check_frozen(self, placed: StampedPose) -> None:
         """Stop a robot whose pose stays the same to the bit under a command to move."""
         driver = self._driver
         timeout, before = driver.settings.frozen_pose_timeout, driver.history.latest
         same = before is not None and placed.pose == before.pose
-        if not same and driver.health.end(FROZEN_POSE):
-            driver.get_logger().info('the pose changes again')
+        if not same:
+            driver.health.end(FROZEN_POSE, 'the pose changes again')
         if not timeout or not same or not self.moving:
             self._changed_at = placed.stamp
             return
         age = 1e-9 * (placed.stamp - self._changed_at)
         if age > timeout:
-            text = f'the pose has not changed for {age:.1f} s'
-            if driver.health.begin(FROZEN_POSE, text):
-                driver.get_logger().warning(f'odom: {text}: stopping the robot')
+            driver.health.begin(FROZEN_POSE, f'the pose has not changed for {age:.1f} s')
 
     def _check_sensor(self, placed: StampedPose) -> None:
         """Stop a robot whose sensor is silent."""
@@ -228,6 +198,4 @@ class Watchdog:
             self._sensed_at = placed.stamp
         age = 1e-9 * (placed.stamp - self._sensed_at)
         if timeout and age > timeout:
-            text = f'no new {self._sensor.name} for {age:.1f} s'
-            if self._driver.health.begin(SENSOR, text):
-                self._driver.get_logger().warning(f'{text}: stopping the robot')
+            self._driver.health.begin(SENSOR, f'no new {self._sensor.name} for {age:.1f} s')
