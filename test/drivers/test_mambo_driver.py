@@ -22,7 +22,7 @@ from waiting import wait_until
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.agent.watchdog import PERIOD as WATCH_PERIOD
 from maasi_drivers.drivers import MamboDriver, TurtlebotDriver
-from maasi_drivers.links.mambo.mambo_robot_link import _POLL_PERIOD
+from maasi_drivers.links.mambo.mambo_robot_link import POLL_PERIOD
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_drivers.vision.camera_model import Camera
@@ -282,7 +282,7 @@ def test_what_is_waited_for_is_short_enough():
     settings, firmware = MamboSettings(), FirmwareSettings()
     sensors = 0.5
     assert settings.link_timeout > sensors
-    assert settings.link_timeout + 2.0 * _POLL_PERIOD + WATCH_PERIOD <= LATEST
+    assert settings.link_timeout + 2.0 * POLL_PERIOD + WATCH_PERIOD <= LATEST
     # Without new commands its firmware has it hover.
     assert firmware.command_timeout <= LATEST
 

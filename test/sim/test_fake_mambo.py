@@ -270,7 +270,7 @@ def test_pyparrot_flies_it(pair):
     wait_until(lambda: link.position.position[0] > 0.1)
     forward, left, up = link.position.position
     assert 0.02 < left < forward and up > 0.6
-    link.hover()
+    link.steer(0.0, 0.0, 0.0, 0.0)
     link.land()
     wait_until(lambda: link.flying_state == 'landed')
     assert fake.refused == 0

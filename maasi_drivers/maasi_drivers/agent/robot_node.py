@@ -282,7 +282,7 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         """
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            problem = arm() if self.active else 'the driver is not active'
+            problem = self.arm_problem() or arm()
             response.success = not problem
             if problem:
                 response.message = problem

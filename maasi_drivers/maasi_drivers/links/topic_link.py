@@ -11,7 +11,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from maasi_drivers.agent.flight_rules import fence_problem, make_vehicle_fence
+from maasi_drivers.agent.flight_rules import fence_problem, make_fence
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
@@ -129,9 +129,7 @@ class TopicLink(RobotLink):
         super().__init__(driver)
         settings = driver.settings
         # In the plane the bounds of the environment have no heights.
-        self._fence = make_vehicle_fence(
-            None, driver.bounds, settings.radius, 0.0, settings.start[2]
-        )
+        self._fence = make_fence(None, driver.bounds, settings.radius, 0.0, settings.start[2])
         self._publisher: CommandPublisher | None = None
         self._polls = 0
         # Whether it has a guard, and whether it had one.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maasi_drivers.agent.flight_rules import make_fence, make_vehicle_fence
+from maasi_drivers.agent.flight_rules import make_fence
 from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
 from maasi_filter.settings import DETECTIONS
 from maasi_planner.settings import PlannerSettings
@@ -115,9 +115,8 @@ def _fence(robot: RobotSettings, scenario: Scenario) -> NDArray[np.float64] | No
         return None
     flies = robot.link == 'mambo_wifi'
     settings = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
-    make = make_fence if flies else make_vehicle_fence
     bounds = scenario.environment.array()
-    return make(settings.geofence, bounds, robot.radius, settings.ground, robot.start[2])
+    return make_fence(settings.geofence, bounds, robot.radius, settings.ground, robot.start[2])
 
 
 def _buildings(scenario: CuboidScenario) -> Scene:

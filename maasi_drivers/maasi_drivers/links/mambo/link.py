@@ -35,6 +35,8 @@ _ROUND = 0.05
 CALLER_TIMEOUT = 0.5
 # From one take-off or landing command to the next while the drone does not obey [s].
 _REPEAT = 0.7
+# Age of what was heard last after which a reported landing does not count [s].
+_OUTDATED = 1.0
 _RETRIES = 3
 # Over Bluetooth: silence after which a command is sent that the drone has to acknowledge [s].
 _PROBE_PERIOD = 0.3
@@ -51,21 +53,11 @@ class MamboLinkError(RuntimeError):
 
 @dataclass(frozen=True)
 class PositionEvent:
-    """The drone's own estimate of its position.
+    """The drone's own estimate of its position, in the axes of its heading at take-off."""
 
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        From the take-off point: forward, left, up, axes of the heading then [m].
-    yaw : float
-        From the heading at take-off, anticlockwise [rad].
-    received : float
-        Monotonic clock [s].
-    """
-
-    position: FloatArray
-    yaw: float
-    received: float
+    position: FloatArray  # from the take-off point: forward, left, up [m]
+    yaw: float  # from the heading at take-off, anticlockwise [rad]
+    received: float  # monotonic clock [s]
 
 
 class MamboLink:
@@ -74,9 +66,7 @@ class MamboLink:
     All calls return at once; a thread of its own talks to pyparrot, which sleeps in its commands. A
     piloting command is sent once. That thread is a dead man's switch too: once the caller has not
     called `keep_alive` for `CALLER_TIMEOUT`, the drone is commanded to hover, and to land after
-    `land_after` more.
-
-    Units: tilt [rad]; climb [m/s]; land_after [s].
+    `land_after` [s] more. `tilt` [rad] and `climb` [m/s] are set in the drone.
     """
 
     def __init__(
@@ -102,20 +92,21 @@ class MamboLink:
         self.battery = -1.0
         #: Time of the last new data or acknowledgement, monotonic clock [s].
         self.heard_at = -math.inf
+        #: The last position event.
+        self.position: PositionEvent | None = None
         #: Position events that could not be used.
         self.bad_events = 0
         #: How often pyparrot's listener had died and was started again.
         self.revived = 0
         self._drone: Any = None
-        self._position: PositionEvent | None = None
         self._stamps: dict[str, Any] = {}
         self._fresh = False
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._connected = threading.Event()
         self._closing = threading.Event()
-        self._closed = threading.Event()
-        self._steering: tuple[int, int, int, int] | None = None
+        # Roll, pitch, yaw, climb of a command that was not sent yet.
+        self._steering: list[int] | None = None
         self._wanted: Literal['', 'take_off', 'land'] = ''
         self._asked_at = -math.inf
         self._called_at = math.inf
@@ -149,11 +140,6 @@ class MamboLink:
         receiver = getattr(self._drone, 'drone_connection', None)
         return Counter(getattr(getattr(receiver, 'udp_receive_sock', None), 'dropped', {}))
 
-    @property
-    def position(self) -> PositionEvent | None:
-        """The last position event, or None."""
-        return self._position
-
     def take_off(self) -> None:
         """Take off; repeated until it does, or until something else is requested."""
         self._want('take_off')
@@ -165,22 +151,17 @@ class MamboLink:
     def steer(self, forward: float, left: float, up: float, turn: float) -> None:
         """Send a piloting command: shares of the largest, -1 to 1; turn anticlockwise."""
         values = (-left, forward, -turn, up)
-        if not all(math.isfinite(value) for value in values):
+        if not all(map(math.isfinite, values)):
             raise ValueError(
                 f'steer: got {(forward, left, up, turn)}, allowed are finite numbers from -1 to 1'
             )
-        roll, pitch, yaw, climb = (round(100.0 * max(-1.0, min(value, 1.0))) for value in values)
         with self._lock:
-            self._steering = (roll, pitch, yaw, climb)
+            self._steering = [round(100.0 * max(-1.0, min(value, 1.0))) for value in values]
         self._wake.set()
 
     def keep_alive(self) -> None:
         """Note that the caller is alive; the first call arms the dead man's switch."""
         self._called_at = time.monotonic()
-
-    def hover(self) -> None:
-        """Send the piloting command with which the drone keeps its place by itself."""
-        self.steer(0.0, 0.0, 0.0, 0.0)
 
     def close(self, patience: float = 3.0) -> None:
         """Leave the drone to its firmware, waiting for `patience` seconds at most."""
@@ -218,7 +199,15 @@ class MamboLink:
                 "e0:14:d0:63:3d:d0 (pyparrot's findMinidrone shows it)"
             )
         if self.kind == 'wifi':
-            _check_port(self.port, self.address)
+            try:
+                DroneSocket(self.address, self.port).close()
+            except OSError as error:
+                # Without a route to the drone its network may come up later.
+                if error.errno == errno.EADDRINUSE:
+                    raise MamboLinkError(
+                        f'UDP port {self.port}: {error.strerror}; allowed is one that is free: one '
+                        'Mambo per process and host'
+                    ) from error
         return minidrone
 
     # ---- the thread --------------------------------------------------------------------------
@@ -257,11 +246,10 @@ class MamboLink:
 
     def _work(self, drone: Any) -> None:
         where = self.address if self.kind == 'ble' else f'{self.address}, TCP {HANDSHAKE_PORT}'
-        while (why := self._try_to_connect(drone)) and not self._closing.is_set():
+        while why := self._try_to_connect(drone):
             self.error = f'no Mambo at {where}: {why}'
-            self._closing.wait(_RECONNECT)
-        if why:
-            return
+            if self._closing.wait(_RECONNECT):
+                return
         self.error = ''
         self._drone = drone
         try:
@@ -295,7 +283,7 @@ class MamboLink:
             self.land()
         else:
             with self._lock:
-                self._steering = (0, 0, 0, 0)
+                self._steering = [0, 0, 0, 0]
 
     def _try_to_connect(self, drone: Any) -> str:
         """Return why there is no connection, or nothing."""
@@ -306,30 +294,25 @@ class MamboLink:
             return str(error) or type(error).__name__
 
     def _do_wanted(self) -> None:
+        now = time.monotonic()
         with self._lock:
-            wanted = self._wanted
-            state = self.flying_state
-            obeyed = (
-                state in AIRBORNE
-                if wanted == 'take_off'
-                else state in ('landed', 'landing', 'emergency')
-            )
-            if wanted == 'land' and state != 'landed' and self._stale():
-                # Its last reported state may be outdated.
-                obeyed = False
-            if wanted == 'take_off' and obeyed:
-                # Request it once: a drone that lands by itself stays down.
-                self._wanted = ''
-            if not wanted or obeyed or time.monotonic() - self._asked_at < _REPEAT:
+            wanted, state = self._wanted, self.flying_state
+            if wanted == 'take_off':
+                obeyed = state in AIRBORNE
+                if obeyed:
+                    # Request it once: a drone that lands by itself stays down.
+                    self._wanted = ''
+            else:
+                # What it reported last may be outdated.
+                known = state == 'landed' or now - self.heard_at <= _OUTDATED
+                obeyed = known and state in ('landed', 'landing', 'emergency')
+            if not wanted or obeyed or now - self._asked_at < _REPEAT:
                 return
-            self._asked_at = time.monotonic()
+            self._asked_at = now
         if wanted == 'take_off':
             self._drone.takeoff()
         else:
             self._drone.land()
-
-    def _stale(self) -> bool:
-        return time.monotonic() - self.heard_at > 1.0
 
     def _send_steering(self) -> None:
         with self._lock:
@@ -359,11 +342,10 @@ class MamboLink:
         if self.kind == 'ble':
             self._fresh = True
             self.heard_at = time.monotonic()
-        if name in _STAMPS:
-            if self._stamps.get(name) != value:
-                self._stamps[name] = value
-                self._fresh = True
-                self.heard_at = time.monotonic()
+        if name in _STAMPS and self._stamps.get(name) != value:
+            self._stamps[name] = value
+            self._fresh = True
+            self.heard_at = time.monotonic()
         elif name == 'FlyingStateChanged_state':
             self.flying_state = str(sensors.flying_state)
         elif name == 'BatteryStateChanged_battery_percent':
@@ -372,26 +354,11 @@ class MamboLink:
             # The last number of its event.
             self._fresh = False
             read = sensors.sensors_dict
-            numbers = [float(read[f'DronePosition_{key}']) for key in ('posx', 'posy', 'posz')]
-            psi = float(read['DronePosition_psi'])
-            position = 0.01 * np.array(numbers)
-            if not (np.isfinite(position).all() and math.isfinite(psi)) or (
-                np.abs(position).max() > _FARTHEST
-            ):
+            keys = ('posx', 'posy', 'posz', 'psi')
+            *place, psi = (float(read[f'DronePosition_{key}']) for key in keys)
+            position = 0.01 * np.array(place)
+            # False for what is no number, too.
+            if np.abs(position).max() <= _FARTHEST and math.isfinite(psi):
+                self.position = PositionEvent(position, -math.radians(psi), time.monotonic())
+            else:
                 self.bad_events += 1
-                return
-            self._position = PositionEvent(position, -math.radians(psi), time.monotonic())
-
-
-def _check_port(port: int, drone: str) -> None:
-    """Raise where another program has the port."""
-    try:
-        DroneSocket(drone, port).close()
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            # No route to the drone yet: its network may come up later.
-            return
-        raise MamboLinkError(
-            f'UDP port {port}: {error.strerror}; allowed is one that is free: one Mambo per '
-            'process and host'
-        ) from error

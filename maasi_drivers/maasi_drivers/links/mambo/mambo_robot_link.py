@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from maasi_drivers.agent.flight_rules import fence_problem, make_fence
-from maasi_drivers.agent.odometry import StampedPose
+from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.robot_topics import OdometryTopic, PoseTopic
@@ -23,7 +24,7 @@ from maasi_filter.ros.lifecycle_node import SettingsError
 from maasi_planner.motion import MotionModel, RobotState
 
 # Longest time between two updates of the pilot [s].
-_POLL_PERIOD = 0.05
+POLL_PERIOD = 0.05
 # At the end: longest wait until the drone reports that it lands, and between two checks [s].
 _LANDING_TIME, _LANDING_PERIOD = 1.0, 0.02
 # Share of a new difference of positions in the velocity.
@@ -55,46 +56,35 @@ class MamboRobotLink(RobotLink):
         self._phase = Phase.CONNECTING
         self._link: MamboLink | None = None
         self._pilot: MamboPilot | None = None
+        self._speed = PoseSpeed()
 
     def prepare(self) -> None:
-        """Make the geofence; check that a connection is possible."""
-        settings = self.driver.settings
+        """Make link and geofence; check that a connection is possible."""
+        driver, mambo, settings = self.driver, self._mambo, self.driver.settings
         self._fence = make_fence(
-            self._mambo.geofence,
-            self.driver.bounds,
-            settings.radius,
-            self._mambo.ground,
-            settings.start[2],
+            mambo.geofence, driver.bounds, settings.radius, mambo.ground, settings.start[2]
         )
         if settings.motion.model == 'unicycle':
             raise SettingsError(
                 f"parameter motion.model: read 'unicycle', allowed with link {settings.link} "
                 'is that of a flying robot, as mambo'
             )
+        kind = 'ble' if settings.link == 'mambo_ble' else 'wifi'
+        tilt = tilt_limit(settings.motion)
+        self._link = MamboLink(kind, mambo.address, mambo.port, tilt, mambo.climb, mambo.land_after)
         try:
-            self._make_link().check()
+            self._link.check()
         except MamboLinkError as error:
             raise SettingsError(f'parameter link: {error}') from error
-
-    def _make_link(self) -> MamboLink:
-        mambo, settings = self._mambo, self.driver.settings
-        return MamboLink(
-            'ble' if settings.link == 'mambo_ble' else 'wifi',
-            mambo.address,
-            mambo.port,
-            tilt_limit(settings.motion),
-            mambo.climb,
-            mambo.land_after,
-        )
 
     # ---- link and life cycle -----------------------------------------------------------------
 
     def connect(self) -> None:
         """Connect; it takes off once the driver is active."""
-        driver = self.driver
-        self._link = link = self._make_link()
+        driver, link = self.driver, self._link
+        assert link is not None
         link.connect()
-        driver.create_wall_timer(min(driver.settings.step, _POLL_PERIOD), self._update)
+        driver.create_wall_timer(min(driver.settings.step, POLL_PERIOD), self._update)
         driver.offer_arm(self._arm, lambda: link.airborne)
         if self._mambo.pose == 'odometry':
             OdometryTopic(driver)
@@ -119,19 +109,17 @@ class MamboRobotLink(RobotLink):
 
     def _arm(self) -> str:
         """Let the drone take off; return why not, empty where it may."""
-        problem = self.driver.arm_problem()
-        if self._pilot is None or problem:
-            return problem or 'the driver is not active'
+        if self._pilot is None:
+            return 'the driver is not active'
         return self._pilot.permit(time.monotonic())
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
         """Fly a velocity command."""
-        if self._pilot is None:
-            return
-        try:
-            self._pilot.fly(np.array(command))
-        except ValueError as error:
-            self.driver.drop('command', str(error))
+        if self._pilot is not None:
+            try:
+                self._pilot.fly(np.array(command))
+            except ValueError as error:
+                self.driver.drop('command', str(error))
 
     def hold(self) -> None:
         """Have the drone hover."""
@@ -196,32 +184,26 @@ class MamboRobotLink(RobotLink):
         if stamp is None:
             # A simulated time has not begun: nothing is late.
             driver.silence.end()
-            return
-        if self._mambo.pose != 'events' or not pilot.has_pose or state is None:
-            return
-        driver.restart_if_back('the clock', stamp)
-        latest = driver.history.latest
-        if latest is None or stamp > latest.stamp:
-            driver.take_pose(
-                StampedPose(
-                    stamp,
-                    state.pose,
-                    pilot.reckoning.covariance(),
-                    state.velocity,
-                    state.angular_velocity,
+        elif self._mambo.pose == 'events' and pilot.has_pose and state is not None:
+            driver.restart_if_back('the clock', stamp)
+            latest, covariance = driver.history.latest, pilot.reckoning.covariance()
+            if latest is None or stamp > latest.stamp:
+                driver.take_pose(
+                    StampedPose(
+                        stamp, state.pose, covariance, state.velocity, state.angular_velocity
+                    )
                 )
-            )
 
     def _judge(self, pilot: MamboPilot) -> None:
         """Log the phase, and report the fault of the pilot."""
-        if pilot.phase is not self._phase:
-            self._phase = pilot.phase
-            why = '' if pilot.phase in _RISING else pilot.problem
-            self.driver.get_logger().info(pilot.phase.value + (f': {why}' if why else ''))
+        phase, problem = pilot.phase, pilot.problem
+        if phase is not self._phase:
+            self._phase = phase
+            why = f': {problem}' if problem and phase not in _RISING else ''
+            self.driver.get_logger().info(phase.value + why)
         # While it takes off, a goal that it has already is kept.
-        if pilot.problem and pilot.phase in _RISING and self.driver.follower.current is not None:
-            return
-        self.driver.judge(_FLIGHT, pilot.problem, 'flying: goals are accepted')
+        if not (problem and phase in _RISING and self.driver.follower.current is not None):
+            self.driver.judge(_FLIGHT, problem, 'flying: goals are accepted')
 
     def observe(self, placed: StampedPose) -> None:
         """Hand a pose of another system to the pilot."""
@@ -232,17 +214,13 @@ class MamboRobotLink(RobotLink):
 
     def _take_pose(self, stamp: int, pose: Pose) -> None:
         driver = self.driver
-        if driver.active and driver.is_new_pose('pose.header.stamp', stamp):
-            driver.take_pose(self._with_velocity(stamp, pose))
-
-    def _with_velocity(self, stamp: int, pose: Pose) -> StampedPose:
-        latest = self.driver.history.latest
-        velocity = np.zeros(3)
-        if latest is not None:
-            passed = 1e-9 * (stamp - latest.stamp)
-            measured = (pose.position - latest.pose.position) / passed
-            velocity = latest.velocity + _SMOOTHING * (measured - latest.velocity)
-        return StampedPose(stamp, pose, self._mambo.pose_covariance(), velocity, np.zeros(3))
+        if not driver.active or not driver.is_new_pose('pose.header.stamp', stamp):
+            return
+        placed, latest = self._speed.place(stamp, pose), driver.history.latest
+        before = placed.velocity if latest is None else latest.velocity
+        velocity = before + _SMOOTHING * (placed.velocity - before)
+        covariance = self._mambo.pose_covariance()
+        driver.take_pose(replace(placed, covariance=covariance, velocity=velocity))
 
     # ---- goals and control -------------------------------------------------------------------
 
@@ -254,14 +232,14 @@ class MamboRobotLink(RobotLink):
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
         """Return the command for the state at which it takes effect, and the goal reached."""
         pilot = self._pilot
-        flies = pilot is not None and pilot.phase is Phase.FLYING and pilot.has_pose
-        return super().steer(pilot.ahead() if pilot and flies else robot, step)
+        if pilot is not None and pilot.phase is Phase.FLYING and pilot.has_pose:
+            robot = pilot.ahead()
+        return super().steer(robot, step)
 
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
         """Return whether pose and images must change: a command on the ground moves nothing."""
-        if self._pilot is not None and self._pilot.phase is not Phase.FLYING:
-            return False
-        return super().is_moving(placed, command)
+        grounded = self._pilot is not None and self._pilot.phase is not Phase.FLYING
+        return not grounded and super().is_moving(placed, command)
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Refuse waypoints outside the geofence."""

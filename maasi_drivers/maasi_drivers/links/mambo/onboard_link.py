@@ -11,9 +11,9 @@ import struct
 import time
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,10 @@ from maasi_drivers.agent.flight_rules import (
 from maasi_drivers.agent.odometry import PoseSpeed, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import FeedPeer, RobotNode
+from maasi_drivers.links.mambo.pilot import ALTITUDE_TOLERANCE, NOT_ALLOWED
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_drivers.vision.measurement_feed import FeedPose, FeedState
+from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.lifecycle_node import SettingsError
 
@@ -44,33 +46,20 @@ class OrderError(ValueError):
 
 
 class OrderKind(IntEnum):
-    """What the robot is to do."""
+    """What the robot is to do: be on the ground, hover where it is, or fly to the position."""
 
     LAND = 0
     HOLD = 1
     GO = 2
 
 
-@dataclass(frozen=True)
-class Order:
-    """An order.
+class Order(NamedTuple):
+    """An order; position and yaw count from where it took off, in the axes of its heading then."""
 
-    Attributes
-    ----------
-    sequence : int
-        Counted up by the sender, 0 to 2^32 - 1.
-    kind : OrderKind
-        What to do: be on the ground, hover where it is, or fly to the position.
-    position : ndarray, shape (3,)
-        From where it took off: forward, left, up, axes of the heading then [m].
-    yaw : float
-        From the heading at take-off, anticlockwise [rad].
-    """
-
-    sequence: int
+    sequence: int  # counted up by the sender, 0 to 2^32 - 1
     kind: OrderKind
-    position: np.ndarray
-    yaw: float = 0.0
+    position: FloatArray  # forward, left, up [m]
+    yaw: float = 0.0  # anticlockwise [rad]
 
 
 def encode(order: Order) -> bytes:
@@ -91,48 +80,22 @@ def decode(data: bytes) -> Order:
     magic, version, kind, reserved, sequence, *numbers = _ORDER.unpack_from(data)
     (checksum,) = _CHECKSUM.unpack_from(data, _ORDER.size)
     expected = zlib.crc32(data[: _ORDER.size])
+    near = all(math.isfinite(value) and abs(value) <= _FARTHEST for value in numbers)
     for good, what in (
         (magic == MAGIC, f'magic: read {magic!r}, allowed is {MAGIC!r}'),
         (version == VERSION, f'version: read {version}, allowed is {VERSION}'),
         (checksum == expected, f'checksum: read {checksum:#010x}, allowed is {expected:#010x}'),
         (kind in list(OrderKind), f'kind: read {kind}, allowed are 0 to 2'),
         (reserved == 0, f'reserved: read {reserved}, allowed is 0'),
-        (
-            all(math.isfinite(value) and abs(value) <= _FARTHEST for value in numbers),
-            f'position, yaw: read {numbers}, allowed are finite numbers within {_FARTHEST:g}',
-        ),
+        (near, f'position, yaw: read {numbers}, allowed are finite numbers within {_FARTHEST:g}'),
     ):
         if not good:
             raise OrderError(what)
     return Order(sequence, OrderKind(kind), np.array(numbers[:3]), numbers[3])
 
 
-class OrderSender:
-    """Sends orders to one robot."""
-
-    def __init__(self, address: str, port: int) -> None:
-        self._to = (address, port)
-        self._sequence = 0
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-
-    def send(self, kind: OrderKind, position: np.ndarray, yaw: float = 0.0) -> str:
-        """Send an order; return why it could not be sent, or nothing."""
-        self._sequence += 1
-        try:
-            self._socket.sendto(encode(Order(self._sequence, kind, position, yaw)), self._to)
-        except OSError as error:
-            return f'orders to {self._to[0]}: {error.strerror or error}'
-        return ''
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
 # Between two orders [s]; without them the program on board hovers, then lands.
 _PERIOD = 0.1
-# The climb after take-off ends within this of its altitude [m].
-_ALTITUDE_TOLERANCE = 0.1
 # At the end: orders to land, and the time between them [s].
 _LAST_ORDERS, _LAST_PERIOD = 5, 0.05
 # Kind of fault.
@@ -153,69 +116,59 @@ class OnboardLink(RobotLink):
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
         self._mambo = driver.settings.mambo or MamboSettings()
-        self._sender: OrderSender | None = None
+        self._socket: socket.socket | None = None
+        self._sequence = 0
         self._speed = PoseSpeed()
         self._order = OrderKind.LAND
         self._target = driver.start_pose.position
-        self._up = False
-        self._rising_since: float | None = None
-        self._lost_since: float | None = None
-        # Why it landed.
-        self._landed_for = ''
         self._feed_state: FeedState | None = None
         self._permission = ArmPermission(self._mambo.arm_timeout)
+        self.activate()
 
     def prepare(self) -> None:
         """Check the settings, and make the geofence."""
-        driver, settings = self.driver, self.driver.settings
+        driver, mambo, settings = self.driver, self._mambo, self.driver.settings
         if settings.image_source != 'feed':
             raise SettingsError(
                 f'parameter image_source: read {settings.image_source!r}, allowed with link '
                 'mambo_feed is feed'
             )
-        driver.feed_peer = FeedPeer(self._mambo.address, self._take_feed_pose)
+        driver.feed_peer = FeedPeer(mambo.address, self._take_feed_pose)
         self._fence = make_fence(
-            self._mambo.geofence,
-            driver.bounds,
-            settings.radius,
-            self._mambo.ground,
-            settings.start[2],
+            mambo.geofence, driver.bounds, settings.radius, mambo.ground, settings.start[2]
         )
         # Positions of the feed are relative to this.
-        place = [*settings.start[:2], self._mambo.ground]
-        self._origin = Pose.from_yaw(place, settings.yaw)
+        self._origin = Pose.from_yaw([*settings.start[:2], mambo.ground], settings.yaw)
 
     # ---- link and life cycle -----------------------------------------------------------------
 
     def connect(self) -> None:
         """Send orders from now on: to be on the ground until it is active and may fly."""
-        self._sender = OrderSender(self._mambo.address, self._mambo.order_port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.driver.create_wall_timer(_PERIOD, self._send_order)
         self.driver.expect(lambda: self._up)
         self.driver.offer_arm(self._arm)
 
     def close(self) -> None:
         """Leave the drone to its program."""
-        if self._sender is not None:
-            self._sender.close()
-            self._sender = None
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
     def activate(self) -> None:
-        """Begin a flight."""
+        """Begin a flight: it has not risen, and there is no reason why it landed."""
         self._up, self._landed_for = False, ''
-        self._rising_since = self._lost_since = None
+        self._rising_since: float | None = None
+        self._lost_since: float | None = None
 
     def _arm(self) -> str:
         """Let the drone take off; return why not, empty where it may."""
-        problem = self.driver.arm_problem()
-        if not problem and not self._mambo.arm:
-            problem = 'on the ground: it may not take off (parameter mambo.arm)'
+        problem = '' if self._mambo.arm else NOT_ALLOWED
         if not problem and self._feed_state is not FeedState.GROUND:
             problem = 'it is in the air, or not heard'
         if not problem:
-            self._up, self._landed_for, self._rising_since = False, '', None
-            self._permission.give(time.monotonic())
-        return problem
+            self.activate()
+        return self._permission.ask(time.monotonic(), problem)
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
         """Order it to its target; its own program flies."""
@@ -245,16 +198,16 @@ class OnboardLink(RobotLink):
 
     def poll(self) -> None:
         """Land a drone whose feed has been silent for long; on the ground it needs a new arm."""
-        driver = self.driver
-        silent = driver.silence.length > driver.settings.odometry_timeout
-        if silent:
-            self._permission.end()
-            self._feed_state = None
-        now = time.monotonic()
-        risen = self._rising_since is not None
-        self._lost_since = (self._lost_since or now) if silent and risen else None
-        if self._lost_since is not None and now - self._lost_since > self._mambo.land_after:
-            self._land('nothing heard from the drone')
+        driver, now = self.driver, time.monotonic()
+        if driver.silence.length <= driver.settings.odometry_timeout:
+            self._lost_since = None
+            return
+        self._permission.end()
+        self._feed_state = None
+        if self._rising_since is not None:
+            self._lost_since = self._lost_since or now
+            if now - self._lost_since > self._mambo.land_after:
+                self._land('nothing heard from the drone')
 
     def goal_problem(self, position: Sequence[float]) -> str | None:
         """Refuse waypoints outside the geofence."""
@@ -265,13 +218,18 @@ class OnboardLink(RobotLink):
         return {'order': self._order.name.lower(), 'landed for': self._landed_for}
 
     def _send_order(self) -> None:
-        if self._sender is None:
+        if self._socket is None:
             return
-        order = self._order if self.driver.active or self._landed_for else OrderKind.LAND
-        relative = compose(inverse(self._origin), Pose(self._target))
-        problem = self._sender.send(order, relative.position)
-        if problem:
-            self.driver.warn_throttled('orders', problem)
+        kind = self._order if self.driver.active or self._landed_for else OrderKind.LAND
+        position = compose(inverse(self._origin), Pose(self._target)).position
+        self._sequence += 1
+        address = self._mambo.address
+        try:
+            data = encode(Order(self._sequence, kind, position))
+            self._socket.sendto(data, (address, self._mambo.order_port))
+        except OSError as error:
+            text = f'orders to {address}: {error.strerror or error}'
+            self.driver.warn_throttled('orders', text)
 
     # ---- the flight --------------------------------------------------------------------------
 
@@ -295,15 +253,13 @@ class OnboardLink(RobotLink):
         self._feed_state = pose.state
         if self._landed_for:
             landed = pose.state == FeedState.GROUND
-            if landed:
-                return f'landed: {self._landed_for}, {UNTIL_ARM}'
-            return f'landing: {self._landed_for}'
+            text, rest = ('landed', f', {UNTIL_ARM}') if landed else ('landing', '')
+            return f'{text}: {self._landed_for}{rest}'
         if not mambo.arm:
-            return 'on the ground: it may not take off (parameter mambo.arm)'
+            return NOT_ALLOWED
         if 0.0 <= pose.battery < mambo.battery_minimum:
             return self._land(f'battery at {pose.battery:.2f}, below {mambo.battery_minimum:.2f}')
-        too_far = outside_fence(self._fence, place.position)
-        if too_far:
+        if too_far := outside_fence(self._fence, place.position):
             return self._land(too_far)
         if self._up:
             down = pose.state != FeedState.AIR
@@ -316,7 +272,7 @@ class OnboardLink(RobotLink):
         start = self.driver.start_pose.position
         self._target, self._order = start, OrderKind.GO
         height = start[2] - place.position[2]
-        self._up = pose.state == FeedState.AIR and abs(height) <= _ALTITUDE_TOLERANCE
+        self._up = pose.state == FeedState.AIR and abs(height) <= ALTITUDE_TOLERANCE
         if not self._up and now - self._rising_since > mambo.take_off_timeout:
             return self._land(f'it did not come to its altitude in {mambo.take_off_timeout:g} s')
         return '' if self._up else 'taking off'

@@ -28,11 +28,12 @@ _BRAKE_SHARE = 0.5
 _NEAR_RATE = 1.0
 # Placeholder until the speed at the largest tilt is measured; never used in flight [m/s].
 _UNKNOWN_SPEED = 1.0
-# How far from its altitude the drone counts as there after take-off [m].
-_ALTITUDE_TOLERANCE = 0.1
+# How far from its altitude a Mambo counts as there after take-off [m].
+ALTITUDE_TOLERANCE = 0.1
 # Under a command faster than this, an event equal to the bit is no new position [m/s].
 _LEAST_SPEED = 0.05
 _STILL = np.zeros(4)
+NOT_ALLOWED = 'on the ground: it may not take off (parameter mambo.arm)'
 
 
 def tilt_limit(motion: MotionSettings) -> float:
@@ -54,7 +55,8 @@ class Phase(Enum):
 class MamboPilot:
     """Flies a Mambo from take-off to landing, and lands it on a fault.
 
-    Shapes and units: fence (3, 2) [m, map].
+    `fence` is (3, 2) [m, map]; `problem` says why it takes no goals; times are of the monotonic
+    clock [s].
     """
 
     def __init__(
@@ -72,22 +74,19 @@ class MamboPilot:
         self.fence = fence
         self.phase = Phase.CONNECTING
         self.problem = 'connecting to the Mambo'
-        place = home.position.copy()
-        place[2] = settings.ground
         speed = settings.full_speed or _UNKNOWN_SPEED
         model = TiltModel(link.tilt, speed, link.climb, settings.full_turn)
+        place = [*home.position[:2], settings.ground]
         self.reckoning = DeadReckoning(model, Pose.from_yaw(place, home.yaw), settings)
-        # Time of the last pose of another system [s].
-        self._other_at = -math.inf
         self._event: PositionEvent | None = None
-        # Time of the last change of the position, monotonic clock [s].
-        self._moved_at = -math.inf
+        # Last position: its time, and that of its last change.
         self._place: FloatArray | None = None
+        self._placed_at = self._moved_at = -math.inf
         # Unchanged in spite of commands: only a changed position is accepted.
         self._stuck = False
         self._command = _STILL
         self._now = -math.inf
-        # Time [s] and value of the last desired velocity in the map [m/s].
+        # Time and value of the last desired velocity in the map [m/s].
         self._desired: tuple[float, FloatArray] = (-math.inf, np.zeros(2))
         self._since = -math.inf
         self._lost_since: float | None = None
@@ -106,7 +105,7 @@ class MamboPilot:
     @property
     def state(self) -> RobotState | None:
         """Where it is; None where that is not known."""
-        return self.reckoning.state if math.isfinite(self._positioned_at()) else None
+        return self.reckoning.state if math.isfinite(self._placed_at) else None
 
     def ahead(self) -> RobotState:
         """Return where it will be, level, when a command that is sent now acts."""
@@ -116,12 +115,12 @@ class MamboPilot:
     @property
     def has_pose(self) -> bool:
         """Whether the position is known, and new enough to fly by."""
-        return self.state is not None and self._lost_since is None
+        return math.isfinite(self._placed_at) and self._lost_since is None
 
     def take_pose(self, now: float, state: RobotState) -> None:
-        """Take a pose of another system, at `now` of the monotonic clock [s]."""
+        """Take a pose of another system."""
+        self._now = now
         self._note_place(now, state.pose.position)
-        self._now = self._other_at = now
         self.reckoning.take(state, now, self.flying)
 
     def _note_place(self, now: float, place: FloatArray) -> None:
@@ -131,15 +130,12 @@ class MamboPilot:
             self._moved_at = now
         elif not commanded and not self._stuck:
             self._moved_at = now
-        self._place = place
+        self._place, self._placed_at = place, now
 
-    # ---- what it is to do --------------------------------------------------------------------
+    # ---- control -----------------------------------------------------------------------------
 
     def fly(self, command: FloatArray) -> None:
-        """Fly a velocity command, once; without another one the drone hovers.
-
-        Shapes and units: command (4,) [rad/s].
-        """
+        """Fly a velocity command (4,), once; without another one the drone hovers."""
         if not np.isfinite(command).all():
             self.hover()
             raise ValueError(f'command: got {command.tolist()}, allowed are finite numbers')
@@ -148,7 +144,7 @@ class MamboPilot:
 
     def hover(self) -> None:
         """Stop: the drone keeps its place by its own camera."""
-        if self.phase in (Phase.CLIMBING, Phase.FLYING):
+        if self.flying:
             self._desired = -math.inf, np.zeros(2)
             self._send(_STILL, _STILL)
 
@@ -186,33 +182,30 @@ class MamboPilot:
     def _send(self, command: FloatArray, shares: FloatArray) -> None:
         self._command = command
         self.reckoning.command(self._now, shares)
-        forward, left, up, turn = shares.tolist()
-        self.link.steer(forward, left, up, turn)
+        self.link.steer(*shares.tolist())
+
+    # ---- what it is to do --------------------------------------------------------------------
 
     def permit(self, now: float) -> str:
-        """Let it take off once; return why not, empty where it may; `now` as in `update`."""
-        problem = self._objection(now)
-        if problem:
-            self._permission.end()
-            return problem
-        self._ended, self._cancelled_at = '', None
-        self._permission.give(now)
-        return ''
+        """Let it take off once; return why not, empty where it may."""
+        problem = self._permission.ask(now, self._objection(now))
+        if not problem:
+            self._ended, self._cancelled_at = '', None
+        return problem
 
     def _objection(self, now: float) -> str:
         if self.phase is Phase.LANDING:
             return 'it lands'
         if self.phase not in (Phase.CONNECTING, Phase.GROUND):
             return 'it is in the air already'
-        low = self._battery_text() if self._battery_low else ''
         unheard = self.problem if self.phase is Phase.CONNECTING else ''
         silent = self._lost_text(now) if self._is_silent(now) else ''
-        return self.link.error or self._unfit() or low or unheard or silent
+        return self.link.error or self._unfit() or self._low_battery() or unheard or silent
 
     def _unfit(self) -> str:
         """Return which parameter keeps it on the ground, or nothing."""
         if not self.settings.arm:
-            return 'on the ground: it may not take off (parameter mambo.arm)'
+            return NOT_ALLOWED
         if self.settings.full_speed is None:
             return (
                 'on the ground: its speed at the largest tilt is not measured (parameter '
@@ -238,11 +231,12 @@ class MamboPilot:
         else:
             self.goal_cancelled(now)
 
-    def end(self, reason: str) -> None:
-        """Land, and do not take off again."""
+    def end(self, reason: str) -> str:
+        """Land, and do not take off again; return the reason."""
         self._ended = self._ended or reason
         if self.phase not in (Phase.CONNECTING, Phase.GROUND):
             self._land()
+        return reason
 
     def _land(self) -> None:
         self.phase = Phase.LANDING
@@ -253,15 +247,14 @@ class MamboPilot:
     # ---- the flight --------------------------------------------------------------------------
 
     def update(self, now: float) -> None:
-        """Advance to `now` on the monotonic clock [s]; at least ten times a second."""
+        """Advance to `now`; at least ten times a second."""
         self._now = now
         self.reckoning.go_on(now, self.flying)
         event = self.link.position
-        if event is not None and event is not self._event:
+        if event is not None and event is not self._event and self.settings.pose == 'events':
             self._event = event
-            if self.settings.pose == 'events':
-                self.reckoning.correct(event, self.flying)
-                self._note_place(event.received, event.position)
+            self.reckoning.correct(event, self.flying)
+            self._note_place(event.received, event.position)
         self.problem = self._advance(now)
 
     def _advance(self, now: float) -> str:
@@ -272,83 +265,87 @@ class MamboPilot:
                 return link.error or 'connecting to the Mambo'
             self.phase = Phase.GROUND
         if link.error:
-            return self._give_up(link.error)
+            self._ended = link.error
+            return self._ended
         lost = self._check_pose(now)
         if self.phase is Phase.GROUND:
             return self._stand(now)
         if self.phase is Phase.LANDING:
-            return self._come_down()
+            if link.flying_state != 'landed':
+                return f'landing: {self._ended or "its goal was cancelled"}'
+            self.phase = Phase.GROUND
+            self._ended = f'landed: {self._ended}' if self._ended else ''
+            return f'{self._ended or "landed: its goal was cancelled"}, {UNTIL_ARM}'
+        if link.flying_state == 'emergency':
+            return self._emergency()
         return self._stay_up(now, lost)
 
-    def _give_up(self, reason: str) -> str:
-        self._ended = reason
-        return reason
+    def _emergency(self) -> str:
+        self._ended = 'the Mambo is in emergency: restart it'
+        return self._ended
 
     def _stand(self, now: float) -> str:
         """Take off if nothing prevents it."""
-        state = self.link.flying_state
-        if self._is_silent(now):
+        state, low = self.link.flying_state, self._low_battery()
+        if low or self._is_silent(now):
             self._permission.end()
         if self._ended:
             return f'{self._ended}, {UNTIL_ARM}'
         if problem := self._unfit():
             return problem
         if state == 'emergency':
-            return self._give_up('the Mambo is in emergency: restart it')
+            return self._emergency()
+        if low:
+            return low
         flies = state in ('hovering', 'flying', 'takingoff')
-        if self._battery_low:
-            self._permission.end()
-            return self._battery_text()
         if not self._permission.holds(now):
             return f'{"in the air, not by this driver" if flies else "on the ground"}, {UNTIL_ARM}'
-        if state != 'landed':
-            if flies:
-                # Started by an earlier driver.
-                self._begin(Phase.TAKING_OFF, now)
-                return Phase.TAKING_OFF.value
-            return 'on the ground: nothing heard of its state yet'
-        if self.link.battery < 0.0:
-            return 'on the ground: nothing heard of its battery yet'
-        if not self.has_pose:
-            return f'on the ground: {self._lost_text(now) or "no position yet"}'
-        self._begin(Phase.TAKING_OFF, now)
-        self.link.take_off()
-        return Phase.TAKING_OFF.value
+        if not flies:
+            if state != 'landed' or self.link.battery < 0.0:
+                what = 'state' if state != 'landed' else 'battery'
+                return f'on the ground: nothing heard of its {what} yet'
+            if not self.has_pose:
+                return f'on the ground: {self._lost_text(now) or "no position yet"}'
+            self.link.take_off()
+        # In the air it was brought by an earlier driver.
+        return self._begin(Phase.TAKING_OFF, now)
 
-    def _begin(self, phase: Phase, now: float) -> None:
+    def _begin(self, phase: Phase, now: float) -> str:
         self._permission.end()
         self.phase, self._since = phase, now
-
-    def _come_down(self) -> str:
-        if self.link.flying_state != 'landed':
-            return f'landing: {self._ended or "its goal was cancelled"}'
-        self.phase = Phase.GROUND
-        if self._ended:
-            self._ended = f'landed: {self._ended}'
-        return f'{self._ended or "landed: its goal was cancelled"}, {UNTIL_ARM}'
+        return phase.value
 
     def _stay_up(self, now: float, lost: float | None) -> str:
-        flying_state = self.link.flying_state
-        if flying_state == 'emergency':
-            return self._give_up('the Mambo is in emergency: restart it')
-        if self._battery_low:
-            return self._end_flight(self._battery_text())
+        """Continue a flight, or land it."""
+        if low := self._low_battery():
+            return self.end(low)
         if lost is not None:
             self.hover()
             text = self._lost_text(now)
-            return self._end_flight(text) if lost >= self.settings.land_after else text
+            return self.end(text) if lost >= self.settings.land_after else text
+        flying_state, timeout = self.link.flying_state, self.settings.take_off_timeout
+        late = now - self._since > timeout
         if self.phase is Phase.TAKING_OFF:
-            return self._rise(now)
+            if flying_state in ('hovering', 'flying'):
+                self._begin(Phase.CLIMBING, now)
+            elif late:
+                return self.end(f'it did not take off in {timeout:g} s: {flying_state}')
+            return Phase.TAKING_OFF.value
         if flying_state in ('landed', 'landing'):
-            return self._end_flight(f'the Mambo is {flying_state} by itself')
-        state = self.state
-        if state is None:
-            return 'no position'
-        outside = outside_fence(self.fence, state.pose.position)
-        if outside:
-            return self._end_flight(outside)
+            return self.end(f'the Mambo is {flying_state} by itself')
+        if outside := outside_fence(self.fence, self.reckoning.course.position):
+            return self.end(outside)
         if self.phase is Phase.CLIMBING:
-            return self._climb(now, state)
+            offset = self.reckoning.course.position[2] - self.home.position[2]
+            if abs(offset) <= ALTITUDE_TOLERANCE:
+                self._begin(Phase.FLYING, now)
+                return ''
+            if late:
+                return self.end(f'it did not come to its altitude in {timeout:g} s')
+            ahead = self.ahead()
+            above = np.array([*ahead.pose.position[:2], self.home.position[2]])
+            self._steer(self.motion.command(ahead, above))
+            return f'{Phase.CLIMBING.value}, {offset:+.2f} m from its altitude'
         cancelled = self._cancelled_at
         if cancelled is not None and now - cancelled >= self.settings.cancel_landing:
             self._cancelled_at = None
@@ -356,75 +353,37 @@ class MamboPilot:
             return 'landing: its goal was cancelled'
         return ''
 
-    def _end_flight(self, reason: str) -> str:
-        self.end(reason)
-        return reason
+    # ---- faults ------------------------------------------------------------------------------
 
-    def _rise(self, now: float) -> str:
-        if self.link.flying_state in ('hovering', 'flying'):
-            self._begin(Phase.CLIMBING, now)
-        elif now - self._since > self.settings.take_off_timeout:
-            return self._end_flight(
-                f'it did not take off in {self.settings.take_off_timeout:g} s: '
-                f'{self.link.flying_state}'
-            )
-        return Phase.TAKING_OFF.value
+    def _low_battery(self) -> str:
+        """Return that the charge is too low, or nothing; an unknown one is negative."""
+        charge, minimum = self.link.battery, self.settings.battery_minimum
+        return f'battery at {charge:.2f}, below {minimum:.2f}' if 0.0 <= charge < minimum else ''
 
-    def _climb(self, now: float, state: RobotState) -> str:
-        offset = state.pose.position[2] - self.home.position[2]
-        if abs(offset) <= _ALTITUDE_TOLERANCE:
-            self._begin(Phase.FLYING, now)
-            return ''
-        if now - self._since > self.settings.take_off_timeout:
-            return self._end_flight(
-                f'it did not come to its altitude in {self.settings.take_off_timeout:g} s'
-            )
-        ahead = self.ahead()
-        above = ahead.pose.position.copy()
-        above[2] = self.home.position[2]
-        self._steer(self.motion.command(ahead, above))
-        return f'{Phase.CLIMBING.value}, {offset:+.2f} m from its altitude'
-
-    # ---- faults -------------------------------------------------------------------
-
-    @property
-    def _battery_low(self) -> bool:
-        return 0.0 <= self.link.battery < self.settings.battery_minimum
-
-    def _battery_text(self) -> str:
-        return f'battery at {self.link.battery:.2f}, below {self.settings.battery_minimum:.2f}'
+    def _ages(self, now: float) -> dict[str, float]:
+        """Return since when link, position, and its changes are missing [s], by what is said."""
+        return {
+            'link lost: nothing from the Mambo': now - self.link.heard_at,
+            'no position': now - self._placed_at,
+            'the position has not changed': now - self._moved_at,
+        }
 
     def _check_pose(self, now: float) -> float | None:
-        """Return for how long link or position have been missing, beyond the timeout [s]."""
+        """Return for how long one of them has been missing, beyond the timeout [s]."""
         timeout = self.settings.link_timeout
-        self._stuck |= now - self._moved_at > timeout and now - self._positioned_at() <= timeout
-        age = max(now - self.link.heard_at, now - self._positioned_at(), now - self._moved_at)
-        if age <= timeout:
+        self._stuck |= now - self._moved_at > timeout and now - self._placed_at <= timeout
+        if max(self._ages(now).values()) <= timeout:
             self._lost_since = None
             return None
         if self._lost_since is None:
             self._lost_since = now
         return now - self._lost_since
 
-    def _positioned_at(self) -> float:
-        if self.settings.pose != 'events':
-            return self._other_at
-        return -math.inf if self._event is None else self._event.received
-
     def _is_silent(self, now: float) -> bool:
         return now - self.link.heard_at > self.settings.link_timeout
 
     def _lost_text(self, now: float) -> str:
-        timeout = self.settings.link_timeout
-        if self._is_silent(now):
-            age = _seconds(now - self.link.heard_at)
-            return f'link lost: nothing from the Mambo for {age}'
-        silent = now - self._positioned_at()
-        if silent > timeout:
-            return f'no position for {_seconds(silent)}'
-        still = now - self._moved_at
-        return f'the position has not changed for {_seconds(still)}' if still > timeout else ''
-
-
-def _seconds(age: float) -> str:
-    return f'{age:.1f} s' if math.isfinite(age) else 'all the time'
+        for text, age in self._ages(now).items():
+            if age > self.settings.link_timeout:
+                return f'{text} for {f"{age:.1f} s" if math.isfinite(age) else "all the time"}'
+        return ''

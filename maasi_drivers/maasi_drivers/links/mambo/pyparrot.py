@@ -23,7 +23,7 @@ _MAX_TILT = (2, 8, 1)
 
 
 def mend(connection: Any) -> None:
-    """Give a connection the method by which pyparrot's `fly_direct` sends one command."""
+    """Give a Bluetooth connection the method by which `fly_direct` sends one command."""
 
     def send_single_pcmd_command(
         command: tuple[int, int, int], roll: int, pitch: int, yaw: int, climb: int
@@ -35,10 +35,7 @@ def mend(connection: Any) -> None:
 
 
 def ask_for_answer(connection: Any, tilt: float) -> None:
-    """Send a command that the drone has to acknowledge, and that changes nothing.
-
-    Units: tilt [rad].
-    """
+    """Send a command that the drone has to acknowledge; it has this tilt [rad] already."""
     content = struct.pack('<f', math.degrees(tilt))
     _write(connection, 'SEND_WITH_ACK', 'DATA_WITH_ACK', _MAX_TILT, content)
 
@@ -66,18 +63,16 @@ def address_towards(host: str) -> str:
         return str(probe.getsockname()[0])
 
 
-def frame_problem(data: bytes) -> str:
-    """Return what is wrong with the frames of a datagram; empty where nothing is."""
+def has_whole_frames(data: bytes) -> bool:
+    """Return whether a datagram is made of frames that pyparrot can take apart."""
     while data:
         if len(data) < _HEADER.size:
-            return f'frame: read {len(data)} bytes, allowed are at least {_HEADER.size}'
+            return False
         kind, _, _, size = _HEADER.unpack_from(data)
-        if kind not in _TYPES:
-            return f'frame type: read {kind}, allowed are 1 to 4'
-        if not _HEADER.size <= size <= len(data):
-            return f'frame size: read {size}, allowed are {_HEADER.size} to {len(data)}'
+        if kind not in _TYPES or not _HEADER.size <= size <= len(data):
+            return False
         data = data[size:]
-    return ''
+    return True
 
 
 class DroneSocket:
@@ -85,7 +80,6 @@ class DroneSocket:
 
     def __init__(self, drone: str, port: int) -> None:
         self.dropped: Counter[str] = Counter()
-        self.problem = ''
         self._drone = drone
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -101,19 +95,15 @@ class DroneSocket:
             data, sender = self._socket.recvfrom(size)
         except TimeoutError:
             return b'', None
-        if sender[0] != self._drone:
-            return self._drop('foreign sender', f'sender: read {sender[0]}, allowed is the drone')
-        problem = frame_problem(data)
-        return self._drop('bad frame', problem) if problem else (data, sender)
+        foreign = sender[0] != self._drone
+        if not foreign and has_whole_frames(data):
+            return data, sender
+        self.dropped['foreign sender' if foreign else 'bad frame'] += 1
+        return b'', None
 
     def close(self) -> None:
         """Close it."""
         self._socket.close()
-
-    def _drop(self, reason: str, text: str) -> tuple[bytes, Any]:
-        self.dropped[reason] += 1
-        self.problem = text
-        return b'', None
 
 
 def guard(connection: Any, drone: str, port: int) -> None:
@@ -131,10 +121,8 @@ def guard(connection: Any, drone: str, port: int) -> None:
     def handle_data(data: bytes) -> None:
         try:
             handle(data)
-        except Exception as error:
-            receiver = connection.udp_receive_sock
-            receiver.dropped['bad content'] += 1
-            receiver.problem = f'content of a frame: {error}'
+        except Exception:
+            connection.udp_receive_sock.dropped['bad content'] += 1
 
     connection._create_udp_connection = open_sockets
     connection.handle_data = handle_data

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import RobotState
-from maasi_planner.motion.mambo import pose_of
 
 _GRAVITY = 9.81
 # Approximate rate at which the firmware brakes without roll and pitch [1/s].
@@ -30,17 +30,8 @@ _HOVER_RATE = 2.0
 _STILL_AIR = np.zeros(2)
 
 
-@dataclass(frozen=True)
-class Course:
-    """Where a drone is and how it moves.
-
-    Attributes
-    ----------
-    position, velocity : ndarray, shape (3,)
-        In the map [m], [m/s].
-    yaw : float
-        From the map's x axis [rad].
-    """
+class Course(NamedTuple):
+    """Where a drone is and how it moves: position and velocity (3,) in the map, yaw [rad]."""
 
     position: FloatArray
     velocity: FloatArray
@@ -49,22 +40,12 @@ class Course:
 
 @dataclass(frozen=True)
 class TiltModel:
-    """Response of a Mambo to piloting commands.
+    """Response of a Mambo to piloting commands."""
 
-    Attributes
-    ----------
-    tilt : float
-        Of 100 per cent roll or pitch [rad].
-    full_speed : float
-        Steady speed under it [m/s].
-    climb, turn : float
-        Of 100 per cent [m/s], [rad/s].
-    """
-
-    tilt: float
-    full_speed: float
-    climb: float
-    turn: float
+    tilt: float  # of 100 per cent roll or pitch [rad]
+    full_speed: float  # steady speed under it [m/s]
+    climb: float  # of 100 per cent [m/s]
+    turn: float  # of 100 per cent [rad/s]
 
     @property
     def thrust(self) -> float:
@@ -117,7 +98,6 @@ _JUMP = 0.5
 # Longest time of one prediction [s].
 _LONGEST = 1.0
 _HISTORY = 64
-_STILL = np.zeros(4)
 # Share of a position event's error that is the push; with poses of another system the time in
 # which it is learnt [s]; the largest [m/s^2]; and the speed above which the model's errors are
 # larger than it [m/s].
@@ -125,7 +105,7 @@ _PUSH_GAIN, _PUSH_TIME, _MOST_PUSH, _SLOW = 0.08, 2.0, 0.5, 0.1
 
 
 class DeadReckoning:
-    """Where the drone is between its position events."""
+    """Where the drone is between its position events; times are of the monotonic clock [s]."""
 
     def __init__(self, model: TiltModel, origin: Pose, settings: MamboSettings) -> None:
         self.model = model
@@ -140,20 +120,18 @@ class DeadReckoning:
         # By the last event [m].
         self._measured = origin.position
         # Recent commands, and the time at which each takes effect.
-        self._sent: deque[tuple[float, FloatArray]] = deque([(-math.inf, _STILL)])
-        self._now: float | None = None
-        # Recent (time, position, yaw) samples, monotonic clock.
+        self._sent: deque[tuple[float, FloatArray]] = deque([(-math.inf, np.zeros(4))])
+        self._now = -math.inf
+        # Recent times, positions and headings.
         self._past: deque[tuple[float, FloatArray, float]] = deque(maxlen=_HISTORY)
 
     @property
     def state(self) -> RobotState:
         """Pose, velocity and angular velocity in the map; tilted as commanded."""
-        course, shares = self.course, self._acting()
-        state = np.zeros(12)
-        state[:3] = course.position
-        state[3:6] = -self.model.tilt * shares[1], self.model.tilt * shares[0], course.yaw
-        turn = np.array([0.0, 0.0, self.model.turn * shares[3]])
-        return RobotState(pose_of(state), course.velocity, turn)
+        course, (forward, left, _, turn) = self.course, self._acting()
+        angles = -self.model.tilt * left, self.model.tilt * forward, course.yaw
+        rates = np.array([0.0, 0.0, self.model.turn * turn])
+        return RobotState(Pose.from_rpy(course.position, angles), course.velocity, rates)
 
     def covariance(self) -> FloatArray:
         """Return that of the pose, (6, 6): x, y, z [m^2], rotations about the map's axes."""
@@ -165,18 +143,16 @@ class DeadReckoning:
 
     def _tilt_doubt(self) -> float:
         """Return the uncertainty of the tilt from the uncertain delay of commands [rad]."""
-        now, delay = self._now or 0.0, self.settings.delay
-        recent = [shares[:2] for acts, shares in self._sent if abs(now - acts) <= delay]
-        if not recent:
-            return 0.0
-        spread = np.abs(np.array(recent) - self._acting()[:2]).max()
+        delay, acting = self.settings.delay, self._acting()[:2]
+        near = [
+            shares[:2] - acting for acts, shares in self._sent if abs(self._now - acts) <= delay
+        ]
         # Standard deviation of a uniform distribution of that half-width.
-        return float(self.model.tilt * spread) / math.sqrt(3.0)
+        return self.model.tilt * float(np.abs(near).max(initial=0.0)) / math.sqrt(3.0)
 
     def _acting(self) -> FloatArray:
         """Return the shares that the drone flies now."""
-        now = -math.inf if self._now is None else self._now
-        return next(shares for acts, shares in reversed(self._sent) if acts <= now)
+        return next(shares for acts, shares in reversed(self._sent) if acts <= self._now)
 
     def command(self, now: float, shares: FloatArray) -> None:
         """Take a command, (4,): forward, left, up, turn as shares of the largest."""
@@ -186,8 +162,8 @@ class DeadReckoning:
             sent.popleft()
 
     def go_on(self, now: float, flying: bool) -> None:
-        """Reckon up to `now` of the monotonic clock [s]; on the ground it stays where it is."""
-        before = now if self._now is None else max(self._now, now - _LONGEST)
+        """Reckon up to `now`; on the ground it stays where it is."""
+        before = max(self._now, now - _LONGEST) if math.isfinite(self._now) else now
         self._now = now
         if now <= before:
             return
@@ -198,8 +174,7 @@ class DeadReckoning:
 
     def ahead(self) -> Course:
         """Return where it will be when a command that is sent now acts."""
-        now = 0.0 if self._now is None else self._now
-        return self._fly(self.course, now, now + self.settings.delay)
+        return self._fly(self.course, self._now, self._now + self.settings.delay)
 
     def _fly(self, course: Course, begin: float, end: float) -> Course:
         sent = list(self._sent)
@@ -211,7 +186,7 @@ class DeadReckoning:
         return course
 
     def take(self, state: RobotState, now: float, flying: bool) -> None:
-        """Take the pose of another system, of `now` on the monotonic clock [s]."""
+        """Take the pose of another system, of `now`."""
         self._now = now
         if flying:
             change = (state.velocity - self.course.velocity) / _PUSH_TIME
@@ -220,27 +195,22 @@ class DeadReckoning:
 
     def correct(self, event: PositionEvent, flying: bool) -> None:
         """Take a position event."""
+        course, latency = self.course, self.settings.latency
         measured = self.origin.position + self._turn @ event.position
         heading = self.origin.yaw + event.yaw
-        self.age = self.settings.latency
-        position, yaw = self._at(event.received - self.settings.latency)
+        self.age = latency
+        position, yaw = self._at(event.received - latency)
         error = measured - position
         if not flying or float(np.abs(error).max()) > _JUMP:
-            velocity = self.course.velocity if flying else np.zeros(3)
-            self.course = Course(measured, velocity, heading)
+            self.course = Course(measured, course.velocity if flying else np.zeros(3), heading)
             self._past.clear()
             return
         change = _PUSH_GAIN / _EVENT_PERIOD**2 * error
         self._learn(change, (measured - self._measured) / _EVENT_PERIOD)
         self._measured = measured
-        turn = _wrapped(heading - yaw)
-        move = _POSITION_GAIN * error
-        course = self.course
-        self.course = Course(
-            course.position + move,
-            course.velocity + _VELOCITY_GAIN / _EVENT_PERIOD * error,
-            course.yaw + turn,
-        )
+        turn, move = math.remainder(heading - yaw, math.tau), _POSITION_GAIN * error
+        speed = _VELOCITY_GAIN / _EVENT_PERIOD * error
+        self.course = Course(course.position + move, course.velocity + speed, course.yaw + turn)
         moved = [(at, place + move, yaw + turn) for at, place, yaw in self._past]
         self._past = deque(moved, maxlen=_HISTORY)
 
@@ -249,22 +219,11 @@ class DeadReckoning:
         if float(np.hypot(*measured[:2])) < _SLOW:
             self.push = np.clip(self.push + change[:2], -_MOST_PUSH, _MOST_PUSH)
 
-    def _at(self, now: float) -> tuple[FloatArray, float]:
-        """Return position and heading at a time of the monotonic clock."""
-        later: tuple[float, FloatArray, float] | None = None
-        for item in reversed(self._past):
-            if item[0] <= now:
-                if later is None:
-                    ahead = min(now - item[0], _LONGEST)
-                    return item[1] + ahead * self.course.velocity, item[2]
-                share = (now - item[0]) / (later[0] - item[0])
-                turn = share * _wrapped(later[2] - item[2])
-                return item[1] + share * (later[1] - item[1]), item[2] + turn
-            later = item
-        if later is not None:
-            return later[1], later[2]
-        return self.course.position, self.course.yaw
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+    def _at(self, time: float) -> tuple[FloatArray, float]:
+        """Return position and heading at a time, from the sample before it."""
+        if not self._past:
+            return self.course.position, self.course.yaw
+        earlier = (item for item in reversed(self._past) if item[0] <= time)
+        at, position, yaw = next(earlier, self._past[0])
+        passed = min(max(time - at, 0.0), _LONGEST)
+        return position + passed * self.course.velocity, yaw

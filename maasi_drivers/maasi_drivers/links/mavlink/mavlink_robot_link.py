@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import fence_problem, make_vehicle_fence
+from maasi_drivers.agent.flight_rules import fence_problem, make_fence
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, ArrivalClock, RobotNode
@@ -66,7 +66,7 @@ class MavlinkRobotLink(RobotLink):
         self._taken = -1
         self._heading: float | None = None
         self._ending = False
-        self._fence = make_vehicle_fence(
+        self._fence = make_fence(
             self._mavlink.geofence,
             driver.bounds,
             settings.radius,

@@ -167,14 +167,10 @@ class Vehicle:
 
         Units: now [s].
         """
-        problem = self._objection(now)
-        if problem:
-            self._permission.end()
-            return problem
-        self._permission.give(now)
-        if self.phase is Phase.STOPPED:
+        problem = self._permission.ask(now, self._objection(now))
+        if not problem and self.phase is Phase.STOPPED:
             self._enter(Phase.PREPARING)
-        return ''
+        return problem
 
     def forbid(self) -> None:
         """End the permission: arming is given up, a flight continues."""
