@@ -2,14 +2,7 @@
 
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.make_filter import load_filter, make_filter, warm_up
-from maasi_filter.metrics import (
-    Gospa,
-    Match,
-    RestrictedMean,
-    gospa,
-    match_targets,
-    restricted_mean,
-)
+from maasi_filter.metrics import Gospa, Match, gospa, match_targets
 from maasi_filter.models.detection import (
     BoxDetection,
     DetectionModel,
@@ -59,7 +52,6 @@ __all__ = [
     'Pose',
     'RangeBearing',
     'RangeBearingElevation',
-    'RestrictedMean',
     'SearchFilter',
     'Sensor',
     'SensorSettings',
@@ -72,7 +64,6 @@ __all__ = [
     'load_filter',
     'make_filter',
     'match_targets',
-    'restricted_mean',
     'warm_up',
     'wrap_angle',
 ]

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import PlainValidator
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
-ImageArray = NDArray[np.uint8]
+# In records that are read from a file pydantic takes them as they are.
+_AS_IT_IS = PlainValidator(lambda value: value)
+
+FloatArray = Annotated[NDArray[np.float64], _AS_IT_IS]
+IntArray = Annotated[NDArray[np.int64], _AS_IT_IS]
+BoolArray = Annotated[NDArray[np.bool_], _AS_IT_IS]
+ByteArray = Annotated[NDArray[np.uint8], _AS_IT_IS]
+ImageArray = ByteArray

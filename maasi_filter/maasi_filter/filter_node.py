@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from maasi_filter.make_filter import FilterMemory, Progress, load_filter, make_filter, warm_up
+from maasi_filter.make_filter import Progress, load_state, make_filter, warm_up
 from maasi_filter.measurement_check import FOUND, REPEATED
 from maasi_filter.node.batch_assembly import BatchAssembly, PendingBatch
 from maasi_filter.node.found_target_exchange import KeptFoundTargets, SharedFoundTargets
@@ -34,7 +34,7 @@ from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
 from maasi_filter.ros.run_node import run
 from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import unsuitable_lengths
-from maasi_filter.state_file import StateFileError
+from maasi_filter.state_file import StateFileError, write_state
 from maasi_msgs.msg import (
     ClusterArray,
     DetectionArray,
@@ -128,20 +128,13 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             name: robot.sensor.build(name, self._dimension)
             for name, robot in sorted(settings.robots.items())
         }
-        self._memory = (
-            FilterMemory(settings.save_file)
-            if settings.save_file and settings.save_batches
-            else None
-        )
         self._shared = SharedFoundTargets(self)
         self._views = FilterViews(self)
         self._begin_anew()
         self._kept = KeptFoundTargets()
         self._restored = b''
-        if self._memory is not None:
-            self._restore(self._memory)
-        elif settings.save_file and Path(settings.save_file).exists():
-            self._load()
+        if settings.save_file and Path(settings.save_file).exists():
+            self._restore(Path(settings.save_file))
 
     def _begin_anew(self) -> None:
         settings = self.settings
@@ -161,58 +154,48 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self._no_faults = {FOUND: 0, REPEATED: 0}
         self._misfits: dict[str, str] = {}
 
-    def _restore(self, memory: FilterMemory) -> None:
-        """Resume after the last batch of a process that died."""
-        try:
-            saved = memory.load()
-            if saved is not None:
-                self._check_bounds(saved[0])
-        except (StateFileError, SettingsError) as error:
-            # The rest of the team continues, so this node starts without the saved state.
-            self.get_logger().error(f'{error}; set aside as {memory.set_aside()}')
-            return
-        if saved is None:
-            return
-        self.filter, progress = saved
-        self._batches.last, self._batches.last_stamp = progress.batch, progress.stamp
-        self._last_step = progress.step
-        self._settled_by = dict(progress.settled_by)
-        self._batches.heard = dict(progress.heard)
-        self._restored = progress.update
-        self.get_logger().warning(
-            f'restarted after batch {progress.batch} with {len(self.filter.found_targets)} found '
-            f'targets, from {memory.path}'
-        )
-
-    def _load(self) -> None:
-        """Resume the saved search.
+    def _restore(self, file: Path) -> None:
+        """Resume the saved search, or after the last batch of a process that died.
 
         Raises
         ------
         SettingsError
-            If the file is damaged, or of another environment.
+            If the file is damaged, or of another environment, and does not belong to the run.
         """
         settings = self.settings
         try:
-            saved = load_filter(settings.save_file)
-        except StateFileError as error:
-            raise SettingsError(f'parameter save_file: {error}') from None
-        self._check_bounds(saved)
+            saved, progress = load_state(file)
+            self._check_bounds(saved)
+        except (StateFileError, SettingsError) as error:
+            if not settings.save_batches:
+                raise SettingsError(f'parameter save_file: {error}') from None
+            # The rest of the team continues, so this node starts without the saved state.
+            aside = file.replace(file.with_name(f'{file.name}.refused'))
+            self.get_logger().error(f'{error}; set aside as {aside}')
+            return
         if saved.settings != settings.filter:
             self.get_logger().warning(
-                f'{settings.save_file} was saved with other settings of the filter; they go on'
+                f'{file} was saved with other settings of the filter; they go on'
             )
         self.filter = saved
-        self.get_logger().info(
-            f'state loaded from {settings.save_file}: {len(saved.found_targets)} found targets'
+        found = f'{len(saved.found_targets)} found targets'
+        if progress is None or not settings.save_batches:
+            self.get_logger().info(f'state loaded from {file}: {found}')
+            return
+        self._batches.last, self._batches.last_stamp = progress.batch, progress.stamp
+        self._last_step = progress.step
+        self._settled_by, self._batches.heard = progress.settled_by, progress.heard
+        self._restored = progress.update.tobytes()
+        self.get_logger().warning(
+            f'restarted after batch {progress.batch} with {found}, from {file}'
         )
 
     def _check_bounds(self, saved: SearchFilter) -> None:
         bounds = self.settings.environment.array()
         if not np.array_equal(saved.bounds, bounds):
             raise SettingsError(
-                f'parameter save_file: {self.settings.save_file}: bounds: got '
-                f'{saved.bounds.tolist()}, allowed are those of the environment, {bounds.tolist()}'
+                f'{self.settings.save_file}: bounds: got {saved.bounds.tolist()}, allowed are '
+                f'those of the environment, {bounds.tolist()}'
             )
 
     def set_up(self) -> None:
@@ -240,7 +223,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         self.expect_subscribers(self._found_publisher, len(self._shared) + 1 if self._shared else 0)
         if not settings.lockstep:
             self.create_wall_timer(_TIMEOUT_PERIOD, self._give_up_waiting)
-        if settings.save_file and settings.save_period > 0.0:
+        if settings.save_period > 0.0 and not settings.save_batches:
             self.create_wall_timer(settings.save_period, self._save)
 
     def start(self) -> None:
@@ -256,23 +239,29 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
     def halt(self) -> None:
         """Save the state."""
-        if self.active:
+        if self.active and not self.settings.save_batches:
             self._save()
 
-    def _save(self) -> None:
-        if not self.settings.save_file or self._memory is not None:
+    def _save(self, progress: Progress | None = None) -> None:
+        settings = self.settings
+        if not settings.save_file:
             return
+        file = Path(settings.save_file)
         try:
-            self.filter.save(self.settings.save_file)
+            if settings.save_batches:
+                file.parent.mkdir(parents=True, exist_ok=True)
+            # After each batch it need not survive a power failure, only the death of the process.
+            durable = not settings.save_batches
+            write_state(file, {**self.filter.state(), 'progress': progress}, durable=durable)
         except OSError as error:
             # A search must not fail because its copy cannot be written.
-            self.get_logger().error(f'{self.settings.save_file}: state not saved: {error.strerror}')
+            self.warn_throttled('state', f'{file}: state not saved: {error.strerror}')
 
     def reset(self) -> None:
         """Begin a new search."""
         self._begin_anew()
-        if self._memory is not None:
-            self._memory.forget()
+        if self.settings.save_file and self.settings.save_batches:
+            Path(self.settings.save_file).unlink(missing_ok=True)
 
     def status(self) -> dict[str, Any]:
         """Return the state of the search."""
@@ -325,7 +314,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             self._process(batch)
 
     def _process(self, batch: PendingBatch) -> None:
-        begin = time.perf_counter()
+        begin, settings = time.perf_counter(), self.settings
         last = self._last_step
         steps = 1 if last is None else min(max(batch.step - last, 0), _MOST_STEPS)
         self._last_step = batch.step
@@ -351,7 +340,7 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
         for robot in sorted(result.misfits.keys() - self._misfits.keys()):
             self.warn_throttled(f'misfit of {robot}', result.misfits[robot])
         self._misfits = result.misfits
-        header = Header(stamp=stamp_to_ros(batch.stamp), frame_id=self.settings.frame)
+        header = Header(stamp=stamp_to_ros(batch.stamp), frame_id=settings.frame)
         for target in result.newly_found:
             self._settled_by[target.id] = batch.id
         clusters = [cluster_to_ros(cluster) for cluster in result.clusters]
@@ -366,9 +355,19 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
             newly_found=[found_target_to_ros(target, batch.id) for target in result.newly_found],
             clusters=clusters,
         )
-        if self._memory is not None:
+        if settings.save_batches:
             # Save before publishing, so that no published result is lost with this process.
-            self._remember(self._memory, update)
+            heard, data = self._batches.heard, serialize_message(update)
+            self._save(
+                Progress(
+                    self._batches.last,
+                    self._batches.last_stamp,
+                    batch.step,
+                    self._settled_by,
+                    heard,
+                    np.frombuffer(data, np.uint8),
+                )
+            )
         # Found targets first, so that subscribers have them when the update arrives.
         if changed or result.found_changed or not self._found_published:
             self._publish_found(header, batch.id)
@@ -399,21 +398,6 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
                 ],
             )
         )
-
-    def _remember(self, memory: FilterMemory, update: FilterUpdate) -> None:
-        progress = Progress(
-            batch=self._batches.last,
-            stamp=self._batches.last_stamp,
-            step=self._last_step or 0,
-            settled_by=self._settled_by,
-            heard=self._batches.heard,
-            update=serialize_message(update),
-        )
-        try:
-            memory.save(self.filter, progress)
-        except OSError as error:
-            # A search must not fail because its copy cannot be written.
-            self.warn_throttled('state', f'{memory.path}: state not saved: {error.strerror}')
 
     def _on_kept(self, message: FoundTargetArray) -> None:
         """Restore targets found before a restart of this node without its state."""

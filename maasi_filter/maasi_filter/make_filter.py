@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import TypeAdapter
 
+from maasi_filter.arrays import ByteArray
 from maasi_filter.ic_phd.filter import IcPhdFilter
 from maasi_filter.models.detection import PARAMETERS, detection_probability
 from maasi_filter.models.pose import Pose
@@ -21,7 +23,7 @@ from maasi_filter.settings import (
     NoiseSettings,
     SensorSettings,
 )
-from maasi_filter.state_file import SavedState, write_state
+from maasi_filter.state_file import StateFileError, read_state
 
 
 def make_filter(
@@ -46,6 +48,18 @@ def make_filter(
     return IcPhdFilter(settings, bounds, generator)
 
 
+@dataclass
+class Progress:
+    """Progress of a run after a batch."""
+
+    batch: int  # Id of the last batch
+    stamp: int  # Of the last batch [ns]
+    step: int  # Of the last batch
+    settled_by: dict[int, int]  # Id of the batch that completed each found target, by its id
+    heard: dict[str, tuple[int, int, int]]  # Batch, measurement, stamp [ns] last heard, by robot
+    update: ByteArray  # The last update, serialised; it may not have been sent yet
+
+
 def load_filter(path: str | os.PathLike[str]) -> SearchFilter:
     """Return the saved filter; it continues bit for bit as the saved one would have.
 
@@ -54,18 +68,18 @@ def load_filter(path: str | os.PathLike[str]) -> SearchFilter:
     StateFileError
         If the file is missing, of another format or version, or damaged; it says which.
     """
-    return filter_of(SavedState(path))
+    return load_state(path)[0]
 
 
-def filter_of(saved: SavedState) -> SearchFilter:
-    """Return the filter of a file.
-
-    Raises
-    ------
-    StateFileError
-        If something is missing, or has a wrong type, shape or number.
-    """
-    return PmbFilter.of(saved) if PmbFilter.method in saved else IcPhdFilter.of(saved)
+def load_state(path: str | os.PathLike[str]) -> tuple[SearchFilter, Progress | None]:
+    """Return the saved filter as `load_filter`, and the progress of its run, if it was saved."""
+    saved = read_state(path)
+    try:
+        kind = PmbFilter if PmbFilter.method in saved else IcPhdFilter
+        progress = TypeAdapter[Any](Progress | None).validate_python(saved.get('progress'))
+        return kind.of(saved[kind.method]), progress
+    except (ValueError, KeyError) as error:
+        raise StateFileError(f'{path}: does not hold a usable state: {error}') from None
 
 
 def warm_up() -> None:
@@ -97,50 +111,3 @@ def warm_up() -> None:
                 search.exploration.at(np.full((1, 3), 3.0))
     origin = np.zeros(3)
     detection_probability(0, np.zeros(PARAMETERS), origin, origin, 0.0)
-
-
-@dataclass
-class Progress:
-    """Progress of a run after a batch."""
-
-    batch: int  # Id of the last batch
-    stamp: int  # Of the last batch [ns]
-    step: int  # Of the last batch
-    #: Id of the batch that completed each found target, by the id of the target.
-    settled_by: dict[int, int] = field(default_factory=dict)
-    #: Batch, measurement and stamp [ns] of the last detections, by robot.
-    heard: dict[str, tuple[int, int, int]] = field(default_factory=dict)
-    #: The last update, as published and serialised; it may not have been sent yet.
-    update: bytes = b''
-
-
-class FilterMemory:
-    """Keeps a filter with its progress in a file, replaced atomically after each batch.
-
-    The file survives the death of the process, not a power failure: it is not forced to the disk.
-    """
-
-    def __init__(self, path: str) -> None:
-        self.path = Path(path)
-
-    def save(self, search: SearchFilter, progress: Progress) -> None:
-        """Save both; OSError if the file cannot be written: the old one is kept."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_state(self.path, {**search.state(), 'progress': progress}, durable=False)
-
-    def load(self) -> tuple[SearchFilter, Progress] | None:
-        """Return the saved filter and progress, or None without a file."""
-        if not self.path.exists():
-            return None
-        saved = SavedState(self.path)
-        return filter_of(saved), saved.read('progress', Progress)
-
-    def set_aside(self) -> Path:
-        """Rename a file that cannot be used, to keep it for inspection; return its new name."""
-        aside = self.path.with_name(f'{self.path.name}.refused')
-        self.path.replace(aside)
-        return aside
-
-    def forget(self) -> None:
-        """Remove the file of a search that has ended."""
-        self.path.unlink(missing_ok=True)

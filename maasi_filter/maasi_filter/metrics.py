@@ -1,9 +1,8 @@
-"""Metrics of the estimate of a set of targets, and of search times."""
+"""Metrics of the estimate of a set of targets."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,77 +133,3 @@ def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Matc
         false_found=apart.shape[0] - len(pairs),
         rmse=math.sqrt(float(squares.mean())) if len(squares) else math.nan,
     )
-
-
-@dataclass(frozen=True)
-class RestrictedMean:
-    """Restricted mean time of runs of which some are censored.
-
-    Parameters
-    ----------
-    finished, runs : int
-        Runs that finished within the cap, and all.
-    """
-
-    mean: float  # Area under the Kaplan-Meier curve up to the cap
-    standard_error: float  # Of the mean (Greenwood's plug-in); 0 for a single run
-    finished: int
-    runs: int
-
-
-def restricted_mean(
-    times: Sequence[float | None], cap: float, ended: Sequence[float] | None = None
-) -> RestrictedMean:
-    """Return the restricted mean time to find all targets.
-
-    Parameters
-    ----------
-    times : sequence of float or None
-        Time at which each run had found all targets; None if it did not.
-    cap : float
-        Upper end of the mean.
-    ended : sequence of float, optional
-        Censoring time of each run that did not find all targets; the cap if not given.
-
-    Raises
-    ------
-    ValueError
-        If there are no runs, or a number is not usable.
-    """
-    _positive('cap', cap)
-    if len(times) == 0:
-        raise ValueError('times: got no runs, allowed is one or more')
-    if ended is not None and len(ended) != len(times):
-        raise ValueError(f'ended: got {len(ended)} numbers, allowed are {len(times)}')
-    last = np.array(
-        [
-            (cap if ended is None else ended[i]) if value is None else value
-            for i, value in enumerate(times)
-        ],
-        dtype=float,
-    )
-    if not (np.isfinite(last).all() and (last >= 0.0).all()):
-        raise ValueError(f'times: got {last.tolist()}, allowed are finite numbers from 0')
-    event = np.array([value is not None for value in times]) & (last <= cap)
-    last = np.minimum(last, cap)
-    moments = np.unique(last[event])
-    survival = 1.0
-    previous = 0.0
-    area = 0.0
-    steps = []
-    for moment in moments:
-        area += survival * (moment - previous)
-        at_risk = int((last >= moment).sum())
-        finished = int(((last == moment) & event).sum())
-        steps.append((moment, at_risk, finished, area))
-        survival *= 1.0 - finished / at_risk
-        previous = moment
-    area += survival * (cap - previous)
-    variance = 0.0
-    for _, at_risk, finished, before in steps:
-        if at_risk > finished:
-            variance += (area - before) ** 2 * finished / (at_risk * (at_risk - finished))
-    runs = len(times)
-    if runs > 1:
-        variance *= runs / (runs - 1)
-    return RestrictedMean(float(area), math.sqrt(variance), int(event.sum()), runs)

@@ -154,9 +154,9 @@ class FilterResult:
         Warnings that the detections of a robot do not fit its settings, by robot.
     """
 
-    clusters: list[Cluster]
-    newly_found: list[FoundTarget]
-    found_changed: bool
-    expected_number: float
+    clusters: list[Cluster] = field(default_factory=list)
+    newly_found: list[FoundTarget] = field(default_factory=list)
+    found_changed: bool = False
+    expected_number: float = 0.0
     dropped: dict[str, int] = field(default_factory=dict)
     misfits: dict[str, str] = field(default_factory=dict)

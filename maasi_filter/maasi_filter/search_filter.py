@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import TypeAdapter
 from typing_extensions import Self
 
 from maasi_filter.arrays import FloatArray
@@ -15,7 +16,7 @@ from maasi_filter.found_targets import FoundTargets
 from maasi_filter.measurement_check import check_taken
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.settings import FilterSettings
-from maasi_filter.state_file import SavedState, write_state
+from maasi_filter.state_file import SavedGenerator, write_state
 from maasi_filter.unexplored_map import UnexploredMap
 
 
@@ -122,6 +123,15 @@ class SearchFilter(Protocol):
         """Return the whole state, random generator included, by the method, for `write_state`."""
 
 
+# What of every filter is saved, with its type, beside e.
+_SAVED: dict[str, Any] = {
+    'settings': FilterSettings,
+    'bounds': FloatArray,
+    'generator': SavedGenerator,
+    'clusters': list[Cluster],
+}
+
+
 class FilterBase:
     """What the filters share: exploration, found targets from elsewhere, and the saved state."""
 
@@ -145,10 +155,6 @@ class FilterBase:
 
     def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
         """Take found targets into the state, of which some are new or changed."""
-        raise NotImplementedError
-
-    def check(self) -> None:
-        """Refuse a loaded state that a step cannot continue from (ValueError)."""
         raise NotImplementedError
 
     def own_found_targets(self) -> list[FoundTarget]:
@@ -177,23 +183,16 @@ class FilterBase:
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Return the whole state, random generator included, by the method."""
-        state = {name: getattr(self, name) for name in ('settings', 'bounds', 'generator')}
-        state['exploration'] = self.exploration.values
-        names = ('clusters', *self.saved)
-        return {self.method: state | {name.lstrip('_'): getattr(self, name) for name in names}}
+        state = {name: getattr(self, name) for name in (*_SAVED, *self.saved)}
+        return {self.method: {**state, 'exploration': self.exploration.values}}
 
     @classmethod
-    def of(cls, saved: SavedState) -> Self:
-        """Return the filter of a file; it continues bit for bit as the saved one would have."""
-        kinds: dict[str, Any] = {'settings': FilterSettings, 'generator': np.random.Generator}
-        kinds |= {'bounds': FloatArray, 'exploration': FloatArray}
-        own = {'clusters': list[Cluster], **cls.saved}
-        kinds |= {name.lstrip('_'): kind for name, kind in own.items()}
-        state = saved.read(cls.method, kinds)
-        with saved.named():
-            search = cls(state['settings'], state['bounds'], state['generator'])
-            search.exploration.restore(state['exploration'])
-            for name in own:
-                setattr(search, name, state[name.lstrip('_')])
-            search.check()
+    def of(cls, saved: Mapping[str, Any]) -> Self:
+        """Return a saved filter; it continues bit for bit as the saved one would have."""
+        kinds = {**_SAVED, **cls.saved}
+        state = {name: TypeAdapter(kinds[name]).validate_python(saved[name]) for name in kinds}
+        search = cls(state['settings'], state['bounds'], state['generator'])
+        search.exploration.values[...] = saved['exploration']
+        for name in ('clusters', *cls.saved):
+            setattr(search, name, state[name])
         return search

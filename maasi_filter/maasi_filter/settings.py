@@ -19,7 +19,6 @@ from maasi_filter.models.detection import (
 from maasi_filter.models.measurement import RangeBearing, RangeBearingElevation
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.plugins import OwnSettings, PluginGroup
-from maasi_filter.pmb.settings import PmbSettings
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -239,6 +238,49 @@ class EnvironmentSettings(Settings):
     def array(self) -> FloatArray:
         """Return the bounds, (d, 2)."""
         return np.array(self.bounds, dtype=float)
+
+
+class OffsetSettings(Settings):
+    """Errors of the robots' positions that last; both 0: their errors are independent."""
+
+    deviation: float = Field(
+        default=0.0, ge=0.0, description='Deviation of a constant offset on each axis [m]'
+    )
+    drift: float = Field(
+        default=0.0,
+        ge=0.0,
+        description='Deviation of the drift of x and y after one metre; grows with its root [m]',
+    )
+
+
+class PmbSettings(Settings):
+    """Settings of the Poisson multi-Bernoulli filter."""
+
+    particles: int = Field(
+        default=300, ge=50, le=100_000, description='Particles of each potential target [1]'
+    )
+    found_probability: float = Field(
+        default=0.99,
+        gt=0.5,
+        lt=1.0,
+        description='Existence probability above which a target can be found [1]',
+    )
+    withdrawn_probability: float = Field(
+        default=0.5,
+        ge=0.0,
+        le=0.5,
+        description='Existence probability below which a found target is withdrawn [1]',
+    )
+    walk: float = Field(
+        default=0.0,
+        ge=0.0,
+        description='Standard deviation of a random walk of the targets on each axis after one '
+        'second; 0: they stand still [m/sqrt(s)]',
+    )
+    offset: OffsetSettings = Field(
+        default_factory=OffsetSettings,
+        description='Errors of the robots that last, which the filter estimates',
+    )
 
 
 Preset = Literal['paper_000', 'paper_001', 'paper_002', 'paper_003']

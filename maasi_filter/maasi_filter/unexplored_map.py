@@ -262,16 +262,6 @@ class UnexploredMap:
         volumes = self.cell_volumes()
         return 1.0 - float((volumes * self.values).sum() / volumes.sum())
 
-    def restore(self, values: FloatArray) -> None:
-        """Put saved values in place of e; ValueError if they do not fit the nodes or [0, 1]."""
-        if values.shape != self.values.shape:
-            raise ValueError(
-                f'exploration: got shape {values.shape}, allowed is {self.values.shape}'
-            )
-        if not ((values >= 0.0) & (values <= 1.0)).all():
-            raise ValueError('exploration: got a number that is not from 0 to 1')
-        self.values[...] = values
-
     def copy(self) -> UnexploredMap:
         """Return an independent copy."""
         other = UnexploredMap(self.bounds, self.spacing)

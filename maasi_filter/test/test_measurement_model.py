@@ -1,10 +1,9 @@
-"""Range and angles: inverses, Jacobians, densities, wrapping and poles."""
+"""Range and angles: inverses, Jacobians, wrapping and poles."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import multivariate_normal
 
 from maasi_filter import NoiseSettings, Pose, RangeBearing, RangeBearingElevation, wrap_angle
 
@@ -56,29 +55,6 @@ def test_poles_have_finite_answers():
     jacobian = solid.jacobian(above, pose)[0]
     np.testing.assert_array_equal(jacobian[0], [0.0, 0.0, 1.0])
     np.testing.assert_array_equal(jacobian[1], 0.0)
-
-
-@pytest.mark.parametrize('model', MODELS)
-def test_log_density_is_a_wrapped_gaussian(model):
-    generator = np.random.default_rng(2)
-    d = model.dimension
-    root = generator.normal(0.0, 0.2, (d, d)) + 0.5 * np.eye(d)
-    covariance = root @ root.T
-    pose = Pose([0.0, 0.0, 0.0])
-    positions = generator.normal(0.0, 3.0, (50, d))
-    z = model.measure(positions[:4], pose) + 0.1
-    z[:, 1] += 2 * np.pi * np.array([0, 1, -1, 2])
-    values = model.log_density(z, positions, pose, covariance)
-    assert values.shape == (4, 50)
-    residual = model.residual(z[:, None, :], model.measure(positions, pose)[None])
-    expected = multivariate_normal(np.zeros(d), covariance).logpdf(residual)
-    np.testing.assert_allclose(values, expected)
-    np.testing.assert_allclose(model.log_density(z[0], positions, pose, covariance), values[0])
-
-
-def test_a_singular_covariance_is_refused():
-    with pytest.raises(ValueError, match='positive definite'):
-        RangeBearing().log_density([1.0, 0.0], [[1.0, 0.0]], Pose([0, 0, 0]), np.zeros((2, 2)))
 
 
 @given(st.floats(-100.0, 100.0))

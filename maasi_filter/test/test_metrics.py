@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from maasi_filter import gospa, match_targets, restricted_mean
+from maasi_filter import gospa, match_targets
 
 points = st.lists(
     st.tuples(st.floats(-10.0, 10.0), st.floats(-10.0, 10.0)), min_size=0, max_size=4
@@ -52,24 +52,6 @@ def test_matching_is_one_to_one_and_takes_as_many_pairs_as_it_can():
     assert np.isnan(match_targets([], [[0.0, 0.0]], 1.0).rmse)
 
 
-def test_restricted_mean_of_finished_runs_is_their_mean():
-    value = restricted_mean([10.0, 20.0, 30.0], 100.0)
-    assert value.mean == pytest.approx(20.0)
-    assert value.standard_error == pytest.approx(np.std([10, 20, 30], ddof=1) / np.sqrt(3))
-    assert (value.finished, value.runs) == (3, 3)
-
-
-def test_runs_that_reach_the_cap_count_as_the_cap():
-    value = restricted_mean([10.0, None, 30.0, 250.0], 100.0)
-    assert value.mean == pytest.approx((10.0 + 100.0 + 30.0 + 100.0) / 4)
-    assert value.finished == 2
-
-
-def test_runs_cut_short_count_as_kaplan_and_meier_have_it():
-    value = restricted_mean([10.0, None, 30.0], 40.0, ended=[10.0, 20.0, 30.0])
-    assert value.mean == pytest.approx(10.0 + 20.0 * 2 / 3)
-
-
 @pytest.mark.parametrize(
     'call',
     [
@@ -78,9 +60,6 @@ def test_runs_cut_short_count_as_kaplan_and_meier_have_it():
         lambda: gospa([[0.0, 0.0]], [[0.0, 0.0]], 0.0),
         lambda: gospa([[0.0, 0.0]], [[0.0, 0.0]], 1.0, 0.5),
         lambda: match_targets([[0.0, 0.0]], [[0.0, 0.0]], -1.0),
-        lambda: restricted_mean([], 10.0),
-        lambda: restricted_mean([np.nan], 10.0),
-        lambda: restricted_mean([None], 10.0, ended=[1.0, 2.0]),
     ],
 )
 def test_bad_input_is_refused(call):

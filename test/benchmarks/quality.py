@@ -26,7 +26,7 @@ from quality_conditions import CONDITIONS, RETURNS, SCENARIOS, SEEDS
 from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
-from maasi_filter.metrics import match_targets, restricted_mean
+from maasi_filter.metrics import match_targets
 from maasi_filter.vector_math import squared_distance
 from maasi_sim.experiments.campaign import run_command
 from maasi_sim.experiments.statistics import paired_difference
@@ -136,6 +136,25 @@ def run_one(condition: str, method: str, seed: int, settings: dict[str, Any] | N
     )
 
 
+def restricted_mean(times: np.ndarray, ended: np.ndarray, cap: float) -> tuple[float, float]:
+    """Return the restricted mean of times (n,) and its standard error (Greenwood's plug-in).
+
+    It is the area under the Kaplan-Meier curve up to `cap`; where `ended` is false the run was cut
+    short at its time.
+    """
+    ended, times = ended & (times <= cap), np.minimum(times, cap)
+    survival, previous, area, steps = 1.0, 0.0, 0.0, []
+    for moment in np.unique(times[ended]):
+        area += survival * (moment - previous)
+        risk, here = (times >= moment).sum(), ((times == moment) & ended).sum()
+        steps.append((risk, here, area))
+        survival *= 1.0 - here / risk
+        previous = moment
+    area += survival * (cap - previous)
+    variance = sum((area - a) ** 2 * n / (m * (m - n)) for m, n, a in steps if m > n)
+    return float(area), math.sqrt(variance * len(times) / max(len(times) - 1, 1))
+
+
 def summary(runs: Sequence[Run], cap: int) -> dict[str, Any]:
     """Return the figures of a row, with 95 % intervals.
 
@@ -146,11 +165,9 @@ def summary(runs: Sequence[Run], cap: int) -> dict[str, Any]:
     complete = sum(run.finished for run in runs)
     false = sum(run.false_found for run in runs)
     found = max(sum(run.found for run in runs), 1)
-    times = restricted_mean(
-        [run.measurements if run.finished else None for run in runs],
-        cap,
-        [float(run.measurements) for run in runs],
-    )
+    measurements = np.array([float(run.measurements) for run in runs])
+    ended = np.array([run.finished for run in runs], np.bool_)
+    mean, error = restricted_mean(measurements, ended, cap)
     return {
         'runs': number,
         'complete': complete,
@@ -162,8 +179,8 @@ def summary(runs: Sequence[Run], cap: int) -> dict[str, Any]:
         ],
         'rmse': math.sqrt(sum(run.squares for run in runs) / found),
         'nees': sum(run.normalised for run in runs) / found,
-        'measurements': times.mean,
-        'measurements_half_width': 1.96 * times.standard_error,
+        'measurements': mean,
+        'measurements_half_width': 1.96 * error,
         'step_ms': 1e3 * float(np.median([run.step for run in runs])),
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from searches import log_density
 
 from maasi_filter import (
     AgentMeasurement,
@@ -61,5 +62,5 @@ def densities(sensor, position, values):
     pose = Pose(np.asarray(position, float))
     probability = np.minimum(sensor.detection.probability(cells(), pose), 0.98)
     values = np.reshape(values, (-1, 2))
-    logs = sensor.measurement.log_density(values, cells(), pose, sensor.covariance)
+    logs = log_density(sensor, values, cells(), pose)
     return probability, np.exp(logs)

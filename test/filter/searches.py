@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import multivariate_normal
 
 from maasi_filter import (
     AgentMeasurement,
@@ -55,6 +56,14 @@ def observe(generator, sensor, targets, pose):
     ).reshape(values.shape)
     values[:, 1] = wrap_angle(values[:, 1])
     return values
+
+
+def log_density(sensor, z, positions, pose):
+    """Return log p(z | x) (m, n) of measurements (m, d) and positions (n, d): 000, (10)."""
+    model = sensor.measurement
+    errors = model.residual(z[:, None, :], model.measure(positions, pose))
+    logs = multivariate_normal(np.zeros(model.dimension), sensor.covariance).logpdf(errors)
+    return logs.reshape(len(z), len(positions))
 
 
 def wander(generator, number, centre=130.0, size=110.0, stride=12.0):

@@ -3,7 +3,7 @@
 import pytest
 from test_filter_node import running, seen_from_a
 
-from maasi_filter.make_filter import FilterMemory
+from maasi_filter.make_filter import load_state
 from maasi_filter.node.found_target_exchange import KeptFoundTargets
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import FoundTargetArray
@@ -66,7 +66,7 @@ def test_a_state_that_cannot_be_used_is_set_aside(tmp_path):
     with running(**options) as (_, team, until):
         seen_from_a(team, until, [1, 2])
         assert (tmp_path / 'state.refused').read_bytes() == bytes(content)
-        assert FilterMemory(options['save_file']).load()[1].batch == 2
+        assert load_state(options['save_file'])[1].batch == 2
 
 
 def test_a_new_search_forgets_the_file(tmp_path):

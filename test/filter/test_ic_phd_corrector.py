@@ -7,6 +7,7 @@ import datetime
 import numpy as np
 import pytest
 from scipy.special import logsumexp
+from searches import log_density
 
 from maasi_filter import (
     AgentMeasurement,
@@ -45,7 +46,7 @@ def case(dimension, seed=0, particles=500, detections=4):
 def dense(sensor, pose, positions, weights, values, background):
     """Return the factor and C(z) of (13) and (16), term by term."""
     probability = sensor.detection.probability(positions, pose)
-    likelihood = np.exp(sensor.measurement.log_density(values, positions, pose, sensor.covariance))
+    likelihood = np.exp(log_density(sensor, values, positions, pose))
     psi = probability * likelihood
     normaliser = background + (psi * weights).sum(axis=1)
     return 1.0 - probability + (psi / normaliser[:, None]).sum(axis=0), normaliser

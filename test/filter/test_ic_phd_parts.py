@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from searches import log_density
 
 from maasi_filter import ExponentialDetection, Pose, Sensor
 from maasi_filter.found_targets import FoundTargets
@@ -39,7 +40,7 @@ def test_births_weigh_what_the_constant_intensity_predicts(dimension):
     )  # fmt: skip
     axis = np.linspace(0.5, 99.5, 100)
     grid = np.stack(np.meshgrid(*[axis] * dimension, indexing='ij'), -1).reshape(-1, dimension)
-    likelihood = np.exp(sensor.measurement.log_density(z[0], grid, POSE, NOISE[dimension]))
+    likelihood = np.exp(log_density(sensor, z, grid, POSE))
     missed = 1.0 - sensor.detection.probability(grid, before)
     chance = sensor.detection.probability(grid, POSE)
     expected = (12.0 / 100.0**dimension * missed * chance * likelihood).sum()

@@ -9,7 +9,7 @@ from searches import floor_sensor, observe, same
 
 from maasi_filter import AgentMeasurement, FilterSettings, Pose
 from maasi_filter.ic_phd.filter import IcPhdFilter
-from maasi_filter.pmb.component import LabelTally
+from maasi_filter.pmb.labels import LabelTally
 from maasi_filter.records import Label
 
 PAIR = np.array([[50.0, 50.0], [51.0, 50.0]])

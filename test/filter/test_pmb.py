@@ -10,9 +10,9 @@ from pmb_problems import PLANE, SIDE, cells, densities, measured, plane_filter, 
 from maasi_filter import FilterSettings, Pose, UnexploredMap, wrap_angle
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.models.sensor import LEAST_PER_SCAN
-from maasi_filter.pmb.births import draw_births
 from maasi_filter.pmb.filter import PmbFilter
-from maasi_filter.pmb.learnt import PRIOR_SCANS, ClutterEstimate
+from maasi_filter.pmb.learnt import PRIOR_SCANS, Learnt
+from maasi_filter.pmb.scan import make_scan
 from maasi_filter.records import Label
 
 TARGET = np.array([[60.0, 45.0]])
@@ -88,15 +88,10 @@ def test_unseen_targets_are_thinned_as_the_exploration_function_says():
     value = sensor.measurement.measure(np.array([[50.0, 30.0]]), Pose(np.array(PLACES[0])))
     probability, likelihood = densities(sensor, PLACES[0], value)
     expected = 3.0 / SIDE**2 * (search.exploration.at(cells()) * probability * likelihood[0]).sum()
-    member = search._scan(_checked(sensor, PLACES[0], value))
-    births = draw_births(member, search.exploration, 3.0, 20_000, np.random.default_rng(0))
-    assert births.intensity[0] == pytest.approx(expected, rel=0.02)
-
-
-def _checked(sensor, place, value):
-    return check_measurements([measured(sensor, place, value)], 1, 0.0, plane_filter()._numbers, 2)[
-        0
-    ]
+    settings = FilterSettings(method='pmb').resolved()
+    (member,) = check_measurements([measured(sensor, PLACES[0], value)], 1, 0.0, settings, 2)
+    scan = make_scan(member, 1.0, search.exploration, 3.0, 20_000, np.random.default_rng(0))
+    assert scan.intensity[0] == pytest.approx(expected, rel=0.02)
 
 
 def test_first_detection_exists_with_the_share_of_clutter():
@@ -114,15 +109,14 @@ def test_first_detection_exists_with_the_share_of_clutter():
 
 
 def test_clutter_is_learnt_as_a_gamma_prior_says():
-    clutter = ClutterEstimate()
-    assert clutter.per_scan('a', 0.0) == LEAST_PER_SCAN
-    assert clutter.per_scan('a', 2.0) == 2.0
+    learnt = Learnt()
+    assert learnt.clutter_per_scan(0.0) == LEAST_PER_SCAN
+    assert learnt.clutter_per_scan(2.0) == 2.0
     for _ in range(40):
-        clutter.count('a', 3.0)
-    assert clutter.per_scan('a', 0.0) == pytest.approx(
+        learnt.count_clutter(3.0)
+    assert learnt.clutter_per_scan(0.0) == pytest.approx(
         (PRIOR_SCANS * LEAST_PER_SCAN + 120.0) / (PRIOR_SCANS + 40)
     )
-    assert clutter.per_scan('b', 0.0) == LEAST_PER_SCAN
 
 
 @pytest.mark.parametrize(
@@ -150,7 +144,8 @@ def test_close_to_the_exact_mixture(targets, tolerance):
                 false = [generator.uniform(5.0, 40.0), generator.uniform(-3.0, 3.0)]
                 values = np.concatenate([values, [false]])
             space = sensor.measurement_space(PLANE)
-            kappa = search._learnt.clutter.per_scan('robot', sensor.clutter * space) / space
+            learnt = search._learnt.get('robot', Learnt())
+            kappa = learnt.clutter_per_scan(sensor.clutter * space) / space
             search.step([measured(sensor, place, values, step)], 1, step)
             exact.update(*densities(sensor, place, values), kappa)
         density = exact.density()

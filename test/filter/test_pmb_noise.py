@@ -7,14 +7,7 @@ from searches import CUBE, DEGREES, RADIANS, cube_sensor, observe
 
 from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose
 from maasi_filter.measurement_check import check_measurements
-from maasi_filter.pmb.learnt import (
-    BOUND,
-    MOST_FACTOR,
-    Consistency,
-    NoiseScale,
-    _excess,
-    innovations,
-)
+from maasi_filter.pmb.learnt import BOUND, MOST_FACTOR, Learnt, excess, innovations
 
 TARGET = np.array([[130.0, 130.0, 130.0]])
 POSE = Pose([112.0, 120.0, 125.0])
@@ -35,7 +28,7 @@ def drawn(generator, factor, number):
 @pytest.mark.parametrize('factor', [0.5, 1.0, 2.25])
 def test_the_innovation_of_a_target_known_exactly_tells_the_factor(factor):
     member = checked(drawn(np.random.default_rng(0), factor, 4000))
-    squares = innovations(member, TARGET, np.zeros((1, 3, 3))).squares / 3.0
+    squares = innovations(member, TARGET, np.zeros((1, 3, 3)))[3] / 3.0
     assert np.mean(squares) == pytest.approx(factor, rel=0.05)
 
 
@@ -48,19 +41,18 @@ def test_errors_of_the_position_that_are_told_are_no_noise():
         noise = generator.multivariate_normal(np.zeros(3), sensor.covariance)
         values = sensor.measurement.measure(TARGET, true) + noise
         member = checked(values, position_covariance=np.eye(3))
-        squares.append(innovations(member, TARGET, np.zeros((1, 3, 3))).squares[0, 0] / 3.0)
+        squares.append(innovations(member, TARGET, np.zeros((1, 3, 3)))[3][0, 0] / 3.0)
     assert np.mean(squares) == pytest.approx(1.0, rel=0.1)
 
 
 def test_the_belief_is_worth_some_detections_and_the_factor_is_bounded():
-    scale = NoiseScale()
-    assert scale.factor('drone') == 1.0
+    learnt, other = Learnt(), Learnt()
+    assert learnt.noise_factor() == 1.0
     for _ in range(2000):
-        scale.count('drone', 0.9, 2.0)
-    assert scale.factor('drone') == pytest.approx(2.0, rel=0.01)
-    assert scale.factor('other') == 1.0
-    scale.count('other', 1.0, 1e9)
-    assert scale.factor('other') == MOST_FACTOR
+        learnt.count_innovation(6.0, 3, 0.9)
+    assert learnt.noise_factor() == pytest.approx(2.0, rel=0.01)
+    other.count_innovation(1e9, 3, 1.0)
+    assert other.noise_factor() == MOST_FACTOR
 
 
 @pytest.mark.parametrize('factor', [0.45, 1.0, 2.25])
@@ -72,7 +64,7 @@ def test_a_filter_learns_the_noise_of_its_robot(factor):
         values = drawn(generator, factor, 1)
         search.step([AgentMeasurement('drone', POSE, cube_sensor(), values)], 1, float(step))
     assert len(search.found_targets) == 1
-    learnt = search._learnt.noise.factor('drone')
+    learnt = search._learnt['drone'].noise_factor()
     assert min(1.0, factor) - 0.15 < learnt < max(1.0, factor) + 0.3
     assert abs(learnt - factor) < 0.5 * abs(1.0 - factor) + 0.2
 
@@ -109,7 +101,7 @@ def test_what_is_as_believed_is_no_misfit_and_no_error(noise):
         search, result = searched(seed, noise=noise)
         assert len(search.found_targets) == 1
         assert not result.misfits
-        assert search._learnt.errors.probabilities['drone'].argmax() == 0
+        assert search._learnt['drone'].errors.argmax() == 0
 
 
 def test_a_target_that_walks_untold_does_not_fit():
@@ -120,12 +112,12 @@ def test_a_target_that_walks_untold_does_not_fit():
 def test_the_excess_of_a_sum_is_that_of_chi_squared(freedom):
     """Its tail beyond four deviations is that of a normal number, within a factor of two."""
     ratio = chi2.isf(norm.sf(BOUND), freedom) / freedom
-    assert norm.sf(_excess(ratio, freedom)) == pytest.approx(norm.sf(BOUND), rel=0.5)
+    assert norm.sf(excess(ratio, freedom)) == pytest.approx(norm.sf(BOUND), rel=0.5)
 
 
 def test_one_detection_of_something_else_is_no_misfit():
-    consistency = Consistency()
+    learnt = Learnt()
     for _ in range(30):
-        consistency.count('drone', 3.0, 3)
-    consistency.count('drone', 1e6, 3)
-    assert not consistency.misfits()
+        learnt.count_innovation(3.0, 3, 0.0)
+    learnt.count_innovation(1e6, 3, 0.0)
+    assert not learnt.misfit('drone')

@@ -7,7 +7,7 @@ from searches import CUBE, cube_sensor
 from maasi_filter import AgentMeasurement, FilterSettings, PmbFilter, Pose
 from maasi_filter.measurement_check import check_measurements
 from maasi_filter.pmb.offsets import Offsets
-from maasi_filter.pmb.settings import OffsetSettings
+from maasi_filter.settings import OffsetSettings
 
 TARGETS = np.array([[120.0, 130.0, 130.0], [150.0, 120.0, 125.0], [130.0, 150.0, 140.0]])
 PLACES = {'a': np.array([125.0, 118.0, 128.0]), 'b': np.array([145.0, 140.0, 130.0])}
@@ -107,6 +107,6 @@ def test_targets_that_are_withdrawn_are_marginalised():
     search = looked(new_filter(deviation=1.0), {'a': np.zeros(3), 'b': np.ones(3)})
     offsets = search._offsets
     part = offsets.covariance[:6, :6].copy()
-    offsets.keep(set())
+    offsets._keep(['a', 'b'])
     assert offsets.keys == ['a', 'b']
     np.testing.assert_array_equal(offsets.covariance, part)

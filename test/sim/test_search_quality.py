@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import quality
 import search_quality
 import search_regimes
 
@@ -41,3 +43,13 @@ def test_a_regime_is_run_and_its_table_printed(tmp_path, capsys):
     assert search_quality.main([*arguments, '--out', str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert '**one drone** (limit 400 s)' in said and '| maasi | 1 |' in said
+
+
+def test_runs_cut_short_count_as_kaplan_and_meier_have_it():
+    times, whole = np.array([10.0, 20.0, 30.0]), np.ones(3, np.bool_)
+    mean, error = quality.restricted_mean(times, whole, 100.0)
+    assert mean == pytest.approx(20.0)
+    assert error == pytest.approx(np.std(times, ddof=1) / np.sqrt(3))
+    mean, _ = quality.restricted_mean(times, np.array([True, False, True]), 40.0)
+    assert mean == pytest.approx(10.0 + 20.0 * 2 / 3)
+    assert quality.restricted_mean(times, whole, 25.0)[0] == pytest.approx(55.0 / 3)

@@ -274,16 +274,6 @@ class IcPhdFilter(FilterBase):
             keep = (offset * offset).sum(axis=1) > self._numbers.removal_distance**2
             self.particles, self.weights = self.particles[keep], self.weights[keep]
 
-    def check(self) -> None:
-        """Refuse a loaded state whose particles or weights are not usable."""
-        n, d = len(self.weights), self.dimension
-        if self.particles.shape != (n, d) or self._centres.shape[1:] != (d,):
-            raise ValueError(f'particles: got shape {self.particles.shape}, allowed is {(n, d)}')
-        if not (np.isfinite(self.particles).all() and np.isfinite(self.weights).all()):
-            raise ValueError('particles, weights: got a number that is not finite')
-        if (self.weights < 0.0).any():
-            raise ValueError(f'weights: got {self.weights.min()}, allowed are numbers from 0')
-
 
 def _nearest_member(
     position: FloatArray, members: Sequence[CheckedMeasurement]

@@ -1,28 +1,20 @@
-"""Association: by loopy belief propagation (Williams and Lau 2014), and by identity."""
+"""Association by loopy belief propagation (Williams and Lau 2014)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_filter.pmb.component import Component, LabelTally
-from maasi_filter.records import Label
+from maasi_filter.arrays import FloatArray
 
 ITERATIONS = 500
 TOLERANCE = 1e-9
-# Odds of clutter against the target that a detection names.
-MISREAD = 1e-6
-# Association probability from which a component gets the identity of a detection.
-LEAST_SHARE = 0.5
 
 
-@dataclass(frozen=True)
-class Marginals:
+class Marginals(NamedTuple):
     """Probabilities of associations in one scan."""
 
     missed: FloatArray  # (n,): That component i caused no detection
@@ -91,53 +83,3 @@ def associate(odds: FloatArray, other: FloatArray) -> Marginals:
     if n and m:
         propagate(odds / other, marginals.missed, marginals.caused, marginals.new)
     return marginals
-
-
-def associate_by_identity(
-    labels: Sequence[Label], components: Sequence[Component], odds: FloatArray, other: FloatArray
-) -> BoolArray:
-    """Leave each detection with an identity only the component of that identity, in place.
-
-    Where no component has the identity yet, those without any remain. Returns the detections (m,)
-    whose identity a component has: no new target causes them.
-    """
-    known = np.zeros(odds.shape[1], np.bool_)
-    identities = [item.labels.identity for item in components]
-    for j, label in enumerate(labels):
-        if not label.identity:
-            continue
-        owner = identities.index(label.identity) if label.identity in identities else -1
-        for i, identity in enumerate(identities):
-            if i != owner and (owner >= 0 or identity):
-                odds[i, j] = 0.0
-        known[j] = owner >= 0
-        # Out of its gate it is a misread identity: clutter.
-        if known[j] and odds[owner, j] > 0.0:
-            other[j] = min(other[j], MISREAD * odds[owner, j])
-    return known
-
-
-def learn_labels(
-    labels: Sequence[Label], components: Sequence[Component], caused: FloatArray
-) -> None:
-    """Count classes, and give a component the identity of a detection that it caused."""
-    taken = {item.labels.identity for item in components}
-    for j, label in enumerate(labels):
-        for i, item in enumerate(components):
-            if caused[i, j] > 0.0:
-                item.labels.add(label, float(caused[i, j]))
-        if label.identity and label.identity not in taken and len(components):
-            best = components[int(np.argmax(caused[:, j]))]
-            if caused[:, j].max() > LEAST_SHARE and not best.labels.identity:
-                best.labels.identity = label.identity
-                taken.add(label.identity)
-
-
-def new_label(labels: Sequence[Label], j: int, components: Sequence[Component]) -> LabelTally:
-    """Return the label of a component born from detection j; an identity belongs to one."""
-    if not labels:
-        return LabelTally()
-    tally = LabelTally.of(labels[j])
-    if any(item.labels.identity == tally.identity for item in components):
-        tally.identity = ''
-    return tally

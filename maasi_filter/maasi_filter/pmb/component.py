@@ -11,10 +11,11 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.found_targets import SAME_TARGET, distance
-from maasi_filter.pmb.births import LEAST_SUPPORT, Births
 from maasi_filter.pmb.density import Density
-from maasi_filter.pmb.factors import MISS, SCALE, Scan, likelihoods, log_factor
-from maasi_filter.records import FoundTarget, Label
+from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
+from maasi_filter.pmb.labels import LabelTally
+from maasi_filter.pmb.scan import LEAST_SUPPORT, Scan
+from maasi_filter.records import FoundTarget
 from maasi_filter.vector_math import squared_distance
 
 # Shares of the believed pi with which a place may answer.
@@ -70,55 +71,6 @@ def reflects(answers, rates):  # type: ignore[no-untyped-def]  # pragma: no cove
     return reflection / (target + reflection)
 
 
-@dataclass
-class LabelTally:
-    """What is known of the class and identity of one potential target.
-
-    Parameters
-    ----------
-    identity : str
-        Empty: not known.
-    classes : dict
-        Sum of the scores of its detections, by class.
-    """
-
-    identity: str = ''
-    classes: dict[str, float] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, label: Label) -> LabelTally:
-        """Return the tally of one label."""
-        tally = cls(label.identity)
-        tally.add(label, 1.0)
-        return tally
-
-    def add(self, label: Label, share: float) -> None:
-        """Count the class of a detection that this target caused with probability `share`.
-
-        A score that is not known counts as 1.
-        """
-        if label.class_id:
-            weight = share * (label.score or 1.0)
-            self.classes[label.class_id] = self.classes.get(label.class_id, 0.0) + weight
-
-    def merge(self, other: LabelTally) -> None:
-        """Add what is known of the same target."""
-        self.identity = self.identity or other.identity
-        for name, score in other.classes.items():
-            self.classes[name] = self.classes.get(name, 0.0) + score
-
-    @property
-    def label(self) -> Label:
-        """The class of the largest sum, with its share of all sums, and the identity."""
-        if not self.classes:
-            return Label(identity=self.identity)
-        # Of equal sums the first by name: the order of detections does not matter.
-        best = min(self.classes, key=lambda name: (-self.classes[name], name))
-        total = sum(self.classes[name] for name in sorted(self.classes))
-        score = self.classes[best] / total if total > 0.0 else 0.0
-        return Label(best, min(score, 1.0), self.identity)
-
-
 # Gate of a detection, in standard deviations and root mean square radii.
 GATE = 6.0
 # Largest squared normalised distance for draws from a detection with too few particles.
@@ -137,6 +89,8 @@ MOST_FACTORS = 150
 LEAST_HITS = 1.5
 # Expected joint detections in a scan from which two components are different targets.
 SEEN_BOTH = 1.5
+# Gate on the squared normalised distance for merging components.
+SAME_PLACE = 6.0
 
 
 @dataclass
@@ -179,27 +133,33 @@ class Component:
         one, two = self.labels.identity, other.labels.identity
         return bool(one and two and one != two)
 
-    def view(self, scan: Scan, gated: IntArray, births: Births) -> View:
+    def view(self, scan: Scan, gated: IntArray) -> View:
         """Return the likelihoods of this component in a scan, of the detections in its gate."""
         density = self.density
         probability = np.empty(len(density.weights))
-        seen = np.empty((len(gated), len(probability)))
-        sums = np.empty((2, len(gated)))
+        seen, sums = np.empty((len(gated), len(probability))), np.empty((2, len(gated)))
+        terms = scan.terms[gated]
         detected = likelihoods(
-            scan.head,
-            scan.terms[gated],
-            density.particles,
-            density.weights,
-            probability,
-            seen,
-            sums,
+            scan.head, terms, density.particles, density.weights, probability, seen, sums
         )
         view = View(probability, detected, gated, seen, sums[0])
-        for k in range(len(gated)):
+        for k, j in enumerate(gated.tolist()):
             total, squares = sums[:, k]
             if not (total > 0.0 and total * total >= LEAST_SUPPORT * squares):
-                self._likelihood_of_draws(view, k, births)
+                self._draw_likelihood(view, k, j, scan)
         return view
+
+    def _draw_likelihood(self, view: View, k: int, j: int, scan: Scan) -> None:
+        """Estimate a likelihood from draws of the detection, as particles are too sparse."""
+        total = self.density.covariance + scan.covariances[j]
+        if squared_distance(scan.means[j] - self.density.mean, total) > SUPPORT_DISTANCE:
+            return
+        logs = self.density.log_at(scan.draws[j, :SUPPORT_DRAWS])
+        drawn = np.exp(np.minimum(logs, 600.0)) * scan.volume[j, :SUPPORT_DRAWS]
+        square = float(drawn @ drawn)
+        if square > 0.0 and float(drawn.sum()) ** 2 > LEAST_SUPPORT * square:
+            view.likelihood[k] = float(drawn.mean())
+            view.drawn[k] = drawn
 
     def odds(self, view: View) -> FloatArray:
         """Return r L_j / (1 - r p_D) of the gated detections."""
@@ -211,14 +171,14 @@ class Component:
         missed: float,
         caused: FloatArray,
         scan: Scan,
-        births: Births,
         generator: np.random.Generator,
     ) -> bool:
         """Update with a scan, given marginal association probabilities; return whether f changed.
 
-        a_0 = p_miss r (1 - p_D) / (1 - r p_D), a_j = p_j, r = sum a (Williams 2015, TOMB/P).
+        a_0 = p_miss r (1 - p_D) / (1 - r p_D), a_j = p_j, r = sum a (Williams 2015, TOMB/P),
+        f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
         """
-        r, detected = self.existence, view.detected
+        r, detected, density = self.existence, view.detected, self.density
         nothing = missed * r * (1.0 - detected) / (1.0 - r * detected)
         own = caused[view.gated]
         detections = float(own.sum())
@@ -239,107 +199,79 @@ class Component:
         terms = scan.terms[view.gated[taken]]
         terms[:, SCALE] += np.log(scale)
         drawn = [k for k in view.drawn if share[k] > LEAST_DRAWN_SHARE]
-        if drawn:
-            self._restart(head, terms, view, drawn, share, births, generator)
+        if not drawn:
+            density.multiply(head, terms, logs, generator)
         else:
-            self.density.multiply(head, terms, logs, generator)
-        most = MOST_FACTORS if self.target is None else MOST_FACTORS_FOUND
-        if len(self.density.heads) > most:
-            self.density.condense()
+            # Draw the posterior from particles and, for some detections, from draws of these.
+            others = [k for k in taken.tolist() if k not in drawn]
+            factor = head[MISS] * (1.0 - view.probability)
+            factor += (share[others] / view.likelihood[others]) @ view.seen[others]
+            particles, weights = [density.particles], [density.weights * factor]
+            for k in drawn:
+                particles.append(scan.draws[view.gated[k], :SUPPORT_DRAWS])
+                weights.append(share[k] * view.drawn[k] / view.drawn[k].sum())
+            draws, total = np.concatenate(particles), np.concatenate(weights)
+            density.restart(head, terms, draws, total, generator)
+        if len(density.heads) > (MOST_FACTORS if self.target is None else MOST_FACTORS_FOUND):
+            density.condense()
         self.stale = True
         return True
 
-    def _likelihood_of_draws(self, view: View, k: int, births: Births) -> None:
-        """Estimate a likelihood from draws of the detection, as particles are too sparse."""
-        j = view.gated[k]
-        total = self.density.covariance + births.covariances[j]
-        if squared_distance(births.means[j] - self.density.mean, total) > SUPPORT_DISTANCE:
-            return
-        logs = self.density.log_at(births.particles[j, :SUPPORT_DRAWS])
-        drawn = np.exp(np.minimum(logs, 600.0)) * births.volume[j, :SUPPORT_DRAWS]
-        square = float(drawn @ drawn)
-        if square > 0.0 and float(drawn.sum()) ** 2 > LEAST_SUPPORT * square:
-            view.likelihood[k] = float(drawn.mean())
-            view.drawn[k] = drawn
 
-    def _restart(
-        self,
-        head: FloatArray,
-        terms: FloatArray,
-        view: View,
-        drawn: list[int],
-        share: FloatArray,
-        births: Births,
-        generator: np.random.Generator,
-    ) -> None:
-        """Draw the posterior from particles and, for some detections, from draws of these."""
-        density = self.density
-        others = [k for k in np.flatnonzero(share > LEAST_SHARE).tolist() if k not in drawn]
-        factor = head[MISS] * (1.0 - view.probability)
-        factor += (share[others] / view.likelihood[others]) @ view.seen[others]
-        particles, weights = [density.particles], [density.weights * factor]
-        for k in drawn:
-            particles.append(births.particles[view.gated[k], :SUPPORT_DRAWS])
-            weights.append(share[k] * view.drawn[k] / view.drawn[k].sum())
-        density.restart(head, terms, np.concatenate(particles), np.concatenate(weights), generator)
+def moments(components: Sequence[Component]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return means (n, d), covariances (n, d, d) and root mean square radii (n,), metres."""
+    densities = [item.density for item in components]
+    return (
+        np.array([density.mean for density in densities]),
+        np.array([density.covariance for density in densities]),
+        np.array([density.radius for density in densities]),
+    )
 
 
-def views(components: Sequence[Component], scan: Scan, births: Births) -> list[View]:
+def views(components: Sequence[Component], scan: Scan) -> list[View]:
     """Return the likelihoods of components in a scan."""
-    d = scan.origins.shape[1]
-    means = np.array([item.density.mean for item in components]).reshape(-1, d)
-    radii = np.array([item.density.radius for item in components])[:, None]
-    apart = np.sqrt(np.square(means - scan.pose.position[:d]).sum(axis=1))[:, None]
-    gates = np.abs(scan.ranges - apart) < GATE * (scan.deviations + radii)
-    return [item.view(scan, gate.nonzero()[0], births) for item, gate in zip(components, gates)]
+    if not components:
+        return []
+    means, _, radii = moments(components)
+    apart = np.sqrt(np.square(means - scan.pose.position[: means.shape[1]]).sum(axis=1))
+    gates = np.abs(scan.ranges - apart[:, None]) < GATE * (scan.deviations + radii[:, None])
+    return [item.view(scan, gate.nonzero()[0]) for item, gate in zip(components, gates)]
 
 
-def same_place(one: Component, other: Component, distance: float) -> bool:
-    """Return whether two components may be one target, within a squared normalised distance.
-
-    Not if they were born in one scan, as a target causes at most one detection per scan, if their
-    identities differ, or if their existence probabilities sum to more than one target.
-    """
-    if one.scan == other.scan or one.differs(other) or one.existence + other.existence > 1.0:
-        return False
+def gap(one: Component, other: Component) -> float:
+    """Return the squared normalised distance of two components."""
     offset = one.density.mean - other.density.mean
-    total = one.density.covariance + other.density.covariance
-    return bool(squared_distance(offset, total) < distance)
+    return float(squared_distance(offset, one.density.covariance + other.density.covariance))
 
 
-def merge(components: list[Component], distance: float) -> list[Component]:
+def merge(components: list[Component]) -> list[Component]:
     """Merge components of one target: the density of the heavier one, the sum of existences.
 
     At most one of the two is a target: the events exclude each other, so their probabilities add.
+    They are two targets if they were born in one scan, as a target causes at most one detection per
+    scan, if their identities differ, or if their probabilities sum to more than one target.
     """
     if len(components) < 2:
         return components
-    means = np.array([item.density.mean for item in components])
-    radii = np.array([item.density.radius for item in components])
+    means, _, radii = moments(components)
     gaps = np.square(means[:, None] - means[None]).sum(axis=2)
-    near = gaps < distance * (radii[:, None] ** 2 + radii[None] ** 2)
-    order = np.argsort([-item.existence for item in components], kind='stable').tolist()
+    near = gaps < SAME_PLACE * (radii[:, None] ** 2 + radii[None] ** 2)
     kept: list[int] = []
-    for i in order:
+    for i in np.argsort([-item.existence for item in components], kind='stable').tolist():
         item = components[i]
-        for k in kept:
-            if near[i, k] and same_place(components[k], item, distance):
-                components[k].existence += item.existence
-                components[k].labels.merge(item.labels)
+        for other in (components[k] for k in kept if near[i, k]):
+            two = item.scan == other.scan or item.differs(other)
+            if (
+                not two
+                and other.existence + item.existence <= 1.0
+                and gap(other, item) < SAME_PLACE
+            ):
+                other.existence += item.existence
+                other.labels.merge(item.labels)
                 break
         else:
             kept.append(i)
     return [components[i] for i in sorted(kept)]
-
-
-def can_be_found(item: Component, probability: float) -> bool:
-    """Return whether a component almost surely exists, at a precisely known position."""
-    return (
-        item.target is None
-        and item.existence > probability
-        and item.hits >= LEAST_HITS
-        and item.density.radius <= item.found_radius
-    )
 
 
 def is_known(i: int, components: Sequence[Component], caused: FloatArray) -> bool:
@@ -348,25 +280,23 @@ def is_known(i: int, components: Sequence[Component], caused: FloatArray) -> boo
     A target causes at most one detection per scan, so two components that together caused more than
     one are two targets.
     """
-    density = components[i].density
-    for f, other in enumerate(components):
-        if other.target is None or components[i].differs(other):
-            continue
-        if caused[[i, f]].sum() > SEEN_BOTH:
-            continue
-        offset = density.mean - other.density.mean
-        total = density.covariance + other.density.covariance
-        if squared_distance(offset, total) < SAME_TARGET:
-            return True
-    return False
+    item = components[i]
+    return any(
+        other.target is not None
+        and not item.differs(other)
+        and caused[[i, f]].sum() <= SEEN_BOTH
+        and gap(item, other) < SAME_TARGET
+        for f, other in enumerate(components)
+    )
 
 
 def nearest(target: FoundTarget, components: Sequence[Component]) -> Component | None:
     """Return the nearest component that is not found within the gate of a target, or None."""
-    best, least = None, SAME_TARGET
-    for item in components:
-        if item.target is None:
-            gap = distance(item.density.mean, item.density.covariance, target)
-            if gap < least:
-                best, least = item, gap
-    return best
+    gaps = [
+        distance(item.density.mean, item.density.covariance, target)
+        if item.target is None
+        else math.inf
+        for item in components
+    ]
+    best = int(np.argmin(gaps)) if gaps else 0
+    return components[best] if gaps and gaps[best] < SAME_TARGET else None

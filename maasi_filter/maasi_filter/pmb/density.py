@@ -19,11 +19,9 @@ from maasi_filter.pmb.factors import (
     CARTESIAN,
     CENTRE,
     FIRST,
-    HEAD,
     KIND,
     MODEL,
     SENSOR,
-    TERM,
     TERMS,
     gaussian_factor,
     log_products,
@@ -40,8 +38,8 @@ MOST_SWEEPS = 8
 
 
 @njit(cache=True, error_model='numpy')
-def _effective(weights, logs, exponent):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Return the effective number of particles with weights w exp(exponent log f)."""
+def _raised(weights, logs, exponent, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fill w f^exponent, up to a constant; return the sum, and the effective number of these."""
     largest = -np.inf
     for i in range(len(weights)):
         if weights[i] > 0.0:
@@ -49,51 +47,26 @@ def _effective(weights, logs, exponent):  # type: ignore[no-untyped-def]  # prag
     total = 0.0
     squares = 0.0
     for i in range(len(weights)):
-        if weights[i] > 0.0:
-            weight = weights[i] * math.exp(exponent * (logs[i] - largest))
-            total += weight
-            squares += weight * weight
-    return total * total / squares
+        out[i] = weights[i] * math.exp(exponent * min(logs[i] - largest, 0.0))
+        total += out[i]
+        squares += out[i] * out[i]
+    return total, total * total / squares
 
 
 @njit(cache=True, error_model='numpy')
-def _exponent(weights, logs, most, least_effective):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _exponent(weights, logs, most, least_effective, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the largest exponent up to `most` that leaves enough effective particles."""
-    if _effective(weights, logs, most) >= least_effective:
+    if _raised(weights, logs, most, out)[1] >= least_effective:
         return most
     low = 0.0
     high = most
     for _ in range(20):
         middle = 0.5 * (low + high)
-        if _effective(weights, logs, middle) >= least_effective:
+        if _raised(weights, logs, middle, out)[1] >= least_effective:
             low = middle
         else:
             high = middle
     return min(max(low, LEAST_STEP), most)
-
-
-@njit(cache=True, error_model='numpy')
-def _reweigh(weights, logs, exponent, least_effective):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Multiply weights by f to an exponent, in place, if that leaves enough effective particles.
-
-    They sum to 1. Returns whether it does.
-    """
-    largest = -np.inf
-    for i in range(len(weights)):
-        if weights[i] > 0.0:
-            largest = max(largest, logs[i])
-    changed = np.empty(len(weights))
-    total = 0.0
-    squares = 0.0
-    for i in range(len(weights)):
-        changed[i] = weights[i] * math.exp(exponent * (logs[i] - largest))
-        total += changed[i]
-        squares += changed[i] * changed[i]
-    if total * total < least_effective * squares:
-        return False
-    for i in range(len(weights)):
-        weights[i] = changed[i] / total
-    return True
 
 
 @njit(cache=True, error_model='numpy')
@@ -169,34 +142,23 @@ def fill_moments(particles, weights, mean, covariance):  # type: ignore[no-untyp
 
 @dataclass(eq=False)
 class Density:
-    """Density of one target's position.
-
-    Parameters
-    ----------
-    heads, terms : arrays
-        Factors, at least one; see `factors`.
-
-    Attributes
-    ----------
-    mean, covariance : (d,) and (d, d) arrays
-        Of the particles.
-    """
+    """Density of one target's position, as particles and as a product of factors."""
 
     particles: FloatArray  # (n, d): Metres
     weights: FloatArray  # (n,): They sum to 1
-    heads: FloatArray
-    terms: FloatArray
-    #: (nx, ny, nz): e at birth, a factor too; empty where there is none. It is not written
-    #: to.
-    grid: FloatArray
+    heads: FloatArray  # (k, HEAD): Of the factors, at least one
+    terms: FloatArray  # (l, TERM): Of all factors
+    grid: FloatArray  # (nx, ny, nz): e at birth, a factor too, not written to; empty: none
     frame: FloatArray  # (3, 3): Lower and upper bounds of the environment, and the step of the grid
-    mean: FloatArray = field(init=False)
-    covariance: FloatArray = field(init=False)
+    mean: FloatArray = field(init=False)  # (d,): Of the particles
+    covariance: FloatArray = field(init=False)  # (d, d)
     radius: float = field(init=False)  # Root mean square distance from the mean, metres
 
     def __post_init__(self) -> None:
         d = self.particles.shape[1]
         self.mean, self.covariance = np.empty(d), np.empty((d, d))
+        # Those of another process, where it is read from a file.
+        renew_addresses(self.heads[:, KIND], self.heads[:, MODEL:])
         self._update_moments()
 
     @classmethod
@@ -228,7 +190,11 @@ class Density:
     ) -> None:
         """Multiply by a factor, whose log at the particles is `logs`."""
         self._append(head, terms)
-        if not _reweigh(self.weights, logs, 1.0, LEAST_EFFECTIVE * len(self.weights)):
+        changed = np.empty(len(self.weights))
+        total, effective = _raised(self.weights, logs, 1.0, changed)
+        if effective >= LEAST_EFFECTIVE * len(changed):
+            self.weights = changed / total
+        else:
             self._temper(generator)
         self._update_moments()
 
@@ -255,21 +221,21 @@ class Density:
         Particles are moved, so they remain a sample of the true density. Its product of factors is
         replaced by a normal density with their moments, which only Metropolis moves use afterwards.
         """
-        d = self.particles.shape[1]
-        moved = self.particles + math.sqrt(variance) * generator.standard_normal(
-            self.particles.shape
-        )
-        self.particles = np.clip(moved, self.frame[0, :d], self.frame[1, :d])
-        self._update_moments()
+        noise = generator.standard_normal(self.particles.shape)
+        self._shift_particles(math.sqrt(variance) * noise)
         self.condense()
 
     def shift(self, way: FloatArray) -> None:
         """Move the whole density, factors included, by `way` (d,), metres."""
         d = len(way)
-        self.particles = np.clip(self.particles + way, self.frame[0, :d], self.frame[1, :d])
         self.heads[:, SENSOR : SENSOR + d] += way
         cartesian = self.terms[:, CARTESIAN] > 0.5
         self.terms[cartesian, CENTRE : CENTRE + d] += way
+        self._shift_particles(way)
+
+    def _shift_particles(self, way: FloatArray) -> None:
+        d = self.particles.shape[1]
+        self.particles = np.clip(self.particles + way, self.frame[0, :d], self.frame[1, :d])
         self._update_moments()
 
     def condense(self) -> None:
@@ -277,23 +243,6 @@ class Density:
         head, self.terms = gaussian_factor(self.mean, self.covariance)
         self.heads = head[None]
         self.grid = np.empty((0, 0, 0))
-
-    def restore(self, frame: FloatArray, grid: tuple[int, ...]) -> None:
-        """Share a filter's frame; refuse what kernels would read beyond the end of its arrays."""
-        n, d = len(self.weights), int((frame[1] > frame[0]).sum())
-        shapes = [item.shape for item in (self.particles, self.heads, self.terms, self.grid)]
-        allowed = [(n, d), (len(self.heads), HEAD), (len(self.terms), TERM), grid]
-        if self.grid.size == 0:
-            allowed[3] = (0, 0, 0)
-        first, number = self.heads[:, FIRST], self.heads[:, TERMS]
-        beyond = (first < 0) | (number < 0) | (first + number > len(self.terms))
-        if shapes != allowed or n < 1 or not len(self.heads) or beyond.any():
-            raise ValueError(f'density: got arrays of shapes {shapes}, allowed are {allowed}')
-        usable = np.isfinite(self.particles).all() and np.isfinite(self.terms).all()
-        if not usable or ((self.weights < 0.0) | (self.weights > 1.0)).any():
-            raise ValueError('density: got numbers that are not finite, or weights not from 0 to 1')
-        renew_addresses(self.heads[:, KIND], self.heads[:, MODEL:])
-        self.frame = frame
 
     def _append(self, head: FloatArray, terms: FloatArray) -> None:
         head[FIRST], head[TERMS] = len(self.terms), len(terms)
@@ -310,12 +259,14 @@ class Density:
         """Take the last factor in by parts, with moves after each (Chopin 2002)."""
         products, last = self._logs(self.particles)
         number = len(self.weights)
+        changed = np.empty(number)
         taken = 0.0
         while taken < 1.0:
-            step = _exponent(self.weights, last, 1.0 - taken, LEAST_EFFECTIVE * number)
+            least = LEAST_EFFECTIVE * number
+            step = _exponent(self.weights, last, 1.0 - taken, least, changed)
             taken = 1.0 if taken + step > 1.0 - 1e-9 else taken + step
-            _reweigh(self.weights, last, step, 0.0)
-            index = _systematic(self.weights, number, generator.random())
+            total, _ = _raised(self.weights, last, step, changed)
+            index = _systematic(changed / total, number, generator.random())
             self.particles = self.particles[index]
             self.weights = np.full(number, 1.0 / number)
             products, last = products[index], last[index]

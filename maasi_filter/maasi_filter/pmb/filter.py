@@ -25,23 +25,11 @@ from maasi_filter.measurement_check import (
     within_range,
     without_repeats,
 )
-from maasi_filter.models.detection import BoxDetection
-from maasi_filter.pmb.association import (
-    Marginals,
-    associate,
-    associate_by_identity,
-    learn_labels,
-    new_label,
-)
-from maasi_filter.pmb.births import Births, born, draw_births
+from maasi_filter.pmb.association import associate
 from maasi_filter.pmb.component import (
     LEAST_HITS,
     PRIOR,
-    RATES,
     Component,
-    LabelTally,
-    View,
-    can_be_found,
     is_known,
     merge,
     nearest,
@@ -50,9 +38,10 @@ from maasi_filter.pmb.component import (
     views,
 )
 from maasi_filter.pmb.density import Density
-from maasi_filter.pmb.factors import Scan, make_scan
+from maasi_filter.pmb.labels import LabelTally, associate_by_identity, learn_labels
 from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
+from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
 from maasi_filter.search_filter import FilterBase
 from maasi_filter.settings import FilterSettings
@@ -66,8 +55,6 @@ FOUND_RADIUS_DEVIATIONS = 2.0
 # is withdrawn.
 MOST_REFLECTING = 0.3
 SURELY_REFLECTING = 0.5
-# Gate on the squared normalised distance for merging components.
-SAME_PLACE = 6.0
 # Existence probability of targets that other filters found.
 CERTAIN = 0.999
 
@@ -82,7 +69,7 @@ class PmbFilter(FilterBase):
     method = 'pmb'
     saved: ClassVar[dict[str, Any]] = {
         'components': list[Component],
-        '_learnt': Learnt,
+        '_learnt': dict[str, Learnt],
         '_offsets': Offsets,
         '_scans': int,
         '_last_id': int,
@@ -94,9 +81,8 @@ class PmbFilter(FilterBase):
     ) -> None:
         super().__init__(settings, bounds, generator)
         self._numbers = settings.resolved()
-        self._expected_targets = self._numbers.expected_targets
         self.components: list[Component] = []
-        self._learnt = Learnt()
+        self._learnt: dict[str, Learnt] = {}
         self._offsets = Offsets(self._numbers.pmb.offset, self.dimension)
         self._rates: FloatArray = PRIOR
         self._scans = 0
@@ -132,143 +118,111 @@ class PmbFilter(FilterBase):
         ]
         return np.concatenate([np.empty(0), *parts])
 
-    # One step.
-
     def step(
         self, measurements: Sequence[AgentMeasurement], steps: int, time: float
     ) -> FilterResult:
         """Predict, correct with every robot of M_k, merge and mark."""
         members = check_measurements(measurements, steps, time, self._numbers, self.dimension)
-        dropped: dict[str, int] = {}
-        newly_found: list[FoundTarget] = []
-        changed = self._predict(time)
-        self._rates = self._rate_of_targets()
-        for member in members:
-            changed |= self._correct(member, newly_found, dropped, time)
-        self._estimate_found()
-        self._reduce()
-        self._cluster()
-        return FilterResult(
-            clusters=list(self.clusters),
-            newly_found=newly_found,
-            found_changed=changed,
-            expected_number=self.expected_number,
-            dropped=dropped,
-            misfits=self._learnt.consistency.misfits(),
+        result = FilterResult()
+        before = self.found_targets
+        self._predict(time)
+        real = [item for item in self.components if item.existence >= LEAST_CLUSTER_MASS]
+        self._rates = rate_of_targets(
+            [item.answers for item in real], [item.existence for item in real]
         )
+        for member in members:
+            self._correct(member, time, result)
+        self._estimate_found()
+        found = [item for item in self.components if item.target is not None]
+        others = [item for item in self.components if item.target is None]
+        self.components = found + merge([i for i in others if i.existence >= LEAST_EXISTENCE])
+        self._cluster()
+        result.clusters = list(self.clusters)
+        # A target that has changed is another record.
+        result.found_changed = bool(result.newly_found) or [*map(id, before)] != [
+            *map(id, self.found_targets)
+        ]
+        result.expected_number = self.expected_number
+        misfits = {robot: learnt.misfit(robot) for robot, learnt in sorted(self._learnt.items())}
+        result.misfits = {robot: text for robot, text in misfits.items() if text}
+        return result
 
-    def _correct(
-        self,
-        member: CheckedMeasurement,
-        newly_found: list[FoundTarget],
-        dropped: dict[str, int],
-        time: float,
-    ) -> bool:
-        """Correct with one robot's scan; return whether what is found changed."""
-        member = without_repeats(within_range(member, dropped), dropped)
+    def _correct(self, member: CheckedMeasurement, time: float, result: FilterResult) -> None:
+        """Correct with one robot's scan (docs/filter.md, Williams 2015, TOMB/P)."""
+        member = without_repeats(within_range(member, result.dropped), result.dropped)
+        learnt = self._learnt.setdefault(member.robot, Learnt())
+        # kappa: clutter per unit of measurement space; N0 / V.
         space = member.sensor.measurement_space(self.bounds)
-        # kappa: clutter per unit of measurement space.
-        kappa = self._learnt.clutter.per_scan(member.robot, member.sensor.clutter * space) / space
-        believed = self._localised(member, kappa)
-        member = self._blurred(believed, kappa)
-        scan = self._scan(member)
-        self._scans += 1
+        kappa = learnt.clutter_per_scan(member.sensor.clutter * space) / space
+        unseen = self._numbers.expected_targets / self.exploration.volume
+        # Errors of the robot's position, those that last and those that the scan tells.
+        if self._offsets.active:
+            member = self._offsets.localise(member, self.components, kappa, unseen)
+        error = learnt.learn_error(member, self.components, kappa, unseen)
+        blurred = replace(member, pose_error=math.hypot(member.pose_error, error))
         # lambda_j = (N0 / V) int e pi g_j dx, by importance sampling from the detections.
-        number = self._numbers.pmb.particles
-        births = draw_births(scan, self.exploration, self._expected_targets, number, self.generator)
+        scan = make_scan(
+            blurred,
+            learnt.noise_factor(),
+            self.exploration,
+            self._numbers.expected_targets,
+            self._numbers.pmb.particles,
+            self.generator,
+        )
+        self._scans += 1
         # p_D = int f pi dx, L_j = int f pi g_j dx.
-        seen = views(self.components, scan, births)
+        seen = views(self.components, scan)
         # Association: odds r L_j / (1 - r p_D) against kappa + lambda_j.
         odds = np.zeros((len(seen), len(scan.terms)))
         for i, (item, view) in enumerate(zip(self.components, seen)):
             odds[i, view.gated] = item.odds(view)
-        other = kappa + births.intensity
-        named = associate_by_identity(member.labels, self.components, odds, other)
-        marginals = associate(odds, other)
-        learn_labels(member.labels, self.components, marginals.caused)
-        blurred = member.pose_error > believed.pose_error
-        self._learnt.count_found(believed, self.components, marginals.caused, blurred)
-        alone = (births.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
-        count_unexplained(scan.centres[alone], self.bounds, dropped)
-        changed = self._offsets.active and bool(self.own_found_targets())
-        changed |= self._update(member, scan, births, seen, marginals, newly_found, time)
-        # r = p_new lambda_j / (kappa + lambda_j).
-        real = np.where(named, 0.0, births.intensity / (kappa + births.intensity))
-        self._add_born(member, scan, births, marginals.new * real)
-        self._learnt.clutter.count(member.robot, float((marginals.new * (1.0 - real)).sum()))
+        other = kappa + scan.intensity
+        tallies = [item.labels for item in self.components]
+        named = associate_by_identity(member.labels, tallies, odds, other)
+        missed, caused, new = associate(odds, other)
+        learn_labels(member.labels, tallies, caused)
+        learnt.count_found(member, self.components, caused, error > 0.0)
+        alone = (scan.intensity <= 0.0) & ~(odds > 0.0).any(axis=0)
+        count_unexplained(scan.centres[alone], self.bounds, result.dropped)
+        # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
+        radius = self._found_radius(blurred)
+        for i, (item, view) in enumerate(zip(self.components, seen)):
+            moved = item.update(view, missed[i], caused[i], scan, self.generator)
+            if caused[i].sum() > 0.5 and not item.foreign:
+                item.pose_error, item.found_radius = blurred.pose_error, radius
+            if item.target is not None:
+                self._keep_or_withdraw(item)
+            elif moved and self._can_be_found(item) and not is_known(i, self.components, caused):
+                result.newly_found.append(self._find(item, member, time))
+        # r = p_new lambda_j / (kappa + lambda_j), f = e pi g_j / int e pi g_j.
+        real = np.where(named, 0.0, scan.intensity / (kappa + scan.intensity))
+        self._add_born(blurred, scan, new * real, radius)
+        learnt.count_clutter(float((new * (1.0 - real)).sum()))
         # e <- e (1 - pi).
         self.exploration.update(scan.detection, member.pose)
-        return changed
 
     def _add_born(
-        self, member: CheckedMeasurement, scan: Scan, births: Births, existence: FloatArray
+        self, member: CheckedMeasurement, scan: Scan, existence: FloatArray, radius: float
     ) -> None:
-        """Add components of r = `existence` (m,) and f = e pi g_j / int e pi g_j."""
-        likely, e = existence >= LEAST_EXISTENCE, self.exploration.kernel()[0]
-        error, radius = member.pose_error, self._found_radius(member)
-        for j, density in born(scan, births, likely, e, self._frame):
-            item = Component(
-                float(existence[j]), density, 1.0, self._scans, error, radius, member.robot
-            )
-            item.labels = new_label(member.labels, j, self.components)
+        """Add a component of r = `existence` (m,) for each detection."""
+        e, error, robot = self.exploration.kernel()[0], member.pose_error, member.robot
+        for j, density in scan.born(existence >= LEAST_EXISTENCE, e, self._frame):
+            item = Component(float(existence[j]), density, 1.0, self._scans, error, radius, robot)
+            if member.labels:
+                item.labels = LabelTally.of(member.labels[j])
+                # An identity belongs to one.
+                if item.labels.identity in {other.labels.identity for other in self.components}:
+                    item.labels.identity = ''
             self.components.append(item)
 
-    def _update(
-        self,
-        member: CheckedMeasurement,
-        scan: Scan,
-        births: Births,
-        seen: Sequence[View],
-        marginals: Marginals,
-        newly_found: list[FoundTarget],
-        time: float,
-    ) -> bool:
-        """Update all components, mark and withdraw; return whether what is found changed."""
-        changed = False
-        radius = self._found_radius(member)
-        detected = (marginals.caused.sum(axis=1) > 0.5).tolist()
-        for i, (item, view) in enumerate(zip(self.components, seen)):
-            caused = marginals.caused[i]
-            # r = a_0 + sum a_j, f = (a_0 (1 - pi) / (1 - p_D) + sum a_j pi g_j / L_j) f / r.
-            moved = item.update(view, marginals.missed[i], caused, scan, births, self.generator)
-            if detected[i] and not item.foreign:
-                item.pose_error, item.found_radius = member.pose_error, radius
-            if item.target is not None:
-                changed |= self._keep_or_withdraw(item, moved)
-            elif (
-                moved
-                and can_be_found(item, self._numbers.pmb.found_probability)
-                and reflects(item.answers, self._rates) < MOST_REFLECTING
-                and not is_known(i, self.components, marginals.caused)
-            ):
-                newly_found.append(self._find(item, member, time))
-                changed = True
-        return changed
-
-    def _localised(self, member: CheckedMeasurement, kappa: float) -> CheckedMeasurement:
-        """Return a scan at the robot's estimated pose, and move found targets with their errors."""
-        if not self._offsets.active:
-            return member
-        self._offsets.keep({target.id for target in self.own_found_targets()})
-        density = self._expected_targets / self.exploration.volume
-        member = self._offsets.localise(member, self.components, kappa, density)
-        for item in self.components:
-            item.stale = True
-        return member
-
-    def _blurred(self, member: CheckedMeasurement, kappa: float) -> CheckedMeasurement:
-        """Return a scan with the error of the robot's position that its fit tells of."""
-        density = self._expected_targets / self.exploration.volume
-        error = self._learnt.errors.learn(member, self.components, kappa, density)
-        return replace(member, pose_error=math.hypot(member.pose_error, error))
-
-    def _scan(self, member: CheckedMeasurement) -> Scan:
-        """Return a member's detections for the kernels, with the noise that was learnt."""
-        detection = member.sensor.detection
-        if isinstance(detection, BoxDetection):
-            # The position error of the robot blurs the edge of a box-shaped field of view.
-            detection = detection.softened(2.0 * member.pose_error)
-        return make_scan(member, self._learnt.noise.factor(member.robot), detection)
+    def _can_be_found(self, item: Component) -> bool:
+        """Return whether a component almost surely exists, at a precisely known position."""
+        return (
+            item.existence > self._numbers.pmb.found_probability
+            and item.hits >= LEAST_HITS
+            and item.density.radius <= item.found_radius
+            and reflects(item.answers, self._rates) < MOST_REFLECTING
+        )
 
     def _find(self, item: Component, member: CheckedMeasurement, time: float) -> FoundTarget:
         """Mark a component as found."""
@@ -281,21 +235,15 @@ class PmbFilter(FilterBase):
         item.target = self._estimate(target, item)
         return item.target
 
-    def _keep_or_withdraw(self, item: Component, moved: bool) -> bool:
-        """Withdraw a found component that hardly exists; return whether its target changed."""
+    def _keep_or_withdraw(self, item: Component) -> None:
+        """Withdraw a found component that hardly exists."""
         if item.foreign:
             item.existence = CERTAIN
-            return False
-        reflecting = reflects(item.answers, self._rates) > SURELY_REFLECTING
-        if reflecting or item.existence < self._numbers.pmb.withdrawn_probability:
+        elif (
+            item.existence < self._numbers.pmb.withdrawn_probability
+            or reflects(item.answers, self._rates) > SURELY_REFLECTING
+        ):
             item.target = None
-            return True
-        return moved
-
-    def _rate_of_targets(self) -> FloatArray:
-        """Return how often targets answer, of what pi says, from all that probably exist."""
-        items = [item for item in self.components if item.existence >= LEAST_CLUSTER_MASS]
-        return rate_of_targets([item.answers for item in items], [item.existence for item in items])
 
     def _estimate(self, target: FoundTarget, item: Component) -> FoundTarget:
         """Return a target with the moments of its particles and the position error of the robot."""
@@ -303,15 +251,8 @@ class PmbFilter(FilterBase):
         covariance.flat[:: self.dimension + 1] += item.pose_error**2
         if self._offsets.active:
             covariance += self._offsets.covariance_of(target.id)
-        return FoundTarget(
-            target.id,
-            item.density.mean.copy(),
-            covariance,
-            target.robot,
-            target.measurement,
-            target.time,
-            label=item.labels.label,
-        )
+        mean, label = item.density.mean.copy(), item.labels.label
+        return replace(target, position=mean, covariance=covariance, label=label)
 
     def _estimate_found(self) -> None:
         """Estimate the found targets whose densities have changed in this step."""
@@ -320,31 +261,17 @@ class PmbFilter(FilterBase):
                 item.target = self._estimate(item.target, item)
             item.stale = False
 
-    def _predict(self, time: float) -> bool:
-        """Predict the random walk since the last step; return whether a found target changed."""
-        walk = self._numbers.pmb.walk
+    def _predict(self, time: float) -> None:
+        """Predict the random walk since the last step."""
         last = time if self._last_time is None else self._last_time
         self._last_time = max(time, last)
-        variance = walk**2 * max(time - last, 0.0)
-        if variance == 0.0:
-            return False
-        self.exploration.diffuse(variance)
-        for item in self.components:
-            if item.foreign:
-                continue
-            item.density.diffuse(variance, self.generator)
-            item.stale = True
-        return any(item.target is not None and item.stale for item in self.components)
-
-    def _reduce(self) -> None:
-        """Prune components with low existence probability, and merge those of one target."""
-        found = [item for item in self.components if item.target is not None]
-        others = [
-            item
-            for item in self.components
-            if item.target is None and item.existence >= LEAST_EXISTENCE
-        ]
-        self.components = found + merge(others, SAME_PLACE)
+        variance = self._numbers.pmb.walk**2 * max(time - last, 0.0)
+        if variance > 0.0:
+            self.exploration.diffuse(variance)
+            for item in self.components:
+                if not item.foreign:
+                    item.density.diffuse(variance, self.generator)
+                    item.stale = True
 
     def _cluster(self) -> None:
         """Publish what may be a target that is not found; a place that reflects weighs less."""
@@ -389,13 +316,3 @@ class PmbFilter(FilterBase):
             item.existence, item.density, item.target = CERTAIN, density, target
             item.pose_error = 0.0
             item.labels = LabelTally.of(target.label)
-
-    def check(self) -> None:
-        """Refuse a loaded state whose components are not usable."""
-        for item in self.components:
-            item.density.restore(self._frame, self.exploration.kernel()[0].shape)
-            if not 0.0 <= item.existence <= 1.0 or item.answers.shape != (len(RATES),):
-                raise ValueError(
-                    f'component: got existence {item.existence} and {len(item.answers)} answers, '
-                    f'allowed are 0 to 1 and {len(RATES)}'
-                )

@@ -18,13 +18,11 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.association import associate
-from maasi_filter.pmb.component import Component
-from maasi_filter.pmb.factors import MOST_PROBABLE
-from maasi_filter.pmb.learnt import innovations
-from maasi_filter.pmb.settings import OffsetSettings
+from maasi_filter.pmb.component import Component, moments
+from maasi_filter.pmb.learnt import innovations, likely, odds_of_detection
+from maasi_filter.settings import OffsetSettings
 
-# Components below this r are not considered, nor associations below this probability.
-LEAST_EXISTENCE = 0.1
+# Associations below this probability are not considered.
 LEAST_PROBABILITY = 0.5
 # Gate on the squared normalised innovation.
 GATE = 25.0
@@ -34,19 +32,13 @@ LEAST_DIFFERENCE = 1e-3
 
 @dataclass(eq=False)
 class Offsets:
-    """Joint normal density of the errors of robots and of found targets.
-
-    Attributes
-    ----------
-    mean, covariance : (n d,), (n d, n d) arrays
-        Metres.
-    """
+    """Joint normal density of the errors of robots and of found targets."""
 
     settings: OffsetSettings
     dimension: int
     keys: list[str | int] = field(default_factory=list)  # Names of robots, and ids of found targets
-    mean: FloatArray = field(default_factory=lambda: np.empty(0))
-    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    mean: FloatArray = field(default_factory=lambda: np.empty(0))  # (n d,): Metres
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # (n d, n d)
     #: Reported position of each robot at its last scan, (3,), metres.
     last: dict[str, FloatArray] = field(default_factory=dict)
     #: Way of each robot on the level since its first scan, metres.
@@ -69,17 +61,17 @@ class Offsets:
         `clutter` is kappa, per unit of measurement space; `unseen` N0 / V, per m^d: the largest
         intensity of undetected targets.
         """
-        self._predict(member)
+        found = {item.target.id for item in components if item.target is not None}
+        self._keep([key for key in self.keys if isinstance(key, str) or key in found])
+        robot = member.robot
+        self._predict(robot, member.pose.position)
         before = self.mean.copy()
-        lasting = self.settings.deviation**2 + self.settings.drift**2 * self.way[member.robot]
-        member = replace(
-            member,
-            pose=self._corrected(member),
-            pose_error=math.sqrt(max(member.pose_error**2 - lasting, 0.0)),
-        )
-        reported = member.pose
+        lasting = self.settings.deviation**2 + self.settings.drift**2 * self.way[robot]
+        error = math.sqrt(max(member.pose_error**2 - lasting, 0.0))
+        pose = _moved(member.pose, self.mean[self._part(robot)])
+        member = replace(member, pose=pose, pose_error=error)
         model = member.sensor.measurement
-        jacobians = model.jacobian(model.inverse(member.values, member.pose), member.pose)
+        jacobians = model.jacobian(model.inverse(member.values, pose), pose)
         other = clutter + unseen / np.maximum(np.abs(np.linalg.det(jacobians)), 1e-12)
         self._update(member, components, other)
         change = self.mean - before
@@ -88,27 +80,20 @@ class Offsets:
             key = item.robot if item.target is None else item.target.id
             if key in self.keys:
                 item.density.shift(-change[self._part(key)])
-        position = reported.position.copy()
-        position[: self.dimension] -= change[self._part(member.robot)]
+            item.stale = True
+        rows = [self._rows(robot, key) for key in self.last if key != robot]
+        apart = [np.trace(row @ self.covariance @ row.T) / self.dimension for row in rows]
+        deviation = math.sqrt(float(np.mean(apart))) if apart else 0.0
         return replace(
             member,
-            pose=Pose(position, reported.orientation),
-            pose_error=math.hypot(member.pose_error, self._deviation_from_others(member.robot)),
+            pose=_moved(pose, change[self._part(robot)]),
+            pose_error=math.hypot(error, deviation),
         )
 
     def find(self, robot: str, target: int) -> None:
         """Let a target that a robot has just found inherit the robot's error."""
         part = self._part(robot)
         self._append(target, self.mean[part], self.covariance[part], self.covariance[part, part])
-
-    def keep(self, targets: set[int]) -> None:
-        """Marginalise found targets that are none of these."""
-        kept = [k for k, key in enumerate(self.keys) if isinstance(key, str) or key in targets]
-        if len(kept) < len(self.keys):
-            index = (self.dimension * np.array(kept)[:, None] + np.arange(self.dimension)).ravel()
-            self.mean = self.mean[index]
-            self.covariance = self.covariance[np.ix_(index, index)]
-            self.keys = [self.keys[k] for k in kept]
 
     def covariance_of(self, target: int) -> FloatArray:
         """Return the covariance of the error of a found target, (d, d); 0 of one of others."""
@@ -117,9 +102,15 @@ class Offsets:
         part = self._part(target)
         return self.covariance[part, part]
 
-    def _predict(self, member: CheckedMeasurement) -> None:
+    def _keep(self, keys: list[str | int]) -> None:
+        """Marginalise all errors but these."""
+        index = np.array([i for key in keys for i in range(len(self.mean))[self._part(key)]], int)
+        self.mean, self.covariance = self.mean[index], self.covariance[np.ix_(index, index)]
+        self.keys = keys
+
+    def _predict(self, robot: str, position: FloatArray) -> None:
         """Add a robot that is new; let the error of another one drift with its way."""
-        robot, d, position = member.robot, self.dimension, member.pose.position
+        d = self.dimension
         if robot not in self.keys:
             own = self.settings.deviation**2 * np.eye(d)
             self._append(robot, np.zeros(d), np.zeros((d, len(self.mean))), own)
@@ -132,36 +123,25 @@ class Offsets:
         level = self._part(robot).start + np.arange(2)
         self.covariance[level, level] += self.settings.drift**2 * way
 
-    def _corrected(self, member: CheckedMeasurement) -> Pose:
-        position = member.pose.position.copy()
-        position[: self.dimension] -= self.mean[self._part(member.robot)]
-        return Pose(position, member.pose.orientation)
-
     def _update(
         self, member: CheckedMeasurement, components: Sequence[Component], other: FloatArray
     ) -> None:
         """Kalman update with the detections that found targets most probably caused."""
-        d, m = self.dimension, len(member.values)
-        likely = [item for item in components if item.existence >= LEAST_EXISTENCE]
-        rows = [self._difference(member.robot, item) for item in likely]
+        d = self.dimension
+        items = likely(components)
+        rows = [self._difference(member.robot, item) for item in items]
         apart = [row @ self.covariance @ row.T for row in rows]
-        if not m or max(map(np.trace, apart), default=0.0) < LEAST_DIFFERENCE**2:
+        most = max(map(np.trace, apart), default=0.0)
+        if not len(member.values) or most < LEAST_DIFFERENCE**2:
             return
-        means = np.array([item.density.mean for item in likely])
-        spread = np.array([item.density.covariance for item in likely]) + apart
-        errors, jacobians, totals, squares = innovations(member, means, spread)
-        # r L / (1 - r p_D) with a normal density and pi at its mean.
-        probability = np.minimum(
-            member.sensor.detection.probability(means, member.pose), MOST_PROBABLE
-        )
-        detected = probability * [item.existence for item in likely]
+        means, covariances, _ = moments(items)
+        errors, jacobians, totals, squares = innovations(member, means, covariances + apart)
+        # r L / (1 - r p_D) with a normal density.
         peaks = np.sqrt(np.linalg.det(2.0 * math.pi * totals))
-        odds = np.exp(-0.5 * squares) / peaks * (detected / (1.0 - detected))[:, None]
+        odds = np.exp(-0.5 * squares) / peaks * odds_of_detection(member, items, means)[:, None]
         odds[squares > GATE] = 0.0
-        caused = associate(odds, other).caused
-        used = [
-            (i, j) for i, j in np.argwhere(caused > LEAST_PROBABILITY).tolist() if apart[i].any()
-        ]
+        caused = np.argwhere(associate(odds, other).caused > LEAST_PROBABILITY).tolist()
+        used = [(i, j) for i, j in caused if apart[i].any()]
         if not used:
             return
         error = np.concatenate([errors[i, j] for i, j in used])
@@ -173,12 +153,6 @@ class Offsets:
         self.mean = self.mean + gain @ error
         covariance = self.covariance - gain @ design @ self.covariance
         self.covariance = 0.5 * (covariance + covariance.T)
-
-    def _deviation_from_others(self, robot: str) -> float:
-        """Return the deviation of a robot's error from those of the other robots, per axis [m]."""
-        rows = [self._rows(robot, key) for key in self.last if key != robot]
-        variances = [np.trace(row @ self.covariance @ row.T) / self.dimension for row in rows]
-        return math.sqrt(float(np.mean(variances))) if variances else 0.0
 
     def _difference(self, robot: str, item: Component) -> FloatArray:
         """Return what takes the error of a component from that of a robot; 0 if it has none."""
@@ -201,3 +175,10 @@ class Offsets:
         self.keys.append(key)
         self.mean = np.concatenate([self.mean, mean])
         self.covariance = np.block([[self.covariance, cross.T], [cross, own]])
+
+
+def _moved(pose: Pose, way: FloatArray) -> Pose:
+    """Return a pose without the error `way` (d,) of its position."""
+    position = pose.position.copy()
+    position[: len(way)] -= way
+    return Pose(position, pose.orientation)
