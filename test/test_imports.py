@@ -45,7 +45,6 @@ ROS_FILES = (
     'sensor_input.py',
     'watchdog.py',
     # Of the simulation.
-    'arming.py',
     'sim_topics.py',
 )
 # Not ament_index_python, which looks up where files are installed.

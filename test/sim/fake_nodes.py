@@ -56,7 +56,6 @@ class Fake(Node):
         self.full_name = self.get_fully_qualified_name()
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self.beat)
-        self.ready = self.create_publisher(LockstepDone, '/lockstep/ready', LATCHED)
         self.done = self.create_publisher(LockstepDone, '/lockstep/done', ALL)
         if role != 'sim_node':
             self.create_subscription(LockstepStep, '/lockstep/step', self.on_step, ALL)
@@ -73,6 +72,8 @@ class Fake(Node):
     def say_ready(self, *peers):
         """Say so once each publisher has as many subscriptions as named, the recorder's apart."""
         self.peers = peers
+        # Last: who hears it knows all others.
+        self.ready = self.create_publisher(LockstepDone, '/lockstep/ready', LATCHED)
         if self.fault != 'silent':
             self.ready_timer = self.create_timer(0.01, self.look_for_peers)
 
@@ -134,8 +135,7 @@ class Sim(Fake):
             self.timer = self.create_timer(0.1, self.look)
         else:
             self.timer = self.create_timer(0.02, self.tick)
-        # The recorder hears by it that this node knows the recorder.
-        self.ready.publish(LockstepDone(node=self.full_name))
+        self.say_ready()
 
     def on_ready(self, message):
         if message.node in self.waiting:

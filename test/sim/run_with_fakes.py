@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from maasi_sim.run import node_plan, run_scenario, scenario_run, supervisor
+from maasi_sim.run import node_plan, run_scenario, scenario_run
 from maasi_sim.targets import mission
 
 FAKES = Path(__file__).with_name('fake_nodes.py')
@@ -33,27 +33,10 @@ def plan_fakes(scenario, run):
 
     found = script.get('found', len(targets) // 2)
     return [
-        plan(
-            'sim',
-            'sim_node',
-            is_clock=True,
-            says_ready=False,
-            says_done=False,
-            topics=('/clock', '/lockstep/step'),
-        ),
-        *(
-            plan(
-                'driver', 'driver', name, topics=(f'/{name}/state', f'/{name}/cmd_vel'), drives=True
-            )
-            for name in names
-        ),
-        plan(
-            'filter',
-            'filter_node',
-            parameters={'targets': targets[: 2 * found] or [0.0]},
-            topics=('/filter_update',),
-        ),
-        plan('planner', 'planner_node', topics=('/decisions', '/measurement_batch')),
+        plan('sim', 'sim_node', is_clock=True, says_done=False),
+        *(plan('driver', 'driver', name, drives=True) for name in names),
+        plan('filter', 'filter_node', parameters={'targets': targets[: 2 * found] or [0.0]}),
+        plan('planner', 'planner_node'),
     ]
 
 
@@ -68,7 +51,7 @@ def main():
     if json.loads(sys.argv[1]).get('long'):
         scenario_run.store_report = scenario_run.read_events = wait
     mission.plan_nodes = plan_fakes
-    supervisor.find_executable = lambda package, executable: Path(executable)
+    node_plan.find_executable = lambda package, executable: Path(executable)
     return run_scenario.main(sys.argv[2:])
 
 

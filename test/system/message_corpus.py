@@ -29,17 +29,7 @@ def kind_of(name):
 
 
 class Corpus:
-    """
-    A seeded source of messages.
-
-    Parameters
-    ----------
-    seed : int
-        The same seed makes the same messages.
-    robot : str
-        Name that good messages carry.
-
-    """
+    """A seeded source of messages; good ones carry the name of a robot."""
 
     def __init__(self, seed, robot='rover'):
         self._random = np.random.default_rng(seed)

@@ -108,7 +108,6 @@ def _planner_plan(name: str, scenario: CuboidScenario, common: dict[str, Any]) -
         'cuboid_planner',
         name,
         {**flatten(settings), **SIMULATED},
-        topics=tuple(f'/{name}/{topic}' for topic in ('state', 'decision', 'cmd_vel', 'link/tx')),
         given={'search_on_start': True},
         drives=True,
     )

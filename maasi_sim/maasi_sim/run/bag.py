@@ -6,7 +6,6 @@ The writer of `rosbags`, extended: it writes by time, with type hashes and the d
 from __future__ import annotations
 
 import contextlib
-import os
 import queue
 import threading
 from collections.abc import Collection, Mapping
@@ -37,24 +36,9 @@ from rosbags.rosbag2.storage_mcap import (
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from maasi_drivers.calibration.bag_reader import (
-    BagError,
-    BagMessage,
-    BagReader,
-    whole_length,
-    write_end,
-)
+from maasi_drivers.calibration.bag_reader import BagError, BagReader
 
-__all__ = [
-    'Bag',
-    'BagError',
-    'BagMessage',
-    'BagWriteError',
-    'BagWriter',
-    'interface_folder',
-    'load_types',
-    'topic_qos',
-]
+__all__ = ['Bag', 'BagError', 'BagWriteError', 'BagWriter', 'load_types', 'topic_qos']
 
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
@@ -68,10 +52,6 @@ ROS_DISTRO = 'jazzy'
 # Latest time after which written messages are in the file [s of wall time].
 FLUSH_PERIOD = 0.5
 _FOREIGN_DISTRO, _OWN_DISTRO = 'ros_distro: rosbags', f'ros_distro: {ROS_DISTRO}'
-# Shortest wait for a message, against busy waiting while a chunk is due [s].
-_LEAST_WAIT = 0.01
-# Marks the announcement of a topic instead of a message.
-_ANNOUNCED = -(2**63)
 _FOREVER = QosTime(9223372036, 854775807)
 
 
@@ -150,15 +130,12 @@ class FlushingStorage(McapWriter):
         self.channel_stats[connection.id] = 0
         write_channel(self.chunk.bio, self.channels[-1], self.schemas)
 
-    def flush(self, now: float) -> float:
-        """Write the chunk to the file if it is due; return the time until it is [s]."""
-        if not self.chunk.msgs:
-            self._flushed = now
-        elif now >= self._flushed + FLUSH_PERIOD:
+    def flush(self) -> None:
+        """Write the chunk to the file if it is due."""
+        if self.chunk.msgs and monotonic() >= self._flushed + FLUSH_PERIOD:
             self.close_chunk()
             self.bio.flush()
-            self._flushed = now
-        return max(0.0, self._flushed + FLUSH_PERIOD - now)
+            self._flushed = monotonic()
 
     def close(self, version: int, metadata: str) -> None:
         """Write index and end."""
@@ -166,13 +143,7 @@ class FlushingStorage(McapWriter):
 
 
 class BagFile(Writer):
-    """A recording in the format of rosbag2, version 9, MCAP with compressed chunks.
-
-    Parameters
-    ----------
-    path : Path
-        Its folder; must not exist.
-    """
+    """A recording in a new folder, in the format of rosbag2: version 9, MCAP, compressed chunks."""
 
     STORAGE_PLUGINS: ClassVar[Mapping[StoragePlugin, type[FlushingStorage]]] = {  # type: ignore[misc, assignment]
         StoragePlugin.MCAP: FlushingStorage
@@ -182,10 +153,10 @@ class BagFile(Writer):
         super().__init__(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
 
-    def flush(self) -> float:
-        """Write due chunks to the file; return the time until the next [s]."""
+    def flush(self) -> None:
+        """Write a chunk that is due to the file."""
         assert isinstance(self.storage, FlushingStorage)
-        return self.storage.flush(monotonic())
+        self.storage.flush()
 
     def close(self) -> None:
         """Write the index and `metadata.yaml`."""
@@ -196,38 +167,21 @@ class BagFile(Writer):
         copy.replace(self.metapath)
 
     def give_up(self) -> None:
-        """Close after a failed write: complete records stay readable, without an index."""
-        file = self.path / f'{self.path.name}.mcap'
+        """Close after a failed write: whole chunks stay readable, without an index."""
         self.metapath.with_suffix('.yaml.tmp').unlink(missing_ok=True)
         with contextlib.suppress(Exception):
             self.abort()
-        with contextlib.suppress(Exception):
-            length = whole_length(file)
-            os.truncate(file, length)
-            with file.open('ab') as end:
-                write_end(end)
 
 
 class BagWriter:
     """Writes a recording in its own thread; after any error it can be closed, and is readable then.
 
-    Messages are in the file after `FLUSH_PERIOD`: a killed process loses no more.
+    Messages are in the file after `FLUSH_PERIOD`: a killed process loses no more. They keep their
+    order: times that do not increase are moved up by a nanosecond.
 
     Images are stored as `sensor_msgs/msg/CompressedImage` on `<topic>/compressed`, in the encoding
-    that image_transport would use. Messages keep their order: times that do not increase are moved
-    up by a nanosecond.
-
-    Parameters
-    ----------
-    path : Path
-        Folder of the recording; must not exist.
-    types : Typestore
-        Message types, from `load_types`.
-    images : {'jpeg', 'png', 'raw'}
-        How images are stored. JPEG has quality 95 without chroma subsampling; PNG is lossless and
-        costs ten times the time.
-    backlog : int
-        Bytes waiting to be written above which `write` blocks.
+    that image_transport would use. JPEG has quality 95 without chroma subsampling; PNG costs ten
+    times the time. `write` blocks while more than `backlog` bytes wait.
 
     Raises
     ------
@@ -272,10 +226,6 @@ class BagWriter:
         if type_name not in self._types.fielddefs:
             raise BagError(f'topic {topic}: unknown message type {type_name}')
         self._topics[topic] = (type_name, qos or topic_qos())
-        # Announcing a topic takes a while: do it before its first message. The stored format of
-        # images is not known yet.
-        if type_name != IMAGE_TYPE:
-            self._queue.put((topic, _ANNOUNCED, b''))
 
     def write(self, topic: str, time: int, data: bytes) -> None:
         """Take a serialised message (CDR) received at `time` [ns]."""
@@ -322,7 +272,7 @@ class BagWriter:
         if self._error is None:
             try:
                 for topic in self._topics:
-                    self._connect(topic, self._topics[topic][0] == IMAGE_TYPE)
+                    self._connect(topic, compressed=True)
                 self._writer.close()
             except Exception as error:
                 self._error = error
@@ -345,49 +295,39 @@ class BagWriter:
             raise kind(f'{self.path}: writing failed: {text}') from self._error
 
     def _work(self) -> None:
-        due = FLUSH_PERIOD
         while True:
-            try:
-                item = self._queue.get(timeout=due)
-            except queue.Empty:
-                item = '', 0, b''
-            if item is None:
-                return
-            topic, time, data = item
+            item = None
+            with contextlib.suppress(queue.Empty):
+                item = self._queue.get(timeout=FLUSH_PERIOD)
+                if item is None:
+                    return
             if self._error is None:
                 try:
-                    if topic and time == _ANNOUNCED:
-                        self._connect(topic, False)
-                    elif topic:
-                        self._store(topic, time, data)
-                    due = max(self._writer.flush(), _LEAST_WAIT)
+                    if item is not None:
+                        self._store(*item)
+                    self._writer.flush()
                 except Exception as error:
                     self._error = error
-                    due = FLUSH_PERIOD
             with self._changed:
-                self._pending -= len(data)
+                self._pending -= 0 if item is None else len(item[2])
                 self._changed.notify_all()
 
     def _store(self, topic: str, time: int, data: bytes) -> None:
         compressed = None
         if self._topics[topic][0] == IMAGE_TYPE and self._images != 'raw':
             compressed = self._compress(data)
-        connection = self._connect(topic, compressed is not None)
+        connection = self._connect(topic, compressed=compressed is not None)
         self._time = max(time, self._time + 1)
         self._writer.write(connection, self._time, data if compressed is None else compressed)
         self.counts[connection.topic] = self.counts.get(connection.topic, 0) + 1
 
-    def _connect(self, topic: str, compressed: bool) -> Connection:
-        type_name, qos = self._topics[topic]
-        name = topic
-        if compressed and self._images != 'raw':
+    def _connect(self, topic: str, *, compressed: bool) -> Connection:
+        name, (type_name, qos) = topic, self._topics[topic]
+        if compressed and type_name == IMAGE_TYPE and self._images != 'raw':
             name, type_name = f'{topic}/compressed', COMPRESSED_TYPE
         if name not in self._connections:
             self._connections[name] = self._writer.add_connection(
-                name,
-                type_name,
-                typestore=self._types,
-                offered_qos_profiles=[qos],
+                name, type_name, typestore=self._types, offered_qos_profiles=[qos]
             )
         return self._connections[name]
 
@@ -406,13 +346,11 @@ class BagWriter:
         pixels = np.ascontiguousarray(pixels)
         if image.encoding == 'rgb8':
             pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-        options = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-        if self._images == 'jpeg':
-            options = [cv2.IMWRITE_JPEG_QUALITY, 95]
-            options += [
-                cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-                cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
-            ]
+        finest = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+        options = {
+            'png': [cv2.IMWRITE_PNG_COMPRESSION, 1],
+            'jpeg': [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, finest],
+        }[self._images]
         done, encoded = cv2.imencode(f'.{self._images}', pixels, options)
         if not done:
             return None

@@ -37,16 +37,9 @@ class Domain:
     A domain, and a namespace in it, is locked by the name of an abstract Unix socket: it is valid
     for all users, makes no file, and ends with the process.
 
-    Parameters
-    ----------
-    number : int, optional
-        The domain to use; the first free one from 1 if not given (0 is the ROS default).
-    purpose : str
-        Locks of different purposes are independent.
-    team : str
-        Namespace of the run.
-    shared : bool
-        Whether other runs, in other namespaces, may use it as well.
+    Without a number it is the first free one from 1 (0 is the ROS default). Locks of different
+    purposes are independent. If `shared`, other runs may use it as well, in other namespaces than
+    `team`.
 
     Raises
     ------
@@ -159,14 +152,9 @@ def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> l
     They fill the memory, and a process that opens a port whose creator died before it was ready
     waits for ever, on this host in all domains.
 
-    Parameters
-    ----------
-    domain : int, optional
-        Domain that no process uses, of which all ports are removed; of others only those that were
-        never ready. New processes use the names of ports again, some of them in all domains: who
-        opens a port while it is removed shares it with nobody.
-    folder : Path
-        Where Fast DDS keeps them.
+    Of `domain`, which no process uses, all ports are removed; of others only those that were never
+    ready. New processes use the names of ports again, some of them in all domains: who opens a port
+    while it is removed shares it with nobody.
     """
     parts: dict[str, list[Path]] = defaultdict(list)
     for path in folder.iterdir() if folder.is_dir() else ():

@@ -11,7 +11,9 @@ from typing import Any
 from maasi_drivers.settings.driver import GuardSettings
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE
 from maasi_filter.ros.parameters import flatten
-from maasi_sim.run.topics import CLOCK, STEP, within
+from maasi_sim.run.processes import NodeProcess, find_executable
+from maasi_sim.run.run_folder import write_text
+from maasi_sim.run.topics import within
 from maasi_sim.scenario.base import BaseScenario
 from maasi_sim.scenario.layering import to_yaml
 
@@ -23,18 +25,8 @@ SIMULATED = {'use_sim_time': True}
 class RunSettings:
     """How a scenario is run.
 
-    Attributes
-    ----------
-    seed : int
-        Of all random numbers.
-    lockstep : bool
-        Step by step, or free running.
-    rate : float, optional
-        Simulated over wall time; None: as fast as possible in lockstep, else 1.
-    recorder : bool
-        Whether the simulation waits for a recorder.
-    file : Path
-        Scenario file with all layers, for the simulation.
+    The rate is simulated over wall time; None: as fast as possible in lockstep, else 1. With
+    `recorder` the simulation waits for one. `file` is the scenario with all layers.
     """
 
     seed: int
@@ -65,8 +57,6 @@ class NodePlan:
         Of the node; the namespace without slashes, empty for none.
     parameters : dict
         Flat, with dots.
-    topics : tuple of str
-        Published ones that the run needs.
     says_ready : bool
         Whether it reports on `lockstep/ready`, and is awaited.
     says_done : bool
@@ -75,12 +65,10 @@ class NodePlan:
         Whether it publishes the time.
     drives : bool
         Whether it commands a robot, which is stopped when the node dies.
-    remaps : dict
-        Remapped topic names.
-    arguments : tuple of str
-        Before those of ROS.
     given : dict
         Parameters passed on the command line, as the file must not start a search on real robots.
+    arguments : tuple of str
+        Before those of ROS.
     """
 
     package: str
@@ -88,7 +76,6 @@ class NodePlan:
     name: str
     namespace: str = ''
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    topics: tuple[str, ...] = ()
     says_ready: bool = True
     says_done: bool = True
     is_clock: bool = False
@@ -109,36 +96,29 @@ class NodePlan:
 
     def parameter_text(self) -> str:
         """Return its parameter file."""
-        content = {'/**': {'ros__parameters': dict(self.parameters)}}
-        return to_yaml(content)
+        return to_yaml({'/**': {'ros__parameters': dict(self.parameters)}})
+
+    def process(self, parameters: Path, logs: Path, log_level: str | None = None) -> NodeProcess:
+        """Write its parameter file into a folder, and return its process, not started yet."""
+        path = parameters / f'{self.file_name}.yaml'
+        write_text(path, self.parameter_text())
+        command = self.command(find_executable(self.package, self.executable), path, log_level)
+        log = logs / f'{self.file_name}.log'
+        return NodeProcess(self.full_name, command, log, self.package)
 
     def command(
         self, executable: Path, parameter_file: Path, log_level: str | None = None
     ) -> list[str]:
         """Return the command line of its process."""
-        return [
-            str(executable),
-            *self.arguments,
-            '--ros-args',
-            '--disable-external-lib-logs',
-            '--remap',
-            f'__node:={self.name}',
-            '--remap',
-            f'__ns:=/{self.namespace}',
-            *(
-                word
-                for before, after in self.remaps.items()
-                for word in ('--remap', f'{before}:={after}')
-            ),
-            '--params-file',
-            str(parameter_file),
-            *(
-                word
-                for name, value in self.given.items()
-                for word in ('--param', f'{name}:={json.dumps(value)}')
-            ),
-            *(('--log-level', log_level) if log_level else ()),
-        ]
+        remaps = {'__node': self.name, '__ns': f'/{self.namespace}', **self.remaps}
+        level = ['--log-level', log_level] if log_level else []
+        words = [str(executable), *self.arguments, '--ros-args', '--disable-external-lib-logs']
+        for before, after in remaps.items():
+            words += ['--remap', f'{before}:={after}']
+        words += ['--params-file', str(parameter_file)]
+        for name, value in self.given.items():
+            words += ['--param', f'{name}:={json.dumps(value)}']
+        return words + level
 
 
 def in_team(plan: NodePlan, team: str) -> NodePlan:
@@ -148,7 +128,6 @@ def in_team(plan: NodePlan, team: str) -> NodePlan:
     return replace(
         plan,
         namespace=f'{team}/{plan.namespace}' if plan.namespace else team,
-        topics=tuple(topic if topic == CLOCK else within(team, topic) for topic in plan.topics),
         remaps={within(team, key): within(team, value) for key, value in plan.remaps.items()},
     )
 
@@ -185,9 +164,6 @@ def sim_plan(executable: str, scenario: BaseScenario, run: RunSettings) -> NodeP
         executable,
         'sim_node',
         parameters=parameters,
-        # The last publishers that it makes: with these the recorder knows all of its others.
-        topics=(CLOCK, STEP),
-        says_ready=False,
         says_done=False,
         is_clock=True,
     )

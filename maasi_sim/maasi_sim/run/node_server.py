@@ -110,18 +110,10 @@ def _die_with(parent: int) -> None:
 def node_process(
     package: str, command: list[str], log: Path, environment: Mapping[str, str]
 ) -> BaseProcess:
-    """Return the process of a node, not started yet.
+    """Return the process of a node with its output in a log, not started yet.
 
-    Parameters
-    ----------
-    package : str
-        Of the executable; one of another package than ours is executed.
-    command : list of str
-        Path of the executable and its arguments, also shown by `ps`.
-    log : Path
-        Of its output.
-    environment : mapping
-        All its variables.
+    A node of another package than ours is executed. The command is the path of the executable and
+    its arguments, also shown by `ps`; `environment` has all variables.
     """
     name = Path(command[0]).name
     script = name if package in _PACKAGES and hasattr(maasi_entry, name) else ''

@@ -33,20 +33,8 @@ def find_executable(package: str, executable: str) -> Path:
 class NodeProcess:
     """A node that runs as a process and cannot outlive this one.
 
-    Attributes
-    ----------
-    name : str
-        Of the node, with namespace.
-    command : list of str
-        What is run.
-    log : Path
-        Of its output; kept over restarts.
-    package : str
-        Of the executable: a node of this suite inherits what the node server has loaded.
-    environment : dict
-        Variables on top of this process's own.
-    restarts : int
-        Number of restarts.
+    Its log is kept over restarts. A node of a package of this suite inherits what the node server
+    has loaded. The environment is on top of this process's own.
     """
 
     name: str
@@ -131,17 +119,8 @@ def stop(
 ) -> list[str]:
     """Stop processes with increasingly strong signals; return when all have ended.
 
-    Parameters
-    ----------
-    processes : sequence of NodeProcess
-        All get each signal at the same time.
-    ending : sequence of (signal, seconds)
-        Signals, and how long to wait after each.
-
-    Returns
-    -------
-    list of str
-        Names of those that had to be killed.
+    All get each signal of `ending` at the same time, and that many seconds [s] until the next one.
+    Returned are the names of those that had to be killed.
     """
     stubborn: list[str] = []
     for number, patience in ending:

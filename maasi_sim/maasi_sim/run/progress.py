@@ -36,15 +36,9 @@ class Status:
 
 
 class ProgressDisplay:
-    """
-    Show the progress of a run.
+    """Shows progress: on a terminal one line that changes, else lines now and then.
 
-    Parameters
-    ----------
-    stream : TextIO
-        Output; on a terminal one line is updated, otherwise lines are printed now and then.
-    period : float
-        Seconds between lines without news, without a terminal.
+    Without a terminal `period` is the time between lines without news [s].
     """
 
     def __init__(self, stream: TextIO | None = None, period: float = 5.0) -> None:

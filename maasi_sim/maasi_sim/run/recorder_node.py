@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import struct
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from functools import cache
 from typing import Any
@@ -15,6 +14,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Twist, TwistStamped
 from rcl_interfaces.msg import Log
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -23,8 +23,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
-from maasi_filter.ros.conversions import stamp_of_step
+from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, reader_of
 from maasi_msgs.msg import LockstepDone, LockstepStep
 from maasi_sim.run.bag import BagError, BagWriter, topic_qos
@@ -43,10 +44,9 @@ _SKIPPED = ('/parameter_events', READY)
 _KEPT = '/found_targets/kept'
 # Topics still recorded during shutdown.
 _AT_THE_END = ('cmd_vel', 'rosout', 'diagnostics', 'transition_event')
-# A message with a stamp in the future is held until that time, so that no stamp is later than its
-# log time. Longest hold [s of wall time], and the lead above which a stamp is assumed to come from
-# another clock [ns].
-_LONGEST_HOLD, _LARGEST_LEAD = 1.0, 60 * 10**9
+# The clock may come after messages of its time: they are logged at their stamp, so that no stamp is
+# later than its log time. A larger lead is assumed to be of another clock [ns].
+_LARGEST_LEAD = 10**9
 # Longest wait for the acknowledgement of stop commands [s].
 _STOP_PATIENCE = 1.0
 
@@ -56,6 +56,8 @@ class Recorder:
     A node that takes serialised messages from all topics that it discovers.
 
     It has no executor: `wait` and `drain` take messages without callbacks, at a fifth of the cost.
+    Without a bag it takes only what the observer needs. Topics of the observer are relative to the
+    namespace `team`, which has no slashes at its ends.
 
     Subscribes
     ----------
@@ -69,19 +71,9 @@ class Recorder:
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone);
     `<robot>/cmd_vel` (geometry_msgs/TwistStamped or Twist): zeros, when `stop_robots` is called
 
-    Parameters
-    ----------
-    domain : int
-        ROS domain.
-    observer : Observer
-        Gets the messages that the report needs.
-    step_length : float
-        Duration of a step [s].
-    bag : BagWriter, optional
-        Recording; None: no recording, and only messages that the observer needs are taken.
-    team : str
-        Namespace of the team, without slashes at its ends. Topics of the observer are relative to
-        it.
+    Calls
+    -----
+    `<robot>/arm` (std_srvs/Trigger), when `arm` is called
     """
 
     def __init__(
@@ -125,8 +117,7 @@ class Recorder:
         self.faults: dict[str, str] = {}
         #: Time of the last diagnostics of each node [s of wall time].
         self.heartbeats: dict[str, float] = {}
-        self._held: list[tuple[str, bytes]] = []
-        self._hold_began = 0.0
+        self._arming: dict[str, Client] = {}
         self._last_done: deque[bytes] = deque(maxlen=100)
         self.ready: set[str] = set()
         # Nodes that answered the newest reader of READY, and the number of others at that time.
@@ -139,6 +130,8 @@ class Recorder:
         self.listener: Callable[[str, str, bytes], None] | None = None
         self._shown: dict[str, str] = {}
         self._wanted = {*observer.topics, CLOCK, DONE, DIAGNOSTICS}
+        # Taken by themselves, in this order.
+        self._in_order = {*observer.update_topics, STEP, CLOCK}
         self._subscriptions: dict[str, Subscription] = {}
         self._refused: set[str] = set()
         self._ready_subscription = self._subscribe(READY, LockstepDone, LATCHED_ALL)
@@ -191,18 +184,6 @@ class Recorder:
             if shown:
                 self._shown[topic] = types[0]
 
-    def missing(self, topics: Sequence[str]) -> list[str]:
-        """Return the topics, among those recorded, with a publisher that is not connected yet.
-
-        `topics` has each topic once for each of its publishers.
-        """
-        publishers = Counter(topics)
-        return [
-            full
-            for full, number in publishers.items()
-            if self._connected(self._relative(full)) < number
-        ]
-
     def unmatched(self) -> list[str]:
         """Return the topics with a publisher that is known, but not connected yet."""
         return [
@@ -212,13 +193,6 @@ class Recorder:
             < self.node.count_publishers(full := self._full(topic))
         ]
 
-    def _connected(self, topic: str | None) -> float:
-        """Return the number of connected publishers; infinite if the topic is not recorded."""
-        if topic is None or not self._wants(topic):
-            return math.inf
-        subscription = self._subscriptions.get(topic)
-        return 0 if subscription is None else subscription.handle.get_publisher_count()
-
     def _wants(self, topic: str) -> bool:
         # A name with an underscore in front is hidden: the inner topics of actions.
         if topic in _SKIPPED or '/_' in topic or topic.endswith(_KEPT):
@@ -227,7 +201,7 @@ class Recorder:
 
     def take_ready(self) -> set[str]:
         """Return the names of the nodes that have reported ready."""
-        for data in _take(self._ready_subscription):
+        for data in _queued(self._ready_subscription):
             self._answered.add(deserialize_message(data, LockstepDone).node)
         self.ready |= self._answered
         return self.ready
@@ -279,33 +253,24 @@ class Recorder:
         # Messages left in the queue would end each wait at once.
         self.take_ready()
         # Messages that an update refers to precede it: take updates first, add them last.
-        updates = [
-            (topic, data)
-            for topic in self.observer.update_topics
-            for data in self._take_from(topic)
-        ]
-        steps = self._take_from(STEP)
-        for data in steps:
+        updates = self._take(self.observer.update_topics)
+        steps = self._take([STEP])
+        for _, data in steps:
             self.step = struct.unpack_from('<Q', data, 4)[0]
-            self._set_time(data, 12)
+            self.time = max(self.time, time_at(data, 12))
             if self._begun is None:
                 self._begun = time_at(data, 12)
                 self.robots = deserialize_message(data, LockstepStep).robots
-        taken = [(CLOCK, data) for data in self._take_from(CLOCK)]
+        taken = self._take([CLOCK])
         for _, data in taken:
-            self._set_time(data, 4)
-        for topic, subscription in self._subscriptions.items():
-            if topic not in (*self.observer.update_topics, STEP, CLOCK):
-                taken += [
-                    (topic, data) for data in _take(subscription) if self._is_own(topic, data)
-                ]
-        taken += updates
-        taken += [(STEP, data) for data in steps]
-        if self._finished:
-            taken = self._until(taken, self._last_step)
-        elif limit is not None and self.step is not None and self._elapsed >= limit:
+            self.time = max(self.time, time_at(data, 4))
+        others = self._take([topic for topic in self._subscriptions if topic not in self._in_order])
+        taken += [item for item in others if self._is_own(*item)]
+        taken += updates + steps
+        over = limit is not None and self._elapsed >= limit
+        if over and self.step is not None and not self._finished:
             self._last_step = self.step - 1
-            taken = self._until(taken, self._last_step)
+        taken = self._until_last_step(taken)
         now = time.monotonic()
         for topic, data in taken:
             self.last_seen[topic] = now
@@ -322,7 +287,7 @@ class Recorder:
         self.observer.settle()
         if self.observer.end_step is not None and not self._finished:
             self._last_step = self.observer.end_step
-            taken = self._until(taken, self._last_step)
+            taken = self._until_last_step(taken)
         self._record(taken)
 
     def _note_planner(self, status: DiagnosticStatus) -> None:
@@ -363,35 +328,14 @@ class Recorder:
         if self.bag is None or self.bag.failed:
             return
         try:
-            for topic, data in self._due(taken):
-                self.bag.write(self._full(topic), self.time, data)
-                self.first.setdefault(topic, self.time)
+            for topic, data in taken:
+                lead = stamp_of(topic, self._subscriptions[topic].msg_type, data) - self.time
+                logged = self.time + (lead if 0 < lead <= _LARGEST_LEAD else 0)
+                self.bag.write(self._full(topic), logged, data)
+                self.first.setdefault(topic, logged)
         except BagError:
             if not self.bag.failed:
                 raise
-
-    def _due(self, taken: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-        """Return what to record now; hold messages with a stamp in the future."""
-        now = time.monotonic()
-        items = self._held + taken
-        if not self._held:
-            self._hold_began = now
-        if self._last_step >= 0:
-            items = self._until(items, self._last_step)
-        self._held = []
-        if self._finished or now - self._hold_began > _LONGEST_HOLD:
-            return items
-        due = []
-        early: set[str] = set()
-        for topic, data in items:
-            lead = stamp_of(topic, self._subscriptions[topic].msg_type, data) - self.time
-            # Keep the order within a topic.
-            if topic in early or 0 < lead <= _LARGEST_LEAD:
-                early.add(topic)
-                self._held.append((topic, data))
-            else:
-                due.append((topic, data))
-        return due
 
     def finish(self) -> None:
         """Keep only messages of the steps so far and of the shutdown from now on."""
@@ -399,28 +343,26 @@ class Recorder:
         if self._last_step < 0 and self.step is not None:
             self._last_step = self.step
 
-    def _until(self, taken: list[tuple[str, bytes]], step: int) -> list[tuple[str, bytes]]:
-        """Return the messages up to a step; those without step or stamp are kept."""
-        end = stamp_of_step(step, self._step_length)
-        kept = []
-        for topic, data in taken:
-            kind = self._subscriptions[topic].msg_type
-            if self._finished and topic.rpartition('/')[2] in _AT_THE_END:
-                kept.append((topic, data))
-                continue
-            if stamp_of(topic, kind, data) > end:
-                continue
-            if _has_step(kind) and deserialize_message(data, kind).step > step:
-                continue
-            kept.append((topic, data))
-        return kept
+    def _until_last_step(self, taken: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+        """Return the messages up to the last step; those without step or stamp are kept."""
+        return taken if self._last_step < 0 else [item for item in taken if self._is_before(*item)]
 
-    def _take_from(self, topic: str) -> list[bytes]:
-        subscription = self._subscriptions.get(topic)
-        return [] if subscription is None else _take(subscription)
+    def _is_before(self, topic: str, data: bytes) -> bool:
+        kind = self._subscriptions[topic].msg_type
+        if self._finished and topic.rpartition('/')[2] in _AT_THE_END:
+            return True
+        if stamp_of(topic, kind, data) > stamp_of_step(self._last_step, self._step_length):
+            return False
+        return not _has_step(kind) or deserialize_message(data, kind).step <= self._last_step
 
-    def _set_time(self, data: bytes, offset: int) -> None:
-        self.time = max(self.time, time_at(data, offset))
+    def _take(self, topics: Sequence[str]) -> list[tuple[str, bytes]]:
+        """Return the topics and messages that wait in subscriptions."""
+        return [
+            (topic, data)
+            for topic in topics
+            if topic in self._subscriptions
+            for data in _queued(self._subscriptions[topic])
+        ]
 
     def done_steps(self) -> dict[str, int]:
         """Return the last step that each node recently reported done."""
@@ -430,12 +372,23 @@ class Recorder:
             steps[message.node] = max(message.step, steps.get(message.node, 0))
         return steps
 
+    def arm(self, robots: Collection[str]) -> None:
+        """Call the service `arm` of drivers, as a person does with real robots.
+
+        Whether a driver has followed is heard when it is ready.
+        """
+        for name in robots:
+            if name not in self._arming:
+                service = self._full(f'/{name}/arm')
+                self._arming[name] = self.node.create_client(Trigger, service)
+            if self._arming[name].service_is_ready():
+                self._arming[name].call_async(Trigger.Request())
+
     def stop_robots(self, names: Collection[str]) -> None:
         """Publish zeros on `cmd_vel` of robots that subscribe to it, and wait until they arrive."""
         types = dict(self.node.get_topic_names_and_types())
         publishers = []
-        for name in names:
-            topic = self._full(f'/{name}/cmd_vel')
+        for topic in (self._full(f'/{name}/cmd_vel') for name in names):
             if self.node.count_subscribers(topic):
                 plain = types[topic] == ['geometry_msgs/msg/Twist']
                 chosen = Twist if plain else TwistStamped
@@ -450,7 +403,7 @@ class Recorder:
             kind: Any = publisher.msg_type
             message = kind()
             if isinstance(message, TwistStamped):
-                message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.time, 10**9)
+                message.header.stamp = stamp_to_ros(self.time)
             publisher.publish(message)
         for publisher in publishers:
             left = max(deadline - time.monotonic(), 0.0)
@@ -479,7 +432,7 @@ def _has_step(kind: Any) -> bool:
     return kind.__module__.startswith('maasi_msgs.') and 'step' in kind.get_fields_and_field_types()
 
 
-def _take(subscription: Subscription) -> list[bytes]:
+def _queued(subscription: Subscription) -> list[bytes]:
     """Return all serialised messages queued in a subscription."""
     taken: list[bytes] = []
     handle = subscription.handle

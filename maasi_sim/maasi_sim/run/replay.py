@@ -11,9 +11,9 @@ from typing import Any
 
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import NodePlan
-from maasi_sim.run.processes import NodeProcess, find_executable, stop
+from maasi_sim.run.processes import NodeProcess, stop
 from maasi_sim.run.replay_node import FILTER, Recording, ReplayNode, plain, read_recording
-from maasi_sim.run.run_folder import make_folder, write_text
+from maasi_sim.run.run_folder import make_folder
 from maasi_sim.run.topics import within
 
 EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
@@ -84,11 +84,7 @@ def _process(facts: dict[str, Any], namespace: str, folder: Path) -> NodeProcess
         namespace,
         {**recorded['parameters'], **REPLAYED},
     )
-    parameters = folder / f'{plan.file_name}.yaml'
-    write_text(parameters, plan.parameter_text())
-    executable = find_executable(plan.package, plan.executable)
-    log = folder / f'{plan.file_name}.log'
-    return NodeProcess(plan.full_name, plan.command(executable, parameters), log, plan.package)
+    return plan.process(folder, folder)
 
 
 def _feed(

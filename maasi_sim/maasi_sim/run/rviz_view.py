@@ -12,15 +12,7 @@ from maasi_sim.scenario.loading import config_folder
 
 
 def view_text(mission: Mission[Any], namespace: str = '') -> str:
-    """Return RViz's configuration for a run of a scenario.
-
-    Parameters
-    ----------
-    mission : Mission
-        Whose robots are shown.
-    namespace : str
-        Of the team, without slashes; empty for none.
-    """
+    """Return RViz's configuration for a run of a scenario, in the namespace of a team."""
     name = 'search_3d' if mission.scenario.dimension == 3 else 'search'
     path = config_folder() / 'rviz' / f'{name}.rviz'
     content = yaml.safe_load(path.read_text(encoding='utf-8'))

@@ -37,20 +37,7 @@ from maasi_sim.view.scene import scene_of
 
 
 class ScenarioRun:
-    """One run of a scenario, from the file to the report.
-
-    Parameters
-    ----------
-    options : Options
-        From the command line.
-    interruption : Interruption
-        Ends the run when it becomes true.
-
-    Raises
-    ------
-    ScenarioError
-        If the scenario or the options are wrong.
-    """
+    """One run of a scenario, from the file to the report; ends when `interruption` is true."""
 
     def __init__(self, options: Options, interruption: Interruption) -> None:
         self.options = options

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maasi_sim.run.arming import Arming
 from maasi_sim.run.bag import BagError, BagWriter, load_types
 from maasi_sim.run.ending import (
     DONE,
@@ -34,8 +33,10 @@ _BACKLOG = 8 * 2**20
 _POLL = 0.02
 # Between two checks for runs that follow the clock [s].
 _FOLLOWERS_PERIOD = 0.5
-# Longest wait for a publisher that the run does not need: it may not fit the recorder [s].
+# Longest wait for a publisher of others, which may not fit the recorder [s].
 _CONNECTION_PATIENCE = 5.0
+# Between two calls to take off: the first may come before a driver is active [s].
+_ARMING_PERIOD = 2.0
 # Wall time between two messages about missing nodes [s].
 _START_PATIENCE = 10.0
 
@@ -43,23 +44,8 @@ _START_PATIENCE = 10.0
 class Session:
     """Records and monitors a run whose nodes have been started.
 
-    Parameters
-    ----------
-    mission : Mission
-        What is run.
-    supervisor : Supervisor
-        Of the nodes.
-    options : Options
-        From the command line.
-    interruption : Interruption
-        Ends the run when it becomes true.
-    display : ProgressDisplay
-        Shows the progress.
-
     Attributes
     ----------
-    recorder : Recorder
-    observer : Observer
     listener : callable or None
         Called with topic, type and content of each message that a page shows; set before `open`.
     ending : Ending
@@ -94,6 +80,7 @@ class Session:
         # Planners whose present error was printed.
         self._told: set[str] = set()
         self._open = contextlib.ExitStack()
+        self._armed_at = 0.0
         # Wall time of the first step and of the end.
         self._begun: float | None = None
         self._ended: float | None = None
@@ -124,17 +111,22 @@ class Session:
 
     def run(self) -> None:
         """Monitor the run from the start to the end of its nodes."""
-        team = f'{self._options.namespace}/'.lstrip('/')
-        robots = [team + name for name in self.mission.taking_off()]
-        self._arming = Arming(self.recorder.context, robots)
         ending = self._wait_until_ready()
         threading.Thread(target=self._warn, daemon=True).start()
         self.ending = ending or self._follow()
-        self._arming.close()
         self._ended = time.monotonic()
         self._check_recording()
         self.recorder.finish()
         self._supervisor.stop(self.recorder, self.is_followed, _POLL)
+
+    def _let_take_off(self) -> None:
+        """Let simulated robots take off whose drivers do not take part yet."""
+        if time.monotonic() - self._armed_at < _ARMING_PERIOD:
+            return
+        self._armed_at = time.monotonic()
+        ready = map(self._supervisor.without_team, self.recorder.ready)
+        names = [name for name in self.mission.taking_off() if f'/{name}/driver' not in {*ready}]
+        self.recorder.arm(names)
 
     def _check_recording(self) -> None:
         """Note which topics with a message at each step lack a recording of their beginning."""
@@ -212,41 +204,35 @@ class Session:
         patience = _START_PATIENCE
         self._name_external_robots()
         expected = [plan.full_name for plan in supervisor.plans if plan.says_ready]
-        senders = [*expected, *sorted(supervisor.clocks)]
-        needed = [topic for plan in supervisor.plans for topic in plan.topics]
         complete: float | None = None
         while True:
             ending = self._check()
             if ending is not None:
                 return ending
-            # Before the check of topics: all topics of a node that has reported are discovered.
-            ready = set(recorder.take_ready())
+            # Nodes report last, so that all topics of one that has reported are discovered.
+            ready = recorder.take_ready()
             recorder.discover()
             # Messages of starting nodes are recorded as they arrive.
             recorder.drain()
-            self._arming.call(ready)
+            self._let_take_off()
             late = [name for name in expected if name not in ready]
-            missing = recorder.missing(needed)
-            unanswered: list[str] = []
-            if not late and not missing:
+            what = [f'{name} is not ready' for name in late]
+            if not late:
                 complete = complete or time.monotonic()
                 unmatched = recorder.unmatched()
+                what = [f'{topic} has a publisher that is not connected' for topic in unmatched]
                 if not unmatched or time.monotonic() - complete > _CONNECTION_PATIENCE:
-                    unanswered = recorder.unanswered(senders)
-                    if not unanswered:
+                    late = recorder.unanswered(expected)
+                    if not late:
                         break
+                    what = [f'{name} does not know the recorder' for name in late]
             waited = time.monotonic() - begin
-            what = ', '.join(
-                [f'{name} is not ready' for name in late]
-                or [f'nobody publishes {topic}' for topic in missing]
-                or [f'{name} does not know the recorder' for name in unanswered]
-                or [f'{topic} has a publisher that is not connected' for topic in unmatched]
-            )
             if waited > self._limits.start:
-                supervisor.failed.update(late or unanswered)
-                return Ending('not_ready', NODE_FAILED, f'{what} after {self._limits.start:g} s')
+                supervisor.failed.update(late)
+                text = f'{", ".join(what)} after {self._limits.start:g} s'
+                return Ending('not_ready', NODE_FAILED, text)
             if waited > patience:
-                self._display.say(f'waiting: {what}')
+                self._display.say(f'waiting: {", ".join(what)}')
                 patience += _START_PATIENCE
             recorder.wait(_POLL)
         for complaint in recorder.complaints:
@@ -278,7 +264,7 @@ class Session:
         while True:
             recorder.wait(_POLL)
             recorder.drain(limit)
-            self._arming.call(recorder.ready)
+            self._let_take_off()
             ending = self._check() or self._goal()
             if ending is not None:
                 return ending

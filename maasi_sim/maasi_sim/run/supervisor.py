@@ -11,10 +11,10 @@ from typing import Any
 
 from maasi_sim.run.ending import NODE_FAILED, Ending
 from maasi_sim.run.node_plan import NodePlan
-from maasi_sim.run.processes import NodeProcess, find_executable, stop
+from maasi_sim.run.processes import NodeProcess, stop
 from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
-from maasi_sim.run.run_folder import ResultsError, write_text
+from maasi_sim.run.run_folder import ResultsError
 from maasi_sim.run.run_options import Options
 from maasi_sim.scenario.base import BaseScenario
 
@@ -49,16 +49,7 @@ class NodeWatch:
     """Detects nodes that hang, by the heartbeats that their executors publish each second.
 
     Time in which a node waited for a processor does not count. Until its first heartbeat a node
-    counts as starting, which may include compilation.
-
-    Parameters
-    ----------
-    silence : float
-        Longest time without a heartbeat [s of wall time].
-    start : float
-        Longest time from the start of the process to its first heartbeat [s of wall time].
-    waited : callable, optional
-        Returns how long a process waited for a processor [s].
+    counts as starting, which may include compilation. Times are of the wall [s].
     """
 
     def __init__(
@@ -85,11 +76,11 @@ class NodeWatch:
         node.beat, node.waited = now, self._waited(node.pid)
 
     def starting(self) -> list[str]:
-        """Return the names of the nodes that have not had a heartbeat."""
+        """Return the nodes without a heartbeat so far."""
         return [name for name, node in self._nodes.items() if node.beat is None]
 
     def late(self, now: float) -> list[str]:
-        """Return the names of the nodes that have been starting for too long."""
+        """Return the nodes that have been starting for too long."""
         return [name for name in self.starting() if now - self._nodes[name].started > self._start]
 
     def hung(self, now: float) -> dict[str, float]:
@@ -113,19 +104,6 @@ class NodeWatch:
 class Supervisor:
     """Starts the nodes of a run; restarts a node that dies or hangs, or ends the run.
 
-    Parameters
-    ----------
-    plans : list of NodePlan
-        Nodes to start.
-    scenario : BaseScenario
-        Limits, and the reaction to a node that dies.
-    options : Options
-        From the command line.
-    folder : Path
-        Of the run: gets parameter files and logs.
-    display : ProgressDisplay
-        Prints messages.
-
     Attributes
     ----------
     processes : dict
@@ -136,13 +114,6 @@ class Supervisor:
         Nodes that caused the end of the run.
     running : bool
         Whether the first step has begun; before it nodes may take long to start.
-
-    Raises
-    ------
-    ProcessError
-        If an executable is not installed.
-    ResultsError
-        If a parameter file cannot be written.
     """
 
     def __init__(
@@ -173,7 +144,7 @@ class Supervisor:
         except OSError as error:
             raise ResultsError(f'{parameters}: {error.strerror}') from error
         self.processes = {
-            plan.full_name: _process(plan, parameters, folder, options.log_level) for plan in plans
+            plan.full_name: plan.process(parameters, folder, options.log_level) for plan in plans
         }
 
     def start(self) -> None:
@@ -192,14 +163,10 @@ class Supervisor:
             self.watch.beat(name, beat)
         recorder.heartbeats.clear()
         ending = self._check_start() or self._check_heartbeats(recorder)
-        if ending is not None:
-            return ending
         for name, process in self.processes.items():
-            if not process.running:
+            if ending is None and not process.running:
                 ending = self._restart(name, process, recorder)
-                if ending is not None:
-                    return ending
-        return None
+        return ending
 
     def _restart(self, name: str, process: NodeProcess, recorder: Recorder) -> Ending | None:
         """Restart a node that has died, or return the ending of the run."""
@@ -260,11 +227,8 @@ class Supervisor:
         if recorder.step is None:
             return Ending('node_hung', NODE_FAILED, f'the simulated time stands still {silence}')
         steps = recorder.done_steps()
-        late = [
-            plan.full_name
-            for plan in self.plans
-            if plan.says_done and steps.get(plan.full_name, -1) < recorder.step
-        ]
+        doers = [plan.full_name for plan in self.plans if plan.says_done]
+        late = [name for name in doers if steps.get(name, -1) < recorder.step]
         self.failed.update(late)
         who = ', '.join(late) or next(iter(self.clocks))
         return Ending(
@@ -318,11 +282,3 @@ class Supervisor:
     def _robot_of(self, node: str) -> str | None:
         name = self.without_team(node).strip('/').partition('/')[0]
         return name if name in self._scenario.robots else None
-
-
-def _process(plan: NodePlan, parameters: Path, folder: Path, level: str | None) -> NodeProcess:
-    """Write the parameter file of a node and return its process."""
-    path = parameters / f'{plan.file_name}.yaml'
-    write_text(path, plan.parameter_text())
-    command = plan.command(find_executable(plan.package, plan.executable), path, level)
-    return NodeProcess(plan.full_name, command, folder / f'{plan.file_name}.log', plan.package)

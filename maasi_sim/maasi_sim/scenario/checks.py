@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
@@ -17,31 +17,34 @@ from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.scenario.visibility import robot_candidates
 from maasi_sim.world.robots import SimulatedSettings
 
-_ROBOT_NAME = re.compile(r'^[a-z][a-z0-9_]*$')
+Problems = Iterator[tuple[Key, str]]
 
+_ROBOT_NAME = re.compile(r'^[a-z][a-z0-9]*(_[a-z0-9]+)*$')
 _RESERVED = ('exploration', 'ground_truth', 'lockstep', 'scenario')
-
 # Largest deviation of a time from a whole number of steps.
 _STEP_TOLERANCE = 1e-6
-
-# Drivers of robots that have no camera.
+# Drivers of robots that have no camera, and those that have link mavlink.
 _RANGING = ('ranging_driver', 'mavlink_driver')
-
-# Drivers that have link mavlink.
 _MAVLINK = ('mavlink_driver', 'mavlink_camera_driver')
-
 # URL of the driver of a simulated vehicle.
 _MAVLINK_URL = re.compile(r'^udpin:[^:]+:(\d+)$')
 
 
-def problems_of(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+def problems_of(scenario: Scenario) -> Problems:
     """Yield problems between keys: key and text."""
     yield from _world_problems(scenario)
-    for name, robot in scenario.robots.items():
-        for inner, text in _robot_problems(name, robot, scenario):
+    ports: dict[str, str] = {}
+    for name in scenario.names():
+        robot = scenario.robots[name]
+        problems = [_robot_problems(name, robot, scenario)]
+        problems.append(_sensor_problems(robot, scenario))
+        problems.append(_simulated_problems(robot, scenario))
+        if robot.link == 'mambo_wifi':
+            problems.append(_mambo_problems(robot))
+        elif robot.link == 'mavlink':
+            problems.append(_mavlink_problems(name, robot, ports))
+        for inner, text in chain(*problems):
             yield ('robots', name, *inner), text
-    yield from _mambo_problems(scenario)
-    yield from _mavlink_problems(scenario)
     yield from event_problems(scenario.events, scenario.names())
     for index, event in enumerate(scenario.events):
         if event.robot in scenario.robots and scenario.robots[event.robot].external:
@@ -53,7 +56,7 @@ def problems_of(scenario: Scenario) -> Iterator[tuple[Key, str]]:
         yield ('stop',), "read 'all_found' but there are no targets, allowed is 'planner_done'"
 
 
-def _world_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
+def _world_problems(scenario: Scenario) -> Problems:
     found = False
     for index, obstacle in enumerate(scenario.environment.obstacles):
         if len(obstacle.centre) > scenario.dimension:
@@ -63,13 +66,13 @@ def _world_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
                 f'read {obstacle.centre}, allowed are {scenario.dimension} coordinates, '
                 'as in environment.bounds',
             )
-    most = _room_for_targets(scenario)
-    if scenario.targets.count is not None and scenario.targets.count > most:
+    most, count = _room_for_targets(scenario), scenario.targets.count
+    if count is not None and count > most:
         found = True
         yield (
             ('targets', 'separation'),
             f'read {scenario.targets.separation}, with which about {most} targets can be drawn '
-            f'at most, not {scenario.targets.count}',
+            f'at most, not {count}',
         )
     if found:
         return
@@ -96,22 +99,20 @@ def _room_for_targets(scenario: Scenario) -> int:
     return max(1, round(1.1 * filled * space / (ball * targets.separation**scenario.dimension)))
 
 
-def _robot_problems(
-    name: str, robot: RobotSettings, scenario: Scenario
-) -> Iterator[tuple[Key, str]]:
+def _robot_problems(name: str, robot: RobotSettings, scenario: Scenario) -> Problems:
     for text in check_names(name):
         yield (), text
     bounds = scenario.environment.array()
     start = np.array(robot.start)
-    if not _inside(start, bounds):
+    point = start[: len(bounds)]
+    if not ((point >= bounds[:, 0]) & (point <= bounds[:, 1])).all():
         yield (
             ('start',),
             f'read {robot.start}, allowed is what lies inside environment.bounds, '
             f'{bounds.tolist()}',
         )
     for index, obstacle in enumerate(scenario.environment.obstacles):
-        size = min(len(obstacle.centre), 3)
-        distance = float(np.linalg.norm(start[:size] - np.array(obstacle.centre)[:size]))
+        distance = math.dist(start[: len(obstacle.centre)], obstacle.centre[:3])
         if distance < obstacle.radius + robot.radius:
             yield (
                 ('start',),
@@ -129,11 +130,9 @@ def _robot_problems(
             yield ('candidates',), 'leave no waypoint inside environment.bounds'
     if robot.body == 'external' and robot.link != 'topics':
         yield ('body',), f"read 'external', allowed with link {robot.link} is simulated"
-    yield from _sensor_problems(robot, scenario)
-    yield from _simulated_problems(robot, scenario)
 
 
-def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
+def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
     """Yield settings that a camera or an external robot does not have."""
     nothing = SimulatedSettings()
     if robot.camera is not None:
@@ -162,13 +161,13 @@ def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tu
 
 def check_names(name: str) -> Iterator[str]:
     """Yield problems of the name of a robot."""
-    if not _ROBOT_NAME.match(name) or name.endswith('_') or '__' in name:
+    if not _ROBOT_NAME.match(name):
         yield f"read '{name}' as a name, allowed are lower case letters, digits and single _"
     if name in _RESERVED:
         yield f"read '{name}' as a name, which is that of a topic; allowed is any other"
 
 
-def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple[Key, str]]:
+def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
     detection = robot.sensor.detection
     used: tuple[str, ...] = ('lower', 'upper') if detection.kind == 'box' else ('size',)
     if detection.kind not in DETECTIONS.own:
@@ -203,113 +202,79 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Iterator[tuple
         yield ('camera',), f"is missing, driver '{robot.driver}' needs it"
 
 
-def _mambo_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
-    for name in scenario.names():
-        robot = scenario.robots[name]
-        if robot.link != 'mambo_wifi':
-            continue
-        key: Key = ('robots', name)
-        if robot.driver != 'mambo_driver':
-            yield (
-                (*key, 'link'),
-                f"read 'mambo_wifi', but driver '{robot.driver}' does not have it; allowed is "
-                "'topics', or driver 'mambo_driver'",
-            )
-        if robot.motion.model != 'mambo':
-            yield (
-                (*key, 'motion', 'model'),
-                f"read '{robot.motion.model}', allowed with link mambo_wifi is 'mambo'",
-            )
-        if robot.guard:
-            yield (
-                (*key, 'guard'),
-                'read true, allowed with link mambo_wifi is false: the drone has one link only',
-            )
-        link = robot.mambo
-        if link is None:
-            yield (
-                (*key, 'mambo'),
-                'is missing, link mambo_wifi needs it: at least {arm: true, full_speed: ...}',
-            )
-            continue
-        key = (*key, 'mambo')
-        if not link.arm:
-            yield (*key, 'arm'), 'read false, allowed is true: it would never take off'
-        if link.full_speed is None:
-            yield (
-                (*key, 'full_speed'),
-                'is missing: it would never take off; measure_mambo measures it',
-            )
-        if link.pose != 'events':
-            yield (*key, 'pose'), f"read '{link.pose}', allowed in simulation is 'events'"
-        if robot.start[2] <= link.ground:
-            yield (
-                ('robots', name, 'start'),
-                f'read height {robot.start[2]}, allowed is what lies above mambo.ground, '
-                f'{link.ground}',
-            )
+def _mambo_problems(robot: RobotSettings) -> Problems:
+    link, model = robot.mambo, robot.motion.model
+    if robot.driver != 'mambo_driver':
+        yield (
+            ('link',),
+            f"read 'mambo_wifi', but driver '{robot.driver}' does not have it; allowed is "
+            "'topics', or driver 'mambo_driver'",
+        )
+    if model != 'mambo':
+        yield ('motion', 'model'), f"read '{model}', allowed with link mambo_wifi is 'mambo'"
+    if robot.guard:
+        text = 'read true, allowed with link mambo_wifi is false: the drone has one link only'
+        yield ('guard',), text
+    if link is None:
+        text = 'is missing, link mambo_wifi needs it: at least {arm: true, full_speed: ...}'
+        yield ('mambo',), text
+        return
+    if not link.arm:
+        yield ('mambo', 'arm'), 'read false, allowed is true: it would never take off'
+    if link.full_speed is None:
+        text = 'is missing: it would never take off; measure_mambo measures it'
+        yield ('mambo', 'full_speed'), text
+    if link.pose != 'events':
+        yield ('mambo', 'pose'), f"read '{link.pose}', allowed in simulation is 'events'"
+    yield from _height_problems(robot, 'above', 'mambo', link.ground)
 
 
-def _mavlink_problems(scenario: Scenario) -> Iterator[tuple[Key, str]]:
-    ports: dict[str, str] = {}
-    for name in scenario.names():
-        robot = scenario.robots[name]
-        if robot.link != 'mavlink':
-            continue
-        key: Key = ('robots', name)
-        if robot.driver not in _MAVLINK:
-            yield (
-                (*key, 'link'),
-                f"read 'mavlink', but driver '{robot.driver}' does not have it; allowed is "
-                "'topics', or one of the drivers " + ', '.join(_MAVLINK),
-            )
-        if robot.guard:
-            yield (
-                (*key, 'guard'),
-                'read true, allowed with link mavlink is false: its autopilot stops it',
-            )
-        link = robot.mavlink
-        if link is None:
-            yield (*key, 'mavlink'), 'is missing, link mavlink needs it: at least {arm: true}'
-            continue
-        key = (*key, 'mavlink')
-        if not link.arm:
-            yield (*key, 'arm'), 'read false, allowed is true: nothing would ever fly'
-        match = _MAVLINK_URL.match(link.url)
-        if match is None:
-            if not robot.external:
-                yield (
-                    (*key, 'url'),
-                    f"read '{link.url}', allowed is udpin:HOST:PORT, as the vehicle is simulated, "
-                    'or autopilot: external',
-                )
-        elif match[1] in ports:
-            yield (
-                (*key, 'url'),
-                f'read port {match[1]}, which {ports[match[1]]} has as well; allowed is any other',
-            )
-        else:
-            ports[match[1]] = name
-        if link.map_yaw != 0.0 and not robot.external:
-            yield (*key, 'map_yaw'), f'read {link.map_yaw}, allowed in simulation is 0'
-        firmware = robot.autopilot.firmware
-        submarine = link.vehicle == 'submarine'
-        if submarine != (firmware == 'ardusub') and not robot.external:
-            yield (
-                (*key, 'vehicle'),
-                f"read '{link.vehicle}', but its autopilot.firmware is '{firmware}'",
-            )
-        rise = robot.start[2] - link.ground
-        if rise >= 0.0 if submarine else rise <= 0.0:
-            side = 'below' if submarine else 'above'
-            yield (
-                ('robots', name, 'start'),
-                f'read height {robot.start[2]}, allowed is what lies {side} mavlink.ground, '
-                f'{link.ground}',
-            )
+def _height_problems(robot: RobotSettings, side: str, link: str, ground: float) -> Problems:
+    rise = robot.start[2] - ground
+    if (rise if side == 'above' else -rise) <= 0.0:
+        text = f'allowed is what lies {side} {link}.ground, {ground}'
+        yield ('start',), f'read height {robot.start[2]}, {text}'
 
 
-def doubts_about(scenario: BaseScenario) -> Iterator[tuple[Key, str]]:
+def _mavlink_problems(name: str, robot: RobotSettings, ports: dict[str, str]) -> Problems:
+    """Yield problems of a vehicle; `ports` has the robots of other vehicles by their ports."""
+    link, firmware = robot.mavlink, robot.autopilot.firmware
+    if robot.driver not in _MAVLINK:
+        yield (
+            ('link',),
+            f"read 'mavlink', but driver '{robot.driver}' does not have it; allowed is "
+            "'topics', or one of the drivers " + ', '.join(_MAVLINK),
+        )
+    if robot.guard:
+        text = 'read true, allowed with link mavlink is false: its autopilot stops it'
+        yield ('guard',), text
+    if link is None:
+        yield ('mavlink',), 'is missing, link mavlink needs it: at least {arm: true}'
+        return
+    if not link.arm:
+        yield ('mavlink', 'arm'), 'read false, allowed is true: nothing would ever fly'
+    match = _MAVLINK_URL.match(link.url)
+    other = name if match is None else ports.setdefault(match[1], name)
+    if match is None and not robot.external:
+        yield (
+            ('mavlink', 'url'),
+            f"read '{link.url}', allowed is udpin:HOST:PORT, as the vehicle is simulated, "
+            'or autopilot: external',
+        )
+    if match is not None and other != name:
+        text = f'read port {match[1]}, which {other} has as well; allowed is any other'
+        yield ('mavlink', 'url'), text
+    submarine = link.vehicle == 'submarine'
+    if not robot.external:
+        if link.map_yaw != 0.0:
+            yield ('mavlink', 'map_yaw'), f'read {link.map_yaw}, allowed in simulation is 0'
+        if submarine != (firmware == 'ardusub'):
+            text = f"read '{link.vehicle}', but its autopilot.firmware is '{firmware}'"
+            yield ('mavlink', 'vehicle'), text
+    yield from _height_problems(robot, 'below' if submarine else 'above', 'mavlink', link.ground)
+
+
+def doubts_about(scenario: BaseScenario) -> Problems:
     """Yield valid but probably unintended values: key and text."""
     robots, limit = scenario.robots, scenario.limits.time
     for index, event in enumerate(scenario.events):
@@ -332,14 +297,10 @@ def doubts_about(scenario: BaseScenario) -> Iterator[tuple[Key, str]]:
             )
 
 
-def event_problems(
-    events: Sequence[EventSettings], names: Sequence[str]
-) -> Iterator[tuple[Key, str]]:
+def event_problems(events: Sequence[EventSettings], names: Sequence[str]) -> Problems:
     """Yield problems of the events: key and text."""
     away: set[str] = set()
-    order = sorted(range(len(events)), key=lambda index: events[index].at)
-    for index in order:
-        event = events[index]
+    for index, event in sorted(enumerate(events), key=lambda item: item[1].at):
         key: Key = ('events', index)
         if event.robot not in names:
             yield (*key, 'robot'), unknown(event.robot, list(names), 'robot')
@@ -348,8 +309,3 @@ def event_problems(
             state = 'is there' if event.do == 'back' else 'has left'
             yield (*key, 'do'), f"read '{event.do}', but {event.robot} {state} at that time"
         (away.add if event.do == 'leave' else away.discard)(event.robot)
-
-
-def _inside(position: Sequence[float] | np.ndarray, bounds: np.ndarray) -> bool:
-    point = np.asarray(position, dtype=float)[: len(bounds)]
-    return bool(((point >= bounds[:, 0]) & (point <= bounds[:, 1])).all())

@@ -77,18 +77,6 @@ class Layer:
                 return self.origins[key[:length]]
         return ''
 
-    def part(self, key: Key) -> Layer:
-        """Return the subtree of a key, an empty mapping if there is none."""
-        data = self.data
-        for step in key:
-            data = data.get(step) if isinstance(data, dict) else None
-        inner = {
-            path[len(key) :]: origin
-            for path, origin in self.origins.items()
-            if path[: len(key)] == key
-        }
-        return Layer({} if data is None else data, inner)
-
 
 def read_layer(path: Path) -> Layer:
     """Read a YAML file whose top is a mapping."""
@@ -192,39 +180,33 @@ def _build(loader: _Loader, node: yaml.Node, key: Key, origins: dict[Key, str], 
     return loader.construct_object(node, deep=True)
 
 
+def under(key: Key, layer: Layer) -> Layer:
+    """Return a layer in which the tree of another stands under a key."""
+    data = layer.data
+    for step in reversed(key):
+        data = {step: data}
+    return Layer(data, {(*key, *path): origin for path, origin in layer.origins.items() if path})
+
+
 def merge(*layers: Layer) -> Layer:
     """Merge layers: mappings key by key, anything else is replaced by the later one."""
-    result = Layer({})
+    result = Layer({}, folder=layers[-1].folder)
     for layer in layers:
-        result.data = _merge(result.data, layer.data, (), result.origins)
+        result.data = _merge(result.data, layer.data)
         result.origins.update(layer.origins)
     return result
 
 
-def _merge(below: Any, above: Any, key: Key, origins: dict[Key, str]) -> Any:
-    if isinstance(below, dict) and isinstance(above, dict):
-        merged = dict(below)
-        for name, value in above.items():
-            merged[name] = (
-                _merge(below[name], value, (*key, name), origins) if name in below else value
-            )
-        return merged
-    for stale in [path for path in origins if path[: len(key)] == key]:
-        del origins[stale]
-    return above
-
-
-def place(target: Layer, key: Key, part: Layer) -> None:
-    """Put a layer's tree under a key of another, with its origins."""
-    data = target.data
-    for step in key[:-1]:
-        data = data[step]
-    data[key[-1]] = part.data
-    for stale in [path for path in target.origins if path[: len(key)] == key and path != key]:
-        del target.origins[stale]
-    for path, origin in part.origins.items():
-        if path:
-            target.origins[key + path] = origin
+def _merge(below: Any, above: Any) -> Any:
+    if not (isinstance(below, dict) and isinstance(above, dict)):
+        return above
+    return {
+        **below,
+        **{
+            name: _merge(below[name], value) if name in below else value
+            for name, value in above.items()
+        },
+    }
 
 
 def override(layer: Layer, key: Key, value: Any, origin: str) -> None:
@@ -305,33 +287,9 @@ def _explain(item: Any, key: Key, model: type[BaseModel], data: Any) -> str:
         return unknown(item['input'], expected, 'value')
     if kind == 'value_error':
         return str(context['error'])
-    if kind in ('too_short', 'too_long'):
-        few = kind == 'too_short'
-        bound = context['min_length' if few else 'max_length']
-        return (
-            f'read {context["actual_length"]} entries, '
-            f'allowed {"is at least" if few else "are at most"} {bound}'
-        )
-    words = {
-        'greater_than': 'more than {gt}',
-        'greater_than_equal': 'at least {ge}',
-        'less_than': 'less than {lt}',
-        'less_than_equal': 'at most {le}',
-        'finite_number': 'a finite number',
-        'float_type': 'a number',
-        'int_type': 'a whole number',
-        'int_from_float': 'a whole number',
-        'string_type': 'text',
-        'bool_type': 'true or false',
-        'list_type': 'a list',
-        'dict_type': 'a mapping of keys',
-        'model_type': 'a mapping of keys',
-        'model_attributes_type': 'a mapping of keys',
-        'none_required': 'nothing (null)',
-    }
-    if kind in words:
-        return f'{read}allowed is {words[kind].format(**context)}'
-    return f'{read}{item["msg"][0].lower()}{item["msg"][1:]}'
+    text = item['msg'].replace('Input should be', 'allowed is').replace(' after validation', '')
+    text = re.sub(r'a valid dictionary( or .*)?', 'a mapping of keys', text)
+    return f'{read}{text[0].lower()}{text[1:]}'
 
 
 def unknown(read: Any, known: Sequence[str], what: str) -> str:

@@ -22,9 +22,9 @@ from maasi_sim.scenario.layering import (
     doubt,
     merge,
     override,
-    place,
     read_layer,
     refuse,
+    under,
     unknown,
     validate,
 )
@@ -88,8 +88,7 @@ def load_scenario(
 def read_scenario(path: str | Path) -> Layer:
     """Return the values of a scenario file with its layers, not checked yet."""
     path = find_scenario(path)
-    layer = read_layer(path)
-    _lay_types_under(layer, path)
+    layer = _with_types(read_layer(path), path)
     _name_folders(layer)
     return layer
 
@@ -132,8 +131,7 @@ def scenario_from_values(values: dict[str, Any], origin: str) -> Scenario:
     What a program made gets no warnings.
     """
     layer = Layer(deepcopy(values), {(): origin})
-    _lay_types_under(layer, config_folder() / 'scenarios' / origin)
-    return _without_warnings(layer)
+    return _without_warnings(_with_types(layer, config_folder() / 'scenarios' / origin))
 
 
 def scenario_from_content(content: dict[str, Any], origin: str) -> Scenario:
@@ -167,7 +165,7 @@ def _with_candidates(layer: Layer) -> Layer:
     robots = layer.data.get('robots')
     if not isinstance(robots, dict):
         return layer
-    result = layer
+    result = deepcopy(layer)
     for name, values in robots.items():
         if isinstance(values, dict) and values.get('candidates') is None:
             candidates: dict[str, Any] = {'ring': 4, 'distance': 1.0}
@@ -179,44 +177,38 @@ def _with_candidates(layer: Layer) -> Layer:
                 # The error is reported when all is validated.
                 pass
             key: Key = ('robots', name, 'candidates')
-            result = with_overrides(result, {layer.origin(key): (key, candidates)})
+            override(result, key, candidates, layer.origin(key))
     return result
 
 
-def _lay_types_under(layer: Layer, path: Path) -> None:
-    """Merge each robot's settings over the layers of its type."""
+def _with_types(layer: Layer, path: Path) -> Layer:
+    """Return a layer over those of the types of its robots."""
     robots = layer.data.get('robots')
-    if isinstance(robots, dict):
-        for name in robots:
-            if isinstance(robots[name], dict):
-                key: Key = ('robots', name)
-                place(layer, key, _robot_layer(path, layer.part(key), key))
+    types: list[Layer] = []
+    for name, own in robots.items() if isinstance(robots, dict) else ():
+        if isinstance(own, dict):
+            key: Key = ('robots', name)
+            types += [under(key, item) for item in _type_layers(own, path, layer, key)]
+    return merge(*types, layer)
 
 
-def _robot_layer(path: Path, own: Layer, key: Key) -> Layer:
+def _type_layers(own: dict[str, Any], path: Path, layer: Layer, key: Key) -> list[Layer]:
+    """Return the layers of a robot's type, for a scenario file."""
     folders = [path.parent / 'robots', path.parent.parent / 'robots', config_folder() / 'robots']
     files: dict[str, Path] = {}
     for folder in folders:
         for file in sorted(folder.glob('*.yaml')):
             files.setdefault(file.stem, file)
-    layers = [read_layer(files['all'])] if 'all' in files else []
-    kind = own.data.get('type')
-    known = sorted(set(files) - {'all'})
-    if kind is None:
-        raise ScenarioError(
-            f'{own.origin(())}: {dotted((*key, "type"))}: is missing, known are {", ".join(known)}'
-        )
-    if kind not in known and own.data.keys() >= RobotSettings.model_fields.keys():
+    kind, known = own.get('type'), sorted(files.keys() - {'all'})
+    if kind not in known and own.keys() >= RobotSettings.model_fields.keys():
         # Of a run: with all layers merged, where the files of types may be missing.
-        return own
-    if isinstance(kind, str):
-        if kind not in known:
-            raise ScenarioError(
-                f'{own.origin(("type",))}: {dotted((*key, "type"))}: '
-                f'{unknown(kind, known, "robot type")}'
-            )
-        layers.append(read_layer(files[kind]))
-    return merge(*layers, own)
+        return []
+    if kind is None or (isinstance(kind, str) and kind not in known):
+        key = (*key, 'type')
+        problem = f'is missing, known are {", ".join(known)}'
+        text = problem if kind is None else unknown(kind, known, 'robot type')
+        raise ScenarioError(f'{layer.origin(key)}: {dotted(key)}: {text}')
+    return [read_layer(files[name]) for name in ('all', str(kind)) if name in files]
 
 
 def robot_type(name: str) -> RobotSettings:
@@ -226,5 +218,7 @@ def robot_type(name: str) -> RobotSettings:
         'start': [0.0, 0.0, 0.0],
         'candidates': {'ring': 4, 'distance': 1.0},
     }
-    own = Layer(content, {(): f'robot type {name}'})
-    return validate(RobotSettings, _robot_layer(config_folder() / 'scenarios' / name, own, ()))
+    origin = f'robot type {name}'
+    layer = Layer({}, {(): origin})
+    layers = _type_layers(content, config_folder() / 'scenarios' / name, layer, ())
+    return validate(RobotSettings, merge(*layers, Layer(content, {(): origin})))

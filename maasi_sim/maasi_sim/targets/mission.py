@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
@@ -15,7 +14,7 @@ from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import unsuitable_lengths, unused_settings
 from maasi_sim.emulators.linked_robots import with_addresses
 from maasi_sim.run.node_plan import SIMULATED, NodePlan, RunSettings, guard_plan, sim_plan
-from maasi_sim.run.topics import BATCH, DECISIONS, FOUND, UPDATE, within
+from maasi_sim.run.topics import BATCH, within
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.schema import RobotSettings, Scenario, planner_settings
 from maasi_sim.scenario.visibility import never_seen
@@ -131,7 +130,6 @@ def _team_plans(
             'filter_node',
             namespace,
             {**flatten(filter_settings.resolved()), **SIMULATED},
-            topics=(within(namespace, UPDATE), within(namespace, FOUND)),
         ),
         NodePlan(
             'maasi_planner',
@@ -139,7 +137,6 @@ def _team_plans(
             'planner_node',
             namespace,
             {**flatten(planner_settings(scenario, names, common)), **SIMULATED},
-            topics=(within(namespace, DECISIONS), within(namespace, BATCH)),
             given={'search_on_start': True},
         ),
     ]
@@ -178,12 +175,6 @@ def _robot_plans(
             'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
         }
     )
-    topics = ['state', 'detections', 'robot_description']
-    if robot.link == 'topics':
-        topics.append('cmd_vel')
-    # Published by several robots; without its package there are no transforms.
-    has_transforms = settings.poses != 'tf' and find_spec('tf2_msgs') is not None
-    shared = ('/tf',) if has_transforms else ()
     own = name in scenario.namespaces()
     plans = [
         NodePlan(
@@ -194,7 +185,6 @@ def _robot_plans(
             {**flatten(settings), **SIMULATED},
             # A robot with its own planner gets its batches from that one.
             remaps={BATCH: within(name, BATCH)} if own else {},
-            topics=(*(f'/{name}/{topic}' for topic in topics), *shared),
             drives=True,
             arguments=_plugin(name, robot.driver, scenario),
         )
