@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -342,20 +343,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f'warning: {recorded.recovered}', file=sys.stderr)
     print(report(recorded, noise, options.target is not None))
     if options.json is not None:
-        content = {
-            'covariance': noise.covariance.tolist(),
-            'deviations': noise.deviations.tolist(),
-            'bias': noise.bias.tolist(),
-            'target': noise.target.tolist(),
-            'used': noise.used,
-            'near': noise.near,
-            'others': noise.others,
-            'left_out': recorded.left_out,
-            'inside': noise.inside,
-            'missed': noise.missed,
-        }
+        content = asdict(noise) | {'deviations': noise.deviations, 'left_out': recorded.left_out}
+        text = json.dumps(content, indent=2, default=np.ndarray.tolist)
         try:
-            options.json.write_text(json.dumps(content, indent=2) + '\n', encoding='utf-8')
+            options.json.write_text(f'{text}\n', encoding='utf-8')
         except OSError as error:
             print(f'error: --json: {options.json}: {error.strerror}', file=sys.stderr)
             return 2

@@ -219,12 +219,11 @@ def process(context, tmp_path):
     """Return a function that starts a driver as a process of its own."""
     running = []
 
-    def start(environment=None, **changes):
+    def start(environment=None, program=('turtlebot_driver',), **changes):
         file = tmp_path / 'parameters.yaml'
         flat = flatten(DriverSettings.model_validate(TURTLEBOT | changes))
         file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-        command = ['turtlebot_driver', '--ros-args']
-        command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
+        command = [*program, '--ros-args', '--remap', '__ns:=/rover', '--params-file', str(file)]
         running.append(subprocess.Popen(command, env=os.environ | (environment or {})))
         return running[-1]
 

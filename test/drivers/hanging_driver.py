@@ -1,9 +1,8 @@
 """A driver whose executor thread loops for ever on SIGUSR1; its middleware goes on."""
 
 import signal
-import sys
 
-from maasi_drivers.drivers import mambo_driver, turtlebot_driver
+from maasi_drivers.drivers import turtlebot_driver
 
 
 def hang(number, frame):
@@ -14,5 +13,4 @@ def hang(number, frame):
 
 if __name__ == '__main__':
     signal.signal(signal.SIGUSR1, hang)
-    main = {'mambo': mambo_driver, 'turtlebot': turtlebot_driver}[sys.argv.pop(1)]
-    raise SystemExit(main())
+    raise SystemExit(turtlebot_driver())

@@ -50,15 +50,14 @@ def sealed(data):
     return data[:-4] + struct.pack('<I', zlib.crc32(data[:-4]))
 
 
-@pytest.mark.parametrize('number', [0, 1, 5, 256])
+@pytest.mark.parametrize('number', [0, 1, 256])
 def test_what_is_sent_is_what_is_read(number):
     sent = packet(number)
     read = decode(encode(sent))
     assert (read.sequence, read.width, read.height) == (7, 160, 120)
     assert_allclose(read.age, 0.012, atol=1e-6)
-    for name in ('centroids', 'areas', 'extents', 'covariances'):
+    for name in ('centroids', 'areas', 'extents', 'covariances', 'border_cut'):
         assert_allclose(getattr(read.blobs, name), getattr(sent.blobs, name), rtol=1e-6, atol=1e-6)
-    assert_array_equal(read.blobs.border_cut, sent.blobs.border_cut)
 
 
 def test_the_bytes_are_those_of_the_document():
@@ -162,27 +161,23 @@ def test_a_packet_over_the_network_has_the_time_of_its_image(feed):
     (found,) = received(receiver, 1)
     assert before - 0.5 - 1e-6 <= found.taken <= time.monotonic() - 0.5
     assert len(found.packet.blobs) == 3
+    with pytest.raises(OSError, match='in use'):
+        FeedReceiver(receiver.port, '127.0.0.1')
 
 
-def test_lost_old_and_damaged_packets_are_counted(feed):
+def test_lost_old_and_damaged_packets_are_counted_and_a_restarted_sender_is_heard(feed):
     receiver, send = feed
     for sequence in (2**32 - 2, 2**32 - 1, 0, 0, 2**32 - 1, 3):
         send(encode(packet(sequence=sequence)))
     send(b'hello')
-    send(encode(packet(sequence=4)))
-    packets = received(receiver, 5)
-    assert [item.packet.sequence for item in packets] == [2**32 - 2, 2**32 - 1, 0, 3, 4]
+    for sequence in (5000, 1, 2):
+        send(encode(packet(sequence=sequence)))
+    packets = received(receiver, 7)
+    assert [item.packet.sequence for item in packets] == [2**32 - 2, 2**32 - 1, 0, 3, 5000, 1, 2]
     assert receiver.counts['lost packet'] == 2
     assert receiver.counts['old packet'] == 2
     assert receiver.counts['bad packet'] == 1
     assert 'length: read 5 bytes' in receiver.problem
-
-
-def test_a_sender_that_was_started_again_is_heard(feed):
-    receiver, send = feed
-    for sequence in (5000, 1, 2):
-        send(encode(packet(sequence=sequence)))
-    assert [item.packet.sequence for item in received(receiver, 3)] == [5000, 1, 2]
 
 
 def test_only_the_sender_that_is_named_is_heard(feed):
@@ -196,12 +191,6 @@ def test_only_the_sender_that_is_named_is_heard(feed):
     assert found.packet.sequence == 2
     assert receiver.counts['foreign sender'] == 1
     assert 'read 127.0.0.1, allowed is 127.0.0.9' in receiver.problem
-
-
-def test_a_port_that_is_taken_is_said(feed):
-    receiver, _ = feed
-    with pytest.raises(OSError, match='in use'):
-        FeedReceiver(receiver.port, '127.0.0.1')
 
 
 # ---- videos ----------------------------------------------------------------------------------
@@ -242,19 +231,18 @@ def test_a_video_is_played_at_its_rate_in_rgb(video):
         assert_allclose(found.centroids, [[30.0 + 5.0 * (frame.number - 1), 60.0]], atol=0.5)
 
 
-def test_a_source_that_is_not_there_is_said(tmp_path):
-    with pytest.raises(ImageSourceError, match='OpenCV cannot open it'):
-        VideoSource(str(tmp_path / 'none.avi'))
-    with pytest.raises(ImageSourceError, match='allowed are'):
-        VideoSource('')
-
-
-def test_a_device_that_is_not_there_is_tried_again():
-    source = VideoSource('/dev/video77')
-    wait_until(lambda: source.error)
-    assert 'cannot open' in source.error
-    assert source.take() is None and not source.ended
-    source.close()
+def test_a_source_that_is_not_there_is_said_and_a_device_is_tried_again(tmp_path):
+    for source, text in (
+        (str(tmp_path / 'none.avi'), 'OpenCV cannot open it'),
+        ('', 'allowed are'),
+    ):
+        with pytest.raises(ImageSourceError, match=text):
+            VideoSource(source)
+    device = VideoSource('/dev/video77')
+    wait_until(lambda: device.error)
+    assert 'cannot open' in device.error
+    assert device.take() is None and not device.ended
+    device.close()
 
 
 def test_the_reference_sender_sends_what_it_sees(feed, video):

@@ -10,16 +10,13 @@ import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from numpy.testing import assert_allclose, assert_array_equal
-from rclpy.executors import SingleThreadedExecutor
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, lockstep_step, parameters_of
+from rclpy.parameter import Parameter
+from robot_team import NANOSECONDS, STEP, lockstep_step
 from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from maasi_drivers.agent.odometry import PoseSpeed
 from maasi_drivers.agent.transform_buffer import TransformBuffer
-from maasi_drivers.drivers import TurtlebotDriver
-from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_from_ros, pose_to_ros, stamp_from_ros, stamp_to_ros
@@ -54,7 +51,7 @@ class Listener:
         team.create_subscription(TFMessage, '/tf_static', self.static.append, LATCHED_ALL)
 
     def buffer(self):
-        made = TransformBuffer(10**12)
+        made = TransformBuffer()
         for messages, static in ((self.static, True), (self.moving, False)):
             for item in (item for message in messages for item in message.transforms):
                 stamp = stamp_from_ros(item.header.stamp)
@@ -215,31 +212,6 @@ def test_a_driver_follows_poses_on_tf_and_stops_when_they_go_stale(play):
     team.until(lambda: robot.move() or team.state.goal_status == AgentState.MOVING)
 
 
-def test_velocities_come_from_differences():
-    speed = PoseSpeed()
-    assert not speed.place(0, Pose.from_yaw([0.0, 0.0, 1.0], 3.1)).velocity.any()
-    placed = speed.place(10**8, Pose.from_yaw([0.02, -0.04, 1.0], -3.1))
-    assert_allclose(placed.velocity, [0.2, -0.4, 0.0], atol=1e-9)
-    assert_allclose(placed.angular_velocity, [0.0, 0.0, 10 * (2 * math.pi - 6.2)], atol=1e-9)
-    # A jump is no velocity, and neither is a difference over a gap.
-    assert not speed.place(2 * 10**8, Pose([9.0, 0.0, 1.0])).velocity.any()
-    assert not speed.place(5 * 10**9, Pose([9.5, 0.0, 1.0])).velocity.any()
-
-
-@pytest.mark.parametrize('source', ['tf', 'pose'])
-@pytest.mark.parametrize('changes', [{'lockstep': True}, {'link': 'mambo_wifi'}])
-def test_what_poses_from_tf_do_not_go_with_is_wrong_input(source, changes):
-    with pytest.raises(ValueError, match='pose_source'):
-        DriverSettings.model_validate(TURTLEBOT | {'pose_source': source} | changes)
-
-
-def test_targets_are_placed_in_the_frame_in_which_nav2_drives():
-    assert DriverSettings.model_validate(TURTLEBOT).poses == 'odometry'
-    assert DriverSettings.model_validate(TURTLEBOT | {'navigation': 'nav2'}).poses == 'tf'
-    chosen = TURTLEBOT | {'navigation': 'nav2', 'pose_source': 'odometry'}
-    assert DriverSettings.model_validate(chosen).poses == 'odometry'
-
-
 def test_a_driver_takes_poses_of_a_localiser_from_a_topic(play):
     driver, team = play(pose_source='pose', odometry_timeout=1.0)
     assert not team.count_subscribers('odom')
@@ -329,24 +301,14 @@ def test_a_goal_in_another_frame_is_reached_where_that_is(play):
 
 def test_without_tf2_msgs_there_is_no_tf_and_all_else_works(play, monkeypatch, capfd):
     monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
-    _, team = play()
+    driver, team = play()
     team.move(3)
     assert not team.count_publishers('/tf') and team.count_publishers('robot_description') == 1
     assert capfd.readouterr().err.count('tf2_msgs is not installed') == 1
     assert 'allowed is' in team.refused([0.0, 0.0, 0.0], frame='dock')
     assert team.takes([1.0, 1.0, 0.0], live=team.move)
-
-
-def test_poses_from_tf_need_tf2_msgs(context, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
-    executor = SingleThreadedExecutor(context=context)
-    driver = TurtlebotDriver(
-        context=context,
-        namespace='/rover',
-        parameter_overrides=parameters_of(TURTLEBOT | {'pose_source': 'tf'}),
-    )
-    executor.add_node(driver)
+    for transition in ('deactivate', 'cleanup'):
+        assert getattr(driver, f'trigger_{transition}')().name == 'SUCCESS'
+    driver.set_parameters([Parameter('pose_source', value='tf')])
     assert driver.trigger_configure().name == 'FAILURE'
     assert 'tf2_msgs is not installed' in driver.problem
-    driver.destroy_node()
-    executor.shutdown()

@@ -111,20 +111,14 @@ def test_one_stamp_far_off_changes_nothing_and_a_real_jump_is_followed(buffer):
     robot(buffer, 200, 5.0)
     assert buffer.latest('map', 'base') == 200
     assert_allclose(buffer.pose('odom', 'base').position[0], 5.0)
-
-
-def test_what_is_kept_has_an_end_in_time_and_number():
-    buffer = TransformBuffer(horizon=SECOND)
-    for k in range(30):
-        robot(buffer, k * SECOND // 10, float(k))
-    with pytest.raises(TransformError):
-        buffer.pose('odom', 'base', 18 * SECOND // 10)
-    assert_allclose(buffer.pose('odom', 'base', 19 * SECOND // 10).position[0], 19.0)
-    for k in range(1, 2000):
-        buffer.add('odom', f'frame {k}', MOUNT, static=True)
-    with pytest.raises(ValueError, match='2000 frames'):
-        buffer.add('odom', 'one more', MOUNT, static=True)
     buffer.clear()
     with pytest.raises(TransformError, match='base'):
         buffer.pose('odom', 'base')
-    assert buffer.pose('odom', 'frame 7') == MOUNT
+    assert buffer.pose('base', 'camera') == MOUNT
+
+
+def test_frames_have_a_largest_number(buffer):
+    for k in range(3, 2000):
+        buffer.add('odom', f'frame {k}', MOUNT, static=True)
+    with pytest.raises(ValueError, match='2000 frames'):
+        buffer.add('odom', 'one more', MOUNT, static=True)

@@ -19,7 +19,6 @@ from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers, parameters_o
 from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.drivers import TurtlebotDriver
-from maasi_drivers.settings.driver import DriverSettings
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState
@@ -89,11 +88,8 @@ def test_without_a_scan_the_robot_is_stopped(play):
     for _ in range(20):
         robot.move()
     assert team.state.goal_status == AgentState.MOVING
-    steps = 0
-    while team.state.goal_status != AgentState.UNAVAILABLE:
-        robot.move(scan=False)
-        steps += 1
-        assert steps * STEP <= 1.5
+    team.until(lambda: robot.move(scan=False) or team.state.goal_status == AgentState.UNAVAILABLE)
+    assert (team.step - 20) * STEP <= 1.5
     assert_array_equal(team.command, np.zeros(4))
     team.until(result.done)
     assert 'no scan for' in result.result().result.reason
@@ -118,23 +114,15 @@ def test_a_waypoint_that_cannot_be_reached_is_given_up(play):
     assert_array_equal(team.command, np.zeros(4))
 
 
-def test_a_scan_that_makes_no_sense_is_counted(play):
+def test_scans_that_make_no_sense_are_counted_and_do_not_keep_the_robot_going(play):
     driver, team = play(**SCANNING)
     robot = Scanned(team)
     robot.move()
-    bad = robot.message()
-    bad.angle_increment = math.nan
-    robot.publisher.publish(bad)
-    team.until(lambda: driver.dropped['scan'] == 1)
-
-
-@pytest.mark.parametrize(
-    'changes', [SCANNING, {'navigation': 'nav2'}, {'scan': {}, 'motion': {'model': 'mambo'}}]
-)
-def test_what_scan_and_nav2_do_not_go_with_is_wrong_input(changes):
-    lockstep = 'motion' not in changes
-    with pytest.raises(ValueError, match=r'scan|navigation'):
-        DriverSettings.model_validate(TURTLEBOT | {'lockstep': lockstep} | changes)
+    bad, empty = robot.message(), robot.message()
+    bad.angle_increment, empty.ranges = math.nan, []
+    for message in (bad, empty):
+        robot.publisher.publish(message)
+    team.until(lambda: driver.dropped['scan'] == 2)
 
 
 # ---- Nav2 ------------------------------------------------------------------------------------

@@ -141,6 +141,11 @@ class PoseHistory:
         """The last pose added, or None."""
         return self._poses[-1] if self._poses else None
 
+    @property
+    def first(self) -> int | None:
+        """The earliest stamp kept [ns], or None."""
+        return self._stamps[0] if self._stamps else None
+
     def add(self, pose: StampedPose) -> bool:
         """Add a pose; False, and nothing added, where its stamp is not after the last one's."""
         if self._stamps and pose.stamp <= self._stamps[-1]:

@@ -1,72 +1,70 @@
-"""A buffer of the transforms on /tf: where a frame was in another one at a stamp. Without ROS."""
+"""A buffer of the transforms on /tf: where a frame was in another one at a stamp. Without ROS.
+
+Of its own, as the wheels of ROS 2 have no tf2_ros.
+"""
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from maasi_drivers.agent.odometry import StampedPose, interpolate
+from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.clocks import StampGate
 
 # Upper bound on frames, against floods.
 _MOST_FRAMES = 2000
-_MOST_STAMPS = 4096
 _LONGEST_NAME = 200
+# A stamp that is farther from the one before is one of another time [ns].
+_JUMP = 10_000_000_000
 
 
 class TransformError(LookupError):
     """A transform is not known, or not at that stamp."""
 
 
+@dataclass
 class _Edge:
-    """The pose of a frame in its parent, over time."""
+    """The pose of a frame in its parent: a fixed one, or its latest ones."""
 
-    def __init__(self, parent: str, static: bool, horizon: int) -> None:
-        self.parent = parent
-        self.static = static
-        self.gate = StampGate(horizon)
-        self.stamps: list[int] = []
-        self.poses: list[Pose] = []
+    parent: str
+    fixed: Pose | None
+    history: PoseHistory = field(default_factory=PoseHistory)
+    gate: StampGate = field(default_factory=lambda: StampGate(_JUMP))
 
-    def at(self, stamp: int | None) -> Pose:
-        """Return the pose at a stamp within those kept; None: the latest."""
-        if self.static or stamp is None:
-            return self.poses[-1]
-        index = bisect_left(self.stamps, stamp)
-        if self.stamps[index] == stamp:
-            return self.poses[index]
-        first, second = (_still(self.stamps[k], self.poses[k]) for k in (index - 1, index))
-        return interpolate(first, second, stamp).pose
+    @property
+    def last(self) -> int | None:
+        """Latest stamp; none where it is fixed [ns]."""
+        latest = self.history.latest
+        return None if latest is None else latest.stamp
 
-
-def _still(stamp: int, pose: Pose) -> StampedPose:
-    zero = np.zeros(3)
-    return StampedPose(stamp, pose, np.zeros((6, 6)), zero, zero)
+    def add(self, stamp: int, pose: Pose) -> None:
+        """Add a pose; one far from those before replaces them, once the next one follows it."""
+        if not self.gate.accepts(stamp):
+            return
+        if self.last is not None and abs(stamp - self.last) > _JUMP:
+            self.history.clear()
+        zero = np.zeros(3)
+        self.history.add(StampedPose(stamp, pose, np.zeros((6, 6)), zero, zero))
 
 
 class TransformBuffer:
-    """Poses of frames in their parents, interpolated in time; nothing is extrapolated.
+    """Poses of frames in their parents, interpolated in time; nothing is extrapolated."""
 
-    Units: horizon [ns].
-    """
-
-    def __init__(self, horizon: int = 10_000_000_000) -> None:
-        self.horizon = horizon
+    def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
 
     def clear(self) -> None:
         """Forget all transforms that are not static, as after a jump of the clock."""
-        self._edges = {name: edge for name, edge in self._edges.items() if edge.static}
+        self._edges = {name: edge for name, edge in self._edges.items() if edge.fixed is not None}
 
     def add(
         self, parent: str, child: str, pose: Pose, stamp: int = 0, *, static: bool = False
     ) -> None:
         """Add a transform; a frame that has another parent from now on loses what was known of it.
 
-        A single stamp that jumps by more than the horizon is not added; the next one that follows
-        it is, and what was before it is forgotten.
+        Stamps of a transform have to grow.
 
         Units: stamp [ns].
         """
@@ -78,30 +76,16 @@ class TransformBuffer:
         if stamp < 0:
             raise ValueError(f'stamp: read {stamp} ns, allowed is from 0')
         edge = self._edges.get(child)
-        if edge is None or edge.parent != parent or edge.static != static:
+        if edge is None or edge.parent != parent or (edge.fixed is not None) != static:
             if edge is None and len(self._edges) >= _MOST_FRAMES:
                 raise ValueError(f'{child!r}: there are {_MOST_FRAMES} frames, no more are allowed')
             if child in self._path(parent):
                 raise ValueError(f'{parent!r} to {child!r}: a loop, allowed is a tree of frames')
-            edge = self._edges[child] = _Edge(parent, static, self.horizon)
+            edge = self._edges[child] = _Edge(parent, pose if static else None)
         if static:
-            edge.poses[:] = [pose]
-        elif edge.gate.accepts(stamp):
-            self._insert(edge, stamp, pose)
-
-    def _insert(self, edge: _Edge, stamp: int, pose: Pose) -> None:
-        stamps, poses = edge.stamps, edge.poses
-        if stamps and abs(stamp - stamps[-1]) > self.horizon:
-            stamps.clear()
-            poses.clear()
-        index = bisect_left(stamps, stamp)
-        if index < len(stamps) and stamps[index] == stamp:
-            poses[index] = pose
-            return
-        stamps.insert(index, stamp)
-        poses.insert(index, pose)
-        old = max(bisect_left(stamps, stamps[-1] - self.horizon), len(stamps) - _MOST_STAMPS)
-        del stamps[:old], poses[:old]
+            edge.fixed = pose
+        else:
+            edge.add(stamp, pose)
 
     def _path(self, frame: str) -> list[str]:
         """Return a frame and those above it, up to its root."""
@@ -127,9 +111,6 @@ class TransformBuffer:
             )
         parts = (up[: up.index(common)], down[: down.index(common)])
         ups, downs = ([self._edges[name] for name in part] for part in parts)
-        for edge, name in zip([*ups, *downs], [*parts[0], *parts[1]], strict=True):
-            if not edge.poses:
-                raise TransformError(f'nothing is known yet of {name!r} in {edge.parent!r}')
         return ups, downs
 
     def latest(self, target: str, source: str) -> int | None:
@@ -138,28 +119,26 @@ class TransformBuffer:
         None where all of them are static.
         """
         ups, downs = self._between(target, source)
-        return min((edge.stamps[-1] for edge in [*ups, *downs] if not edge.static), default=None)
+        return min((edge.last for edge in [*ups, *downs] if edge.last is not None), default=None)
 
     def pose(self, target: str, source: str, stamp: int | None = None) -> Pose:
-        """Return the pose of frame `source` in frame `target`.
+        """Return the pose of frame `source` in frame `target`; by default at `latest`.
 
         Units: stamp [ns].
         """
-        ups, downs = self._between(target, source)
-        dynamic = [edge for edge in [*ups, *downs] if not edge.static]
-        if dynamic:
-            first = max(edge.stamps[0] for edge in dynamic)
-            last = min(edge.stamps[-1] for edge in dynamic)
-            stamp = last if stamp is None else stamp
-            if not first <= stamp <= last:
-                raise TransformError(
-                    f'{source!r} in {target!r} at {stamp} ns is not known, allowed is from {first} '
-                    f'to {last} ns'
-                )
+        stamp = self.latest(target, source) if stamp is None else stamp
         sides = []
-        for edges in (ups, downs):
+        for edges in self._between(target, source):
             placed = Pose(np.zeros(3))
             for edge in edges:
-                placed = compose(edge.at(stamp), placed)
+                found = edge.fixed
+                if found is None and (then := edge.history.at(stamp or 0)) is not None:
+                    found = then.pose
+                if found is None:
+                    raise TransformError(
+                        f'{source!r} in {target!r} at {stamp} ns is not known, allowed is from '
+                        f'{edge.history.first} to {edge.last} ns'
+                    )
+                placed = compose(found, placed)
             sides.append(placed)
         return compose(inverse(sides[0]), sides[1])

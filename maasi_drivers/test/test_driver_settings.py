@@ -1,10 +1,11 @@
-"""Camera settings and calibrations."""
+"""Settings of drivers, and calibrations of cameras."""
 
 import pytest
 from numpy.testing import assert_allclose
 from pydantic import ValidationError
 
 from maasi_drivers.settings.camera import CameraSettings, load_calibration
+from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.vision.camera_model import Camera
 
 K = [250.0, 0.0, 81.0, 0.0, 251.0, 62.0, 0.0, 0.0, 1.0]
@@ -19,13 +20,11 @@ distortion_coefficients: {rows: 1, cols: 5, data: [-0.2, 0.05, 0.001, -0.002, 0.
 """
 
 
-def test_the_centre_of_the_image_is_the_optical_centre_unless_told_otherwise():
-    view = Camera.from_settings(CameraSettings(width=160, height=120))
-    assert_allclose(view.matrix, [[260.0, 0.0, 79.5], [0.0, 260.0, 59.5], [0.0, 0.0, 1.0]])
-
-
 def test_camera_info_replaces_the_intrinsics_and_keeps_the_rest():
     settings = CameraSettings(marker_diameter=0.05)
+    # The centre of the image is the optical centre unless told otherwise.
+    matrix = Camera.from_settings(settings).matrix
+    assert_allclose(matrix, [[260.0, 0.0, 79.5], [0.0, 260.0, 59.5], [0.0, 0.0, 1.0]])
     calibrated = settings.with_calibration(160, 120, K, D)
     view = Camera.from_settings(calibrated)
     assert_allclose(view.matrix, [[250, 0, 81], [0, 251, 62], [0, 0, 1]])
@@ -94,8 +93,53 @@ def test_a_wrong_calibration_file_is_named(tmp_path, text):
         {'rate': 0.0},
         {'mount': {'rpy': [0.0, 0.0]}},
         {'focal': 3},
+        {'segmentation': {'rule': 'magic'}},
+        {'segmentation': {'threshold': -1}},
+        {'segmentation': {'threshold': float('nan')}},
+        {'segmentation': {'peak_saturation': 0.1}},
+        {'segmentation': {'maximum_diameter': 0.5}},
     ],
 )
-def test_wrong_settings_are_refused(values):
+def test_wrong_settings_of_a_camera_are_refused(values):
     with pytest.raises(ValidationError):
         CameraSettings.model_validate(values)
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'lockstep': True, 'command_type': 'twist'}, 'command_type: got'),
+        ({'lockstep': True, 'camera': {'stamp_offset': 0.01}}, 'stamp_offset: got'),
+        ({'lockstep': True, 'pose_source': 'tf'}, 'pose_source: got'),
+        ({'lockstep': True, 'pose_source': 'pose'}, 'pose_source: got'),
+        ({'link': 'mambo_wifi', 'pose_source': 'tf'}, 'pose_source: got'),
+        ({'link': 'mambo_wifi', 'pose_source': 'pose'}, 'pose_source: got'),
+        ({'lockstep': True, 'link': 'mavlink'}, 'link: got'),
+        ({'lockstep': True, 'image_source': 'feed'}, 'image_source: got'),
+        ({'image_source': 'video'}, 'video: got'),
+        ({'video': '/dev/video0'}, 'video: got'),
+        ({'lockstep': True, 'scan': {}, 'motion': {'model': 'unicycle'}}, 'scan: got'),
+        ({'lockstep': True, 'navigation': 'nav2'}, 'navigation: got'),
+        ({'scan': {}, 'motion': {'model': 'mambo'}}, 'scan: got'),
+        ({'mambo': {'geofence': [[0.0, 1.0], [1.0, 0.0], [0.0, 1.0]]}}, 'lowest below a highest'),
+        ({'mavlink': {'geofence': [[0.0, 1.0], [0.0, 0.0], [0.0, 1.0]]}}, 'lowest below a highest'),
+        ({'mavlink': {'system': 9, 'own_system': 9}}, 'own_system: got'),
+    ],
+)
+def test_what_does_not_go_together_is_refused(values, message):
+    with pytest.raises(ValidationError, match=message):
+        DriverSettings.model_validate({'environment': {'bounds': [[0, 2], [0, 2]]}} | values)
+
+
+@pytest.mark.parametrize(
+    ('values', 'source'),
+    [
+        ({}, 'odometry'),
+        # Targets are placed in the frame in which Nav2 drives.
+        ({'navigation': 'nav2'}, 'tf'),
+        ({'navigation': 'nav2', 'pose_source': 'odometry'}, 'odometry'),
+    ],
+)
+def test_where_poses_come_from(values, source):
+    values |= {'environment': {'bounds': [[0, 2], [0, 2]]}}
+    assert DriverSettings.model_validate(values).poses == source
