@@ -11,7 +11,6 @@ from report_check import check_report
 from waiting import wait_until
 
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.replay_node import plain
 
 # Far more than any of the runs takes, for a machine that is busy with something else.
 PATIENCE = 400.0
@@ -76,6 +75,16 @@ def processes_with(text):
             if text in line and int(entry.name) != os.getpid():
                 found.append(int(entry.name))
     return found
+
+
+def plain(message):
+    """Return a message of a bag as plain values that can be compared."""
+    if hasattr(message, '__dataclass_fields__'):
+        names = [name for name in message.__dataclass_fields__ if name != '__msgtype__']
+        return {name: plain(getattr(message, name)) for name in names}
+    if isinstance(message, list):
+        return [plain(item) for item in message]
+    return message.tolist() if hasattr(message, 'tolist') else message
 
 
 def of_topic(run, topic):

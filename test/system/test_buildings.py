@@ -7,11 +7,10 @@ import subprocess
 import numpy as np
 import pytest
 import yaml
-from scenario_runs import PATIENCE, command, of_topic, processes_with, run_scenario
+from scenario_runs import PATIENCE, command, of_topic, plain, processes_with, run_scenario
 
 from maasi_sim.buildings.scenario import load_cuboid_scenario, mission_of
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.replay_node import plain
 
 pytestmark = pytest.mark.system
 

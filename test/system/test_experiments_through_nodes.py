@@ -2,11 +2,10 @@
 
 import pytest
 import yaml
-from scenario_runs import run_scenario
+from scenario_runs import plain, run_scenario
 
 from maasi_sim.experiments.papers import find
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.replay_node import plain
 from maasi_sim.scenario.loading import scenario_from_content
 from maasi_sim.search import search
 

@@ -3,36 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import sys
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
-if TYPE_CHECKING:
-    from rich.live import Live
-    from rich.text import Text
-
-
-@dataclass(frozen=True)
-class Status:
-    """Shown values: simulated time [s], counts, explored share, real-time factor."""
-
-    time: float
-    measurements: int
-    found: int
-    targets: int
-    explored: float
-    factor: float
-    word: str = 'found'
-
-    def text(self) -> str:
-        """Return it as one line."""
-        targets = f' of {self.targets}' if self.targets else ''
-        return (
-            f'{self.time:7.1f} s   {self.measurements:4d} measurements   '
-            f'{self.found} {self.word}{targets}   {100.0 * self.explored:3.0f} % explored   '
-            f'{self.factor:.1f} x real time'
-        )
+# ECMA-48: back to the begin of the line, which is erased.
+_ERASE = '\r\x1b[K'
 
 
 class ProgressDisplay:
@@ -47,7 +24,8 @@ class ProgressDisplay:
         self._period = 0.1 if self._terminal else period
         self._last = -1e9
         self._found = -1
-        self._live: Live | None = None
+        # On a terminal: the line that changes.
+        self._line = ''
 
     @property
     def due(self) -> bool:
@@ -56,18 +34,16 @@ class ProgressDisplay:
 
     def say(self, text: str) -> None:
         """Print a line; a closed terminal or a full disk does not end the run."""
+        erase = _ERASE if self._line else ''
         with contextlib.suppress(OSError):
-            if self._live is not None:
-                self._live.console.print(text, markup=False, highlight=False)
-            else:
-                print(text, file=self._stream, flush=True)
+            print(f'{erase}{text}\n{self._line}', end='', file=self._stream, flush=True)
 
-    def show(self, status: Status) -> None:
+    def show(self, text: str, found: int) -> None:
         """Show a status, if an update is due or it has a new target."""
-        if not self.due and (self._terminal or status.found == self._found):
+        if not self.due and (self._terminal or found == self._found):
             return
-        self._found = status.found
-        self._write(status.text())
+        self._found = found
+        self._write(text)
 
     def share(self, what: str, part: float) -> None:
         """Show how much of something is done, if an update is due."""
@@ -79,27 +55,13 @@ class ProgressDisplay:
         if not self._terminal:
             self.say(text)
             return
-        if self._live is None:
-            self._live = _live(self._stream)
-            self._live.start()
-        # Without markup and without highlighting of numbers.
-        self._live.update(_plain_text(text), refresh=True)
+        # A line that wraps could not be erased.
+        self._line = text[: shutil.get_terminal_size().columns - 1]
+        with contextlib.suppress(OSError):
+            print(f'{_ERASE}{self._line}', end='', file=self._stream, flush=True)
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
-
-
-def _plain_text(text: str) -> Text:
-    from rich.text import Text
-
-    return Text(text)
-
-
-def _live(stream: TextIO) -> Live:
-    from rich.console import Console
-    from rich.live import Live
-
-    return Live(console=Console(file=stream), auto_refresh=False, transient=False)
+        """Leave the line that changes as it is."""
+        if self._line:
+            self._line = ''
+            self.say('')

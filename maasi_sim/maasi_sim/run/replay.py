@@ -9,10 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from maasi_msgs.msg import FoundTarget
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import NodeProcess, stop
-from maasi_sim.run.replay_node import FILTER, Recording, ReplayNode, plain, read_recording
+from maasi_sim.run.replay_node import FILTER, Recording, ReplayNode, read_recording
 from maasi_sim.run.run_folder import make_folder
 from maasi_sim.run.topics import within
 
@@ -32,15 +35,24 @@ REPLAYED = {
 }
 
 
-def differences(recorded: list[dict[str, Any]], found: list[dict[str, Any]]) -> list[str]:
+class _Interrupted(Exception):
+    """A signal has arrived."""
+
+
+class _FilterError(Exception):
+    """A filter does not answer: text and process."""
+
+
+def differences(recorded: list[FoundTarget], found: list[FoundTarget]) -> list[str]:
     """Return in words how two lists of found targets differ; empty if they are equal to the bit."""
     lines = []
     if len(recorded) != len(found):
         lines.append(f'{len(recorded)} found targets were recorded, {len(found)} found now')
     for before, now in zip(recorded, found):
-        for key, value in before.items():
-            if now.get(key) != value:
-                lines.append(f'target {before["id"]}: {key} was {value}, is {now.get(key)}')
+        for key in before.get_fields_and_field_types():
+            old, new = getattr(before, key), getattr(now, key)
+            if not np.array_equal(old, new):
+                lines.append(f'target {before.id}: {key} was {old}, is {new}')
     return lines
 
 
@@ -69,6 +81,12 @@ def replay(
             node = ReplayNode(domain.number, robots, recording.namespaces)
             try:
                 return _feed(node, recording, processes, interrupted)
+            except _Interrupted:
+                return INTERRUPTED
+            except _FilterError as error:
+                text, process = error.args
+                print(f'error: {text}\n--- {process.log}\n{process.last_words()}', file=sys.stderr)
+                return FAILED
             finally:
                 node.close()
         finally:
@@ -95,61 +113,44 @@ def _feed(
 ) -> int:
     first_difference = None
 
-    def wait_for(
-        condition: Callable[[], bool], what: str, patience: float = _PATIENCE
-    ) -> int | None:
+    def wait_for(condition: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
         deadline = time.monotonic() + patience
         while not condition():
             if interrupted():
-                return INTERRUPTED
+                raise _Interrupted
             for process in processes:
                 if not process.running:
-                    return _failed(f'{process.name} {process.how_it_ended()}', process)
+                    raise _FilterError(f'{process.name} {process.how_it_ended()}', process)
             if time.monotonic() > deadline:
-                return _failed(f'{what} for {patience:g} s', processes[0])
+                raise _FilterError(f'{what} for {patience:g} s', processes[0])
             node.spin()
-        return None
 
-    code = wait_for(lambda: node.ready, 'the filter was not ready', _START_PATIENCE)
-    if code is not None:
-        return code
-    for index, batch in enumerate(recording.batches):
+    wait_for(lambda: node.ready, 'the filter was not ready', _START_PATIENCE)
+    for number, batch in enumerate(recording.batches, start=1):
         node.publish(batch)
-        code = wait_for(
-            lambda number=index + 1: len(node.updates) >= number,  # type: ignore[misc]
-            f'the filter did not answer batch {batch.id}',
+        wait_for(
+            lambda number=number: len(node.updates) >= number,  # type: ignore[misc]
+            f'the filter did not answer batch {batch.update.batch_id}',
         )
-        if code is not None:
-            return code
-        if first_difference is None and not _same(plain(node.updates[-1]), batch.update):
-            first_difference = batch
-    code = wait_for(
+        # Robots are missing where none is requested.
+        batch.update.missing = node.updates[-1].missing
+        if first_difference is None and node.updates[-1] != batch.update:
+            first_difference = batch.update.batch_id
+    wait_for(
         lambda: all(node.found_batch[key] >= last for key, last in recording.found_batch.items()),
         'the filter published no found targets',
     )
-    if code is not None:
-        return code
     lines = []
     for namespace, found in recording.found.items():
-        now = [plain(target) for target in node.found[namespace]]
+        now = node.found[namespace]
         lines += [within(namespace, f' {line}').strip() for line in differences(found, now)]
     for line in lines:
         print(line)
     if first_difference is not None:
-        print(f'the first update that differs is that of batch {first_difference.id}')
+        print(f'the first update that differs is that of batch {first_difference}')
     number = sum(len(found) for found in recording.found.values())
     if lines:
         print(f'{len(recording.batches)} batches replayed: the found targets are NOT equal')
         return DIFFERENT
     print(f'{len(recording.batches)} batches replayed: {number} found targets, equal to the bit')
     return EQUAL
-
-
-def _same(update: dict[str, Any], recorded: dict[str, Any]) -> bool:
-    """Compare updates, except for missing robots, which are not requested in a replay."""
-    return {**update, 'missing': []} == {**recorded, 'missing': []}
-
-
-def _failed(text: str, process: NodeProcess) -> int:
-    print(f'error: {text}\n--- {process.log}\n{process.last_words()}', file=sys.stderr)
-    return FAILED

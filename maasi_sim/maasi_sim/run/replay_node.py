@@ -17,7 +17,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
 from maasi_msgs.msg import (
-    BatchMember,
     DetectionArray,
     FilterUpdate,
     FoundTarget,
@@ -33,20 +32,15 @@ FILTER = 'filter_node'
 
 @dataclass
 class Batch:
-    """One recorded update of a filter, in a namespace: its inputs in their order, and its output.
+    """One recorded update of a filter, in a namespace, and its serialised measurements in order.
 
-    Members are robot, decision and measurement, the stamp seconds and nanoseconds. `late` is a
-    measurement that arrived after its batch, or without a request.
+    `late` is a measurement that arrived after its batch, or without a request.
     """
 
-    id: int
-    step: int
-    stamp: tuple[int, int]
-    members: list[tuple[str, int, int]]
+    update: FilterUpdate
     detections: list[bytes]
-    update: Any
-    late: bool = False
-    namespace: str = ''
+    namespace: str
+    late: bool
 
 
 @dataclass
@@ -60,7 +54,7 @@ class Recording:
 
     facts: dict[str, Any]
     batches: list[Batch] = field(default_factory=list)
-    found: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    found: dict[str, list[FoundTarget]] = field(default_factory=dict)
     found_batch: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -83,62 +77,36 @@ def read_recording(path: Path) -> Recording:
         robots = recording.facts['scenario']['robots']
         topics = {within(team, f'/{name}/detections'): name for name in robots}
         detections: dict[tuple[str, int], bytes] = {}
-        for topic, kind, _, data in bag.raw(topics):
-            message = bag.decode(data, kind)
+        for topic, _, _, data in bag.raw(topics):
+            index = deserialize_message(data, DetectionArray).measurement
             # Duplicate index: a restarted driver; the filter used the first.
-            detections.setdefault((topics[topic], int(message.measurement)), data)
+            detections.setdefault((topics[topic], index), data)
         for namespace in recording.namespaces:
             last = 0
-            for item in bag.messages([within(team, within(namespace, UPDATE))]):
-                batch = _batch(item.message, detections, path)
-                batch.namespace = namespace
-                batch.late = batch.id <= last
-                last = max(last, batch.id)
-                recording.batches.append(batch)
-            for item in bag.messages([within(team, within(namespace, FOUND))]):
-                recording.found[namespace] = [plain(target) for target in item.message.targets]
-                recording.found_batch[namespace] = int(item.message.batch_id)
+            for _, _, _, data in bag.raw([within(team, within(namespace, UPDATE))]):
+                update = deserialize_message(data, FilterUpdate)
+                used = [
+                    _find(detections, member.robot, member.measurement, path)
+                    for member in update.members
+                ]
+                late = update.batch_id <= last
+                last = max(last, update.batch_id)
+                recording.batches.append(Batch(update, used, namespace, late))
+            for _, _, _, data in bag.raw([within(team, within(namespace, FOUND))]):
+                array = deserialize_message(data, FoundTargetArray)
+                recording.found[namespace] = list(array.targets)
+                recording.found_batch[namespace] = array.batch_id
     if len(recording.found) > 1:
-        recording.batches.sort(key=lambda batch: (batch.step, batch.namespace))
+        recording.batches.sort(key=lambda batch: (batch.update.step, batch.namespace))
     return recording
 
 
-def _batch(update: Any, detections: dict[tuple[str, int], bytes], path: Path) -> Batch:
-    members = [
-        (member.robot, int(member.decision), int(member.measurement)) for member in update.members
-    ]
-    missing = [
-        key for key in ((name, index) for name, _, index in members) if key not in detections
-    ]
-    if missing:
-        name, index = missing[0]
-        raise BagError(f'{path}: measurement {index} of {name} is not in the recording')
-    stamp = update.header.stamp
-    return Batch(
-        int(update.batch_id),
-        int(update.step),
-        (int(stamp.sec), int(stamp.nanosec)),
-        members,
-        [detections[name, index] for name, _, index in members],
-        plain(update),
-    )
-
-
-def plain(message: Any) -> Any:
-    """Return a message, of `rosbags` or of ROS, as plain values that can be compared."""
-    fields = getattr(message, '__dataclass_fields__', None)
-    names = [name for name in fields if name != '__msgtype__'] if fields else None
-    if names is None and hasattr(message, 'get_fields_and_field_types'):
-        names = list(message.get_fields_and_field_types())
-    if names is not None:
-        return {name: plain(getattr(message, name)) for name in names}
-    if isinstance(message, str):
-        return message
-    if hasattr(message, 'tolist'):
-        return message.tolist()
-    if isinstance(message, (list, tuple)):
-        return [plain(item) for item in message]
-    return message
+def _find(
+    detections: dict[tuple[str, int], bytes], robot: str, measurement: int, path: Path
+) -> bytes:
+    if (robot, measurement) not in detections:
+        raise BagError(f'{path}: measurement {measurement} of {robot} is not in the recording')
+    return detections[robot, measurement]
 
 
 class ReplayNode:
@@ -200,19 +168,18 @@ class ReplayNode:
 
     def publish(self, batch: Batch) -> None:
         """Publish a batch with the measurements that the filter had processed."""
+        update = batch.update
         if not batch.late:
-            self._publish_batch(batch)
-        for (robot, _, _), data in zip(batch.members, batch.detections):
-            self._detections[robot].publish(deserialize_message(data, DetectionArray))
-
-    def _publish_batch(self, batch: Batch) -> None:
-        message = MeasurementBatch(id=batch.id, step=batch.step)
-        message.stamp.sec, message.stamp.nanosec = batch.stamp
-        message.members = [
-            BatchMember(robot=robot, decision=decision, measurement=measurement)
-            for robot, decision, measurement in batch.members
-        ]
-        self._batches[batch.namespace].publish(message)
+            self._batches[batch.namespace].publish(
+                MeasurementBatch(
+                    id=update.batch_id,
+                    step=update.step,
+                    stamp=update.header.stamp,
+                    members=update.members,
+                )
+            )
+        for member, data in zip(update.members, batch.detections):
+            self._detections[member.robot].publish(deserialize_message(data, DetectionArray))
 
     def _on_found(self, namespace: str, message: FoundTargetArray) -> None:
         self.found[namespace] = list(message.targets)

@@ -41,15 +41,10 @@ def _camera(name: str, topic: str, *, shown: bool) -> dict[str, Any]:
     return {
         'Class': 'rviz_default_plugins/Image',
         'Enabled': shown,
-        'Max Value': 1,
-        'Median window': 5,
-        'Min Value': 0,
         'Name': name,
         'Normalize Range': False,
         'Topic': {
-            'Depth': 5,
             'Durability Policy': 'Volatile',
-            'History Policy': 'Keep Last',
             'Reliability Policy': 'Best Effort',
             'Value': topic,
         },

@@ -20,7 +20,7 @@ from maasi_sim.run.ending import (
     Interruption,
 )
 from maasi_sim.run.mission import Mission
-from maasi_sim.run.progress import ProgressDisplay, Status
+from maasi_sim.run.progress import ProgressDisplay
 from maasi_sim.run.recorder_node import Recorder
 from maasi_sim.run.run_options import Options
 from maasi_sim.run.supervisor import Supervisor
@@ -329,14 +329,12 @@ class Session:
         observer.news = False
         seconds = self.recorder.elapsed
         wall = time.monotonic() - (self._begun or time.monotonic())
+        targets = f' of {observer.total}' if observer.total else ''
+        explored = max(observer.explored, self.recorder.explored)
         self._display.show(
-            Status(
-                time=seconds,
-                measurements=observer.measurements,
-                found=observer.found,
-                targets=observer.total,
-                explored=max(observer.explored, self.recorder.explored),
-                word=self.mission.found_word,
-                factor=seconds / wall if wall > 0.0 else 0.0,
-            )
+            f'{seconds:7.1f} s   {observer.measurements:4d} measurements   '
+            f'{observer.found} {self.mission.found_word}{targets}   '
+            f'{100.0 * explored:3.0f} % explored   '
+            f'{seconds / wall if wall > 0.0 else 0.0:.1f} x real time',
+            observer.found,
         )
