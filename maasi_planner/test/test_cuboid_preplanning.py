@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from maasi_planner.buildings import CuboidSettings, plan_mission
-from maasi_planner.buildings.preplanning import detection_probability, footprint
-from maasi_planner.buildings.settings import SearchCameraSettings
+from maasi_planner.buildings.preplanning import detection_probability, footprint, plan_mission
+from maasi_planner.buildings.settings import CuboidSettings, SearchCameraSettings
 
 AREA = [[0, 300], [0, 300], [0, 80]]
 BUILDING = {'centre': [175, 130], 'size': [60, 60, 60]}

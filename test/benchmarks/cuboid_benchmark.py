@@ -21,7 +21,7 @@ from cuboid_instances import joint_problems, problems_of_missions
 from literal_cuboid import TightProblem, solve_with_highs, solve_with_scip
 from timing import entry
 
-from maasi_planner.buildings import solve_jointly
+from maasi_planner.buildings.centralized import solve_jointly
 
 GAP, LIMIT = 1e-4, 20.0
 
@@ -43,7 +43,7 @@ def against(name: str, solve: Callable[..., Any], title: str, number: int) -> di
     for problem in problems:
         ours = time_of(lambda problem=problem: solver.solve(problem))
         plan = solver.solve(problem)
-        tight = TightProblem(solver.dynamics, solver.objective, problem)
+        tight = TightProblem(solver, problem)
         bound, value, spent = solve(tight, gap=GAP, limit=LIMIT)
         if plan is None or plan.objective > value + GAP or plan.objective < bound - GAP:
             raise RuntimeError(f'{title}: another optimum, in [{bound}, {value}]: {plan}')

@@ -19,17 +19,15 @@ BIG = 1000.0
 class LiteralProblem:
     """Columns and rows of P2; `squares` are (weight, columns, coefficients, constant)."""
 
-    def __init__(self, dynamics, objective, problem):
-        self.dynamics, self.objective, self.problem = dynamics, objective, problem
+    def __init__(self, solver, problem):
+        self.dynamics, self.settings, self.problem = solver.dynamics, solver.settings, problem
         self.lower, self.upper, self.integer, self.cost = [], [], [], []
         self.rows = []
         self.squares = []
-        self.constant = 0.0
         self._dynamics_rows()
         self._visit_rows()
         self._obstacle_rows()
-        if problem.brakes:
-            self._braking_rows()
+        self._braking_rows()
         self._objective()
 
     def column(self, lower, upper, integer=False, cost=0.0):
@@ -39,143 +37,113 @@ class LiteralProblem:
         self.cost.append(cost)
         return len(self.cost) - 1
 
+    def binary(self, cost=0.0):
+        return self.column(0, 1, True, cost)
+
     def row(self, columns, coefficients, lower, upper):
         self.rows.append((list(columns), list(coefficients), lower, upper))
 
     def _dynamics_rows(self):
-        d, T, p = self.dynamics, self.objective.horizon, self.problem
+        d, T, p = self.dynamics, self.settings.horizon, self.problem
         self.P = np.empty((T + 1, 3), dtype=int)
         self.v = np.empty((T + 1, 3), dtype=int)
         self.u = np.empty((T, 3), dtype=int)
         gamma = d.step / d.mass
         for a in range(3):
             for k in range(T + 1):
-                low, high = (p.position[a],) * 2 if k == 0 else p.area[a]
-                if k == 1:  # given by the state
-                    low, high = -1e6, 1e6
-                self.P[k, a] = self.column(low, high)
-                low, high = (p.velocity[a],) * 2 if k == 0 else (-d.speed, d.speed)
-                self.v[k, a] = self.column(low, high)
+                # P_1 is given by the state, too.
+                bounds = [(p.position[a],) * 2, (-1e6, 1e6), p.area[a]][min(k, 2)]
+                self.P[k, a] = self.column(*bounds)
+                bounds = (p.velocity[a],) * 2 if k == 0 else (-d.speed, d.speed)
+                self.v[k, a] = self.column(*bounds)
             for k in range(T):
-                self.u[k, a] = self.column(-d.force, d.force)
+                u = self.u[k, a] = self.column(-d.force, d.force)
                 self.row([self.P[k + 1, a], self.P[k, a], self.v[k, a]], [1, -1, -d.step], 0, 0)
                 fall = -gamma * d.weight[a]
-                self.row(
-                    [self.v[k + 1, a], self.v[k, a], self.u[k, a]],
-                    [1, -d.retained, -gamma],
-                    fall,
-                    fall,
-                )
+                self.row([self.v[k + 1, a], self.v[k, a], u], [1, -d.retained, -gamma], fall, fall)
 
     def _visit_rows(self):
-        T, p = self.objective.horizon, self.problem
-        self.y, self.visited = {}, {}
-        rewards = self.objective.rewards()
-        for n in np.flatnonzero(p.wanted) if not p.homing else []:
+        T, p = self.settings.horizon, self.problem
+        rewards = self.settings.rewards()
+        for n in np.flatnonzero(p.wanted):
             inside = []
             for k in range(1, T + 1):
                 faces = []
                 for a in range(3):
                     for sign, bound in ((-1.0, -p.cuboids[n, a, 0]), (1.0, p.cuboids[n, a, 1])):
-                        b = self.column(0, 1, True)  # b_{tau,n,l}
+                        b = self.binary()  # b_{tau,n,l}
                         self.row([self.P[k, a], b], [sign, BIG - bound], -np.inf, BIG)
                         faces.append(b)
-                b_tilde = self.column(0, 1, True)
+                b_tilde = self.binary()
                 self.row([b_tilde, *faces], [6, *[-1] * 6], -np.inf, 0)
                 inside.append(b_tilde)
-                self.visited[k, int(n)] = b_tilde
-            b_hat = self.column(0, 1, True)
-            if self.objective.discount == 1.0:
+            b_hat = self.binary()
+            if self.settings.discount == 1.0:
                 self.row([b_hat, *inside], [1, *[-1] * T], -np.inf, 0)
-                y = self.column(0, 1, True, -rewards[1])
-                self.row([y, b_hat], [1, -1], -np.inf, 0)
+                self.row([self.binary(-rewards[1]), b_hat], [1, -1], -np.inf, 0)
             else:
                 # One visit counts, with the reward of its step.
-                counted = [self.column(0, 1, True, -rewards[k]) for k in range(1, T + 1)]
+                counted = [self.binary(-rewards[k]) for k in range(1, T + 1)]
                 for c, b_tilde in zip(counted, inside):
                     self.row([c, b_tilde], [1, -1], -np.inf, 0)
                 self.row([b_hat, *counted], [-1, *[1] * T], -np.inf, 0)
 
-    def _faces(self, k, low, high):
-        """Keep to the outer side of one face; return the six z."""
-        z = [self.column(0, 1, True) for _ in range(6)]
+    def _faces(self):
+        """Return z of the six faces of an object, of which one is kept beyond."""
+        z = [self.binary() for _ in range(6)]
         self.row(z, [1] * 6, -np.inf, 5)
-        del k, low, high
         return z
 
-    def _beyond(self, column, z, a, low, high, offset=(0.0, 0.0), more=(), factors=()):
-        below, above = z[2 * a], z[2 * a + 1]
-        self.row([column, *more, below], [1, *factors, -BIG], -np.inf, low + offset[1])
-        self.row([column, *more, above], [1, *factors, BIG], high + offset[0], np.inf)
+    def _beyond(self, z, a, box, columns, coefficients=(1,), up=0.0, down=0.0):
+        below, above = z[2 * a : 2 * a + 2]
+        self.row([*columns, below], [*coefficients, -BIG], -np.inf, box[a, 0] + up)
+        self.row([*columns, above], [*coefficients, BIG], box[a, 1] - down, np.inf)
 
     def _obstacle_rows(self):
-        T, p = self.objective.horizon, self.problem
-        self.z = {}
-        for o, box in enumerate(p.obstacles):
-            for k in range(2, T + 1):
-                z = self._faces(k, box[:, 0], box[:, 1])
-                self.z[k, o] = z
+        for box in self.problem.obstacles:
+            for k in range(2, self.settings.horizon + 1):
+                z = self._faces()
                 for a in range(3):
-                    self._beyond(self.P[k, a], z, a, box[a, 0], box[a, 1])
-                    if p.between:
-                        self._beyond(self.P[k - 1, a], z, a, box[a, 0], box[a, 1])
+                    for i in (k - 1, k) if self.settings.between_samples else (k,):
+                        self._beyond(z, a, box, [self.P[i, a]])
 
     def _braking_rows(self):
         """The way to brake, each axis with full force, stays in the area and beyond a face."""
-        T, p, d = self.objective.horizon, self.problem, self.dynamics
+        T, p = self.settings.horizon, self.problem
+        ends = [[self.P[T, a], self.v[T, a]] for a in range(3)]
         for a in range(3):
-            paths = self._stops(a)
-            for factor, up, down in paths:
-                self.row([self.P[T, a], self.v[T, a]], [1, factor], p.area[a, 0] - down, np.inf)
-                self.row([self.P[T, a], self.v[T, a]], [1, factor], -np.inf, p.area[a, 1] + up)
+            for factor, up, down in self._stops(a):
+                self.row(ends[a], [1, factor], p.area[a, 0] - down, np.inf)
+                self.row(ends[a], [1, factor], -np.inf, p.area[a, 1] + up)
         for box in p.obstacles:
-            z = self._faces(T + 1, box[:, 0], box[:, 1])
+            z = self._faces()
             for a in range(3):
-                self._beyond(self.P[T, a], z, a, box[a, 0], box[a, 1])
+                self._beyond(z, a, box, [self.P[T, a]])
                 for factor, up, down in self._stops(a):
-                    self._beyond(
-                        self.P[T, a],
-                        z,
-                        a,
-                        box[a, 0],
-                        box[a, 1],
-                        (-down, up),
-                        [self.v[T, a]],
-                        [factor],
-                    )
-        del d
+                    self._beyond(z, a, box, ends[a], [1, factor], up, down)
 
     def _stops(self, a):
         """Return way = P + factor v - up (moving up), + down (moving down), after each step."""
         d = self.dynamics
         result = []
-        losses = d.deceleration(a)
         for steps in range(1, d.braking_steps() + 1):
-            factor, ways = 0.0, []
-            for loss in losses:
-                # v -> way, by simulating v = 0 and v = 1 without stopping.
-                ends = []
-                for speed in (0.0, 1.0):
-                    way = 0.0
-                    for _ in range(steps):
-                        way += d.step * speed
-                        speed = d.retained * speed - loss
-                    ends.append(way)
-                factor = ends[1] - ends[0]
-                ways.append(-ends[0])
-            result.append((factor, ways[0], ways[1]))
+            # v -> way, by simulating v = 0 and v = 1 without stopping.
+            ways = np.zeros((2, 2))
+            for way, loss in zip(ways, d.deceleration[:, a]):
+                speeds = np.array([0.0, 1.0])
+                for _ in range(steps):
+                    way += d.step * speeds
+                    speeds = d.retained * speeds - loss
+            result.append((ways[0, 1] - ways[0, 0], -ways[0, 0], -ways[1, 0]))
         return result
 
     def _objective(self):
-        T, p, o = self.objective.horizon, self.problem, self.objective
+        T, p, s = self.settings.horizon, self.problem, self.settings
         for a in range(3):
-            if p.homing:
-                raise ValueError('homing: the literal problem is that of the search')
-            self.squares.append((o.guidance, [self.P[o.guided, a]], [1.0], -float(p.target[a])))
+            self.squares.append((s.guidance_weight, [self.P[s.guided, a]], [1.0], -p.target[a]))
             for k in range(1, T):
-                self.squares.append(
-                    (o.smoothness, [self.u[k, a], self.u[k - 1, a]], [1.0, -1.0], 0.0)
-                )
+                pair = [self.u[k, a], self.u[k - 1, a]]
+                self.squares.append((s.smoothness_weight, pair, [1.0, -1.0], 0.0))
 
     def value(self, x):
         """Return the objective of columns x."""
@@ -189,30 +157,25 @@ class LiteralProblem:
         x = np.zeros(len(self.cost))
         x[self.P], x[self.v], x[self.u] = plan.positions, plan.velocities, plan.controls
         for columns, coefficients, lower, upper in self.rows:
-            if any(self.integer[c] for c in columns):
-                continue
-            value = np.dot(coefficients, x[columns])
-            assert lower - tolerance <= value <= upper + tolerance
+            if not any(self.integer[c] for c in columns):
+                value = np.dot(coefficients, x[columns])
+                assert lower - tolerance <= value <= upper + tolerance
         continuous = ~np.array(self.integer)
         assert (x[continuous] >= np.array(self.lower)[continuous] - tolerance).all()
         assert (x[continuous] <= np.array(self.upper)[continuous] + tolerance).all()
         total = self.value(x)
-        seen = set()
+        cuboids = [cuboid for _, cuboid in plan.visits]
+        assert len(set(cuboids)) == len(cuboids) and self.problem.wanted[cuboids].all()
         for step, cuboid in plan.visits:
-            assert cuboid not in seen and self.problem.wanted[cuboid]
-            seen.add(cuboid)
             box = self.problem.cuboids[cuboid]
             assert (plan.positions[step] >= box[:, 0] - tolerance).all()
             assert (plan.positions[step] <= box[:, 1] + tolerance).all()
-            total -= self.objective.rewards()[step]
-        for k in range(2, self.objective.horizon + 1):
+            total -= self.settings.rewards()[step]
+        for k in range(2, self.settings.horizon + 1):
+            ends = plan.positions[k - self.settings.between_samples : k + 1]
             for box in self.problem.obstacles:
-                ends = (
-                    plan.positions[k - 1 : k + 1] if self.problem.between else plan.positions[[k]]
-                )
-                assert (
-                    (ends <= box[:, 0] + 2e-3).all(axis=0) | (ends >= box[:, 1] - 2e-3).all(axis=0)
-                ).any(), (k, ends, box)
+                below = (ends <= box[:, 0] + 2e-3).all(axis=0)
+                assert (below | (ends >= box[:, 1] - 2e-3).all(axis=0)).any(), (k, ends, box)
         return total
 
 
@@ -224,7 +187,7 @@ class TightProblem(LiteralProblem):
     """
 
     def _reach(self):
-        d, T, p = self.dynamics, self.objective.horizon, self.problem
+        d, T, p = self.dynamics, self.settings.horizon, self.problem
         reach = np.empty((T + 1, 3, 2))
         for side, sign in enumerate((-1.0, 1.0)):
             place, speed = p.position.astype(float), p.velocity.astype(float)
@@ -237,9 +200,9 @@ class TightProblem(LiteralProblem):
         return reach
 
     def _visit_rows(self):
-        T, p = self.objective.horizon, self.problem
+        T, p = self.settings.horizon, self.problem
         self.reach = self._reach()
-        rewards = self.objective.rewards()
+        rewards = self.settings.rewards()
         at_step = {k: [] for k in range(1, T + 1)}
         for n in np.flatnonzero(p.wanted):
             visits = []
@@ -248,7 +211,7 @@ class TightProblem(LiteralProblem):
                 # Where the next step leads is given: a visit on a face counts despite rounding.
                 box = p.cuboids[n] + [-TOUCH, TOUCH] if k == 1 else p.cuboids[n]
                 if (box[:, 0] <= high).all() and (box[:, 1] >= low).all():
-                    beta = self.column(0, 1, True, -rewards[k])
+                    beta = self.binary(-rewards[k])
                     visits.append(beta)
                     at_step[k].append((beta, box))
             if len(visits) > 1:
@@ -271,28 +234,26 @@ class TightProblem(LiteralProblem):
                     self.row([self.P[k, a], *columns], [1, *drops], -np.inf, high)
 
     def _obstacle_rows(self):
-        T, p = self.objective.horizon, self.problem
+        T, p = self.settings.horizon, self.problem
         for box in p.obstacles:
             for k in range(2, T + 1):
-                steps = [k - 1, k] if p.between else [k]
-                low = np.min([self.reach[i, :, 0] for i in steps], axis=0)
-                high = np.max([self.reach[i, :, 1] for i in steps], axis=0)
+                steps = [k - 1, k] if self.settings.between_samples else [k]
+                low, high = self.reach[steps, :, 0].min(axis=0), self.reach[steps, :, 1].max(axis=0)
                 if (high <= box[:, 0]).any() or (low >= box[:, 1]).any():
                     continue
                 faces = []
                 for a in range(3):
-                    if box[a, 0] > p.area[a, 0] and low[a] <= box[a, 0]:
-                        z = self.column(0, 1, True)
+                    # The lower face, then the upper one, mirrored.
+                    for side, sign in ((0, 1), (1, -1)):
+                        face = sign * box[a, side]
+                        nearest = (low, -high)[side][a]
+                        if face <= sign * p.area[a, side] or nearest > face:
+                            continue
+                        z = self.binary()
                         faces.append(z)
                         for i in steps:
-                            most = max(self.reach[i, a, 1] - box[a, 0], 0.0)
-                            self.row([self.P[i, a], z], [1, -most], -np.inf, box[a, 0])
-                    if box[a, 1] < p.area[a, 1] and high[a] >= box[a, 1]:
-                        z = self.column(0, 1, True)
-                        faces.append(z)
-                        for i in steps:
-                            most = max(box[a, 1] - self.reach[i, a, 0], 0.0)
-                            self.row([self.P[i, a], z], [1, most], box[a, 1], np.inf)
+                            most = max(sign * self.reach[i, a, 1 - side] - face, 0.0)
+                            self.row([self.P[i, a], z], [sign, -most], -np.inf, face)
                 self.row(faces, [1] * len(faces), -np.inf, len(faces) - 1)
 
 

@@ -60,10 +60,10 @@ class Flight:
             lambda: (
                 self.odometry.get_subscription_count() == 1
                 and self.heard.get_subscription_count() == 1
-                and self.node.count_publishers('rover/cmd_vel') == 1
-                and self.node.count_publishers('rover/state') == 1
-                and self.node.count_publishers('rover/link/tx') == 1
-                and self.node.count_publishers('rover/decision') == 1
+                and all(
+                    self.node.count_publishers(f'rover/{topic}') == 1
+                    for topic in ('cmd_vel', 'state', 'link/tx', 'decision')
+                )
             )
         )
 
@@ -140,6 +140,8 @@ def test_a_robot_among_buildings_moves_only_while_it_searches(flight):
     assert flight.call('start').success
     assert any(command != still for command in flight.fly(3))
     assert flight.states[-1].goal_status == AgentState.MOVING
+    frames = [item[-1].header.frame_id for item in (flight.states, flight.commands)]
+    assert frames == ['map', 'rover/base_link']
     known = len(flight.commands)
     assert flight.call('pause').success
     # At once, not with the next step.

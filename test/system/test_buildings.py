@@ -39,6 +39,11 @@ def test_robots_share_a_building_and_the_nodes_do_what_one_process_does(tmp_path
     assert report['most_heard'] == 1
     assert all(number > 0 for number in report['measurements'].values())
     assert (run.folder / 'report.png').stat().st_size > 20_000
+    shots = report['snapshots']
+    chances = [shot['detection_probability'] for shot in shots]
+    assert report['least_detection_probability'] == min(chances) > 0.7
+    assert sum(report['measurements'].values()) == len(shots) >= 16
+    assert '16 of 16 cuboids visited (ended: all cuboids visited)' in run.output
     # Nobody but sim and planners takes part.
     logs = sorted(path.stem for path in run.folder.glob('*.log'))
     robots = ('blue', 'green')

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_planner.buildings.guidance import WayFinder, assigned, nearest
+from maasi_planner.buildings.dynamics import Dynamics
 from maasi_planner.buildings.preplanning import CoveragePlan, detection_probability
-from maasi_planner.buildings.problem import Objective, Plan, PlanSolver, Problem
-from maasi_planner.buildings.robot_model import Dynamics, Hazard, HeardPlan, rewards
-from maasi_planner.buildings.settings import CuboidSettings, HazardSettings
-
-How = Literal['optimal', 'best_so_far', 'shifted', 'brake']
+from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
+from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
+from maasi_planner.buildings.sharing import Broadcast, assigned, nearest, rewards
+from maasi_planner.buildings.way_finder import WayFinder
 
 # Tolerances of arrival at the station [m, m/s].
 _ARRIVED, _ARRIVED_SPEED = 2.0, 2.0
@@ -34,29 +32,6 @@ class Activity(Enum):
     SEARCHING = 0
     RETURNING = 1
     RECHARGING = 2
-
-
-@dataclass(frozen=True)
-class Broadcast:
-    """Message of a robot to those in range at a step (V-B).
-
-    robot: its name; step: t; position, velocity (3,): [m, m/s]; searching: whether it takes part; a
-    robot on its way home still shares its search map; visited (N,): V, its search map;
-    flight_steps: t_Fl, since its last recharge; plan: steps from now until the visit, by cuboid, of
-    its previous plan; hazard: of its battery; predicted (3,): position at t + tau* + 1 in its
-    previous plan [m].
-    """
-
-    robot: str
-    step: int
-    position: FloatArray
-    velocity: FloatArray
-    searching: bool
-    visited: BoolArray
-    flight_steps: int
-    plan: Mapping[int, int]
-    hazard: Hazard
-    predicted: FloatArray
 
 
 @dataclass(frozen=True)
@@ -77,36 +52,6 @@ class Snapshot:
     detection_probability: float
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Decision of a robot at a step.
-
-    control (3,): force until the next step [N]; velocity (3,): resulting velocity at the next step
-    [m/s]; plan: plan of the decision; how: optimal; best_so_far: a limit ended the solve; shifted:
-    no solution, it continues the previous plan; brake: no valid previous plan either; target (3,):
-    x* [m]; activity: present activity.
-    """
-
-    control: FloatArray
-    velocity: FloatArray
-    plan: Plan
-    how: How
-    target: FloatArray
-    activity: Activity
-
-
-def make_objective(settings: CuboidSettings) -> Objective:
-    """Return the objective of settings."""
-    return Objective(
-        settings.horizon,
-        settings.guidance_step,
-        settings.guidance_weight,
-        settings.smoothness_weight,
-        settings.visit_weight,
-        settings.discount,
-    )
-
-
 def decision_stream(seed: int, robot: str, step: int) -> np.random.Generator:
     """Return the generator of a robot's decision at a step: the same in every process."""
     key = (seed, crc32(robot.encode()), step, crc32(b'cuboid'))
@@ -122,8 +67,7 @@ class SearchAgent:
     """A robot with its own planner.
 
     At each step: `observe` its state, send the returned message, and `decide` with the messages
-    received.
-    `mission` is the same for all robots; `home` is G, where it recharges (3,) [m].
+    received. `mission` is the same for all robots; steps take `step` seconds.
     """
 
     def __init__(
@@ -131,32 +75,28 @@ class SearchAgent:
         name: str,
         settings: CuboidSettings,
         mission: CoveragePlan,
-        dynamics: Dynamics,
-        hazard: HazardSettings,
-        home: ArrayLike,
+        robot: SearcherSettings,
+        step: float = 1.0,
     ) -> None:
         self.name = name
         self.settings = settings
         self.mission = mission
-        self.dynamics = dynamics
-        self.hazard = Hazard(hazard.alpha, hazard.beta, hazard.failures)
-        self._recharge_steps = hazard.recharge_steps
-        self.home = np.asarray(home, dtype=float)
-        self.solver = PlanSolver(
-            dynamics, make_objective(settings), settings.node_limit, settings.time_limit
-        )
-        self.solids = inflated(mission.solids, settings.clearance)
+        self.dynamics = Dynamics(robot.dynamics, step)
+        self.hazard = robot.hazard
+        self.home = np.array(robot.start, dtype=float)
+        self.solver = PlanSolver(self.dynamics, settings)
+        self._solids = inflated(mission.solids, settings.clearance)
         self._cuboids = inflated(mission.boxes, -_INTO)
-        climb = dynamics.deceleration(2)[1] / max(1.0 - dynamics.retained, 1e-9)
-        self._ways = WayFinder(
-            self.solids, mission.area, dynamics.speed, min(climb, dynamics.speed)
-        )
+        speed = self.dynamics.speed
+        climb = float(self.dynamics.deceleration[1, 2]) / max(1.0 - self.dynamics.retained, 1e-9)
+        self._ways = WayFinder(self._solids, mission.area, speed, min(climb, speed))
         self._check_home()
         self.visited = np.zeros(len(mission.cells), dtype=bool)
         self.snapshots: list[Snapshot] = []
         self.activity = Activity.SEARCHING
         self.flight_steps = 0
         self.plan: Plan | None = None
+        self.target = self.home
         self.failed = 0
         self.put_off = 0
         self._recharge_left = 0
@@ -165,26 +105,15 @@ class SearchAgent:
         self.velocity = np.zeros(3)
 
     def _check_home(self) -> None:
-        area = self.mission.area
-        if not (
-            np.isfinite(self.home).all()
-            and (self.home >= area[:, 0]).all()
-            and (self.home <= area[:, 1]).all()
-        ):
-            raise ValueError(
-                f'{self.name}: start: read {self.home.tolist()}, allowed is what lies inside the '
-                f'area, {area.tolist()} [m]'
-            )
-        if self.mission.hits(self.home):
-            raise ValueError(
-                f'{self.name}: start: read {self.home.tolist()}, which is inside an object or '
-                'obstacle, allowed is a place outside'
-            )
-        if not any(self._ways.reaches(self.home, centre) for centre in self.mission.centres):
-            raise ValueError(
-                f'{self.name}: start: read {self.home.tolist()}, from where no cuboid can be '
-                'reached: obstacles close it in'
-            )
+        area, problem = self.mission.area, ''
+        if not ((self.home >= area[:, 0]) & (self.home <= area[:, 1])).all():
+            problem = f', allowed is what lies inside the area, {area.tolist()} [m]'
+        elif self.mission.hits(self.home):
+            problem = ', which is inside an object or obstacle, allowed is a place outside'
+        elif not any(self._ways.reaches(self.home, centre) for centre in self.mission.centres):
+            problem = ', from where no cuboid can be reached: obstacles close it in'
+        if problem:
+            raise ValueError(f'{self.name}: start: read {self.home.tolist()}{problem}')
 
     @property
     def done(self) -> bool:
@@ -204,11 +133,11 @@ class SearchAgent:
             self.plan = None
         self.step = step
         self.position, self.velocity = place, speed
+        plan = {}
         if self.activity is Activity.SEARCHING:
-            for n in np.flatnonzero(self.mission.inside(place)):
-                if not self.visited[n]:
-                    self.visited[n] = True
-                    self.snapshots.append(self._snapshot(int(n)))
+            self._photograph()
+            if self.plan is not None:
+                plan = {n: k - 1 for k, n in self.plan.visits}
         elif self.activity is Activity.RETURNING:
             slow = float(np.abs(speed).max()) <= _ARRIVED_SPEED
             if slow and float(np.linalg.norm(place - self.home)) <= _ARRIVED:
@@ -216,115 +145,96 @@ class SearchAgent:
                 self._recharge_left = -1
         if self.activity is Activity.RECHARGING:
             return None
-        plan = {}
-        if self.activity is Activity.SEARCHING and self.plan is not None:
-            plan = {n: k - 1 for k, n in self.plan.visits}
         return Broadcast(
-            self.name,
-            step,
-            place,
-            speed,
-            self.activity is Activity.SEARCHING,
-            self.visited.copy(),
-            self.flight_steps,
-            plan,
-            self.hazard,
-            self.predicted(),
+            robot=self.name,
+            step=step,
+            position=place,
+            velocity=speed,
+            searching=self.activity is Activity.SEARCHING,
+            visited=self.visited.copy(),
+            flight_steps=self.flight_steps,
+            plan=plan,
+            hazard=self.hazard,
+            predicted=self._predicted(),
         )
 
-    def _snapshot(self, n: int) -> Snapshot:
-        cell = self.mission.cells[n]
-        distance = cell.distance(self.position)
-        return Snapshot(
-            self.name,
-            self.step,
-            n,
-            self.position.copy(),
-            -cell.normal,
-            distance,
-            detection_probability(distance, self.settings.camera),
-        )
+    def _photograph(self) -> None:
+        """Take a snapshot of each new cuboid that it is in."""
+        for n in np.flatnonzero(self.mission.inside(self.position) & ~self.visited):
+            self.visited[n] = True
+            cell = self.mission.cells[n]
+            distance = cell.distance(self.position)
+            chance = detection_probability(distance, self.settings.camera)
+            self.snapshots.append(
+                Snapshot(
+                    self.name, self.step, int(n), self.position, -cell.normal, distance, chance
+                )
+            )
 
     def decide(
         self, heard: Sequence[Broadcast], rng: np.random.Generator, wanted: BoolArray | None = None
-    ) -> Choice:
-        """Decide for the step that was observed last."""
+    ) -> Plan:
+        """Decide for the step that was observed last; `wanted` (N,) replaces the drawn rewards."""
         fails, minutes = rng.random(2)
         if self.activity is not Activity.RECHARGING:
             for message in heard:
                 self.visited |= message.visited  # (15i)
         self._battery(float(fails), float(minutes))
         heard = [message for message in heard if message.searching]
-        drawn = rewards(
-            len(self.visited),
-            self.flight_steps,
-            self.settings.horizon,
-            self.hazard,
-            [HeardPlan(m.plan, m.flight_steps, m.hazard) for m in heard],
-            self.settings.alpha,
-            self.settings.beta,
-            self.settings.condition,
-            rng,
-        )
-        problem = self.problem(heard, drawn if wanted is None else wanted)
-        plan = self.solver.solve(problem)
-        return self.follow(plan, problem.target)
+        if wanted is None:
+            draws = rng.random(len(self.visited))
+            wanted = rewards(self.settings, self.hazard, self.flight_steps, heard, draws)
+        return self.follow(self.solver.solve(self.problem(heard, wanted)))
 
     def problem(self, heard: Sequence[Broadcast], wanted: BoolArray) -> Problem:
         """Return the problem of the step, with rewards (N,) of 1 for `wanted` cuboids."""
         homing = self.activity is not Activity.SEARCHING
-        target = self.home if homing else self._target(heard)
-        if self.settings.around_corners and (target != self.position).any():
-            target = self._ways.first_corner(self.position, target)
+        self.target = self.home if homing else self._aim(heard)
+        if self.settings.around_corners and (self.target != self.position).any():
+            self.target = self._ways.first_corner(self.position, self.target)
         return Problem(
-            self.position,
-            self.velocity,
-            target,
-            self._cuboids,
-            wanted & ~self.visited,
-            self.solids,
-            self.mission.area,
-            homing,
-            self.settings.between_samples,
-            True,
-            [(k - 1, n) for k, n in self.plan.visits if k > 2] if self.plan else [],
-            self.put_off,
+            position=self.position,
+            velocity=self.velocity,
+            target=self.target,
+            cuboids=self._cuboids,
+            wanted=wanted & ~self.visited,
+            obstacles=self._solids,
+            area=self.mission.area,
+            homing=homing,
+            hint=[(k - 1, n) for k, n in self.plan.visits if k > 2] if self.plan else [],
+            put_off=self.put_off,
         )
 
-    def _target(self, heard: Sequence[Broadcast]) -> FloatArray:
+    def _aim(self, heard: Sequence[Broadcast]) -> FloatArray:
         """Return x*: the cuboid nearest to its predicted position, or the assigned one (10)."""
         unvisited = np.flatnonzero(~self.visited)
         if heard:
-            if self.settings.assignment == 'predicted':
-                places = np.stack([self.predicted(), *(message.predicted for message in heard)])
-            else:
-                places = np.stack([self.position, *(message.position for message in heard)])
-            order = sorted(
-                range(len(places)), key=lambda i: self.name if i == 0 else heard[i - 1].robot
+            predicted = self.settings.assignment == 'predicted'
+            places = {m.robot: m.predicted if predicted else m.position for m in heard}
+            places[self.name] = self._predicted() if predicted else self.position
+            order = sorted(places)
+            chosen = assigned(
+                np.stack([places[name] for name in order]),
+                order.index(self.name),
+                self.mission.centres,
+                unvisited,
             )
-            chosen = assigned(places[order], order.index(0), self.mission.centres, unvisited)
         else:
-            chosen = nearest(self.predicted(), self.mission.centres, unvisited)
+            chosen = nearest(self._predicted(), self.mission.centres, unvisited)
         return self.position if chosen is None else self.mission.centres[chosen]
 
-    def predicted(self) -> FloatArray:
+    def _predicted(self) -> FloatArray:
         """Return x at t + tau* + 1 of the previous plan; the present position without a plan."""
         if self.plan is None:
             return self.position
-        guided = self.solver.objective.guided
-        return np.asarray(self.plan.positions[min(guided + 1, len(self.plan.positions) - 1)])
+        last = len(self.plan.positions) - 1
+        return np.asarray(self.plan.positions[min(self.settings.guided + 1, last)])
 
-    def follow(self, plan: Plan | None, target: FloatArray) -> Choice:
-        """Return the choice of a plan; without one, of the previous plan, or to brake."""
-        how: How
-        if plan is not None:
-            how = 'optimal' if plan.status == 'optimal' else 'best_so_far'
-        else:
+    def follow(self, plan: Plan | None) -> Plan:
+        """Take over a plan; without one, the rest of the previous plan, or to brake."""
+        if plan is None:
             self.failed += 1
             plan = self._shifted()
-            how = 'shifted'
-            if plan is None:
-                plan, how = self._stop(), 'brake'
         before = [k - 1 for k, _ in self.plan.visits if k > 1] if self.plan else []
         now = [k for k, _ in plan.visits]
         # Count postponements: otherwise a robot can postpone its visit for ever.
@@ -332,16 +242,16 @@ class SearchAgent:
         self.plan = plan
         if self.activity is not Activity.RECHARGING:
             self.flight_steps += 1
-        return Choice(plan.controls[0], plan.velocities[1], plan, how, target, self.activity)
+        return plan
 
     def _battery(self, fails: float, minutes: float) -> None:
         if self.activity is Activity.SEARCHING:
-            if fails < self.hazard(self.flight_steps):
+            if fails < self.hazard.failure(self.flight_steps):
                 self.activity = Activity.RETURNING
                 self.plan = None
         elif self.activity is Activity.RECHARGING:
             if self._recharge_left < 0:
-                low, high = self._recharge_steps
+                low, high = self.hazard.recharge_steps
                 self._recharge_left = low + int(minutes * (high - low + 1))
             self._recharge_left -= 1
             if self._recharge_left <= 0:
@@ -349,37 +259,14 @@ class SearchAgent:
                 self.flight_steps = 0
                 self.plan = None
 
-    def _shifted(self) -> Plan | None:
-        """Return the rest of the previous plan, with braking at its end."""
-        if self.plan is None:
-            return None
-        off = max(
-            float(np.abs(self.plan.positions[1] - self.position).max()),
-            float(np.abs(self.plan.velocities[1] - self.velocity).max()),
-        )
-        if off > _SAME_STATE:
-            return None
-        return self._flown(list(self.plan.controls[1:]), [(k - 1, n) for k, n in self.plan.visits])
-
-    def _stop(self) -> Plan:
-        return self._flown([], [])
-
-    def _flown(self, controls: list[FloatArray], visits: list[tuple[int, int]]) -> Plan:
-        """Return the plan of given controls, followed by braking."""
-        horizon = self.settings.horizon
-        positions, velocities, used = [self.position], [self.velocity], []
-        for k in range(horizon):
-            control = controls[k] if k < len(controls) else self.dynamics.braking(velocities[-1])
-            place, speed = self.dynamics.next(positions[-1], velocities[-1], control)
-            positions.append(place)
-            velocities.append(speed)
-            used.append(control)
-        return Plan(
-            np.array(positions),
-            np.array(velocities),
-            np.array(used),
-            [(k, n) for k, n in visits if k >= 1 and not self.visited[n]],
-            float('nan'),
-            'time_limit',
-            0,
-        )
+    def _shifted(self) -> Plan:
+        """Return the rest of the previous plan, if that holds, with braking at its end."""
+        plan, controls, visits = self.plan, [], []
+        if plan is not None and (
+            np.abs(plan.positions[1] - self.position).max() <= _SAME_STATE
+            and np.abs(plan.velocities[1] - self.velocity).max() <= _SAME_STATE
+        ):
+            controls = list(plan.controls[1:])
+            visits = [(k - 1, n) for k, n in plan.visits if k > 1 and not self.visited[n]]
+        flown = self.dynamics.fly(self.position, self.velocity, controls, self.settings.horizon)
+        return Plan(*flown, visits, 'shifted' if controls else 'brake')

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
-from maasi_planner.buildings.robot_model import Dynamics
+from maasi_planner.buildings.dynamics import Dynamics
 
 # The objective is scaled so that its rows are of the size of one.
 SCALE = 1e4
@@ -43,23 +43,18 @@ class AxisRows:
     Rows: positions P_2 to P_T, velocities v_1 to v_T, forces, and P_T plus the ways that are left
     after each step of braking, as if air resistance were all. P_1 is given by the state.
 
-    matrix (m, T): rows; gram (m, m): matrix H^-1 matrix', H the Hessian of the objective; gain (T,
-    m): H^-1 matrix'; inverse (T, T): H^-1; pull (T + 1,): weight of the squared distance from the
-    target at P_0 to P_T, scaled [1/m^2]; smoothness: weight of the squared change of force, scaled
-    [1/N^2].
+    matrix (m, T): rows; gram (m, m): matrix H^-1 matrix', H the Hessian of the objective; inverse
+    (T, T): H^-1; pull (T + 1,): weight of the squared distance from the target at P_0 to P_T,
+    scaled [1/m^2].
     """
 
     matrix: FloatArray
     gram: FloatArray
-    gain: FloatArray
     inverse: FloatArray
     pull: FloatArray
-    smoothness: float
 
 
-def axis_rows(
-    dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: float, braking_steps: int
-) -> AxisRows:
+def axis_rows(dynamics: Dynamics, horizon: int, pull: FloatArray, smoothness: float) -> AxisRows:
     """Return the rows of an axis; `pull` (T + 1,) and `smoothness` not scaled yet."""
     forces = np.eye(horizon)
     gamma = dynamics.step / dynamics.mass
@@ -68,8 +63,7 @@ def axis_rows(
     for k in range(horizon):
         velocities[k + 1] = dynamics.retained * velocities[k] + gamma * forces[k]
         positions[k + 1] = positions[k] + dynamics.step * velocities[k]
-    ways = dynamics.step * np.cumsum(dynamics.retained ** np.arange(braking_steps))
-    terminal = positions[horizon] + ways[:, None] * velocities[horizon]
+    terminal = positions[horizon] + dynamics.rolling_ways()[:, None] * velocities[horizon]
     matrix = np.vstack([positions[2:], velocities[1:], forces, terminal])
     differences = np.diff(forces, axis=0)
     hessian = (
@@ -77,15 +71,8 @@ def axis_rows(
     )
     inverse = np.linalg.inv(hessian)
     inverse = 0.5 * (inverse + inverse.T)
-    gain = inverse @ matrix.T
-    return AxisRows(
-        np.ascontiguousarray(matrix),
-        np.ascontiguousarray(matrix @ gain),
-        np.ascontiguousarray(gain),
-        inverse,
-        SCALE * pull,
-        SCALE * smoothness,
-    )
+    gram = np.ascontiguousarray(matrix @ (inverse @ matrix.T))
+    return AxisRows(np.ascontiguousarray(matrix), gram, inverse, SCALE * pull)
 
 
 @njit(cache=True, error_model='numpy')

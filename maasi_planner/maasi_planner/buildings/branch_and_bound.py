@@ -31,15 +31,14 @@ FOUND, EXHAUSTED, UNFINISHED, FULL = 0, 1, 2, 3
 class Instance(NamedTuple):
     """One problem for the compiled search; objectives scaled.
 
-    gram (3, m, m): of the axes; free, lower, upper (3, m): values of the rows at the free minimum,
+    gram (m, m): of each axis; free, lower, upper (3, m): values of the rows at the free minimum,
     and their bounds; rise, sink (3, J): what the ways to brake are longer by than their rows, going
     up and down [m]; given (2, 3): P_0 and P_1 [m]; area (3, 2): [m]; horizon: T; visit_step,
     visit_cuboid (Q,): visits to choose from, in order of their steps; visit_reward (Q,): their
-    rewards; visit_lower, visit_upper (Q, 3): their cuboids [m]; ahead (Q,): most reward that can
-    follow a visit; follows (Q, Q): whether a visit (column) may follow another (row); obstacles (O,
-    3, 2): corners, clearance included [m]; between: whether segments, and not only positions, keep
-    away from obstacles; brakes: whether the way to brake after the horizon keeps away from them as
-    well.
+    rewards; visit_lower, visit_upper (Q, 3): their cuboids [m]; most: most reward of all visits;
+    ahead (Q,): most reward that can follow a visit; follows (Q, Q): whether a visit (column) may
+    follow another (row); obstacles (O, 3, 2): corners, clearance included [m]; between: whether
+    segments, and not only positions, keep away from obstacles.
     """
 
     gram: FloatArray
@@ -56,20 +55,20 @@ class Instance(NamedTuple):
     visit_reward: FloatArray
     visit_lower: FloatArray
     visit_upper: FloatArray
+    most: float
     ahead: FloatArray
     follows: BoolArray
     obstacles: FloatArray
     between: bool
-    brakes: bool
 
 
 @njit(cache=True)
-def _ahead(instance: Instance, tree: Tree, node: int, first: float) -> float:
+def _ahead(instance: Instance, tree: Tree, node: int) -> float:
     """Return the most reward that can be added to a node."""
     if tree.closed[node]:
         return 0.0
     if tree.number[node] == 0:
-        return first
+        return instance.most
     return instance.ahead[tree.visits[node, tree.number[node] - 1]]
 
 
@@ -98,10 +97,9 @@ def _solve(instance: Instance, tree: Tree, node: int, cutoff: float) -> bool:
         for i in range(instance.lower.shape[1]):
             if lower[i] > upper[i] + 1e-9:
                 return False
-        tree.counts[5] += 1
         total -= tree.cost[node, a]
         cost = solve_axis(
-            instance.gram[a],
+            instance.gram,
             instance.free[a],
             lower,
             upper,
@@ -133,8 +131,6 @@ def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int)
     steps = instance.rise.shape[1]
     first = 3 * horizon - 1
     for k in range(begin, end + 1):
-        if k > horizon and not instance.brakes:
-            break
         for o in range(instance.obstacles.shape[0]):
             clear = False
             for a in range(3):
@@ -150,9 +146,8 @@ def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int)
                     far = _position(instance, tree, node, a, k - 1)
                     low = min(low, far)
                     high = max(high, far)
-                slack = FACE_TOLERANCE
-                below = high <= instance.obstacles[o, a, 0] + slack
-                above = low >= instance.obstacles[o, a, 1] - slack
+                below = high <= instance.obstacles[o, a, 0] + FACE_TOLERANCE
+                above = low >= instance.obstacles[o, a, 1] - FACE_TOLERANCE
                 if instance.between and k == 2:
                     given = instance.given[1, a]
                     below = below and given <= instance.obstacles[o, a, 0] + GIVEN_TOLERANCE
@@ -167,9 +162,8 @@ def _obstructed(instance: Instance, tree: Tree, node: int, begin: int, end: int)
 
 @njit(cache=True)
 def _branch_on_faces(
-    instance: Instance, tree: Tree, node: int, k: int, o: int, closed: bool, first: float
+    instance: Instance, tree: Tree, node: int, k: int, o: int, closed: bool
 ) -> None:
-    horizon = instance.horizon
     total = tree.cost[node, 0] + tree.cost[node, 1] + tree.cost[node, 2]
     for a in range(3):
         for side in range(2):
@@ -184,7 +178,7 @@ def _branch_on_faces(
                     continue
                 if side == 1 and given < face - GIVEN_TOLERANCE:
                     continue
-            child = copy_node(tree, node, horizon + 2)
+            child = copy_node(tree, node)
             if child < 0:
                 return
             tree.closed[child] = closed
@@ -195,15 +189,14 @@ def _branch_on_faces(
                 else:
                     tree.low[child, a, i] = max(tree.low[child, a, i], face)
             tree.dirty[child] = 1 << a
-            tree.bound[child] = total - tree.reward[child] - _ahead(instance, tree, child, first)
+            tree.bound[child] = total - tree.reward[child] - _ahead(instance, tree, child)
             push(tree, child)
 
 
 @njit(cache=True)
-def begin(instance: Instance, tree: Tree, first: float, hint: IntArray) -> None:
+def begin(instance: Instance, tree: Tree, hint: IntArray) -> None:
     """Start a search: the root, and the visits of an earlier plan as a closed node."""
     size = tree.heap.shape[0]
-    horizon = instance.horizon
     tree.counts[:] = 0
     tree.counts[1] = size - 1
     tree.counts[3] = -1
@@ -219,7 +212,7 @@ def begin(instance: Instance, tree: Tree, first: float, hint: IntArray) -> None:
     tree.high[0] = math.inf
     tree.cost[0] = 0.0
     if hint.shape[0]:
-        child = copy_node(tree, 0, horizon + 2)
+        child = copy_node(tree, 0)
         tree.closed[child] = True
         for i in range(hint.shape[0]):
             _visit(instance, tree, child, hint[i])
@@ -274,7 +267,7 @@ def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
                 break
         if not meets:
             continue
-        child = copy_node(tree, node, instance.horizon + 2)
+        child = copy_node(tree, node)
         if child < 0:
             return
         _visit(instance, tree, child, q)
@@ -283,14 +276,11 @@ def _extend(instance: Instance, tree: Tree, node: int, total: float) -> None:
 
 
 @njit(cache=True)
-def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
+def search(instance: Instance, tree: Tree, most: int) -> int:
     """Continue a search by at most `most` nodes.
 
-    Returns
-    -------
-    int
-        FOUND: the best node is the optimum; EXHAUSTED: there is no plan; UNFINISHED: nodes are
-        left; FULL: there was no room for more, the best node may not be the optimum.
+    Returns FOUND: the best node is the optimum; EXHAUSTED: there is no plan; UNFINISHED: nodes are
+    left; FULL: there was no room for more, the best node may not be the optimum.
     """
     horizon = instance.horizon
     end = horizon + 1
@@ -303,15 +293,11 @@ def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
         node = pop(tree)
         if tree.bound[node] >= tree.best[0] - GAP:
             # No other node is better.
-            free(tree, node)
-            while tree.counts[0] > 0:
-                free(tree, tree.heap[tree.counts[0] - 1])
-                tree.counts[0] -= 1
             break
         if tree.dirty[node]:
             solved += 1
             tree.counts[2] += 1
-            gain = tree.reward[node] + _ahead(instance, tree, node, first)
+            gain = tree.reward[node] + _ahead(instance, tree, node)
             if not _solve(instance, tree, node, tree.best[0] + gain - GAP):
                 free(tree, node)
                 continue
@@ -329,7 +315,7 @@ def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
         until = end if tree.closed[node] else last
         k, o = _obstructed(instance, tree, node, 2, until)
         if k >= 0:
-            _branch_on_faces(instance, tree, node, k, o, tree.closed[node], first)
+            _branch_on_faces(instance, tree, node, k, o, tree.closed[node])
             free(tree, node)
             continue
         own = total - tree.reward[node]
@@ -339,7 +325,7 @@ def search(instance: Instance, tree: Tree, first: float, most: int) -> int:
                 k, o = _obstructed(instance, tree, node, last + 1, end)
                 if k >= 0:
                     better = False
-                    _branch_on_faces(instance, tree, node, k, o, True, first)
+                    _branch_on_faces(instance, tree, node, k, o, True)
             _extend(instance, tree, node, total)
         if better:
             if tree.counts[3] >= 0:

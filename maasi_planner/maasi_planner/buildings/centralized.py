@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import heapq
 import math
-import time
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
 
@@ -20,67 +19,43 @@ from maasi_planner.buildings.problem import Plan, PlanSolver, Problem
 _GAP = 1e-7
 
 
-@dataclass
-class JointPlan:
-    """Plans of all robots.
-
-    plans: in the order of the problems; objective: their sum, (6) with each cuboid counted once;
-    status: optimal, or time_limit: conflicts were resolved in the order of the robots; solves:
-    number of solved problems of single robots.
-    """
-
-    plans: list[Plan]
-    objective: float
-    status: Literal['optimal', 'time_limit']
-    solves: int
-
-
-def solve_jointly(
-    solver: PlanSolver, problems: Sequence[Problem], time_limit: float = math.inf
-) -> JointPlan | None:
-    """Return the optimal plans of all robots; None if a robot has none."""
-    begun = time.perf_counter()
+def solve_jointly(solver: PlanSolver, problems: Sequence[Problem]) -> list[Plan] | None:
+    """Return the optimal plans of all robots, in the order of the problems; None: one has none."""
     known: dict[tuple[int, frozenset[int]], Plan | None] = {}
 
-    def plan_of(robot: int, forbidden: frozenset[int], hint: Plan | None = None) -> Plan | None:
+    def plan_of(robot: int, forbidden: frozenset[int], hint: list[tuple[int, int]]) -> Plan | None:
         key = (robot, forbidden)
         if key not in known:
             problem = problems[robot]
             wanted = problem.wanted.copy()
             wanted[list(forbidden)] = False
-            visits = problem.hint if hint is None else hint.visits
-            kept = [(k, n) for k, n in visits if n not in forbidden]
+            kept = [(k, n) for k, n in hint if n not in forbidden]
             known[key] = solver.solve(replace(problem, wanted=wanted, hint=kept))
         return known[key]
 
     nothing: frozenset[int] = frozenset()
-    first = [plan_of(robot, nothing) for robot in range(len(problems))]
-    if any(plan is None for plan in first):
-        return None
-    number = 0
+    first = [plan_of(robot, nothing, problem.hint) for robot, problem in enumerate(problems)]
     begin = [plan for plan in first if plan is not None]
-    queue: list[tuple[float, int, tuple[frozenset[int], ...], list[Plan]]] = [
-        (_total(begin), number, tuple(nothing for _ in problems), begin)
-    ]
-    seen = {queue[0][2]}
+    if len(begin) < len(problems):
+        return None
+    start = tuple(nothing for _ in problems)
+    queue = [(_total(begin), 0, start, begin)]
+    seen = {start}
     while queue:
-        total, _, forbidden, plans = heapq.heappop(queue)
-        conflict = _conflict(plans)
-        if conflict is None:
-            status: Literal['optimal', 'time_limit'] = 'optimal'
-            return JointPlan(plans, total, status, len(known))
-        if time.perf_counter() - begun > time_limit:
-            return _in_turn(solver, problems, len(known))
-        cuboid, robots = conflict
-        # Branch: either this robot or all others must not visit the cuboid.
-        one, others = robots[0], [robot for robot in range(len(problems)) if robot != robots[0]]
-        for leaving in ([one], others):
-            child = list(forbidden)
-            new = list(plans)
+        _, _, forbidden, plans = heapq.heappop(queue)
+        users = Counter(n for plan in plans for _, n in plan.visits)
+        cuboid = max(users, key=lambda n: (users[n], -n), default=None)
+        if cuboid is None or users[cuboid] == 1:
+            return plans
+        visiting = [robot for robot, plan in enumerate(plans) if _visits(plan, cuboid)]
+        # Branch: either the first of these robots or all others must not visit the cuboid.
+        others = [robot for robot in range(len(problems)) if robot != visiting[0]]
+        for leaving in (visiting[:1], others):
+            child, new = list(forbidden), list(plans)
             for robot in leaving:
                 child[robot] = child[robot] | {cuboid}
-                if any(n == cuboid for _, n in plans[robot].visits):
-                    again = plan_of(robot, child[robot], plans[robot])
+                if robot in visiting:
+                    again = plan_of(robot, child[robot], plans[robot].visits)
                     if again is None:
                         break
                     new[robot] = again
@@ -90,38 +65,13 @@ def solve_jointly(
                 key = tuple(child)
                 if key not in seen:
                     seen.add(key)
-                    number += 1
-                    heapq.heappush(queue, (_total(new), number, key, new))
+                    heapq.heappush(queue, (_total(new), len(seen), key, new))
     return None
+
+
+def _visits(plan: Plan, cuboid: int) -> bool:
+    return any(n == cuboid for _, n in plan.visits)
 
 
 def _total(plans: Sequence[Plan]) -> float:
     return round(math.fsum(plan.objective for plan in plans) / _GAP) * _GAP
-
-
-def _conflict(plans: Sequence[Plan]) -> tuple[int, list[int]] | None:
-    """Return a cuboid that several robots visit, and these robots."""
-    users: dict[int, list[int]] = {}
-    for robot, plan in enumerate(plans):
-        for _, cuboid in plan.visits:
-            users.setdefault(cuboid, []).append(robot)
-    shared = {cuboid: robots for cuboid, robots in users.items() if len(robots) > 1}
-    if not shared:
-        return None
-    cuboid = max(shared, key=lambda n: (len(shared[n]), -n))
-    return cuboid, shared[cuboid]
-
-
-def _in_turn(solver: PlanSolver, problems: Sequence[Problem], solves: int) -> JointPlan | None:
-    """Return sequential plans, each without the cuboids of the earlier ones."""
-    taken: set[int] = set()
-    plans: list[Plan] = []
-    for problem in problems:
-        wanted = problem.wanted.copy()
-        wanted[sorted(taken)] = False
-        plan = solver.solve(replace(problem, wanted=wanted))
-        if plan is None:
-            return None
-        taken |= {n for _, n in plan.visits}
-        plans.append(plan)
-    return JointPlan(plans, _total(plans), 'time_limit', solves + len(problems))

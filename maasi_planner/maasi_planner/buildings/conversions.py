@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from geometry_msgs.msg import Vector3
-from std_msgs.msg import Header
+from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from maasi_filter.arrays import FloatArray
@@ -18,9 +18,11 @@ from maasi_filter.ros.conversions import (
 )
 from maasi_msgs.msg import CuboidDecision, SearchLink
 from maasi_msgs.msg import Snapshot as SnapshotMessage
-from maasi_planner.buildings.agent import Broadcast, Choice, SearchAgent, Snapshot
+from maasi_planner.buildings.agent import SearchAgent, Snapshot
 from maasi_planner.buildings.preplanning import CoveragePlan
-from maasi_planner.buildings.robot_model import Hazard
+from maasi_planner.buildings.problem import Plan
+from maasi_planner.buildings.settings import HazardSettings
+from maasi_planner.buildings.sharing import Broadcast
 
 # Upper bound of the parameters of a battery.
 _LARGEST_HAZARD = 1e9
@@ -90,64 +92,53 @@ def broadcast_from_ros(message: SearchLink, cuboids: int) -> Broadcast:
         visited=np.array(message.visited, dtype=bool),
         flight_steps=int(message.flight_steps),
         plan={int(n): int(k) for n, k in zip(message.planned, message.planned_in)},
-        hazard=Hazard(message.alpha, message.beta, bool(message.failures)),
+        hazard=HazardSettings(
+            alpha=message.alpha, beta=message.beta, failures=bool(message.failures)
+        ),
         predicted=predicted,
     )
 
 
-def snapshot_to_ros(shot: Snapshot) -> SnapshotMessage:
-    """Return a snapshot."""
-    return SnapshotMessage(
-        cuboid=shot.cuboid,
-        position=point_to_ros(shot.position),
-        direction=vector_to_ros(shot.direction),
-        distance=shot.distance,
-        detection_probability=shot.detection_probability,
-    )
-
-
-def choice_to_ros(
-    agent: SearchAgent,
-    choice: Choice,
-    shots: list[Snapshot],
-    heard: list[str],
-    solve_time: float,
-    header: Header,
+def decision_to_ros(
+    agent: SearchAgent, plan: Plan, shots: list[Snapshot], header: Header
 ) -> CuboidDecision:
-    """Return a decision with the snapshots of its step."""
+    """Return a decision with the snapshots since the one before; robots heard are not set."""
     return CuboidDecision(
         header=header,
         step=agent.step,
         robot=agent.name,
-        activity=choice.activity.value,
-        how=choice.how,
-        target=point_to_ros(choice.target),
-        heard=heard,
+        activity=agent.activity.value,
+        how=plan.how,
+        target=point_to_ros(agent.target),
         visited=int(agent.visited.sum()),
         done=agent.done,
-        objective=choice.plan.objective,
-        nodes=choice.plan.nodes,
-        solve_time=solve_time,
-        control=vector_to_ros(choice.control),
-        planned=[n for _, n in choice.plan.visits],
-        planned_in=[k for k, _ in choice.plan.visits],
-        snapshots=[snapshot_to_ros(shot) for shot in shots],
+        objective=plan.objective,
+        nodes=plan.nodes,
+        control=vector_to_ros(plan.controls[0]),
+        planned=[n for _, n in plan.visits],
+        planned_in=[k for k, _ in plan.visits],
+        snapshots=[
+            SnapshotMessage(
+                cuboid=shot.cuboid,
+                position=point_to_ros(shot.position),
+                direction=vector_to_ros(shot.direction),
+                distance=shot.distance,
+                detection_probability=shot.detection_probability,
+            )
+            for shot in shots
+        ],
     )
 
 
 def mission_markers(mission: CoveragePlan, header: Header) -> MarkerArray:
     """Return objects and obstacles as boxes."""
-    markers = []
-    for namespace, boxes, tint in (
-        ('objects', mission.objects, colour(0.6, 0.6, 0.7, 0.6)),
-        ('obstacles', mission.obstacles, colour(0.4, 0.38, 0.33, 0.9)),
-    ):
-        for number, box in enumerate(boxes):
-            markers.append(_box(header, namespace, number, box, tint))
-    return MarkerArray(markers=markers)
+    solid, barrier = colour(0.6, 0.6, 0.7, 0.6), colour(0.4, 0.38, 0.33, 0.9)
+    objects = [_box(header, 'objects', n, box, solid) for n, box in enumerate(mission.objects)]
+    others = [_box(header, 'obstacles', n, box, barrier) for n, box in enumerate(mission.obstacles)]
+    return MarkerArray(markers=objects + others)
 
 
-def agent_markers(agent: SearchAgent, choice: Choice, header: Header) -> MarkerArray:
+def agent_markers(agent: SearchAgent, plan: Plan, header: Header) -> MarkerArray:
     """Return markers of a robot, its plan, its search map, and its camera direction."""
     name = agent.name
     markers = []
@@ -155,20 +146,14 @@ def agent_markers(agent: SearchAgent, choice: Choice, header: Header) -> MarkerA
         visited = bool(agent.visited[number])
         tint = colour(0.3, 0.7, 0.9, 0.1) if visited else colour(0.85, 0.4, 0.0, 0.35)
         markers.append(_box(header, f'{name}/cuboids', number, box, tint))
-    robot = Marker(header=header, ns=f'{name}/robot', type=Marker.SPHERE)
+    robot = _marker(header, f'{name}/robot', Marker.SPHERE, colour(0.1, 0.3, 0.9))
     robot.pose.position = point_to_ros(agent.position)
-    robot.pose.orientation.w = 1.0
-    robot.scale.x = robot.scale.y = robot.scale.z = 4.0
-    robot.color = colour(0.1, 0.3, 0.9)
-    line = Marker(header=header, ns=f'{name}/plan', type=Marker.LINE_STRIP)
-    line.pose.orientation.w = 1.0
+    robot.scale = vector_to_ros(np.full(3, 4.0))
+    line = _marker(header, f'{name}/plan', Marker.LINE_STRIP, colour(0.1, 0.7, 0.2))
     line.scale.x = 0.8
-    line.color = colour(0.1, 0.7, 0.2)
-    line.points = [point_to_ros(point) for point in choice.plan.positions]
-    arrow = Marker(header=header, ns=f'{name}/camera', type=Marker.ARROW)
-    arrow.pose.orientation.w = 1.0
+    line.points = [point_to_ros(point) for point in plan.positions]
+    arrow = _marker(header, f'{name}/camera', Marker.ARROW, colour(0.9, 0.1, 0.1))
     arrow.scale.x, arrow.scale.y = 0.8, 2.0
-    arrow.color = colour(0.9, 0.1, 0.1)
     if agent.snapshots:
         shot = agent.snapshots[-1]
         tip = shot.position + shot.distance * shot.direction
@@ -178,11 +163,15 @@ def agent_markers(agent: SearchAgent, choice: Choice, header: Header) -> MarkerA
     return MarkerArray(markers=[*markers, robot, line, arrow])
 
 
-def _box(header: Header, namespace: str, number: int, box: FloatArray, tint: object) -> Marker:
-    marker = Marker(header=header, ns=namespace, id=number, type=Marker.CUBE)
-    marker.pose.position = point_to_ros(box.mean(axis=1))
+def _marker(header: Header, namespace: str, kind: int, tint: ColorRGBA) -> Marker:
+    marker = Marker(header=header, ns=namespace, type=kind, color=tint)
     marker.pose.orientation.w = 1.0
-    size = box[:, 1] - box[:, 0]
-    marker.scale.x, marker.scale.y, marker.scale.z = (float(length) for length in size)
-    marker.color = tint
+    return marker
+
+
+def _box(header: Header, namespace: str, number: int, box: FloatArray, tint: ColorRGBA) -> Marker:
+    marker = _marker(header, namespace, Marker.CUBE, tint)
+    marker.id = number
+    marker.pose.position = point_to_ros(box.mean(axis=1))
+    marker.scale = vector_to_ros(box[:, 1] - box[:, 0])
     return marker

@@ -17,8 +17,10 @@ from maasi_filter.ros.clocks import JUMP, StampGate
 from maasi_filter.ros.conversions import (
     FASTEST,
     MarkerBoard,
+    bounded,
     point_to_ros,
     pose_from_ros,
+    pose_to_ros,
     stamp_from_ros,
     stamp_of_step,
     stamp_to_ros,
@@ -27,19 +29,19 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
 from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState, CuboidDecision, LockstepStep, SearchLink, SearchLinkArray
-from maasi_planner.buildings.agent import Activity, Broadcast, SearchAgent, decision_stream
+from maasi_planner.buildings.agent import Activity, SearchAgent, decision_stream
 from maasi_planner.buildings.conversions import (
     agent_markers,
     broadcast_from_ros,
     broadcast_to_ros,
-    choice_to_ros,
+    decision_to_ros,
     mission_markers,
     vector_from_ros,
     vector_to_ros,
 )
 from maasi_planner.buildings.preplanning import plan_mission
-from maasi_planner.buildings.robot_model import Dynamics
 from maasi_planner.buildings.settings import CuboidPlannerSettings
+from maasi_planner.buildings.sharing import Broadcast
 from maasi_planner.conversions import path_to_ros
 from maasi_planner.node.search_action import offer_services
 from maasi_planner.node.search_modes import Mode, SearchModes
@@ -87,7 +89,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         try:
             self._search = settings.search()
             self._mission = plan_mission(self._search, settings.environment.array())
-            self._dynamics = Dynamics.from_settings(settings.dynamics, settings.step)
             self.agent = self._make_agent()
         except ValueError as error:
             raise SettingsError(f'parameter {error}') from error
@@ -98,9 +99,7 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
 
     def _make_agent(self) -> SearchAgent:
         settings = self.settings
-        return SearchAgent(
-            self.name, self._search, self._mission, self._dynamics, settings.hazard, settings.start
-        )
+        return SearchAgent(self.name, self._search, self._mission, settings, settings.step)
 
     def _begin_anew(self) -> None:
         self._state: tuple[int, Pose, np.ndarray] | None = None
@@ -122,7 +121,9 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
 
     def set_up(self) -> None:
         """Compile and connect."""
-        self._warm_up()
+        agent = self._make_agent()
+        agent.observe(0, self.settings.start, np.zeros(3))
+        agent.decide([], decision_stream(self.settings.seed, self.name, 0))
         lockstep = self.settings.lockstep
         self._command_publisher = self.create_publisher(
             TwistStamped, 'cmd_vel', RELIABLE if lockstep else 10
@@ -153,11 +154,6 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
             self.get_logger().warning(
                 f'the {cell.face} face of object {cell.target} is not searched whole: {reason}'
             )
-
-    def _warm_up(self) -> None:
-        agent = self._make_agent()
-        agent.observe(0, self.settings.start, np.zeros(3))
-        agent.decide([], decision_stream(self.settings.seed, self.name, 0))
 
     def start(self) -> None:
         """Start the search, unless it waits for the service."""
@@ -220,46 +216,38 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
     def _on_odometry(self, message: Odometry) -> None:
         if not self.active:
             return
+        try:
+            self._read_odometry(message)
+        except ValueError as error:
+            self.drop('bad odometry', f'odom.{error}')
+        else:
+            self._try_step()
+
+    def _read_odometry(self, message: Odometry) -> None:
+        lockstep, duration = self.settings.lockstep, self.settings.step
         stamp = stamp_from_ros(message.header.stamp)
-        step = round(stamp * 1e-9 / self.settings.step)
-        if abs(stamp_of_step(step, self.settings.step) - stamp) > _STAMP_TOLERANCE:
-            self.drop(
-                'bad odometry',
-                f'odom.header.stamp: read {stamp * 1e-9:.6f} s, allowed are multiples of step, '
-                f'{self.settings.step} s',
-            )
-            return
+        read = f'header.stamp: read {stamp * 1e-9:.6f} s'
+        step = round(stamp * 1e-9 / duration)
+        if abs(stamp_of_step(step, duration) - stamp) > _STAMP_TOLERANCE:
+            raise ValueError(f'{read}, allowed are multiples of step, {duration} s')
         try:
             reading = pose_from_ros(message.pose.pose)
         except ValueError as error:
-            self.drop('bad odometry', f'odom.pose.{error}')
-            return
+            raise ValueError(f'pose.{error}') from None
         velocity = vector_from_ros(message.twist.twist.linear)
-        if not (np.abs(velocity) <= FASTEST).all():
-            self.drop(
-                'bad odometry',
-                f'odom.twist: read {velocity}, allowed are finite numbers up to {FASTEST:g} [m/s]',
+        bounded('twist', velocity, FASTEST)
+        if not (lockstep or self._gate.accepts(stamp)):
+            raise ValueError(
+                f'{read}, which is far from the one before; allowed if the next one follows it'
             )
-            return
-        if not (self.settings.lockstep or self._gate.accepts(stamp)):
-            self.drop(
-                'bad odometry',
-                f'odom.header.stamp: read {stamp * 1e-9:.6f} s, which is far from the one before; '
-                'allowed if the next one follows it',
-            )
-            return
+        if not lockstep and step < self._decided_step:
+            self.get_logger().warning(f'odom.header.stamp went back to step {step}: starting anew')
+            self.reset()
         # Odometry is relative to the start.
         pose = compose(Pose.from_yaw(self.settings.start, self.settings.yaw), reading)
         self._state = (step, pose, pose.rotation() @ velocity)
-        if not self.settings.lockstep:
-            if step < self._decided_step:
-                self.get_logger().warning(
-                    f'odom.header.stamp went back to step {step}: starting anew'
-                )
-                self.reset()
-                self._state = (step, pose, pose.rotation() @ velocity)
+        if not lockstep:
             self._wanted_step = step
-        self._try_step()
 
     def _on_heard(self, message: SearchLinkArray) -> None:
         if not self.active:
@@ -308,17 +296,13 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         _, pose, velocity = self._state
         self._observed = self._searching
         broadcast = self.agent.observe(step, pose.position, velocity) if self._observed else None
-        if broadcast is None:
-            self._link = SearchLink(
-                header=self._header(step),
-                step=step,
-                robot=self.name,
-                silent=True,
-                position=point_to_ros(pose.position),
-                velocity=vector_to_ros(velocity),
-            )
+        header = self._header(step)
+        if broadcast is not None:
+            self._link = broadcast_to_ros(broadcast, header)
         else:
-            self._link = broadcast_to_ros(broadcast, self._header(step))
+            self._link = SearchLink(header=header, step=step, robot=self.name, silent=True)
+            self._link.position = point_to_ros(pose.position)
+            self._link.velocity = vector_to_ros(velocity)
         self._sent_step = step
         self._sent_at = time.monotonic()
         self._link_publisher.publish(self._link)
@@ -336,67 +320,53 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         return heard
 
     def _decide(self, heard: list[Broadcast]) -> None:
+        """Decide, or let the robot stand if it does not search; publish what came out."""
         step = self._sent_step
-        if not self._observed:
-            self._stand(step)
-            return
-        agent = self.agent
-        begun = time.perf_counter()
-        choice = agent.decide(heard, decision_stream(self.settings.seed, self.name, step))
-        self._solve_time = time.perf_counter() - begun
-        self._decided_step = step
         header = self._header(step)
-        if choice.how in ('shifted', 'brake'):
-            self.warn_throttled(
-                'how', f'step {step}: no plan was found, it does this: {choice.how}'
-            )
+        velocity = np.zeros(3)
+        if self._observed:
+            agent = self.agent
+            begun = time.perf_counter()
+            plan = agent.decide(heard, decision_stream(self.settings.seed, self.name, step))
+            self._solve_time = time.perf_counter() - begun
+            velocity = plan.velocities[1]
+            if plan.how in ('shifted', 'brake'):
+                text = f'step {step}: no plan was found, it does this: {plan.how}'
+                self.warn_throttled('how', text)
+            shots = agent.snapshots[self._published_shots :]
+            decision = decision_to_ros(agent, plan, shots, header)
+            decision.heard = [message.robot for message in heard]
+            decision.solve_time = self._solve_time
+            self._decision_publisher.publish(decision)
+            self._published_shots = len(agent.snapshots)
+            self._path_publisher.publish(path_to_ros(plan.positions, header))
+            markers = agent_markers(agent, plan, header)
+            self._markers_publisher.publish(self._board.replace(markers))
+        self._decided_step = step
+        self._publish_state(step, header)
         assert self._state is not None
-        pose = self._state[1]
-        turned = pose.rotation().T @ choice.velocity
-        self._command = TwistStamped(header=header)
+        self._command = TwistStamped(header=self._header(step))
         self._command.header.frame_id = f'{self.name}/base_link'
-        self._command.twist.linear = vector_to_ros(turned)
-        names = [message.robot for message in heard]
-        shots = agent.snapshots[self._published_shots :]
-        self._decision_publisher.publish(
-            choice_to_ros(agent, choice, shots, names, self._solve_time, header)
-        )
-        self._published_shots = len(agent.snapshots)
-        self._publish_state(step, header)
-        self._path_publisher.publish(path_to_ros(choice.plan.positions, header))
-        self._markers_publisher.publish(self._board.replace(agent_markers(agent, choice, header)))
-        self._command_publisher.publish(self._command)
-        self.done(step)
-
-    def _stand(self, step: int) -> None:
-        """Process a step without search: the robot stands."""
-        self._decided_step = step
-        header = self._header(step)
-        self._command = TwistStamped(header=header)
-        self._command.header.frame_id = f'{self.name}/base_link'
-        self._publish_state(step, header)
+        self._command.twist.linear = vector_to_ros(self._state[1].rotation().T @ velocity)
         self._command_publisher.publish(self._command)
         self.done(step)
 
     def _publish_state(self, step: int, header: Header) -> None:
         assert self._state is not None
         _, pose, velocity = self._state
-        agent = self.agent
-        away = agent.activity is not Activity.SEARCHING
+        activity = self.agent.activity
+        away = activity is not Activity.SEARCHING
         message = AgentState(
             header=header,
             step=step,
             robot=self.name,
             battery=-1.0,
             goal_status=AgentState.UNAVAILABLE if away else AgentState.MOVING,
-            reason=_REASONS[agent.activity],
+            reason=_REASONS[activity],
         )
         if not self._observed:
             message.goal_status, message.reason = AgentState.IDLE, self.modes.describe()
-        message.pose.pose.position = point_to_ros(pose.position)
-        w, x, y, z = (float(value) for value in pose.orientation)
-        turn = message.pose.pose.orientation
-        turn.w, turn.x, turn.y, turn.z = w, x, y, z
+        message.pose.pose = pose_to_ros(pose)
         message.twist.linear = vector_to_ros(velocity)
         self._state_publisher.publish(message)
 

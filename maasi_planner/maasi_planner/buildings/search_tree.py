@@ -18,9 +18,9 @@ class Tree(NamedTuple):
     3): of each axis; dirty (n,): bit mask of the axes that have to be solved again; closed (n,):
     whether no further visits are made; visits, number (n, V): the visits made; low, high (n, 3, T +
     2): bounds of the positions P_0 to P_T and, last, of the way to brake [m]; values (n, 3, m): of
-    the rows; heap, spare (n,): nodes by bound, and nodes that are free; counts (6,): sizes of
-    `heap` and `spare`, nodes solved, best node (-1: none), out of nodes, axes solved; best (1,):
-    objective of the best node; scratch (3, m): bounds of an axis while it is solved; room: scratch
+    the rows; heap, spare (n,): nodes by bound, and nodes that are free; counts (5,): sizes of
+    `heap` and `spare`, nodes solved, best node (-1: none), out of nodes; best (1,): objective of
+    the best node; scratch (3, m): bounds of an axis while it is solved; room: scratch
     of `solve_axis`.
     """
 
@@ -58,7 +58,7 @@ def make_tree(size: int, horizon: int, rows: int) -> Tree:
         values=np.empty((size, 3, rows)),
         heap=np.empty(size, dtype=np.int64),
         spare=np.empty(size, dtype=np.int64),
-        counts=np.zeros(6, dtype=np.int64),
+        counts=np.zeros(5, dtype=np.int64),
         best=np.full(1, np.inf),
         scratch=np.empty((3, rows)),
         room=AxisRoom(np.empty(n, np.int64), np.empty(n), np.empty((n, n)), np.empty((2, n))),
@@ -110,7 +110,7 @@ def free(tree: Tree, node: int) -> None:
 
 
 @njit(cache=True)
-def copy_node(tree: Tree, source: int, size: int) -> int:
+def copy_node(tree: Tree, source: int) -> int:
     """Return a copy of a node whose bounds can be tightened; -1: there is no room."""
     if tree.counts[1] == 0:
         tree.counts[4] = 1
@@ -125,7 +125,7 @@ def copy_node(tree: Tree, source: int, size: int) -> int:
         tree.visits[node, i] = tree.visits[source, i]
     for a in range(3):
         tree.cost[node, a] = tree.cost[source, a]
-        for k in range(size):
+        for k in range(tree.low.shape[2]):
             tree.low[node, a, k] = tree.low[source, a, k]
             tree.high[node, a, k] = tree.high[source, a, k]
         for i in range(tree.values.shape[2]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -9,7 +10,7 @@ from pydantic import Field, model_validator
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.node_settings import NodeSettings
-from maasi_filter.settings import EnvironmentSettings, Finite, Settings
+from maasi_filter.settings import EnvironmentSettings, Finite, Settings, Vector3
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Face = Literal['west', 'east', 'south', 'north', 'bottom', 'top']
@@ -33,6 +34,10 @@ class BoxSettings(Settings):
         size = np.array(self.size)
         centre = np.array([*self.centre, floor + 0.5 * size[2]])[:3]
         return np.stack([centre - 0.5 * size, centre + 0.5 * size], axis=1)
+
+    def numbers(self, floor: float) -> list[float]:
+        """Return centre and size as six numbers, on a floor at that height [m]."""
+        return [*self.array(floor).mean(axis=1).tolist(), *self.size]
 
 
 class ObjectSettings(BoxSettings):
@@ -73,6 +78,17 @@ class DynamicsSettings(Settings):
     speed: float = Field(default=15.0, gt=0.0, description='Largest speed on each axis [m/s]')
     gravity: float = Field(default=9.81, ge=0.0, description='g [m/s^2]')
 
+    @model_validator(mode='after')
+    def _lifts(self) -> DynamicsSettings:
+        weight = self.mass * self.gravity
+        if weight >= self.force:
+            raise ValueError(
+                f'force: got {self.force} N, which cannot lift the weight of the robot, '
+                f'{self.mass:g} kg x {self.gravity:g} m/s^2 = {weight:.2f} N; '
+                'allowed is more than that'
+            )
+        return self
+
 
 class HazardSettings(Settings):
     """Failure probability of a battery at each step, 004, (3)."""
@@ -94,6 +110,24 @@ class HazardSettings(Settings):
                 f'recharge_steps: got {self.recharge_steps}, allowed is the least first'
             )
         return self
+
+    def failure(self, steps: float) -> float:
+        """Return p_b(t), t steps after the battery was charged: (3)."""
+        if not self.failures:
+            return 0.0
+        exponent = min(max(-self.beta * (steps - self.alpha), -700.0), 700.0)
+        return 1.0 / (1.0 + self.alpha * math.exp(exponent))
+
+
+class SearcherSettings(Settings):
+    """A robot that searches buildings."""
+
+    start: Vector3 = Field(description='Where it starts, and recharges, x y z [m, map]')
+    yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
+    dynamics: DynamicsSettings = Field(default_factory=DynamicsSettings, description='Its body')
+    hazard: HazardSettings = Field(
+        default_factory=HazardSettings, description='How its battery fails'
+    )
 
 
 class CuboidMethodSettings(Settings):
@@ -153,6 +187,16 @@ class CuboidMethodSettings(Settings):
         description='Nodes of a solve; then the best plan so far, the same on every machine [1]',
     )
 
+    @property
+    def guided(self) -> int:
+        """Index of the position that is drawn to a cuboid, tau* + 1."""
+        return min(self.guidance_step, self.horizon - 1) + 1
+
+    def rewards(self, put_off: int = 0) -> FloatArray:
+        """Return the reward of a visit at P_0 to P_T, (T + 1,); it was put off as often [1]."""
+        steps = np.maximum(np.arange(self.horizon + 1) - 1, 0)
+        return np.asarray(self.visit_weight * self.discount ** ((1 + put_off) * steps))
+
 
 class CuboidSettings(CuboidMethodSettings):
     """The distributed model predictive control of 004 and its mission."""
@@ -164,7 +208,7 @@ class CuboidSettings(CuboidMethodSettings):
 Box = Annotated[list[Finite], Field(min_length=6, max_length=6)]
 
 
-class CuboidPlannerSettings(NodeSettings):
+class CuboidPlannerSettings(NodeSettings, SearcherSettings):
     """Settings of the planner node of one robot."""
 
     live: ClassVar[frozenset[str]] = frozenset({'link_patience'})
@@ -176,14 +220,6 @@ class CuboidPlannerSettings(NodeSettings):
     )
     step: float = Field(default=1.0, gt=0.0, le=10.0, description='dT, duration of a step [s]')
     environment: EnvironmentSettings = Field(description='Where robots may be')
-    start: list[Finite] = Field(
-        min_length=3, max_length=3, description='Where it starts, and recharges [m, map]'
-    )
-    yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
-    dynamics: DynamicsSettings = Field(default_factory=DynamicsSettings, description='Its body')
-    hazard: HazardSettings = Field(
-        default_factory=HazardSettings, description='How its battery fails'
-    )
     planner: CuboidMethodSettings = Field(
         default_factory=CuboidMethodSettings, description='The method'
     )
@@ -227,15 +263,3 @@ class CuboidPlannerSettings(NodeSettings):
         content['objects'] = objects
         content['obstacles'] = [{'centre': box[:3], 'size': box[3:]} for box in self.obstacles]
         return CuboidSettings.model_validate(content)
-
-
-def box_numbers(item: BoxSettings, floor: float) -> list[float]:
-    """Return centre and size of a box as six numbers, on a floor at that height [m]."""
-    corners = item.array(floor)
-    return [*corners.mean(axis=1).tolist(), *item.size]
-
-
-def face_words(item: ObjectSettings) -> str:
-    """Return the faces of an object as a string."""
-    faces: list[Face] = item.faces
-    return ' '.join(faces)

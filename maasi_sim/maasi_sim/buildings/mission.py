@@ -4,67 +4,34 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.arrays import BoolArray, FloatArray
-from maasi_planner.buildings import (
-    Activity,
-    Broadcast,
-    Choice,
-    CoveragePlan,
-    CuboidSettings,
-    Dynamics,
-    DynamicsSettings,
-    HazardSettings,
-    SearchAgent,
-    Snapshot,
-    decision_stream,
-    plan_mission,
-    solve_jointly,
-)
+from maasi_planner.buildings.agent import Activity, SearchAgent, Snapshot, decision_stream
+from maasi_planner.buildings.centralized import solve_jointly
+from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
+from maasi_planner.buildings.problem import Plan
+from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
+from maasi_planner.buildings.sharing import Broadcast
 
 Scheme = Literal['distributed', 'sequential', 'centralized']
-
-
-@dataclass
-class SearchRobot:
-    """A robot of a mission; it starts, and recharges, at `start`, (3,) [m]."""
-
-    start: FloatArray
-    dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
-    hazard: HazardSettings = field(default_factory=HazardSettings)
 
 
 @dataclass
 class MissionRecord:
     """What became of a mission.
 
-    Attributes
-    ----------
-    mission : CoveragePlan
-        What was searched.
-    steps, complete : int, bool
-        Until all cuboids were visited, or it was given up; whether all were.
-    paths : dict
-        By robot: positions at all steps, (steps + 1, 3) [m].
-    visited, active : (steps + 1,) array
-        Cuboids visited by the team, and robots that search.
-    snapshots : list of Snapshot
-        In order of time.
-    collisions, outside : int
-        Steps on which a robot's way cut an object or obstacle, or it was outside the area.
-    how : dict
-        Number of choices by how they were made.
-    solve_times : array
-        Wall time of each decision [s]; of all robots together if centralized.
-    recharges : int
-        Batteries that failed.
-    plans : dict
-        Predicted positions of all robots at the steps that were asked for.
+    steps, complete: until all cuboids were visited, or it was given up; whether all were; paths: by
+    robot: positions at all steps, (steps + 1, 3) [m]; visited, active (steps + 1,): cuboids visited
+    by the team, and robots that search; snapshots: in order of time; collisions, outside: steps on
+    which a robot's way cut an object or obstacle, or it was outside the area; how: number of
+    decisions by how they were made; solve_times: wall time of each decision, of all robots together
+    if centralized [s]; recharges: batteries that failed; plans: predicted positions of all robots
+    at the steps that were asked for.
     """
 
     mission: CoveragePlan
@@ -114,7 +81,7 @@ class CuboidMission:
         self,
         settings: CuboidSettings,
         area: ArrayLike,
-        robots: Mapping[str, SearchRobot],
+        robots: Mapping[str, SearcherSettings],
         step: float = 1.0,
         seed: int = 1,
         scheme: Scheme = 'distributed',
@@ -124,20 +91,13 @@ class CuboidMission:
         self.scheme = scheme
         self.mission = plan_mission(settings, area)
         self.agents = {
-            name: SearchAgent(
-                name,
-                settings,
-                self.mission,
-                Dynamics.from_settings(robots[name].dynamics, step),
-                robots[name].hazard,
-                robots[name].start,
-            )
+            name: SearchAgent(name, settings, self.mission, robots[name], step)
             for name in sorted(robots)
         }
         self.positions = {name: agent.home.copy() for name, agent in self.agents.items()}
         self.velocities = {name: np.zeros(3) for name in self.agents}
         self.step = 0
-        self.choices: dict[str, Choice] = {}
+        self.choices: dict[str, Plan] = {}
 
     def run(self, limit: int = 2000, keep: tuple[int, ...] = ()) -> MissionRecord:
         """Run until the team has visited all cuboids, or for `limit` steps.
@@ -165,12 +125,12 @@ class CuboidMission:
             times += self._decide(broadcasts)
             recharges += sum(self.agents[name].activity is Activity.RETURNING for name in searching)
             if self.step in keep:
-                plans[self.step] = {n: c.plan.positions for n, c in self.choices.items()}
+                plans[self.step] = {n: c.positions for n, c in self.choices.items()}
             for name, choice in self.choices.items():
                 how[choice.how] = how.get(choice.how, 0) + 1
                 agent = self.agents[name]
                 place, speed = agent.dynamics.next(
-                    self.positions[name], self.velocities[name], choice.control
+                    self.positions[name], self.velocities[name], choice.controls[0]
                 )
                 collisions += self.mission.way_hits(self.positions[name], place)
                 beyond = (place < area[:, 0] - 1e-2) | (place > area[:, 1] + 1e-2)
@@ -202,47 +162,26 @@ class CuboidMission:
                 broadcasts[name] = message
         return broadcasts
 
-    def _rng(self, name: str) -> np.random.Generator:
-        return decision_stream(self.seed, name, self.step)
-
     def _decide(self, broadcasts: dict[str, Broadcast]) -> list[float]:
-        heard = self.heard(broadcasts)
+        """Let all robots decide, and return how long each took, or all together [s]."""
         if self.scheme == 'centralized':
-            return self._decide_jointly(broadcasts, heard)
+            return [self._decide_jointly()]
+        places = {name: message.position for name, message in broadcasts.items()}
+        # None hears while it recharges.
+        reach = within_range(places, self.settings.communication_range)
         times = []
-        done: dict[str, Choice] = {}
+        done: dict[str, Plan] = {}
         for name, agent in self.agents.items():
-            wanted = None
-            if self.scheme == 'sequential':
-                wanted = self._not_planned(agent, heard[name], done)
+            heard = [broadcasts[other] for other in reach.get(name, [])]
+            wanted = _not_planned(heard, done, agent) if self.scheme == 'sequential' else None
+            rng = decision_stream(self.seed, name, self.step)
             begun = time.perf_counter()
-            done[name] = agent.decide(heard[name], self._rng(name), wanted)
+            done[name] = agent.decide(heard, rng, wanted)
             times.append(time.perf_counter() - begun)
         self.choices = done
         return times
 
-    def heard(self, broadcasts: dict[str, Broadcast]) -> dict[str, list[Broadcast]]:
-        """Return the messages that each robot receives; none while it recharges."""
-        places = {name: message.position for name, message in broadcasts.items()}
-        reach = within_range(places, self.settings.communication_range)
-        return {name: [broadcasts[other] for other in reach.get(name, [])] for name in self.agents}
-
-    def _not_planned(
-        self, agent: SearchAgent, heard: list[Broadcast], done: dict[str, Choice]
-    ) -> BoolArray:
-        """Return the cuboids that no plan of another robot has, the new ones where there are."""
-        wanted = np.ones(len(agent.visited), dtype=bool)
-        for message in heard:
-            if message.robot in done:
-                planned = [n for _, n in done[message.robot].plan.visits]
-            else:
-                planned = [n for n, tau in message.plan.items() if tau >= 0]
-            wanted[planned] = False
-        return wanted
-
-    def _decide_jointly(
-        self, broadcasts: dict[str, Broadcast], heard: dict[str, list[Broadcast]]
-    ) -> list[float]:
+    def _decide_jointly(self) -> float:
         agents = list(self.agents.values())
         known = np.any([agent.visited for agent in agents], axis=0)
         for agent in agents:
@@ -253,25 +192,18 @@ class CuboidMission:
         problems = [agent.problem([], everything) for agent in agents]
         joint = solve_jointly(agents[0].solver, problems)
         spent = time.perf_counter() - begun
-        self.choices = {}
-        for index, agent in enumerate(agents):
-            plan = None if joint is None else joint.plans[index]
-            self.choices[agent.name] = agent.follow(plan, problems[index].target)
-        return [spent]
+        plans = [None] * len(agents) if joint is None else joint
+        self.choices = {agent.name: agent.follow(plan) for agent, plan in zip(agents, plans)}
+        return spent
 
 
-def summary(record: MissionRecord) -> dict[str, Any]:
-    """Return the figures of a mission as plain values."""
-    chances = [shot.detection_probability for shot in record.snapshots]
-    return {
-        'steps': record.steps,
-        'complete': record.complete,
-        'cuboids': len(record.mission.cells),
-        'visited': int(record.visited[-1]),
-        'collisions': record.collisions,
-        'outside': record.outside,
-        'recharges': record.recharges,
-        'least_detection_probability': min(chances) if chances else None,
-        'solve_median': float(np.median(record.solve_times)) if len(record.solve_times) else None,
-        **{f'choices_{how}': number for how, number in sorted(record.how.items())},
-    }
+def _not_planned(heard: list[Broadcast], done: dict[str, Plan], agent: SearchAgent) -> BoolArray:
+    """Return the cuboids that no plan of another robot has, the new ones where there are."""
+    wanted = np.ones(len(agent.visited), dtype=bool)
+    for message in heard:
+        if message.robot in done:
+            planned = [n for _, n in done[message.robot].visits]
+        else:
+            planned = [n for n, tau in message.plan.items() if tau >= 0]
+        wanted[planned] = False
+    return wanted

@@ -4,38 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.buildings import CoveragePlan
+from maasi_planner.buildings.agent import Activity
+from maasi_planner.buildings.preplanning import CoveragePlan
 from maasi_sim.buildings.scenario import CuboidScenario
-from maasi_sim.run.run_record import RunEnd, RunRecord, TeamLog
+from maasi_sim.run.run_record import RunEnd, RunRecord, TeamLog, rows
 from maasi_sim.run.topics import STEP
 
-SEARCHING = 0
-_ACTIVITIES = ('searching', 'returning', 'recharging')
 
-
-@dataclass(frozen=True)
-class SnapshotRecord:
-    """A snapshot as it was reported; position (3,) [m] and optical axis (3,)."""
-
-    cuboid: int
-    agent: str
-    step: int
-    time: float
-    position: FloatArray
-    direction: FloatArray
-    distance: float
-    detection_probability: float
-
-
-@dataclass(frozen=True)
-class Moment:
-    """When a cuboid was visited."""
+class Moment(NamedTuple):
+    """When a cuboid was visited: since the first step [s], and the step."""
 
     time: float
     step: int
@@ -45,26 +28,14 @@ class Moment:
 class CuboidRecord(RunRecord):
     """The record of a search of buildings.
 
-    Attributes
-    ----------
-    mission : CoveragePlan
-        Searched objects.
-    snapshots : list of SnapshotRecord
-        In the order of steps and robots; of a cuboid there can be several.
-    choices : dict
-        Decisions by the way they were made.
-    active : (n, 2) array
-        Time [s] and robots that search.
-    solve_times : array
-        Of decisions [s].
-    most_heard : int
-        Largest number of robots received at once.
-    completed : Moment or None
-        When the last cuboid was visited.
+    mission: searched objects; snapshots: as in the report, in the order of time and robots; of a
+    cuboid there can be several; choices: decisions by the way they were made; active (n, 2): time
+    [s] and robots that search; solve_times: of decisions [s]; most_heard: largest number of robots
+    received at once; completed: when the last cuboid was visited.
     """
 
     mission: CoveragePlan
-    snapshots: list[SnapshotRecord] = field(default_factory=list)
+    snapshots: list[dict[str, Any]] = field(default_factory=list)
     choices: dict[str, int] = field(default_factory=dict)
     active: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     solve_times: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -112,7 +83,7 @@ class CuboidObserver:
         """When the last cuboid was visited, if `stop` asks for that."""
         if self.scenario.stop != 'all_found' or self.found < self.total:
             return None
-        return max(self._visited_at.values(), key=lambda moment: moment.step)
+        return max(self._visited_at.values())
 
     @property
     def settled(self) -> str | None:
@@ -166,39 +137,26 @@ class CuboidObserver:
             wall_time=end.wall_time,
         )
         if self.found == self.total:
-            record.completed = max(self._visited_at.values(), key=lambda moment: moment.step)
+            record.completed = max(self._visited_at.values())
         active: dict[float, int] = {}
         times = []
         for name, decisions in self._decisions.items():
-            activity = SEARCHING
+            activity = Activity.SEARCHING
             for item in decisions:
-                moment = self._team.time(item.header.stamp)
-                if moment > end_time:
+                time = self._team.time(item.header.stamp)
+                if time > end_time:
                     continue
                 record.choices[item.how] = record.choices.get(item.how, 0) + 1
                 record.most_heard = max(record.most_heard, len(item.heard))
                 times.append(float(item.solve_time))
-                active[moment] = active.get(moment, 0) + (item.activity == SEARCHING)
-                if item.activity != activity:
-                    activity = int(item.activity)
-                    record.events.append(
-                        {'time': moment, 'agent': name, 'event': _ACTIVITIES[activity]}
-                    )
-                record.snapshots += [
-                    SnapshotRecord(
-                        int(shot.cuboid),
-                        name,
-                        int(item.step),
-                        moment,
-                        np.array([shot.position.x, shot.position.y, shot.position.z]),
-                        np.array([shot.direction.x, shot.direction.y, shot.direction.z]),
-                        float(shot.distance),
-                        float(shot.detection_probability),
-                    )
-                    for shot in item.snapshots
-                ]
-        record.snapshots.sort(key=lambda shot: (shot.step, shot.agent, shot.cuboid))
-        record.active = np.array(sorted(active.items()), dtype=float).reshape(-1, 2)
+                before, activity = activity, Activity(item.activity)
+                active[time] = active.get(time, 0) + (activity is Activity.SEARCHING)
+                if activity is not before:
+                    word = activity.name.lower()
+                    record.events.append({'time': time, 'agent': name, 'event': word})
+                record.snapshots += [self._snapshot(shot, name, time) for shot in item.snapshots]
+        record.snapshots.sort(key=lambda shot: (shot['time'], shot['agent'], shot['cuboid']))
+        record.active = rows(sorted(active.items()), 2)
         record.solve_times = np.array(times)
         for name, raw in self._states.items():
             states = (self._team.decode(data, 'AgentState') for data in raw)
@@ -207,3 +165,17 @@ class CuboidObserver:
             )
         record.add_events(self._team.events, end.events)
         return record
+
+    def _snapshot(self, shot: Any, agent: str, time: float) -> dict[str, Any]:
+        cell = self.mission.cells[int(shot.cuboid)]
+        return {
+            'cuboid': int(shot.cuboid),
+            'object': cell.target,
+            'face': cell.face,
+            'agent': agent,
+            'time': time,
+            'position': [shot.position.x, shot.position.y, shot.position.z],
+            'direction': [shot.direction.x, shot.direction.y, shot.direction.z],
+            'distance': float(shot.distance),
+            'detection_probability': float(shot.detection_probability),
+        }

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.buildings import CoveragePlan
+from maasi_planner.buildings.preplanning import CoveragePlan
 
 # Palette for colour-blind readers (Okabe and Ito).
 COLOURS = ('#CC79A7', '#D62728', '#009E73', '#0072B2', '#E69F00', '#56B4E9', '#8C564B')

@@ -15,62 +15,43 @@ def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
 
     There are no targets; visited cuboids count as found, `cuboids` in the report.
     """
-    mission = record.mission
-    first: dict[int, Any] = {}
-    for shot in record.snapshots:
-        first.setdefault(shot.cuboid, shot)
-    numbers = dict.fromkeys(record.scenario.names(), 0)
-    for shot in record.snapshots:
-        numbers[shot.agent] += 1
+    mission, shots = record.mission, record.snapshots
+    visited = {shot['cuboid'] for shot in shots}
     total = len(mission.cells)
-    chances = [shot.detection_probability for shot in record.snapshots]
     cuts = sum(
         mission.way_hits(begin, end)
         for path in record.trajectories.values()
         for begin, end in zip(path[:-1, 1:], path[1:, 1:])
     )
+    times = record.solve_times
     complete = record.completed
     return {
         **identity(record, 'buildings'),
         'cuboids': {
             'total': total,
-            'visited': len(first),
-            'missed': sorted(set(range(total)) - set(first)),
+            'visited': len(visited),
+            'missed': sorted(set(range(total)) - visited),
             'lost': [
                 {'object': cell.target, 'face': cell.face, 'reason': reason}
                 for cell, reason in mission.lost
             ],
         },
-        'missed': total - len(first),
-        'coverage': mission.coverage * len(first) / total,
-        'snapshots': [
-            {
-                'cuboid': shot.cuboid,
-                'object': mission.cells[shot.cuboid].target,
-                'face': mission.cells[shot.cuboid].face,
-                'agent': shot.agent,
-                'time': shot.time,
-                'position': shot.position.tolist(),
-                'direction': shot.direction.tolist(),
-                'distance': shot.distance,
-                'detection_probability': shot.detection_probability,
-            }
-            for shot in record.snapshots
-        ],
-        'least_detection_probability': min(chances) if chances else None,
-        'measurements': numbers,
-        'measurements_to_find_all': len(record.snapshots) if complete else None,
+        'missed': total - len(visited),
+        'coverage': mission.coverage * len(visited) / total,
+        'snapshots': shots,
+        'least_detection_probability': min(
+            (shot['detection_probability'] for shot in shots), default=None
+        ),
+        'measurements': {
+            name: sum(shot['agent'] == name for shot in shots) for name in record.scenario.names()
+        },
+        'measurements_to_find_all': len(shots) if complete else None,
         'time_to_find_all': complete.time if complete else None,
         'decisions': sum(record.choices.values()),
         'choices': dict(sorted(record.choices.items())),
-        'solve_time': (
-            {
-                'median': float(np.median(record.solve_times)),
-                'largest': float(record.solve_times.max()),
-            }
-            if len(record.solve_times)
-            else None
-        ),
+        'solve_time': {'median': float(np.median(times)), 'largest': float(times.max())}
+        if len(times)
+        else None,
         'most_heard': record.most_heard,
         'collisions': int(cuts),
         'distance': {name: path_length(path) for name, path in record.trajectories.items()},
@@ -78,13 +59,20 @@ def build_cuboid_report(record: CuboidRecord) -> dict[str, Any]:
     }
 
 
+def reason_of_end(report: dict[str, Any]) -> str:
+    """Return in words why a search of buildings ended."""
+    if report['end_reason'] == 'all_found':
+        return 'all cuboids visited'
+    return END_REASONS.get(report['end_reason'], report['end_reason'])
+
+
 def cuboid_summary(report: dict[str, Any]) -> str:
     """Return the report in a few lines."""
     cuboids = report['cuboids']
-    reason = END_REASONS.get(report['end_reason'], report['end_reason'])
-    if report['end_reason'] == 'all_found':
-        reason = 'all cuboids visited'
-    lines = [f'{cuboids["visited"]} of {cuboids["total"]} cuboids visited (ended: {reason})']
+    lines = [
+        f'{cuboids["visited"]} of {cuboids["total"]} cuboids visited '
+        f'(ended: {reason_of_end(report)})'
+    ]
     lines.append(
         f'{len(report["snapshots"])} snapshots, {report["decisions"]} decisions, '
         f'{report["collisions"]} collisions'

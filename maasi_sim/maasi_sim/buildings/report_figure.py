@@ -11,8 +11,7 @@ from matplotlib.patches import Rectangle
 from maasi_filter.arrays import FloatArray
 from maasi_sim.buildings.observer import CuboidRecord
 from maasi_sim.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours_of
-from maasi_sim.buildings.report import build_cuboid_report
-from maasi_sim.run.report_files import END_REASONS
+from maasi_sim.buildings.report import build_cuboid_report, reason_of_end
 from maasi_sim.run.report_panels import (
     MARGIN,
     MapView,
@@ -30,7 +29,7 @@ def plot_cuboid_report(record: CuboidRecord) -> Figure:
     """Return a figure: the mission from above and the sides, cuboids visited over time."""
     colours = colours_of(record.scenario.names())
     panels = make_panels(_area(record), len(colours), [0.7, 1.4])
-    visited = {shot.cuboid for shot in record.snapshots}
+    visited = {shot['cuboid'] for shot in record.snapshots}
     for view in panels.views:
         _draw_mission(view, record, visited)
         for name, colour in colours.items():
@@ -83,8 +82,8 @@ def _draw_visited(axes: Axes, record: CuboidRecord) -> None:
     seen: set[int] = set()
     times, counts = [0.0], [0]
     for shot in record.snapshots:
-        seen.add(shot.cuboid)
-        times.append(shot.time)
+        seen.add(shot['cuboid'])
+        times.append(shot['time'])
         counts.append(len(seen))
     axes.step(
         [*times, record.end_time], [*counts, counts[-1]], where='post', color='#D62728', lw=2.0
@@ -103,15 +102,12 @@ def _draw_active(axes: Axes, record: CuboidRecord) -> None:
 def _rows(record: CuboidRecord) -> list[tuple[str, str]]:
     report = build_cuboid_report(record)
     least, complete = report['least_detection_probability'], report['time_to_find_all']
-    reason = END_REASONS.get(report['end_reason'], report['end_reason'])
-    if report['end_reason'] == 'all_found':
-        reason = 'all cuboids visited'
     rows = [
         ('visited', f'{report["cuboids"]["visited"]} of {report["cuboids"]["total"]}'),
         ('all visited after', '-' if complete is None else f'{complete:.0f} s'),
         ('least p_d', '-' if least is None else f'{least:.3g} of a snapshot'),
         ('collisions', str(report['collisions'])),
         *((key, f'{number} decisions') for key, number in report['choices'].items()),
-        ('ended', f'{reason}, at {record.end_time:.1f} s'),
+        ('ended', f'{reason_of_end(report)}, at {record.end_time:.1f} s'),
     ]
     return rows + event_rows(record, 4, 0)

@@ -7,20 +7,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from pydantic import Field
 
-from maasi_filter.settings import Finite, Settings, Vector3
-from maasi_planner.buildings import (
-    CoveragePlan,
-    CuboidSettings,
-    Dynamics,
-    DynamicsSettings,
-    HazardSettings,
-    SearchAgent,
-    plan_mission,
-)
-from maasi_sim.buildings.mission import CuboidMission, SearchRobot
+from maasi_planner.buildings.agent import SearchAgent
+from maasi_planner.buildings.preplanning import CoveragePlan, plan_mission
+from maasi_planner.buildings.settings import CuboidSettings, DynamicsSettings, SearcherSettings
+from maasi_sim.buildings.mission import CuboidMission
 from maasi_sim.scenario.base import BaseScenario, ScenarioEnvironment
 from maasi_sim.scenario.checks import check_names, doubts_about, event_problems
 from maasi_sim.scenario.layering import Key, Layer, ScenarioError, doubt, refuse, validate
@@ -32,7 +24,7 @@ from maasi_sim.world.world import TargetSettings, World
 NAME = 'cuboid_mpc'
 
 
-class SearchRobotSettings(Settings):
+class SearchRobotSettings(SearcherSettings):
     """One robot: its type's settings with the scenario's own on top."""
 
     type: str = Field(description='Name of the type: a file in config/robots')
@@ -40,12 +32,7 @@ class SearchRobotSettings(Settings):
     link: Literal['topics'] = Field(
         default='topics', description='How its planner reaches it; the other end is simulated'
     )
-    start: Vector3 = Field(description='Position at the start, and of its station, x y z [m, map]')
-    yaw: Finite = Field(default=0.0, description='Heading at the start [rad]')
     dynamics: DynamicsSettings = Field(description='Its body')
-    hazard: HazardSettings = Field(
-        default_factory=HazardSettings, description='How its battery fails'
-    )
     odometry: OdometrySettings = Field(
         default_factory=OdometrySettings, description='Errors of its simulated odometry'
     )
@@ -140,12 +127,7 @@ def _problems(scenario: CuboidScenario) -> Iterator[tuple[Key, str]]:
         return
     for name, robot in scenario.robots.items():
         try:
-            dynamics = Dynamics.from_settings(robot.dynamics, scenario.step)
-        except ValueError as error:
-            yield _split(('robots', name, 'dynamics'), str(error))
-            continue
-        try:
-            SearchAgent(name, scenario.planner, mission, dynamics, robot.hazard, robot.start)
+            SearchAgent(name, scenario.planner, mission, robot, scenario.step)
         except ValueError as error:
             yield _split(('robots',), str(error).replace(': ', '.', 1))
 
@@ -164,10 +146,5 @@ def warm_up_buildings() -> None:
 
 def mission_of(scenario: CuboidScenario) -> CuboidMission:
     """Return a search of buildings in this process, as its nodes carry it out."""
-    robots = {
-        name: SearchRobot(np.array(robot.start), robot.dynamics, robot.hazard)
-        for name, robot in scenario.robots.items()
-    }
-    return CuboidMission(
-        scenario.planner, scenario.environment.array(), robots, scenario.step, scenario.seed
-    )
+    area = scenario.environment.array()
+    return CuboidMission(scenario.planner, area, scenario.robots, scenario.step, scenario.seed)

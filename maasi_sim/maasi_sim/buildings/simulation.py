@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.buildings import CoveragePlan, Dynamics
-from maasi_planner.motion import Body, RobotState
+from maasi_planner.buildings.dynamics import Dynamics
+from maasi_planner.buildings.preplanning import CoveragePlan
+from maasi_planner.motion import RobotState
 from maasi_planner.motion.base import check_command
 from maasi_planner.settings import MotionSettings
 from maasi_sim.buildings.mission import within_range
@@ -18,35 +18,11 @@ from maasi_sim.world.robots import Battery, Equipment
 from maasi_sim.world.simulation import SimulatedTeam
 
 
-class MassPointBody(Body):
-    """A mass point under bounded forces, 004, (1): the force that reaches a commanded velocity."""
-
-    def __init__(self, dynamics: Dynamics, pose: Pose, velocity: ArrayLike) -> None:
-        self._dynamics = dynamics
-        self._orientation = pose.orientation
-        self._position = pose.position
-        self._velocity = np.array(velocity, dtype=float)
-
-    def step(self, velocity_command: ArrayLike, dt: float) -> None:
-        """See `Body.step`; `dt` is that of the dynamics."""
-        if abs(dt - self._dynamics.step) > 1e-9:
-            raise ValueError(f'dt: got {dt} s, allowed is {self._dynamics.step} s')
-        pose = Pose(self._position, self._orientation)
-        wanted = pose.rotation() @ check_command(velocity_command)[:3]
-        control = self._dynamics.control_for(self._velocity, wanted)
-        self._position, self._velocity = self._dynamics.next(
-            self._position, self._velocity, control
-        )
-
-    def robot_state(self) -> RobotState:
-        """See `Body.robot_state`."""
-        return RobotState(Pose(self._position, self._orientation), self._velocity)
-
-
 class SearchingRobot:
-    """A simulated robot that searches buildings.
+    """A simulated robot that searches buildings: a mass point under bounded forces, 004, (1).
 
-    A command holds for one step. Without one it brakes and hovers, as autopilots do.
+    A command holds for one step: the force that reaches its velocity. Without one it brakes and
+    hovers, as autopilots do.
     """
 
     camera = ranging = laser = None
@@ -68,11 +44,10 @@ class SearchingRobot:
         )
         self.battery = Battery(settings.battery)
         self._mission = mission
-        self._dynamics = Dynamics.from_settings(settings.dynamics, scenario.step)
+        self._dynamics = Dynamics(settings.dynamics, scenario.step)
         start = Pose.from_yaw(settings.start, settings.yaw)
-        self._body = MassPointBody(self._dynamics, start, np.zeros(3))
-        self.state = self._body.robot_state()
-        self._command: FloatArray | None = None
+        self.state = RobotState(start, np.zeros(3))
+        self._command = np.zeros(4)
         self._odometry = OdometryModel(settings.odometry, start, seed, name)
         self.odometry: OdometryReading = self._odometry.step(self.state, 0)
 
@@ -81,21 +56,22 @@ class SearchingRobot:
         self._command = check_command(velocity)
 
     def step(self, step: int, dt: float) -> None:
-        """Advance by `dt` seconds to the discrete step `step`, from 1."""
-        before = self.state
-        command, self._command = self._command, None
-        self._body.step(np.zeros(4) if command is None else command, dt)
-        self.state = self._body.robot_state()
-        if self._mission.way_hits(before.pose.position, self.state.pose.position):
-            self.collisions += 1
-        self.battery.drain(float(np.linalg.norm(self.state.velocity)), dt)
+        """Advance by `dt` seconds, those of the dynamics, to the discrete step `step`, from 1."""
+        pose = self.state.pose
+        control = self._dynamics.control_for(
+            self.state.velocity, pose.rotation() @ self._command[:3]
+        )
+        self._command = np.zeros(4)
+        place, velocity = self._dynamics.next(pose.position, self.state.velocity, control)
+        self.state = RobotState(Pose(place, pose.orientation), velocity)
+        self.collisions += self._mission.way_hits(pose.position, place)
+        self.battery.drain(float(np.linalg.norm(velocity)), dt)
         self.odometry = self._odometry.step(self.state, step)
 
     def stand(self, step: int) -> None:
         """Stand still until the discrete step `step`; the last command is void."""
-        self._command = None
-        self._body = MassPointBody(self._dynamics, self.state.pose, np.zeros(3))
-        self.state = self._body.robot_state()
+        self._command = np.zeros(4)
+        self.state = RobotState(self.state.pose, np.zeros(3))
         self.odometry = self._odometry.step(self.state, step)
 
 

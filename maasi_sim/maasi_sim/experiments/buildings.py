@@ -7,13 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from maasi_planner.buildings import (
-    CuboidSettings,
-    DynamicsSettings,
-    HazardSettings,
-    plan_mission,
-)
-from maasi_sim.buildings.mission import CuboidMission, SearchRobot, summary
+from maasi_planner.buildings.agent import inflated
+from maasi_planner.buildings.preplanning import plan_mission
+from maasi_planner.buildings.settings import CuboidSettings, SearcherSettings
+from maasi_sim.buildings.mission import CuboidMission
 from maasi_sim.buildings.picture import draw_mission, legend
 from maasi_sim.experiments.experiment import Outcome, Quantity, Results, Run
 from maasi_sim.experiments.statistics import mean_interval
@@ -49,101 +46,80 @@ def mission_settings(settings: dict[str, Any]) -> CuboidSettings:
     return CuboidSettings.model_validate({'time_limit': _FOR_EVER, **settings['mission']})
 
 
-def _robots(settings: dict[str, Any], seed: int) -> dict[str, SearchRobot]:
-    """Return the robots of a case: at given places, or at random ones outside of objects."""
+def _mission(settings: dict[str, Any], seed: int, scheme: Any) -> CuboidMission:
+    """Return the mission of a case; robots start at given places, or random ones."""
+    search, area = mission_settings(settings), settings['area']
     rng = np.random.default_rng(seed)
-    hazard = {'failures': False, **settings.get('hazard', {})}
-    dynamics = DynamicsSettings.model_validate(settings.get('dynamics', {}))
     starts = settings.get('starts')
     if starts is None:
-        box = np.array(settings.get('spawn', settings['area']), dtype=float)
-        mission = plan_mission(mission_settings(settings), settings['area'])
+        box = np.array(settings.get('spawn', area), dtype=float)
+        # Robots start at least 2 m from objects.
+        solids = inflated(plan_mission(search, area).solids, 2.0)
         starts = {}
         while len(starts) < settings['agents']:
             place = rng.uniform(box[:, 0], box[:, 1])
-            # Robots start at least 2 m from objects.
-            near = (mission.solids[:, :, 0] - 2.0 < place) & (place < mission.solids[:, :, 1] + 2.0)
+            near = (solids[:, :, 0] < place) & (place < solids[:, :, 1])
             if not near.all(axis=1).any():
                 starts[f'agent{len(starts) + 1:02d}'] = place.tolist()
     robots = {}
     for name in sorted(starts):
-        own = dict(hazard)
+        hazard = {'failures': False, **settings.get('hazard', {})}
         if 'alpha_range' in settings:
-            own['alpha'] = float(rng.uniform(*settings['alpha_range']))
-        robots[name] = SearchRobot(
-            np.array(starts[name], dtype=float), dynamics, HazardSettings.model_validate(own)
-        )
-    return robots
+            hazard['alpha'] = float(rng.uniform(*settings['alpha_range']))
+        robot = {'start': starts[name], 'dynamics': settings.get('dynamics', {}), 'hazard': hazard}
+        robots[name] = SearcherSettings.model_validate(robot)
+    return CuboidMission(search, area, robots, seed=seed, scheme=scheme)
 
 
 def run_mission(settings: dict[str, Any], seed: int) -> Outcome:
     """Run a mission of a case."""
-    mission = CuboidMission(
-        mission_settings(settings),
-        settings['area'],
-        _robots(settings, seed),
-        seed=seed,
-        scheme=settings.get('scheme', 'distributed'),
-    )
-    record = mission.run(settings.get('limit', _LIMIT), tuple(settings.get('keep', ())))
-    facts = summary(record)
-    length = record.steps + 1
+    mission = _mission(settings, seed, settings.get('scheme', 'distributed'))
+    limit = settings.get('limit', _LIMIT)
+    record = mission.run(limit, tuple(settings.get('keep', ())))
     columns: dict[str, Any] = {
-        'step': np.arange(length),
+        'step': np.arange(record.steps + 1),
         'visited': record.visited,
         'active': record.active,
     }
     for name, path in record.paths.items():
-        for axis, letter in enumerate('xyz'):
-            columns[f'{name}_{letter}'] = path[:, axis]
+        columns.update({f'{name}_{letter}': path[:, axis] for axis, letter in enumerate('xyz')})
+    shots = [{name: getattr(shot, name) for name in _SNAPSHOT} for shot in record.snapshots]
     return Outcome(
         {
             'steps': record.steps if record.complete else None,
-            'limit': settings.get('limit', _LIMIT),
+            'limit': limit,
             'complete': record.complete,
-            'cuboids': facts['cuboids'],
-            'visited': facts['visited'],
+            'cuboids': len(record.mission.cells),
+            'visited': int(record.visited[-1]),
             'coverage': record.mission.coverage,
             'collisions': record.collisions,
             'outside': record.outside,
             'recharges': record.recharges,
             'active': float(record.active.mean()),
-            'least_detection_probability': facts['least_detection_probability'],
+            'least_detection_probability': min(
+                (shot['detection_probability'] for shot in shots), default=None
+            ),
             'optimal': record.how.get('optimal', 0) / max(sum(record.how.values()), 1),
         },
         columns,
-        {
-            'snapshots': [
-                {name: getattr(shot, name) for name in _SNAPSHOT} for shot in record.snapshots
-            ],
-            'plans': {
-                str(step): {name: plan.tolist() for name, plan in plans.items()}
-                for step, plans in record.plans.items()
-            },
-        },
+        {'snapshots': shots, 'plans': record.plans},
         {'solve_mean': float(record.solve_times.mean()) if len(record.solve_times) else 0.0},
     )
 
 
 def run_timing(settings: dict[str, Any], seed: int) -> Outcome:
     """Time the decisions of both controllers at the first steps of a mission."""
-    spent = {}
-    visited = {}
+    spent: dict[str, float] = {}
+    facts: dict[str, Any] = {}
     for scheme in ('centralized', 'distributed'):
-        mission = CuboidMission(
-            mission_settings(settings),
-            settings['area'],
-            _robots(settings, seed),
-            seed=seed,
-            scheme=scheme,  # type: ignore[arg-type]
-        )
+        mission = _mission(settings, seed, scheme)
         begun = time.perf_counter()
         record = mission.run(_STEPS_TIMED)
         spent[scheme] = float(record.solve_times.mean())
         spent[f'{scheme}_mission'] = time.perf_counter() - begun
-        visited[f'visited_{scheme}'] = int(record.visited[-1])
-    rows = {'step': np.arange(_STEPS_TIMED)}
-    return Outcome({'cuboids': len(mission.mission.cells), **visited}, rows, {}, spent)
+        facts[f'visited_{scheme}'] = int(record.visited[-1])
+    facts = {'cuboids': len(mission.mission.cells), **facts}
+    return Outcome(facts, {'step': np.arange(_STEPS_TIMED)}, {}, spent)
 
 
 # Figures.

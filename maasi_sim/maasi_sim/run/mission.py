@@ -9,7 +9,6 @@ from rosbags.typesys.store import Typestore
 
 from maasi_sim.run.node_plan import NodePlan, RunSettings
 from maasi_sim.run.run_record import RunEnd, RunRecord
-from maasi_sim.scenario.base import BaseScenario
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,32 +84,34 @@ class Observer(Protocol[RecordOut]):
 class Mission(Protocol[Record]):
     """A kind of search: scenario, nodes, observer and report."""
 
-    #: Name of the scenario.
+    #: Name of the scenario, and the scenario with all layers.
     name: str
+    scenario: Any
     #: Word for a success in the progress line.
     found_word: str
 
-    @property
-    def scenario(self) -> BaseScenario:
-        """The scenario with all layers."""
-
     def prepare(self) -> None:
         """Assign addresses on this host to simulated robots."""
+        return None
 
     def plan_nodes(self, run: RunSettings) -> list[NodePlan]:
         """Return the nodes to start."""
 
     def cameras(self) -> list[str]:
         """Return the robots whose images are shown."""
+        return []
 
     def taking_off(self) -> list[str]:
         """Return the simulated robots that take off by their drivers' service `arm`."""
+        return []
 
     def external(self) -> list[str]:
         """Return the robots moved by another program, which take off on the user's command."""
+        return []
 
     def warning(self) -> str:
         """Return a warning about the scenario, or an empty text; takes a while."""
+        return ''
 
     def observer(self, types: Typestore) -> Observer[Record]:
         """Return the observer of a run."""
@@ -120,6 +121,7 @@ class Mission(Protocol[Record]):
 
     def tables(self, record: Record) -> dict[str, str]:
         """Return further files of the report: their text by name."""
+        return {}
 
     def summary(self, report: dict[str, Any]) -> str:
         """Return a report in a few lines."""

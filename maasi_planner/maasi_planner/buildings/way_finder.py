@@ -1,4 +1,4 @@
-"""Guidance targets: the local assignment (10), and paths around obstacles."""
+"""Paths around obstacles."""
 
 from __future__ import annotations
 
@@ -6,35 +6,11 @@ import heapq
 
 import numpy as np
 
-from maasi_filter.arrays import BoolArray, FloatArray, IntArray
+from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_planner.buildings.preplanning import segment_cuts
 
 # Distance of intermediate targets from the corners of obstacles [m].
 _BERTH = 3.0
-
-
-def nearest(place: FloatArray, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the unvisited cuboid nearest to a position (3,), None if none is left."""
-    if not len(unvisited):
-        return None
-    offset = centres[unvisited] - place
-    return int(unvisited[np.argmin((offset * offset).sum(axis=1))])
-
-
-def assigned(places: FloatArray, own: int, centres: FloatArray, unvisited: IntArray) -> int | None:
-    """Return the cuboid assigned to robot `own` among robots at positions (m, 3): (10).
-
-    None if fewer cuboids than robots are left and this robot gets none.
-    """
-    if not len(unvisited):
-        return None
-    # Deferred: SciPy takes long to import, and searches for targets do not need it.
-    from scipy.optimize import linear_sum_assignment
-
-    cost = np.sqrt(((places[:, None, :] - centres[unvisited][None, :, :]) ** 2).sum(axis=2))
-    rows, columns = linear_sum_assignment(cost)
-    chosen = np.flatnonzero(rows == own)
-    return int(unvisited[columns[chosen[0]]]) if len(chosen) else None
 
 
 class WayFinder:

@@ -1,0 +1,88 @@
+"""The mass point of 004, (1) and (2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from maasi_filter.arrays import FloatArray
+from maasi_planner.buildings.settings import DynamicsSettings
+
+
+class Dynamics:
+    """The three independent axes of (1), sampled every `step` seconds.
+
+    `retained` is phi = 1 - eta, `weight` is u_g (3,) [N], and `deceleration` (2, 3) is the largest
+    loss of speed in a step beyond air resistance, going up and down [m/s].
+    """
+
+    def __init__(self, settings: DynamicsSettings | None = None, step: float = 1.0) -> None:
+        settings = settings or DynamicsSettings()
+        self.mass = settings.mass
+        self.retained = 1.0 - settings.resistance
+        self.force = settings.force
+        self.speed = settings.speed
+        self.step = step
+        self.weight = np.array([0.0, 0.0, settings.mass * settings.gravity])
+        self.deceleration = (
+            step / self.mass * np.stack([self.force + self.weight, self.force - self.weight])
+        )
+
+    def next(
+        self, position: ArrayLike, velocity: ArrayLike, control: ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return position [m] and velocity [m/s] after a step under a force (3,) [N]: (1)."""
+        speed = np.asarray(velocity, dtype=float)
+        push = np.asarray(control, dtype=float) - self.weight
+        return (
+            np.asarray(position, dtype=float) + self.step * speed,
+            self.retained * speed + self.step / self.mass * push,
+        )
+
+    def fly(
+        self,
+        position: FloatArray,
+        velocity: FloatArray,
+        controls: Sequence[FloatArray] | FloatArray,
+        steps: int,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return positions and velocities (steps + 1, 3), and forces: those given, then braking."""
+        positions, velocities, used = [position], [velocity], []
+        for k in range(steps):
+            used.append(controls[k] if k < len(controls) else self.braking(velocities[-1]))
+            place, speed = self.next(positions[-1], velocities[-1], used[-1])
+            positions.append(place)
+            velocities.append(speed)
+        return np.array(positions), np.array(velocities), np.array(used)
+
+    def control_for(self, velocity: ArrayLike, wanted: ArrayLike) -> FloatArray:
+        """Return the force (3,) [N] within its bounds that gets closest to a wanted velocity."""
+        change = np.asarray(wanted, dtype=float) - self.retained * np.asarray(velocity, dtype=float)
+        return np.clip(self.mass / self.step * change + self.weight, -self.force, self.force)
+
+    def braking(self, velocity: ArrayLike) -> FloatArray:
+        """Return the force (3,) [N] that stops the robot as fast as its bounds allow."""
+        return self.control_for(velocity, np.zeros(3))
+
+    def braking_steps(self) -> int:
+        """Return the largest number of steps until the robot is at rest on all axes."""
+        speed, steps = np.full((2, 3), self.speed), 0
+        while (speed > 0.0).any():
+            speed = self.retained * speed - self.deceleration
+            steps += 1
+        return steps
+
+    def rolling_ways(self) -> FloatArray:
+        """Return the way [m] from a speed of 1 after each step of braking by air resistance."""
+        return self.step * np.cumsum(self.retained ** np.arange(self.braking_steps()))
+
+    def shorter_ways(self) -> FloatArray:
+        """Return by how much full force shortens these ways, going up and down, (2, 3, steps)."""
+        lost = np.zeros((2, 3))
+        ways = np.zeros((2, 3, self.braking_steps()))
+        for j in range(1, ways.shape[2]):
+            lost = self.retained * lost + self.deceleration
+            ways[:, :, j] = ways[:, :, j - 1] + self.step * lost
+        return ways
