@@ -6,14 +6,12 @@ fenced as text.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import re
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import yaml
@@ -36,12 +34,10 @@ DOCUMENTS = [
     *sorted((ROOT / 'docs').rglob('*.md')),
     *sorted((ROOT / 'examples').rglob('*.md')),
 ]
-NOT_CODE = ('text', 'mermaid')
 NODES = {'filter_node': FilterNodeSettings, '/**': DriverSettings}
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     place: str
     language: str
     text: str
@@ -55,7 +51,7 @@ def blocks(text: str, name: str) -> Iterator[Block]:
             marked = re.fullmatch(r'<!-- not run: \S.*-->', token.content.strip()) is not None
         elif token.type in ('fence', 'code_block'):
             language = token.info.strip() or guess(token.content)
-            if not marked and language not in NOT_CODE:
+            if not marked and language not in ('text', 'mermaid'):
                 yield Block(f'{name}:{token.map[0] + 1}', language, token.content)
             marked = False
         elif token.type == 'inline':
@@ -64,12 +60,9 @@ def blocks(text: str, name: str) -> Iterator[Block]:
 
 def guess(text: str) -> str:
     """Return the language of a block that does not say it."""
-    first = text.split()[0] if text.split() else ''
     if re.match(r'(from|import) \w', text):
         return 'python'
-    if re.fullmatch(r"[\w.'/*]+:", first):
-        return 'yaml'
-    return 'sh'
+    return 'yaml' if re.match(r"\s*[\w.'/*]+:\s", text) else 'sh'
 
 
 BLOCKS = [
@@ -79,21 +72,18 @@ BLOCKS = [
 ]
 
 
-def of(*languages: str) -> pytest.MarkDecorator:
+def of(language: str) -> pytest.MarkDecorator:
+    chosen = [block for block in BLOCKS if block.language == language]
     # The program of the README is run by test_pip_install.py.
-    chosen = [
-        block
-        for block in BLOCKS
-        if block.language in languages
-        and not (block.language == 'python' and block.place.startswith('README'))
-    ]
+    if language == 'python':
+        chosen = [block for block in chosen if not block.place.startswith('README')]
     return pytest.mark.parametrize('block', chosen, ids=lambda block: block.place)
 
 
 def test_each_block_has_a_language_that_is_checked() -> None:
-    known = ('python', 'yaml', 'sh')
-    assert [(item.place, item.language) for item in BLOCKS if item.language not in known] == []
-    assert {item.language for item in BLOCKS} == set(known)
+    assert {item.language for item in BLOCKS} == {'python', 'yaml', 'sh'}
+    text = 'A\n\n<!-- not run: flies -->\n```sh\nx\n```\n\n    ./scripts/demo\n\n```text\nx\n```\n'
+    assert [(block.place, block.language) for block in blocks(text, 'a.md')] == [('a.md:8', 'sh')]
 
 
 @of('python')
@@ -101,9 +91,6 @@ def test_python(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('MPLBACKEND', 'Agg')
     exec(compile(block.text, block.place, 'exec'), {'__name__': '__main__'})
-
-
-# ---- YAML ------------------------------------------------------------------------------------
 
 
 def check_yaml(text: str, folder: Path) -> None:
@@ -116,8 +103,7 @@ def check_yaml(text: str, folder: Path) -> None:
         load_scenario(file)
     elif keys <= set(NODES):
         for name, content in layer.data.items():
-            values = flat(content['ros__parameters'])
-            assert check(NODES[name], values)[1] == {}
+            assert check(NODES[name], flat(content['ros__parameters']))[1] == {}
     elif keys <= set(Scenario.model_fields):
         file.write_text(to_yaml(merge(read_layer(find_scenario('mambo_turtlebot')), layer).data))
         load_scenario(file)
@@ -136,8 +122,9 @@ def check_yaml(text: str, folder: Path) -> None:
 def flat(values: dict[str, Any], prefix: str = '') -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key, value in values.items():
-        inner = flat(value, f'{prefix}{key}.') if isinstance(value, dict) else {prefix + key: value}
-        result.update(inner)
+        result |= (
+            flat(value, f'{prefix}{key}.') if isinstance(value, dict) else {prefix + key: value}
+        )
     return result
 
 
@@ -161,38 +148,28 @@ def test_wrong_yaml_is_found(text: str, tmp_path: Path) -> None:
         check_yaml(text, tmp_path)
 
 
-# ---- commands --------------------------------------------------------------------------------
-
-
-def commands(text: str) -> Iterator[list[str]]:
-    """Yield the words of each command of a block, without variables before it."""
+def check_commands(text: str) -> None:
+    """Check that the commands of ours in a block exist, and take their options."""
     # A line that is indented goes on.
-    text = re.sub(r'\\?\n\s+', ' ', text.strip())
-    for line in text.splitlines():
-        for part in re.split(r' && | ; ', re.sub(r'\$\(.*?\)', 'X', line)):
-            words = shlex.split(part, comments=True)
-            while words and re.match(r'[A-Z_]+=', words[0]):
-                words.pop(0)
-            if words:
-                yield words
-
-
-def module_of(package: str, executable: str) -> str:
-    """Return the module that `ros2 run` runs."""
-    entries = (ROOT / package / 'setup.py').read_text()
-    assert f"'{executable} = maasi_entry:{executable}'" in entries, f'{package}: no {executable}'
-    (target,) = getattr(maasi_entry, executable).args
-    return target.partition(':')[0]
+    text = re.sub(r'\$\(.*?\)', 'X', re.sub(r'\\?\n\s+', ' ', text.strip()))
+    for part in re.split(r'\n| && | ; ', text):
+        words = shlex.split(part, comments=True)
+        while words and re.match(r'[A-Z_]+=', words[0]):
+            words.pop(0)
+        if words:
+            check_command(words)
 
 
 def check_command(words: list[str]) -> None:
-    """Check that a command of ours exists and takes its options."""
     program, *rest = words
     if program.startswith('./scripts/'):
         check_script(ROOT / program, rest)
     elif program == 'ros2' and rest[1].startswith('maasi'):
         if rest[0] == 'run':
-            check_module(module_of(rest[1], rest[2]), rest[3:])
+            entries = (ROOT / rest[1] / 'setup.py').read_text()
+            assert f"'{rest[2]} = maasi_entry:{rest[2]}'" in entries, rest
+            (target,) = getattr(maasi_entry, rest[2]).args
+            check_module(target.partition(':')[0], rest[3:])
         else:
             launch = (ROOT / rest[1] / 'launch' / rest[2]).read_text()
             names = {argument.partition(':=')[0] for argument in rest[3:]}
@@ -215,8 +192,7 @@ def check_script(script: Path, arguments: list[str]) -> None:
     elif module:
         check_module(module[1], arguments)
     elif file:
-        known = re.findall(r"'(--[\w-]+)'", (ROOT / file[1]).read_text())
-        check_options(arguments, set(known))
+        check_options(arguments, re.findall(r"'(--[\w-]+)'", (ROOT / file[1]).read_text()))
 
 
 def check_module(name: str, arguments: list[str]) -> None:
@@ -227,8 +203,8 @@ def check_module(name: str, arguments: list[str]) -> None:
         # A node: what follows is for ROS.
         assert not arguments or arguments[0] in ('--ros-args', '--help'), arguments
         return
-    parser: argparse.ArgumentParser = module.build_parser()
-    check_options(arguments, set(parser._option_string_actions))
+    parser = module.build_parser()
+    check_options(arguments, parser._option_string_actions)
     # A line of usage has choices, and names for values.
     if not re.search(r'[\[\]|]|\.\.\.', ' '.join(arguments)) and '--help' not in arguments:
         try:
@@ -237,15 +213,14 @@ def check_module(name: str, arguments: list[str]) -> None:
             raise AssertionError(f'{name} refuses {arguments}') from leaving
 
 
-def check_options(arguments: list[str], known: set[str]) -> None:
-    given = set(re.findall(r'--[a-z][\w-]*', ' '.join(arguments)))
-    assert given <= known, f'unknown options: {sorted(given - known)}'
+def check_options(arguments: list[str], known: Any) -> None:
+    unknown = set(re.findall(r'--[a-z][\w-]*', ' '.join(arguments))) - set(known)
+    assert not unknown, f'unknown options: {sorted(unknown)}'
 
 
 @of('sh')
 def test_commands(block: Block) -> None:
-    for words in commands(block.text):
-        check_command(words)
+    check_commands(block.text)
 
 
 @pytest.mark.parametrize(
@@ -263,10 +238,4 @@ def test_commands(block: Block) -> None:
 )
 def test_wrong_commands_are_found(line: str) -> None:
     with pytest.raises((AssertionError, OSError)):
-        for words in commands(line):
-            check_command(words)
-
-
-def test_marked_blocks_are_left_out() -> None:
-    text = 'A\n\n<!-- not run: flies -->\n```sh\nx\n```\n\n    ./scripts/demo\n\n```text\nx\n```\n'
-    assert [(block.place, block.language) for block in blocks(text, 'a.md')] == [('a.md:8', 'sh')]
+        check_commands(line)

@@ -3,52 +3,30 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').rglob('*.md'))]
+ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 COLUMNS = 120
 # Folders at the root: what begins with one of them in backticks is a path in this repository.
-FOLDERS = (
-    'config',
-    'docs',
-    'examples',
-    'maasi_msgs',
-    'maasi_filter',
-    'maasi_planner',
-    'maasi_drivers',
-    'maasi_sim',
-    'scripts',
-    'test',
-)
+PACKAGES = ('maasi_msgs', 'maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
+FOLDERS = ('config', 'docs', 'examples', *PACKAGES, 'scripts', 'test')
 # Names of ROS packages and of executables or types in them, not paths.
 NOT_PATHS = re.compile(r'maasi_msgs/(msg/|action/)?[A-Z]\w*$')
-
-documents = pytest.mark.parametrize(
-    'document', DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix()
-)
-
-
-def text_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield number and text of each line outside of code blocks."""
-    fenced = False
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.lstrip().startswith('```'):
-            fenced = not fenced
-        elif not fenced and not line.startswith('    '):
-            yield number, line
 
 
 def long_lines(text: str) -> list[int]:
     """Return the numbers of lines that are too long and can be wrapped: no tables, no code."""
-    return [
-        number
-        for number, line in text_lines(text)
-        if len(line) >= COLUMNS and not line.lstrip().startswith('|') and ' ' in line.strip()
-    ]
+    long, fenced = [], False
+    for number, line in enumerate(text.splitlines(), 1):
+        fenced ^= line.lstrip().startswith('```')
+        table = line.lstrip().startswith(('|', '```')) or line.startswith('    ')
+        if len(line) >= COLUMNS and ' ' in line.strip() and not (fenced or table):
+            long.append(number)
+    return long
 
 
 def anchors(text: str) -> set[str]:
@@ -61,15 +39,13 @@ def dead_links(text: str, folder: Path) -> list[str]:
     """Return the relative links whose file or heading does not exist."""
     dead = []
     for link in re.findall(r'\]\(([^)\s]+)\)', text):
+        name, _, anchor = link.partition('#')
         if re.match(r'\w+:', link):
             continue
-        name, _, anchor = link.partition('#')
-        path = folder / name
-        if not path.exists():
+        if not (folder / name).exists() or (
+            anchor and anchor not in anchors((folder / name).read_text() if name else text)
+        ):
             dead.append(link)
-        elif anchor:
-            known = anchors(path.read_text() if name else text)
-            dead += [] if anchor in known else [link]
     return dead
 
 
@@ -78,23 +54,16 @@ def dead_paths(text: str) -> list[str]:
     dead = []
     for quoted in re.findall(r'`([^`\n]+)`', text):
         path = quoted.removeprefix('./').split(' ')[0].rstrip('/')
-        if not re.fullmatch(r'[\w./*-]+', path) or '/' not in path:
-            continue
-        if path.split('/')[0] in FOLDERS and not NOT_PATHS.match(path) and not any(ROOT.glob(path)):
+        ours = re.fullmatch(r'[\w.*-]+(/[\w.*-]+)+', path) and path.split('/')[0] in FOLDERS
+        if ours and not NOT_PATHS.match(path) and not any(ROOT.glob(path)):
             dead.append(quoted)
     return dead
 
 
-@documents
-def test_lines_are_short(document: Path) -> None:
-    assert long_lines(document.read_text()) == []
-
-
-@documents
-def test_links_and_paths_exist(document: Path) -> None:
+@pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_lines_are_short_and_links_and_paths_exist(document: Path) -> None:
     text = document.read_text()
-    assert dead_links(text, document.parent) == []
-    assert dead_paths(text) == []
+    assert (long_lines(text), dead_links(text, document.parent), dead_paths(text)) == ([], [], [])
 
 
 def test_what_is_wrong_is_found(tmp_path: Path) -> None:
@@ -104,10 +73,8 @@ def test_what_is_wrong_is_found(tmp_path: Path) -> None:
     text = '[a](gone.md) [b](there.md#gone) [c](#gone)\n'
     assert dead_links(text, tmp_path) == ['gone.md', 'there.md#gone', '#gone']
     text = '`test/test_documents.py` `./scripts/test -k x` `docs/` `maasi_msgs/Detection` `a/b`\n'
-    assert dead_paths(text + '`test/gone.py` `./scripts/gone`\n') == [
-        'test/gone.py',
-        './scripts/gone',
-    ]
+    dead = ['test/gone.py', './scripts/gone']
+    assert dead_paths(text + '`test/gone.py` `./scripts/gone`\n') == dead
     long = 'word ' * 30
     assert long_lines(f'{long}\n| {long} |\n    {long}\n```\n{long}\n```\n- {long}\n') == [1, 7]
 
@@ -120,21 +87,14 @@ def table_rows(text: str, heading: str) -> list[list[str]]:
 
 
 def test_each_room_is_described_and_each_described_room_exists() -> None:
-    text = (ROOT / 'docs' / 'architecture.md').read_text()
-    described = {row[0].strip('`') for row in table_rows(text, 'Rooms')}
-    rooms = {
-        path.parent.relative_to(ROOT).as_posix()
-        for folder in FOLDERS
-        for path in ROOT.glob(f'{folder}/*/**/__init__.py')
-        if folder.startswith('maasi_')
-    }
-    assert rooms <= described
+    described = {row[0].strip('`') for row in table_rows(ARCHITECTURE.read_text(), 'Rooms')}
+    inits = [path for name in PACKAGES for path in ROOT.glob(f'{name}/*/**/__init__.py')]
+    assert {path.parent.relative_to(ROOT).as_posix() for path in inits} <= described
     assert all((ROOT / room).is_dir() for room in described)
 
 
 def test_names_of_the_glossary_stand_in_their_files() -> None:
-    text = (ROOT / 'docs' / 'architecture.md').read_text()
-    rows = table_rows(text, 'Glossary')
+    rows = table_rows(ARCHITECTURE.read_text(), 'Glossary')
     assert rows
     for _, _, names, files in rows:
         paths = re.findall(r'`([^`]+)`', files)
@@ -145,11 +105,8 @@ def test_names_of_the_glossary_stand_in_their_files() -> None:
 
 def test_numbers_of_the_claims_are_those_of_the_experiments() -> None:
     whole = (ROOT / 'docs' / 'reproduction.md').read_text()
-    rows = [
-        line
-        for line in (ROOT / 'docs' / 'claims.md').read_text().splitlines()
-        if line.startswith('|') and 'reproduction.md#' in line
-    ]
+    lines = (ROOT / 'docs' / 'claims.md').read_text().splitlines()
+    rows = [line for line in lines if line.startswith('|') and 'reproduction.md#' in line]
     assert len(rows) > 10
     for row in rows:
         measured, place = row.strip('|').split('|')[2:]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -21,9 +20,7 @@ from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_sim.run.bag import Bag
-from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import RunSettings
-from maasi_sim.run.processes import find_executable
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search
 from maasi_sim.targets.mission import plan_nodes
@@ -31,6 +28,17 @@ from maasi_sim.targets.mission import plan_nodes
 EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
 # Far more than anything takes, on a machine that is busy with something else [s].
 PATIENCE = 400.0
+
+
+def run_python(*arguments):
+    """Run Python to its end and return what it did."""
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -82,21 +90,19 @@ def run(tmp_path_factory):
     content['limits'] = {'time': 20.0}
     (folder / 'robots').symlink_to(EXAMPLES / 'robots')
     (folder / 'search.yaml').write_text(yaml.safe_dump(content))
-    command = [sys.executable, '-m', 'maasi_sim.run.run_scenario', str(folder / 'search.yaml')]
-    done = subprocess.run(
-        [*command, '--lockstep', '--out', str(folder / 'out')],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    command = ['-m', 'maasi_sim.run.run_scenario', folder / 'search.yaml', '--lockstep']
+    done = run_python(*command, '--out', folder / 'out')
     assert done.returncode in (0, 1), done.stdout + done.stderr
     return folder
 
 
-def test_nodes_run_planner_and_sensor_as_one_process_does(run):
+@pytest.fixture(scope='module')
+def report(run):
+    return json.loads((run / 'out' / 'report.json').read_text())
+
+
+def test_nodes_run_planner_and_sensor_as_one_process_does(run, report):
     result = search(load_scenario(run / 'search.yaml'), seed=1)
-    report = json.loads((run / 'out' / 'report.json').read_text())
     found = [item['position'] for item in report['found']]
     assert result.total_measurements > 20
     assert report['measurements'] == result.measurements
@@ -104,64 +110,38 @@ def test_nodes_run_planner_and_sensor_as_one_process_does(run):
     assert np.allclose(found, positions, atol=1e-6)
 
 
-def test_a_recording_is_read_as_the_document_says(run, capsys):
+def test_a_recording_is_read_as_the_document_says(run, report, capsys):
     text = (EXAMPLES.parent / 'docs' / 'how_to' / 'bags.md').read_text()
     (block,) = re.findall(r'```python\n(.*?)```', text, re.DOTALL)
     exec(block.replace('runs/20260101_120000/bag', str(run / 'out' / 'bag')), {})
-    report = json.loads((run / 'out' / 'report.json').read_text())
     assert len(report['found']) > 0
     assert capsys.readouterr().out.splitlines()[-1].count('(') == len(report['found'])
 
 
-def test_a_recording_is_read_without_our_packages(run):
-    done = subprocess.run(
-        # Isolated: neither PYTHONPATH nor the current folder.
-        [
-            sys.executable,
-            '-I',
-            str(EXAMPLES / 'read_bag' / 'read_bag.py'),
-            str(run / 'out' / 'bag'),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+def test_a_recording_is_read_without_our_packages(run, report):
+    # Isolated: neither PYTHONPATH nor the current folder.
+    done = run_python('-I', EXAMPLES / 'read_bag' / 'read_bag.py', run / 'out' / 'bag')
     assert done.returncode == 0, done.stderr
     with Bag(run / 'out') as bag:
         stamps = [item.message.header.stamp for item in bag.messages(['/scout/state'])]
     first = stamps[0].sec + 1e-9 * stamps[0].nanosec
     assert f'/scout/state: {len(stamps)} poses, from {first:.1f} to' in done.stdout
-    report = json.loads((run / 'out' / 'report.json').read_text())
     assert done.stdout.count('target ') == len(report['found'])
 
 
-def test_detections_of_ones_own_are_found_without_a_warning():
+def test_detections_of_ones_own_are_found_without_a_warning(domain):
     folder = EXAMPLES / 'own_detections'
-    with Domain() as domain:
-        environment = {**os.environ, **domain.environment()}
-        node = subprocess.Popen(
-            [
-                str(find_executable('maasi_filter', 'filter_node')),
-                *('--ros-args', '--params-file', str(folder / 'filter.yaml')),
-            ],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        try:
-            done = subprocess.run(
-                [sys.executable, str(folder / 'own_detections.py')],
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=PATIENCE,
-                check=False,
-            )
-        finally:
-            node.terminate()
-            log, _ = node.communicate(timeout=PATIENCE)
+    node = subprocess.Popen(
+        ['filter_node', '--ros-args', '--params-file', str(folder / 'filter.yaml')],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        done = run_python(folder / 'own_detections.py')
+    finally:
+        node.terminate()
+        log, _ = node.communicate(timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     match = re.match(r'found a target at \((.*), (.*)\) m after', done.stdout)
     assert match and np.allclose([float(part) for part in match.groups()], [3.0, 2.0], atol=0.1)
@@ -173,33 +153,26 @@ def test_the_team_of_the_field_finds_its_targets_in_simulation():
     assert result.missed == 0 and result.false_found == 0
 
 
-# What differs from the simulation, by node: the rest of the parameters has to be the same.
+# Settings of each node, and what differs from the simulation: the rest has to be the same.
 OF_THE_FIELD = {
-    'turtlebot_driver': {'battery_minimum', 'image_transport', 'tf_rate'},
-    'turtlebot_guard': set(),
-    'drone_driver': {'battery_minimum', 'image_transport', 'link'},
-    'filter_node': set(),
-    'planner_node': set(),
+    'turtlebot_driver': (DriverSettings, {'battery_minimum', 'image_transport', 'tf_rate'}),
+    'turtlebot_guard': (GuardSettings, set()),
+    'drone_driver': (DriverSettings, {'battery_minimum', 'image_transport', 'link'}),
+    'filter_node': (FilterNodeSettings, set()),
+    'planner_node': (PlannerNodeSettings, set()),
 }
 
 
-def of_the_field(name):
-    """Return the parameters in a file."""
-    text = (EXAMPLES / 'field_team' / f'{name}.yaml').read_text()
-    return yaml.safe_load(text)['/**']['ros__parameters']
-
-
 def test_the_parameters_of_the_field_are_those_of_its_simulation():
-    file = EXAMPLES / 'field_team' / 'search.yaml'
+    folder = EXAMPLES / 'field_team'
+    file = folder / 'search.yaml'
     plans = {
         '_'.join(filter(None, (plan.namespace, plan.name))): plan
         for plan in plan_nodes(load_scenario(file), RunSettings(1, False, None, False, file))
     }
-    models = {'driver': DriverSettings, 'guard': GuardSettings}
-    models |= {'filter_node': FilterNodeSettings, 'planner_node': PlannerNodeSettings}
-    for node, allowed in OF_THE_FIELD.items():
-        model = models.get(node) or models[node.rpartition('_')[2]]
-        settings, problems = check(model, of_the_field(node))
+    for node, (model, allowed) in OF_THE_FIELD.items():
+        parameters = yaml.safe_load((folder / f'{node}.yaml').read_text())['/**']['ros__parameters']
+        settings, problems = check(model, parameters)
         assert problems == {}, node
         simulated = dict(plans[node].parameters)
         del simulated['use_sim_time']
@@ -207,20 +180,17 @@ def test_the_parameters_of_the_field_are_those_of_its_simulation():
         here = flatten(settings.resolved())
         # Of the autopilot the simulation knows nothing.
         different = {key for key in here if here[key] != there.get(key)}
-        different = {key for key in different if not key.startswith('mavlink.')}
-        assert different == allowed, node
-    autopilot = dict(
-        line.split()
-        for line in (EXAMPLES / 'field_team' / 'arducopter.parm').read_text().splitlines()
-        if not line.startswith('#')
-    )
-    assert int(autopilot['MAV_GCS_SYSID']) == of_the_field('drone_driver')['mavlink.own_system']
+        assert {key for key in different if not key.startswith('mavlink.')} == allowed, node
+        own_system = parameters.get('mavlink.own_system', None)
+        if own_system is not None:
+            lines = (folder / 'arducopter.parm').read_text().splitlines()
+            autopilot = dict(line.split() for line in lines if not line.startswith('#'))
+            assert int(autopilot['MAV_GCS_SYSID']) == own_system
 
 
-def test_the_nodes_of_the_field_become_active_with_their_file(domain, tmp_path):
+def test_the_nodes_of_the_field_become_active_with_their_file(context, tmp_path):
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
-    from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor
     from waiting import wait_until
 
@@ -231,18 +201,16 @@ def test_the_nodes_of_the_field_become_active_with_their_file(domain, tmp_path):
         '/filter_node': 'filter_node',
         '/planner_node': 'planner_node',
     }
-    processes = []
     heard = {}
-    context = Context()
-    rclpy.init(context=context, domain_id=domain.number)
-    node = rclpy.create_node('listener', context=context)
 
     def listen(message):
         heard.update({status.name: status.message for status in message.status})
 
+    node = rclpy.create_node('listener', context=context)
     node.create_subscription(DiagnosticArray, '/diagnostics', listen, 50)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
+    processes = []
     try:
         for name, executable in started.items():
             namespace = name.rpartition('/')[0] or '/'
@@ -251,10 +219,7 @@ def test_the_nodes_of_the_field_become_active_with_their_file(domain, tmp_path):
             with (tmp_path / executable).open('w') as log:
                 processes.append(
                     subprocess.Popen(
-                        [executable, *words],
-                        cwd=EXAMPLES / 'field_team',
-                        stdout=log,
-                        stderr=log,
+                        [executable, *words], cwd=EXAMPLES / 'field_team', stdout=log, stderr=log
                     )
                 )
 
@@ -270,4 +235,3 @@ def test_the_nodes_of_the_field_become_active_with_their_file(domain, tmp_path):
             process.wait(PATIENCE)
         executor.shutdown()
         node.destroy_node()
-        rclpy.shutdown(context=context)

@@ -1,7 +1,5 @@
 """The packages installed by pip, where ROS and what only extras need cannot be imported."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -13,29 +11,16 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('config', 'maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
-ROS = (
-    'ament_index_python',
-    'builtin_interfaces',
-    'geometry_msgs',
-    'maasi_msgs',
-    'rclpy',
-    'std_msgs',
+BLOCKED = (
+    *('ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'maasi_msgs', 'rclpy'),
+    *('std_msgs', 'distributed', 'matplotlib', 'PIL', 'pymavlink', 'pyparrot', 'rich'),
+    'setproctitle',
 )
-EXTRAS = ('distributed', 'matplotlib', 'PIL', 'pymavlink', 'pyparrot', 'rich', 'setproctitle')
 BLOCK = 'raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)\n'
 
 
 @pytest.fixture(scope='module')
-def blocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder whose modules cannot be imported, and hide those of the same name."""
-    folder = tmp_path_factory.mktemp('blocked')
-    for name in (*ROS, *EXTRAS):
-        (folder / f'{name}.py').write_text(BLOCK)
-    return folder
-
-
-@pytest.fixture(scope='module')
-def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prefix(tmp_path_factory):
     """Return where pip has installed the packages, without what they require."""
     sources = tmp_path_factory.mktemp('sources')
     for name in PACKAGES:
@@ -51,18 +36,23 @@ def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return prefix
 
 
-def modules_of(prefix: Path) -> Path:
+def modules_of(prefix):
     """Return the folder of the modules that pip installed."""
     return next(prefix.glob('**/maasi_filter/filter_node.py')).parents[1]
 
 
-def run(command: list[str], folder: Path, *path: Path | str) -> subprocess.CompletedProcess[str]:
-    """Run a command in a folder, with these folders in Python's path."""
-    environment = os.environ | {'PYTHONPATH': os.pathsep.join(map(str, path))}
+def run(folder, path, *arguments):
+    """Run Python in a folder, with these folders in its path; ROS and extras are not there."""
+    blocked = folder / 'blocked'
+    blocked.mkdir()
+    for name in BLOCKED:
+        (blocked / f'{name}.py').write_text(BLOCK)
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join(map(str, [blocked, *path]))}
+    command = [sys.executable, *map(str, arguments)]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
-def without_ros() -> str:
+def without_ros():
     """Return the program in README's section about using the libraries without ROS."""
     section = (ROOT / 'README.md').read_text().split('## Without ROS\n')[1].split('\n## ')[0]
     block = section.split('\n\n    from ')[1]
@@ -70,7 +60,7 @@ def without_ros() -> str:
     return '\n'.join(['from ' + block.splitlines()[0], *(line[4:] for line in lines)])
 
 
-def test_pip_installs_every_file(prefix: Path) -> None:
+def test_pip_installs_every_file(prefix):
     modules = modules_of(prefix)
     for package in PACKAGES[1:]:
         for path in (ROOT / package / package).rglob('*'):
@@ -81,29 +71,26 @@ def test_pip_installs_every_file(prefix: Path) -> None:
         assert {path.name for path in prefix.glob(f'**/maasi_config/{folder}/*')} == names
 
 
-def test_an_installed_scenario_is_loaded_from_any_folder(
-    prefix: Path, blocked: Path, tmp_path: Path
-) -> None:
+def test_an_installed_scenario_is_loaded_from_any_folder(prefix, tmp_path):
     # All but the search itself, whose kernels would be compiled for minutes at this new place.
     program = without_ros().split('\n\n')[0]
     program += '\nprint(search.__module__, load_scenario.__code__.co_filename)'
     program += "\nprint(len(load_scenario('mambo_turtlebot').robots))"
-    done = run([sys.executable, '-c', program], tmp_path, blocked, modules_of(prefix))
+    done = run(tmp_path, [modules_of(prefix)], '-c', program)
     assert done.returncode == 0, done.stderr
     assert str(prefix) in done.stdout and done.stdout.splitlines()[-1] == '2'
 
 
-def test_a_command_that_needs_ros_says_so(prefix: Path, blocked: Path, tmp_path: Path) -> None:
-    [script] = prefix.glob('**/bin/filter_node')
-    done = run([sys.executable, str(script)], tmp_path, blocked, modules_of(prefix))
+def test_a_command_that_needs_ros_says_so(prefix, tmp_path):
+    done = run(tmp_path, [modules_of(prefix)], next(prefix.glob('**/bin/filter_node')))
     assert done.returncode == 2
     assert 'error: filter_node: no module rclpy: it needs ROS 2 Jazzy' in done.stderr
     assert 'Traceback' not in done.stderr
 
 
-def test_the_program_in_the_readme_runs_as_printed(blocked: Path, tmp_path: Path) -> None:
+def test_the_program_in_the_readme_runs_as_printed(tmp_path):
     path = os.environ.get('PYTHONPATH', '').split(os.pathsep)
     ours = [item for item in path if any(name in item for name in PACKAGES)]
-    done = run([sys.executable, '-c', without_ros()], tmp_path, blocked, *ours)
+    done = run(tmp_path, ours, '-c', without_ros())
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith('all_found ')
