@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import bisect
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,11 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Polygon
 from matplotlib.path import Path as Outline
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from maasi_sim.buildings.picture import draw_box
 from maasi_sim.run.run_folder import write_whole
-from maasi_sim.view.event_log import Event, EventLog
+from maasi_sim.view.event_log import Event, EventLog, Scene
 from maasi_sim.view.event_maker import LEFT, MOVING, SILENT, UNAVAILABLE
 
 # Pictures per second, and size [in] at a resolution [px/in].
@@ -35,62 +35,51 @@ _FADE = 1.0
 
 
 class Moments:
-    """What holds at a time: the last event of each kind and owner."""
+    """What holds at a time, which only rises: the last event of each kind and owner, and ways."""
 
     def __init__(self, log: EventLog) -> None:
-        self.log = log
-        self._times: dict[tuple[str, str], list[float]] = {}
-        self._events: dict[tuple[str, str], list[Event]] = {}
-        self._waypoints: dict[str, tuple[list[float], list[list[float] | None]]] = {}
-        for event in sorted(log.events, key=lambda item: float(item[0])):
-            key = event[1], event[2]
-            self._times.setdefault(key, []).append(event[0])
-            self._events.setdefault(key, []).append(event)
-            for row in event[7] if event[1] == 'plan' else []:
-                times, waypoints = self._waypoints.setdefault(row[0], ([], []))
-                times.append(event[0])
-                waypoints.append(row[3] if row[2] >= 0 else None)
+        self.scene: Scene = log.scene
+        self.time = 0.0
+        #: Last event by kind, then by owner; detections of the last moments.
+        self.last: dict[str, dict[str, Event]] = defaultdict(dict)
+        self.seen: list[Event] = []
+        #: By robot: its way so far, and where it is sent, None: it stays.
+        self.ways: dict[str, list[list[float]]] = defaultdict(list)
+        self.waypoints: dict[str, list[float] | None] = {}
+        #: Cuboids visited.
+        self.visited: set[int] = set()
+        moving = {event[2] for event in log.events if event[1] == 'robot'}
+        self.robots = sorted(moving | set(self.scene.get('robots', {})))
+        # The next one is the last of the list.
+        self._coming = sorted(log.events, key=lambda event: float(event[0]))[::-1]
 
-    def until(self, kind: str, owner: str, time: float) -> list[Event]:
-        """Return the events of a kind and owner at or before a time."""
-        key = kind, owner
-        return self._events.get(key, [])[: bisect.bisect_right(self._times.get(key, []), time)]
+    def advance(self, time: float) -> None:
+        """Take the events until a time."""
+        self.time = time
+        while self._coming and self._coming[-1][0] <= time:
+            event = self._coming.pop()
+            _, kind, owner, *content = event
+            self.last[kind][owner] = event
+            if kind == 'robot':
+                self.ways[owner].append(content[0][:3])
+            elif kind == 'seen':
+                self.seen.append(event)
+            elif kind == 'plan':
+                for name, _, chosen, waypoint, *_ in content[4]:
+                    self.waypoints[name] = waypoint if chosen >= 0 else None
+            elif kind == 'cuboid':
+                self.visited |= {shot[0] for shot in content[5]}
+        self.seen = [event for event in self.seen if event[0] >= time - _FADE]
 
-    def now(self, kind: str, time: float) -> Iterator[Event]:
-        """Yield the event of each owner that holds at a time."""
-        for known, owner in sorted(self._times):
-            if known == kind:
-                events = self.until(kind, owner, time)
-                if events:
-                    yield events[-1]
-
-    @property
-    def robots(self) -> list[str]:
-        """Names of all robots."""
-        moving = {owner for kind, owner in self._times if kind == 'robot'}
-        return sorted(moving | set(self.log.scene.get('robots', {})))
-
-    def waypoint(self, robot: str, time: float) -> list[float] | None:
-        """Return where a robot is sent at a time; None: it stays, or has not decided."""
-        times, waypoints = self._waypoints.get(robot, ([], []))
-        index = bisect.bisect_right(times, time)
-        return waypoints[index - 1] if index else None
-
-    def found(self, time: float) -> int:
-        """Return how many targets or cuboids were found by a time."""
-        if 'cuboids' in self.log.scene:
-            return len(self.visited(time))
-        return sum(len(event[3]) for event in self.now('found', time))
-
-    def visited(self, time: float) -> set[int]:
-        """Return the cuboids visited by a time."""
-        owners = {owner for kind, owner in self._times if kind == 'cuboid'}
-        return {
-            shot[0]
-            for owner in owners
-            for event in self.until('cuboid', owner, time)
-            for shot in event[8]
-        }
+    def title(self) -> str:
+        """Return name and time of the run, and what was found."""
+        found, total = len(self.visited), len(self.scene.get('cuboids', []))
+        word = 'visited' if total else 'found'
+        if not total:
+            found = sum(len(event[3]) for event in self.last['found'].values())
+            total = self.scene.get('targets', 0)
+        of = f' of {total}' if total else ''
+        return f'{self.scene.get("name", "")}   {self.time:.1f} s   {word} {found}{of}'
 
 
 def write_video(log: EventLog, path: Path, speed: float = 5.0) -> None:
@@ -128,47 +117,20 @@ def _write_gif(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
 
 def _pictures(log: EventLog, speed: float) -> Iterator[NDArray[np.uint8]]:
     """Yield pictures of the run, (height, width, 3)."""
-    moments = Moments(log)
+    now = Moments(log)
+    bounds = np.array(log.scene.get('bounds') or _extent(log))
     figure = Figure(figsize=_SIZE, dpi=_RESOLUTION, layout='constrained')
     canvas = FigureCanvasAgg(figure)
-    count = max(1, math.ceil(log.duration / speed * RATE)) + 1
     picture = np.zeros((1, 1, 3), np.uint8)
-    for index in range(count):
-        time = min(index * speed / RATE, log.duration)
+    for index in range(max(1, math.ceil(log.duration / speed * RATE)) + 1):
+        now.advance(min(index * speed / RATE, log.duration))
         figure.clear()
-        _draw(figure, moments, time)
+        _draw(figure.add_subplot(projection='3d' if len(bounds) == 3 else None), now, bounds)
         canvas.draw()
         picture = np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
         yield picture
     for _ in range(round(_HOLD * RATE)):
         yield picture
-
-
-def _draw(figure: Figure, moments: Moments, time: float) -> None:
-    scene = moments.log.scene
-    bounds = np.array(scene.get('bounds') or _extent(moments.log))
-    spatial = len(bounds) == 3
-    axes: Any = figure.add_subplot(projection='3d' if spatial else None)
-    axes.set_xlim(*bounds[0])
-    axes.set_ylim(*bounds[1])
-    axes.set_xlabel('x [m]')
-    axes.set_ylabel('y [m]')
-    if spatial:
-        axes.set_zlim(*bounds[2])
-        axes.set_zlabel('z [m]')
-        # Labels of the axes need room.
-        axes.set_box_aspect(bounds[:, 1] - bounds[:, 0], zoom=0.9)
-        _draw_boxes(axes, moments, time)
-        _draw_links(axes, moments, time)
-    else:
-        axes.set_aspect('equal')
-        _draw_floor(axes, moments, time)
-    _draw_targets(axes, moments, time, spatial)
-    _draw_robots(axes, moments, time, spatial)
-    total = len(scene['cuboids']) if 'cuboids' in scene else scene.get('targets')
-    of = f' of {total}' if total else ''
-    word = 'visited' if 'cuboids' in scene else 'found'
-    axes.set_title(f'{scene.get("name", "")}   {time:.1f} s   {word} {moments.found(time)}{of}')
 
 
 def _extent(log: EventLog) -> list[list[float]]:
@@ -177,60 +139,72 @@ def _extent(log: EventLog) -> list[list[float]]:
     return np.stack([low, high], axis=1).tolist()
 
 
-def _draw_floor(axes: Any, moments: Moments, time: float) -> None:
-    for event in moments.now('map', time):
+def _draw(axes: Any, now: Moments, bounds: NDArray[np.float64]) -> None:
+    size = len(bounds)
+    for name, limits in zip('xyz', bounds):
+        axes.set(**{f'{name}lim': limits, f'{name}label': f'{name} [m]'})
+    if size == 3:
+        # Labels of the axes need room.
+        axes.set_box_aspect(bounds[:, 1] - bounds[:, 0], zoom=0.9)
+        _draw_boxes(axes, now)
+    else:
+        axes.set_aspect('equal')
+        _draw_floor(axes, now)
+    _draw_targets(axes, now, size)
+    for index, name in enumerate(now.robots):
+        if name in now.last['robot']:
+            _draw_robot(axes, now, name, _NAMED.get(name, _ROBOTS[index % len(_ROBOTS)]), bounds)
+    axes.set_title(now.title())
+
+
+def _plot(axes: Any, places: ArrayLike, size: int, style: str, **options: Any) -> None:
+    """Draw places (n, 3) [m]; in the plane without their height."""
+    axes.plot(*np.asarray(places, dtype=float).reshape(-1, 3)[:, :size].T, style, **options)
+
+
+def _draw_floor(axes: Any, now: Moments) -> None:
+    for event in list(now.last['map'].values())[:1]:
         (x, y, _), (dx, dy, _), (nx, ny, _), digits = event[3:7]
         values = np.frombuffer(digits.encode(), np.uint8).reshape(nx, ny).T - ord('0')
         extent = (x - dx / 2, x + (nx - 0.5) * dx, y - dy / 2, y + (ny - 0.5) * dy)
         axes.imshow(values, origin='lower', extent=extent, cmap='Greys', vmin=0, vmax=24)
-        break
-    scene = moments.log.scene
-    kept = max((robot.get('clearance', 0.0) for robot in scene['robots'].values()), default=0.0)
-    for *centre, radius in scene.get('obstacles', []):
+    kept = max((robot.get('clearance', 0.0) for robot in now.scene['robots'].values()), default=0.0)
+    for *centre, radius in now.scene.get('obstacles', []):
         axes.add_patch(Circle(centre[:2], radius, color='#59636e'))
         if kept:
             axes.add_patch(Circle(centre[:2], radius + kept, fill=False, ls='--', ec='#59636e'))
 
 
-def _draw_boxes(axes: Any, moments: Moments, time: float) -> None:
-    scene = moments.log.scene
-    visited = moments.visited(time)
-    for box in scene.get('objects', []):
-        draw_box(axes, np.array(box), '#B9B9C9', 0.35, '')
-    for box in scene.get('blocks', []):
-        draw_box(axes, np.array(box), '#8A8478', 0.6, '')
-    for number, box in enumerate(scene.get('cuboids', [])):
-        done = number in visited
-        colour = _VISITED if done else _OPEN
-        draw_box(axes, np.array(box), colour, 0.12 if done else 0.35, '')
+def _draw_boxes(axes: Any, now: Moments) -> None:
+    """Draw buildings and cuboids, and lines between robots of which one hears the other."""
+    for key, colour, alpha in (('objects', '#B9B9C9', 0.35), ('blocks', '#8A8478', 0.6)):
+        for box in now.scene.get(key, []):
+            draw_box(axes, np.array(box), colour, alpha, '')
+    for number, box in enumerate(now.scene.get('cuboids', [])):
+        style = (_VISITED, 0.12) if number in now.visited else (_OPEN, 0.35)
+        draw_box(axes, np.array(box), *style, '')
+    places = {name: way[-1] for name, way in now.ways.items()}
+    for name, event in now.last['cuboid'].items():
+        for other in event[6]:
+            if name in places and other in places:
+                _plot(axes, [places[name], places[other]], 3, ':', color='0.3', lw=1.0)
 
 
-def _draw_targets(axes: Any, moments: Moments, time: float, spatial: bool) -> None:
-    size = 3 if spatial else 2
-    for event in moments.now('truth', time):
-        axes.plot(*np.array(event[3]).reshape(-1, 3)[:, :size].T, 'x', color='0.2', ms=6)
-    for event in moments.now('filter', time):
+def _draw_targets(axes: Any, now: Moments, size: int) -> None:
+    for event in now.last['truth'].values():
+        _plot(axes, event[3], size, 'x', color='0.2', ms=6)
+    for event in now.last['filter'].values():
         for x, y, z, mass, *covariance in event[4]:
             _mark(axes, (x, y, z)[:size], covariance, 2.0, _POTENTIAL, min(0.3 + mass, 1.0))
-    for event in moments.now('found', time):
+    for event in now.last['found'].values():
         for number, x, y, z, covariance, *_ in event[3]:
             _mark(axes, (x, y, z)[:size], covariance, 3.0, _FOUND, 1.0)
             axes.text(*(x, y, z)[:size], f'  {number}', fontsize=8)
-    for name in moments.log.scene.get('robots', {}):
-        for when, *_, place, detections in reversed(moments.until('seen', name, time)):
-            if when < time - _FADE:
-                break
-            for reach, bearing, elevation, *_ in detections:
-                level = reach * math.cos(elevation)
-                spot = np.add(
-                    place,
-                    (
-                        level * math.cos(bearing),
-                        level * math.sin(bearing),
-                        reach * math.sin(elevation),
-                    ),
-                )
-                axes.plot(*spot[:size, None], '+', color=_SEEN, ms=6)
+    for *_, place, detections in now.seen:
+        for reach, bearing, elevation, *_ in detections:
+            level = math.cos(elevation)
+            ray = level * math.cos(bearing), level * math.sin(bearing), math.sin(elevation)
+            _plot(axes, np.add(place, np.multiply(reach, ray)), size, '+', color=_SEEN, ms=6)
 
 
 def _mark(
@@ -243,107 +217,69 @@ def _mark(
 ) -> None:
     """Draw a place; in the plane with the ellipse of its covariance."""
     axes.plot(*np.array(place)[:, None], 'o', color=colour, ms=4, alpha=alpha)
-    if len(place) == 3:
-        return
-    xx, xy, _, yy, *_ = covariance
-    values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-    widths = 2.0 * deviations * np.sqrt(np.maximum(values, 0.0))
-    angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
-    axes.add_patch(
-        Ellipse(
-            (place[0], place[1]),
-            widths[1],
-            widths[0],
-            angle=angle,
-            fill=False,
-            color=colour,
-            alpha=alpha,
-        )
-    )
+    if len(place) == 2:
+        xx, xy, _, yy, *_ = covariance
+        values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
+        widths = 2.0 * deviations * np.sqrt(np.maximum(values[::-1], 0.0))
+        angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+        style: Any = {'fill': False, 'color': colour, 'alpha': alpha}
+        axes.add_patch(Ellipse((place[0], place[1]), *widths, angle=angle, **style))
 
 
-def _draw_robots(axes: Any, moments: Moments, time: float, spatial: bool) -> None:
-    size = 3 if spatial else 2
-    now = {event[2]: event for event in moments.now('robot', time)}
-    for index, name in enumerate(moments.robots):
-        if name not in now:
-            continue
-        colour = _NAMED.get(name, _ROBOTS[index % len(_ROBOTS)])
-        path = np.array([event[3][:size] for event in moments.until('robot', name, time)])
-        axes.plot(*path.T, '-', color=colour, lw=1.3)
-        status = now[name][5]
-        ways = moments.until('way', name, time) if status == MOVING else []
-        if ways and ways[-1][3]:
-            axes.plot(*np.array(ways[-1][3])[:, :size].T, '--', color=colour, lw=1.3)
-        waypoint = moments.waypoint(name, time)
-        if waypoint is not None and status == MOVING:
-            axes.plot(*np.array(waypoint)[:size, None], 's', color=colour, ms=8, mfc='none')
-        *place, yaw = now[name][3]
-        away = status in (UNAVAILABLE, LEFT, SILENT)
-        if not away:
-            _draw_view(axes, moments.log.scene, name, now[name][3], colour)
-        marker: Any = 'D' if spatial else _arrow(yaw)
-        axes.plot(
-            *np.array(place)[:size, None],
-            marker=marker,
-            color=colour,
-            ms=8 if spatial else 16,
-            alpha=0.35 if away else 1.0,
-        )
-        axes.text(*place[:size], f'   {name}', fontsize=9, weight='bold')
-        fence = moments.log.scene.get('robots', {}).get(name, {}).get('fence')
-        if fence:
-            _draw_fence(axes, fence, colour, spatial)
+def _draw_robot(
+    axes: Any, now: Moments, name: str, colour: str, bounds: NDArray[np.float64]
+) -> None:
+    size, robot = len(bounds), now.scene.get('robots', {}).get(name, {})
+    (*place, yaw), _, status = now.last['robot'][name][3:6]
+    _plot(axes, now.ways[name], size, '-', color=colour, lw=1.3)
+    if status == MOVING:
+        _plot(axes, now.last['way'].get(name, [[]])[-1], size, '--', color=colour, lw=1.3)
+        waypoint = now.waypoints.get(name) or []
+        _plot(axes, waypoint, size, 's', color=colour, ms=8, mfc='none')
+    away = status in (UNAVAILABLE, LEFT, SILENT)
+    if size == 3 and not away:
+        # How high it is.
+        x, y, z = place
+        axes.plot([x, x], [y, y], [bounds[2, 0], z], ':', color=colour, lw=0.8)
+    elif 'view' in robot and not away:
+        axes.add_patch(_view(robot['view'], place, yaw, colour))
+    marker: Any = 'D' if size == 3 else _arrow(yaw)
+    style = {'ms': 8 if size == 3 else 16, 'alpha': 0.35 if away else 1.0}
+    _plot(axes, place, size, '', marker=marker, color=colour, **style)
+    axes.text(*place[:size], f'   {name}', fontsize=9, weight='bold')
+    if 'fence' in robot:
+        _draw_fence(axes, robot['fence'], colour, size)
 
 
 def _arrow(yaw: float) -> Outline:
     """Return a marker that points along a yaw [rad]."""
     ahead, left = np.array([1.4, -0.9, -0.5, -0.9, 1.4]), np.array([0.0, 0.8, 0.0, -0.8, 0.0])
+    return Outline(np.column_stack([ahead, left]) @ _turn(yaw))
+
+
+def _turn(yaw: float) -> NDArray[np.float64]:
+    """Return what turns rows x, y by a yaw [rad]."""
     cos, sin = math.cos(yaw), math.sin(yaw)
-    return Outline(np.column_stack([ahead * cos - left * sin, ahead * sin + left * cos]))
+    return np.array([[cos, sin], [-sin, cos]])
 
 
-def _draw_view(axes: Any, scene: dict[str, Any], name: str, pose: list[float], colour: str) -> None:
-    """Draw the field of view; in space only how high the robot is."""
-    x, y, z, yaw = pose
-    if len(scene.get('bounds') or [0, 0]) == 3:
-        axes.plot([x, x], [y, y], [scene['bounds'][2][0], z], ':', color=colour, lw=0.8)
-        return
-    view = scene['robots'].get(name, {}).get('view')
-    if view is None:
-        return
+def _view(view: dict[str, Any], place: list[float], yaw: float, colour: str) -> Any:
+    """Return the outline of a field of view from above."""
     style: Any = {'ec': colour, 'fc': (*to_rgb(colour), 0.12), 'ls': ':'}
-    if view['kind'] == 'box':
-        (left, low), (right, high) = view['lower'][:2], view['upper'][:2]
-        corners = np.array([[left, low], [right, low], [right, high], [left, high]])
-        turn = yaw if view['turns'] else 0.0
-        turned = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
-        axes.add_patch(Polygon(corners @ turned + (x, y), **style))
-    else:
+    if view['kind'] != 'box':
         wide, high = view['size'][:2]
-        axes.add_patch(Ellipse((x, y), 2.0 * wide, 2.0 * high, **style))
+        return Ellipse((place[0], place[1]), 2.0 * wide, 2.0 * high, **style)
+    (left, low), (right, high) = view['lower'][:2], view['upper'][:2]
+    corners = np.array([[left, low], [right, low], [right, high], [left, high]])
+    return Polygon(corners @ _turn(yaw if view['turns'] else 0.0) + place[:2], **style)
 
 
-def _draw_links(axes: Any, moments: Moments, time: float) -> None:
-    """Draw lines between robots of which one hears the other."""
-    places = {event[2]: event[3][:3] for event in moments.now('robot', time)}
-    for event in moments.now('cuboid', time):
-        for other in event[6]:
-            if event[2] in places and other in places:
-                ends = np.array([places[event[2]], places[other]])
-                axes.plot(*ends.T, ':', color='0.3', lw=1.0)
-
-
-def _draw_fence(axes: Any, fence: list[list[float]], colour: str, spatial: bool) -> None:
+def _draw_fence(axes: Any, fence: list[list[float]], colour: str, size: int) -> None:
     """Draw the edges of a geofence (3, 2) [m]."""
     (left, right), (low, high), heights = fence
+    style = {'color': colour, 'lw': 0.9, 'alpha': 0.7}
     corners = [(left, low), (right, low), (right, high), (left, high)]
-    ring = np.array([*corners, corners[0]])
-    style = {'color': colour, 'lw': 0.9, 'alpha': 0.7, 'linestyle': '-.'}
-    if not spatial:
-        axes.plot(*ring.T, **style)
-        return
-    for z in heights:
-        axes.plot(*ring.T, np.full(len(ring), z), **style)
-    for x, y in corners:
-        axes.plot([x, x], [y, y], heights, **style)
+    for z in heights if size == 3 else heights[:1]:
+        _plot(axes, [(*corner, z) for corner in [*corners, corners[0]]], size, '-.', **style)
+    for corner in corners if size == 3 else []:
+        _plot(axes, [(*corner, z) for z in heights], size, '-.', **style)
