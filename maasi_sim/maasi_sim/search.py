@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
@@ -12,9 +13,9 @@ from maasi_drivers.agent.odometry import MapOdometry, StampedPose
 from maasi_drivers.agent.sensor_reading import SensorReading
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus, WaypointFollower
 from maasi_drivers.vision.marker_detector import MarkerDetector, read_markers
+from maasi_filter import SearchFilter
 from maasi_filter.arrays import FloatArray
 from maasi_filter.make_filter import make_filter
-from maasi_filter.metrics import match_targets
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import AgentMeasurement, FoundTarget
 from maasi_planner.coordinator import Coordinator, PresentRobot
@@ -22,12 +23,10 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.planners import Planner
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.team import Decision
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult, SearchState
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.targets.tally import numbered
-from maasi_sim.view.live_view import open_view
 from maasi_sim.view.search_trace import SearchTrace
 from maasi_sim.world.simulation import simulated_robot, step_of_event
 from maasi_sim.world.world import World
@@ -50,9 +49,8 @@ class _Robot:
         self.detector = (
             None if settings.camera is None else MarkerDetector(settings.camera, scenario.dimension)
         )
-        period = scenario.robots[name].sensor.period
-        rate = period if settings.camera is None else 1.0 / settings.camera.rate
-        self.imaging_steps = steps_of(rate, scenario.step) if rate > 0.0 else 1
+        period = settings.sensor.period if settings.camera is None else 1.0 / settings.camera.rate
+        self.imaging_steps = steps_of(period, scenario.step) if period > 0.0 else 1
         self.pose: StampedPose
         self.state: RobotState
         self.distance = 0.0
@@ -79,12 +77,8 @@ class _Robot:
 
     def has_ended(self, goal: int) -> bool:
         """Return whether the goal of this number has ended."""
-        follower = self.follower
-        return (
-            follower.goal is not None
-            and follower.goal.id == goal
-            and follower.status != GoalStatus.MOVING
-        )
+        now, status = self.follower.goal, self.follower.status
+        return now is not None and now.id == goal and status != GoalStatus.MOVING
 
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
         """Return the measurement of the robot at a step."""
@@ -106,86 +100,17 @@ class _Robot:
         )
 
 
+@dataclass
 class _Group:
     """Robots that share filter and planner: all, or a single one (002, section 4)."""
 
-    def __init__(
-        self, space: str, names: list[str], scenario: Scenario, trace: SearchTrace
-    ) -> None:
-        self.space = space
-        self.names = names
-        self.trace = trace
-        seed = trace.seed
-        common = {'step': scenario.step, 'seed': seed, 'lockstep': True}
-        self.coordinator = Coordinator(planner_settings(scenario, names, common))
-        self.filter = make_filter(
-            scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
-        )
-        self.last_batch: int | None = None
-        # Found targets at the end of the previous step, for the other groups.
-        self.shared: list[FoundTarget] = []
-        self.filter_times: list[float] = []
-        self.planning_times: list[float] = []
-
-    def plan(
-        self,
-        step: int,
-        robots: Mapping[str, _Robot],
-        taken: Sequence[tuple[FloatArray, float]],
-    ) -> tuple[dict[str, PresentRobot], Decision | None]:
-        """Plan for the free robots, and send them to their waypoints."""
-        coordinator = self.coordinator
-        present = {
-            name: PresentRobot(
-                robots[name].state,
-                coordinator.is_idle(name)
-                or robots[name].has_ended(coordinator.decision_index(name) + 1),
-            )
-            for name in self.names
-            if name in robots
-        }
-        begin = perf_counter()
-        decision = coordinator.plan(step, present, taken)
-        if decision is not None:
-            self.planning_times.append(perf_counter() - begin)
-            self.trace.decision(
-                step * coordinator.settings.step, self.space, decision, coordinator.exploration
-            )
-            for name, chosen in decision.robots.items():
-                if not chosen.stays:
-                    number = coordinator.decision_index(name) + 1
-                    robots[name].follower.take(Goal(number, step, chosen.waypoint))
-        return present, decision
-
-    def measure(
-        self,
-        step: int,
-        time: float,
-        robots: Mapping[str, _Robot],
-        present: Mapping[str, PresentRobot],
-        others: Sequence[_Group],
-    ) -> list[str]:
-        """Measure with the robots that are due, update the filter, and return their names."""
-        able = {name for name in present if step % robots[name].imaging_steps == 0}
-        members = self.coordinator.measuring(step, present, able)
-        if not members:
-            return []
-        measurements = [
-            robots[item.robot].measure(step, time, item.measurement) for item in members
-        ]
-        gone = 1 if self.last_batch is None else step - self.last_batch
-        self.last_batch = step
-        begin = perf_counter()
-        for other in others:
-            self.filter.take_over(other.names[0], other.shared)
-        result = self.filter.step(measurements, gone, time)
-        self.filter_times.append(perf_counter() - begin)
-        known = result.found_changed or bool(others)
-        found = self.filter.own_found_targets() if known else None
-        self.trace.update(time, self.space, measurements, result, found)
-        self.coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
-        self.trace.explored(time, self.space, self.coordinator.exploration)
-        return [item.robot for item in members]
+    space: str
+    names: list[str]
+    coordinator: Coordinator
+    filter: SearchFilter
+    # Step of the last batch, and found targets at the end of the previous step, for other groups.
+    last_batch: int | None = None
+    shared: list[FoundTarget] = field(default_factory=list)
 
 
 def leaving(scenario: Scenario) -> dict[int, list[str]]:
@@ -241,110 +166,157 @@ def search(
         scenario = scenario.model_copy(update={'planner': renamed})
         planner = None
     running = _Search(scenario, seed, planner)
-    feed = open_view(running.trace) if view else None
-    end_reason = running.run(most_measurements)
-    if feed is not None:
-        feed.close(f'ended: {end_reason}')
-    return running.result(end_reason)
+    if view:
+        running.trace.show()
+    result = running.run(most_measurements)
+    running.trace.end(result.end_reason)
+    return result
 
 
 class _Search:
     """A search while it runs, step by step."""
 
-    def __init__(self, scenario: Scenario, seed: int, planner: MakePlanner | None) -> None:
+    def __init__(self, scenario: Scenario, seed: int, make_planner: MakePlanner | None) -> None:
         self.scenario = scenario
         self.world = scenario.world(seed)
         self.trace = SearchTrace(scenario, seed)
-        self.step = -1
+        self.step, self.time = 0, 0.0
         self._robots = {name: _Robot(name, scenario, seed, self.world) for name in scenario.names()}
+        self._here = dict(self._robots)
         self._departures = leaving(scenario)
-        self._away: set[str] = set()
+        common = {'step': scenario.step, 'seed': seed, 'lockstep': True}
         self._groups = [
-            _Group(space, names, scenario, self.trace)
+            _Group(
+                space,
+                names,
+                Coordinator(planner_settings(scenario, names, common)),
+                make_filter(
+                    scenario.filter, scenario.environment.array(), np.random.default_rng(seed)
+                ),
+            )
             for space, names in scenario.namespaces().items()
         ]
+        if make_planner is not None:
+            for group in self._groups:
+                group.coordinator.planner = make_planner(scenario.planner, self._missing)
         self._destinations = {
             name: np.array(robot.start) for name, robot in scenario.robots.items()
         }
         truth = np.asarray(self.world.targets, dtype=float)
         self.trace.truth(0.0, truth)
         self._radius = scoring_radius(scenario, truth)
-        self._counts = dict.fromkeys(self._robots, 0)
-        self._progress: list[SearchState] = []
-        self._decisions: list[Decision] = []
+        self._result = SearchResult(scenario, self.trace, dict.fromkeys(self._robots, 0))
         # Whether the last score of a step was complete.
         self._complete = False
-        if planner is not None:
-            for group in self._groups:
-                group.coordinator.planner = planner(scenario.planner, self._missing)
 
-    def run(self, most_measurements: int | None) -> str:
-        """Run the search and return the reason of its end."""
+    def run(self, most_measurements: int | None) -> SearchResult:
+        """Run the search and return its result."""
+        reason = None
         for step in range(steps_of(self.scenario.limits.time, self.scenario.step)):
-            self.step = step
-            time = step * self.scenario.step
-            self._let_leave(time)
-            here = {name: r for name, r in self._robots.items() if name not in self._away}
-            for robot in here.values():
-                robot.observe(round(time * 1e9))
-            self.trace.robots(time, {name: robot.state for name, robot in here.items()})
+            self.step, self.time = step, step * self.scenario.step
+            self._let_leave()
+            for robot in self._here.values():
+                robot.observe(round(self.time * 1e9))
+            self.trace.robots(self.time, {name: r.state for name, r in self._here.items()})
             commands = {
                 name: robot.follower.update(robot.state, self.step)[0]
-                for name, robot in here.items()
+                for name, robot in self._here.items()
             }
             self._complete = False
             for group in self._groups:
-                self._plan(group, here)
+                present = self._plan(group)
+                self._measure(group, present)
             reason = self._end_reason(most_measurements)
             if reason is not None:
-                return reason
+                break
             for group in self._groups:
                 group.shared = group.filter.own_found_targets()
-            for name, robot in here.items():
+            for name, robot in self._here.items():
                 robot.move(commands[name], self.step + 1, self.scenario.step)
-        return 'time_limit'
+        result = self._result
+        result.end_reason = reason or 'time_limit'
+        result.steps = self.step + 1
+        result.found_targets, result.truth, result.scores = self._state()
+        result.distance = {name: robot.distance for name, robot in self._robots.items()}
+        return result
 
-    def _let_leave(self, time: float) -> None:
+    def _let_leave(self) -> None:
         for name in self._departures.get(self.step, []):
-            self._away.add(name)
-            self.trace.leave(time, name)
+            self._here.pop(name, None)
+            self.trace.leave(self.time, name)
             for group in self._groups:
                 if name in group.names:
                     group.coordinator.leave(name)
 
-    def _plan(self, group: _Group, here: Mapping[str, _Robot]) -> None:
-        """Plan for the robots of a group, measure with those that are due, and score."""
-        others = [other for other in self._groups if other is not group]
+    def _plan(self, group: _Group) -> dict[str, PresentRobot]:
+        """Plan for the free robots of a group, and send them to their waypoints."""
+        coordinator, here = group.coordinator, self._here
+        present = {
+            name: PresentRobot(
+                here[name].state,
+                coordinator.is_idle(name)
+                or here[name].has_ended(coordinator.decision_index(name) + 1),
+            )
+            for name in group.names
+            if name in here
+        }
         taken = [
             (self._destinations[name], self.scenario.robots[name].radius)
-            for other in others
+            for other in self._groups
             for name in other.names
-            if name in here
+            if other is not group and name in here
         ]
-        present, decision = group.plan(self.step, here, taken)
-        for name in present:
-            self._destinations[name] = group.coordinator.destination(name, present[name].state)
+        begin = perf_counter()
+        decision = coordinator.plan(self.step, present, taken)
         if decision is not None:
-            self._decisions.append(decision)
-        time = self.step * self.scenario.step
-        measured = group.measure(self.step, time, here, present, others)
-        for name in measured:
-            self._counts[name] += 1
-        if measured:
-            self._score(time, measured)
+            self._result.planning_times.append(perf_counter() - begin)
+            self._result.decisions.append(decision)
+            self.trace.decision(self.time, group.space, decision, coordinator)
+            for name, chosen in decision.robots.items():
+                if not chosen.stays:
+                    number = coordinator.decision_index(name) + 1
+                    here[name].follower.take(Goal(number, self.step, chosen.waypoint))
+        for name, robot in present.items():
+            self._destinations[name] = coordinator.destination(name, robot.state)
+        return present
 
-    def _score(self, time: float, measured: list[str]) -> None:
-        truth = self.world.targets_at(self.step)
+    def _measure(self, group: _Group, present: Mapping[str, PresentRobot]) -> None:
+        """Measure with the robots of a group that are due, update its filter, and score."""
+        able = {name for name in present if self.step % self._robots[name].imaging_steps == 0}
+        members = group.coordinator.measuring(self.step, present, able)
+        if not members:
+            return
+        measurements = [
+            self._here[item.robot].measure(self.step, self.time, item.measurement)
+            for item in members
+        ]
+        gone = 1 if group.last_batch is None else self.step - group.last_batch
+        group.last_batch = self.step
+        others = [other for other in self._groups if other is not group]
+        begin = perf_counter()
+        for other in others:
+            group.filter.take_over(other.names[0], other.shared)
+        result = group.filter.step(measurements, gone, self.time)
+        self._result.filter_times.append(perf_counter() - begin)
+        group.coordinator.absorb({item.robot: item.pose for item in measurements}, result.clusters)
+        known = result.found_changed or bool(others)
+        found = group.filter.own_found_targets() if known else None
+        self.trace.update(self.time, group.space, measurements, result, found, group.coordinator)
+        self._score([item.robot for item in members])
+
+    def _score(self, measured: list[str]) -> None:
+        counts = self._result.measurements
+        for name in measured:
+            counts[name] += 1
+        found, truth, scores = self._state()
         if self.world.walk > 0.0:
-            self.trace.truth(time, truth)
-        found = self._found_targets()
-        scores = self._scores(found, truth)
+            self.trace.truth(self.time, truth)
         self._complete = self._complete or (bool(len(truth)) and scores.complete)
-        self._progress.append(
+        self._result.progress.append(
             SearchState(
-                time,
+                self.time,
                 self.step,
-                sum(self._counts.values()),
+                sum(counts.values()),
                 len(found),
                 scores.match.true_found,
                 scores.match.rmse,
@@ -356,45 +328,21 @@ class _Search:
     def _end_reason(self, most_measurements: int | None) -> str | None:
         if self._complete and self.scenario.stop == 'all_found':
             return 'all_found'
-        searching = [group for group in self._groups if not self._away.issuperset(group.names)]
+        searching = [group for group in self._groups if self._here.keys() & set(group.names)]
         if searching and all(group.coordinator.finished is not None for group in searching):
             return 'planner_done'
-        if most_measurements is not None and sum(self._counts.values()) >= most_measurements:
+        measured = sum(self._result.measurements.values())
+        if most_measurements is not None and measured >= most_measurements:
             return 'measurement_limit'
         return None
 
-    def _found_targets(self) -> list[FoundTarget]:
-        return numbered([group.filter.own_found_targets() for group in self._groups])
+    def _state(self) -> tuple[list[FoundTarget], FloatArray, Scores]:
+        """Return the found targets of all groups, the true ones, and the scores now."""
+        found = numbered([group.filter.own_found_targets() for group in self._groups])
+        truth = np.asarray(self.world.targets_at(self.step), dtype=float)
+        return found, truth, score(found, truth, self._radius, self.scenario.scoring.order)
 
     def _missing(self) -> FloatArray:
         """Return the true targets that are not found yet, (n, 3) [m]."""
-        positions = np.array([item.position for item in self._found_targets()])
-        pairs = match_targets(positions, self.world.targets_at(self.step), self._radius).pairs
-        return np.delete(self.world.targets_3d_at(self.step), [j for _, j in pairs], axis=0)
-
-    def _scores(self, found: list[FoundTarget], truth: FloatArray) -> Scores:
-        return score(found, truth, self._radius, self.scenario.scoring.order)
-
-    def result(self, end_reason: str) -> SearchResult:
-        """Return the result after `run`."""
-        found = self._found_targets()
-        truth = np.asarray(self.world.targets_at(max(self.step, 0)), dtype=float)
-        scores = self._scores(found, truth)
-        return SearchResult(
-            end_reason=end_reason,
-            found_targets=found,
-            truth=truth,
-            missed=len(truth) - scores.match.true_found,
-            false_found=len(found) - scores.match.true_found,
-            rmse=scores.match.rmse,
-            measurements=self._counts,
-            distance={name: robot.distance for name, robot in self._robots.items()},
-            steps=self.step + 1,
-            progress=self._progress,
-            decisions=self._decisions,
-            trace=self.trace,
-            filter_times=[item for group in self._groups for item in group.filter_times],
-            planning_times=[item for group in self._groups for item in group.planning_times],
-            pairs=scores.match.pairs,
-            origin=self.scenario.environment.origin,
-        )
+        matched = [j for _, j in self._state()[2].match.pairs]
+        return np.delete(self.world.targets_3d_at(self.step), matched, axis=0)

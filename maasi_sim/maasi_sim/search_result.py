@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
 from maasi_planner.team import Decision
 from maasi_sim.scenario.base import OriginSettings
-from maasi_sim.targets.tables import data_frame
+from maasi_sim.scenario.schema import Scenario
+from maasi_sim.targets.scoring import Scores
+from maasi_sim.targets.tables import columns, found_rows
 from maasi_sim.targets.tally import FoundCount
 from maasi_sim.view.search_trace import SearchTrace
 
@@ -48,52 +51,78 @@ class SearchResult:
 
     Attributes
     ----------
+    scenario : Scenario
+        That was run.
+    trace : SearchTrace
+        For a replay.
+    measurements, distance : dict
+        Number of measurements, and distance travelled, of each robot [m].
     end_reason : str
-        'all_found', 'planner_done' or 'time_limit'.
+        'all_found', 'planner_done', 'time_limit' or 'measurement_limit'.
+    steps : int
+        Length of the search.
     found_targets : list of FoundTarget
         At the end.
     truth : (n, d) array
         True targets [m].
-    missed, false_found : int
-        True targets without a found one, and found ones without a true one.
-    rmse : float
-        Of the true ones among those found [m]; nan without any.
-    measurements : dict
-        Number of each robot.
-    distance : dict
-        Distance travelled by each robot [m].
-    steps : int
-        Length of the search.
+    scores : Scores
+        Of the found targets against the truth.
     progress : list of SearchState
         After each measurement batch.
     decisions : list of Decision
         In their order.
     filter_times, planning_times : list of float
         Wall time of each filter step and of each decision [s].
-    trace : SearchTrace or None
-        For a replay.
-    pairs : list of (int, int)
-        Index of a found target, and of the true one that it is.
-    origin : OriginSettings or None
-        Of the map on the earth.
     """
 
-    end_reason: str
-    found_targets: list[FoundTarget]
-    truth: FloatArray
-    missed: int
-    false_found: int
-    rmse: float
+    scenario: Scenario
+    trace: SearchTrace = field(repr=False, compare=False)
     measurements: dict[str, int]
-    distance: dict[str, float]
-    steps: int
+    distance: dict[str, float] = field(default_factory=dict)
+    end_reason: str = ''
+    steps: int = 0
+    found_targets: list[FoundTarget] = field(default_factory=list)
+    truth: FloatArray = field(init=False)
+    scores: Scores = field(init=False)
     progress: list[SearchState] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     filter_times: list[float] = field(default_factory=list)
     planning_times: list[float] = field(default_factory=list)
-    trace: SearchTrace | None = field(default=None, repr=False, compare=False)
-    pairs: list[tuple[int, int]] = field(default_factory=list)
-    origin: OriginSettings | None = None
+
+    @property
+    def missed(self) -> int:
+        """True targets without a found one."""
+        return self.scores.match.missed
+
+    @property
+    def false_found(self) -> int:
+        """Found targets without a true one."""
+        return self.scores.match.false_found
+
+    @property
+    def rmse(self) -> float:
+        """Of the true ones among those found [m]; nan without any."""
+        return self.scores.match.rmse
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Index of a found target, and of the true one that it is."""
+        return self.scores.match.pairs
+
+    @property
+    def origin(self) -> OriginSettings | None:
+        """Of the map on the earth."""
+        return self.scenario.environment.origin
+
+    @property
+    def total_measurements(self) -> int:
+        """Measurements of all robots."""
+        return sum(self.measurements.values())
+
+    @property
+    def complete(self) -> bool:
+        """Whether all targets are found, and nothing else."""
+        return self.missed == 0 and self.false_found == 0
 
     def save_replay(self, path: str | Path) -> None:
         """Write a page that shows the search, one HTML file.
@@ -103,7 +132,6 @@ class SearchResult:
         ResultsError
             If it cannot be written.
         """
-        assert self.trace is not None, 'a result that `search` returned has a trace'
         self.trace.save_replay(Path(path))
 
     def to_dataframe(self, table: str = 'found_targets') -> Any:
@@ -123,14 +151,23 @@ class SearchResult:
         ValueError
             If there is no such table.
         """
-        return data_frame(self, table)
-
-    @property
-    def total_measurements(self) -> int:
-        """Measurements of all robots."""
-        return sum(self.measurements.values())
-
-    @property
-    def complete(self) -> bool:
-        """Whether all targets are found, and nothing else."""
-        return self.missed == 0 and self.false_found == 0
+        if table not in ('found_targets', 'progress'):
+            raise ValueError(f"table: got {table!r}, allowed are 'found_targets', 'progress'")
+        try:
+            pandas = import_module('pandas')
+        except ImportError:
+            raise ImportError(
+                'to_dataframe needs pandas, which is not installed: pip install pandas'
+            ) from None
+        if table == 'found_targets':
+            rows = found_rows(self.found_targets, self.truth, self.pairs, self.origin)
+            frame = pandas.DataFrame(rows, columns=columns(self.truth.shape[1], self.origin))
+            return frame.astype({'target': 'Int64', 'error': float})
+        rows = []
+        for item in self.progress:
+            counts = ('time', 'step', 'measurements', 'found', 'true_found', 'rmse')
+            row = {name: getattr(item, name) for name in counts}
+            for name, place in item.positions.items():
+                row |= {f'{name}_{axis}': float(value) for axis, value in zip('xyz', place)}
+            rows.append(row | {f'{name}_measures': name in item.members for name in item.positions})
+        return pandas.DataFrame(rows)

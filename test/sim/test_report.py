@@ -471,7 +471,7 @@ def test_picture_in_space(types, tmp_path):
     for name in scenario.names():
         run.state(0.0, name, [1.0, 1.0, 1.0])
         run.state(1.0, name, [100.0, 50.0, 30.0])
-    run.declare(0.5, run.observer.truth[0] + 0.5, 'drone1', deviation=1.0)
+    run.declare(0.5, run.observer.world.targets[0] + 0.5, 'drone1', deviation=1.0)
     run.update(0.5, ['drone1', 'drone2'])
     record = run.record()
     figure = plot_report(record)

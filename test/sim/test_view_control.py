@@ -72,7 +72,7 @@ def test_a_stop_of_all_passes_what_waits_in_the_browser():
             released.wait()
         return True, command
 
-    hub = Hub({'name': 'test', 'robots': {}, 'bounds': [[0, 1], [0, 1]]})
+    hub = Hub({'name': 'test', 'robots': {}, 'bounds': [[0, 1], [0, 1]], 'control': True})
     server = ViewServer(hub, 0, commander=commander)
     hub.put([0.0, 'log', '', 'team', '', 'begin'])
     try:

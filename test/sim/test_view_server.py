@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import re
 import socket
 import threading
 import time
@@ -37,15 +38,22 @@ def server(hub):
 
 @pytest.fixture
 def commanded(hub):
-    """Return a server that takes commands, and the commands."""
+    """Return a function that commands a server with its token, and what was carried out."""
     calls = []
 
-    def commander(command, robot):
-        calls.append((command, robot))
+    def commander(*command):
+        calls.append(command)
         return True, 'paused'
 
+    def command(body, headers=None, length=None):
+        headers = {'X-Maasi-Token': made.token} if headers is None else headers
+        if length is not None:
+            headers['Content-Length'] = length
+        return ask(made, 'POST', '/control', body, headers)
+
     made = ViewServer(hub, 0, commander=commander)
-    yield made, calls
+    assert made.token in made.address
+    yield command, calls
     made.close()
 
 
@@ -150,9 +158,9 @@ def test_a_long_run_is_thinned_and_browsers_begin_anew():
         if index % 100 == 0:
             hub.put([index * STATE_PERIOD, 'log', '', 'found', 'rover', 'target'])
     assert hub.size <= 1000
-    portion = hub.next(0, 900, 0.0)
-    assert json.loads(portion.scene)['thinned'] > STATE_PERIOD
-    events = json.loads(portion.events)
+    text, _, _ = hub.next(0, 900, 0.0)
+    scene, events = map(json.loads, re.findall('^data: (.*)$', text, re.MULTILINE))
+    assert scene['thinned'] > STATE_PERIOD
     assert sum(event[1] == 'log' for event in events) == 15
     assert events[-1] == state(1499)
 
@@ -198,7 +206,7 @@ def test_other_machines_need_the_whole_link(hub, capsys):
     for host, status in (('192.0.2.7', 200), (socket.gethostname(), 200), ('evil.example', 403)):
         assert ask(server, 'GET', f'/?{link.query}', headers={'Host': host})[0] == status
     assert ask(server, 'POST', '/control', '{}', {'X-Maasi-Token': server.token})[0] == 403
-    view.end()
+    view.close()
 
 
 @needs_chromium
@@ -208,7 +216,7 @@ def test_a_browser_on_another_machine_gets_the_events_by_the_whole_link(hub):
     with chromium() as shown:
         shown.open(view.server.address)
         shown.until("maasi.log.robots().includes('rover')")
-    view.end()
+    view.close()
 
 
 def test_where_a_port_is_in_use_the_next_one_is_taken_and_said(server, capsys):
@@ -217,7 +225,7 @@ def test_where_a_port_is_in_use_the_next_one_is_taken_and_said(server, capsys):
     view.announce(print)
     said = capsys.readouterr().out
     assert f'port {server.port} is in use: the page is at {view.server.port}' in said
-    view.end()
+    view.close()
 
 
 def test_the_page_is_served_and_nothing_else(server):
@@ -266,51 +274,40 @@ def test_it_is_read_only_by_default(server):
     assert '?' not in server.address
 
 
-def test_a_command_needs_the_token(commanded):
-    server, calls = commanded
+def test_commands_are_carried_out_with_the_token(commanded):
+    command, calls = commanded
     body = json.dumps({'command': 'pause', 'robot': 'rover'})
     for headers in ({}, {'X-Maasi-Token': 'wrong'}):
-        assert ask(server, 'POST', '/control', body, headers)[0] == 403
+        assert command(body, headers)[0] == 403
     assert calls == []
-    status, text = ask(server, 'POST', '/control', body, {'X-Maasi-Token': server.token})
+    status, text = command(body)
     assert status == 200 and json.loads(text) == {'done': True, 'message': 'paused'}
-    assert calls == [('pause', 'rover')]
-    assert server.token in server.address
-
-
-@pytest.mark.parametrize('command', ['pause', 'resume', 'home', 'stop', 'release'])
-def test_these_commands_are_carried_out(commanded, command):
-    server, calls = commanded
-    body = json.dumps({'command': command, 'robot': None})
-    assert ask(server, 'POST', '/control', body, {'X-Maasi-Token': server.token})[0] == 200
-    assert calls == [(command, None)]
+    assert calls.pop() == ('pause', 'rover')
+    for word in ('pause', 'resume', 'home', 'stop', 'release'):
+        assert command(json.dumps({'command': word, 'robot': None}))[0] == 200
+        assert calls.pop() == (word, None)
 
 
 @pytest.mark.parametrize(
-    ('body', 'status'),
+    ('body', 'length', 'status'),
     [
-        ('{', 400),
-        ('[' * 4000, 400),
-        ('null', 400),
-        ('{"command": "launch"}', 400),
-        ('{"command": ["stop"]}', 400),
-        ('{"command": "stop", "robot": "../../other"}', 400),
-        ('{"command": "stop", "robot": 7}', 400),
-        ('x' * (LARGEST_BODY + 1), 413),
+        ('{', None, 400),
+        ('[' * 4000, None, 400),
+        ('null', None, 400),
+        ('{"command": "launch"}', None, 400),
+        ('{"command": ["stop"]}', None, 400),
+        ('{"command": "stop", "robot": "../../other"}', None, 400),
+        ('{"command": "stop", "robot": 7}', None, 400),
+        ('x' * (LARGEST_BODY + 1), None, 413),
+        # Of unknown or huge length: not read.
+        ('', '', 411),
+        ('', '-1', 411),
+        ('', '99999999999', 413),
     ],
 )
-def test_wrong_commands_are_refused(commanded, body, status):
-    server, calls = commanded
-    assert ask(server, 'POST', '/control', body, {'X-Maasi-Token': server.token})[0] == status
-    assert calls == []
-
-
-def test_a_body_of_unknown_or_huge_length_is_not_read(commanded):
-    server, calls = commanded
-    head = f'POST /control HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Maasi-Token: {server.token}\r\n'
-    for length in ('', 'Content-Length: -1\r\n', 'Content-Length: 99999999999\r\n'):
-        answer = send(server, f'{head}{length}\r\n'.encode())
-        assert answer.split()[1] in (b'411', b'413')
+def test_wrong_commands_are_refused(commanded, body, length, status):
+    command, calls = commanded
+    assert command(body, length=length)[0] == status
     assert calls == []
 
 

@@ -13,8 +13,9 @@ from waiting import wait_until
 
 from maasi_filter.ros.qos import RELIABLE
 from maasi_sim.run.bag import Bag, BagWriter, load_types
+from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.view.event_log import EventLog
-from maasi_sim.view.live_view import LiveView, MessageFeed
+from maasi_sim.view.live_view import RunPage
 from maasi_sim.view.messages import is_shown, read_events
 from maasi_sim.view.page_file import REPLAY, write_replay
 from maasi_sim.view.scene import empty_scene
@@ -62,7 +63,6 @@ class Watched:
             self.found = shown.number()
             self.decisions = shown.page.evaluate('maasi.log.decisions.times.length')
             self.controls = shown.page.is_visible('#controls')
-            shown.check()
 
 
 @pytest.fixture(scope='module')
@@ -148,7 +148,6 @@ def test_the_page_shows_the_bag(run, address):
             }"""
         )
         assert colours > 20
-        shown.check()
 
 
 @needs_chromium
@@ -165,7 +164,6 @@ def test_the_page_says_how_many_targets_are_expected_to_be_left(run, address):
         shown.seek(10.0)
         shown_number = shown.page.inner_text('dt:text-is("expected left") + dd')
         assert float(shown_number) == pytest.approx(expected, rel=0.01)
-        shown.check()
 
 
 @needs_chromium
@@ -183,7 +181,6 @@ def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
         )[3::4]
         # From the upper left corner, by rows: y falls, x rises.
         assert shades == [90, 0, 90, 90]
-        shown.check()
 
 
 @needs_chromium
@@ -216,7 +213,6 @@ def test_a_click_on_a_decision_shows_its_candidates(run, address):
         assert shown.page.evaluate('maasi.time') == pytest.approx(
             seconds(later['header']['stamp']), abs=1e-3
         )
-        shown.check()
 
 
 def objective(robot, index):
@@ -238,7 +234,6 @@ def test_a_click_on_a_robot_shows_why_it_goes_there(run, address):
         shown.page.click('#robots tr[data-robot=turtlebot]')
         shown.settle()
         assert 'turtlebot, decision' in shown.page.inner_text('#why')
-        shown.check()
 
 
 @needs_chromium
@@ -262,7 +257,6 @@ def test_it_plays_by_the_space_bar_also_on_a_phone_in_space_and_in_the_dark(run,
         assert shown.page.locator('#map').screenshot() != flat
         # Nothing is wider than the phone.
         assert shown.page.evaluate('document.documentElement.scrollWidth') <= 390
-        shown.check()
 
 
 def test_a_recording_that_is_none_is_refused(tmp_path, capsys):
@@ -310,10 +304,9 @@ def test_a_recording_without_a_scenario_is_shown(run, tmp_path):
 
 
 def test_the_view_node_shows_a_bag_that_is_played_and_begins_again_with_it(run, ros):
-    view = LiveView(empty_scene(), 0)
-    feed = MessageFeed(view, load_types(), waits=False)
+    view = RunPage(empty_scene(), ViewOptions(0), 0, '', waits=False)
     player = rclpy.create_node('player', enable_rosout=False)
-    node = ViewNode(feed.put)
+    node = ViewNode(view.put_message)
     executor = SingleThreadedExecutor()
     try:
         with Bag(run.bag) as bag:
@@ -351,7 +344,6 @@ def test_the_view_node_shows_a_bag_that_is_played_and_begins_again_with_it(run, 
         executor.shutdown()
         node.destroy_node()
         player.destroy_node()
-        feed.close()
         view.end()
 
 

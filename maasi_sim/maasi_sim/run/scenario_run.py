@@ -105,7 +105,7 @@ class ScenarioRun:
             session = Session(
                 self.mission, self.supervisor, self.options, self.interruption, self.display
             )
-            session.listener = None if page is None else page.put
+            session.listener = None if page is None else page.put_message
             session.open(domain.number, self.folder)
             # Ctrl-C ends the wait at once; the run reports it.
             with self.interruption.at_once():
@@ -123,7 +123,7 @@ class ScenarioRun:
             if session is not None:
                 session.close()
             if page is not None:
-                page.close()
+                page.end()
             self.display.close()
         return self._report(session)
 
@@ -165,7 +165,7 @@ class ScenarioRun:
         except OSError as error:
             self.display.say(f'warning: no view: {options.host}: {error.strerror or error}')
             return None
-        page.view.announce(self.display.say)
+        page.announce(self.display.say)
         return page
 
     def _leave_replay(self) -> None:

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -29,41 +28,38 @@ def found_rows(
     `pairs` are indices of a found target and of the true one that it is. Without an origin of the
     map rows have no geodetic coordinates.
     """
-    true = dict(pairs)
-    rows = []
+    rows, true = [], dict(pairs)
     for index, item in enumerate(found):
         target = true.get(index)
         error = None if target is None else float(np.linalg.norm(item.position - truth[target]))
-        row: Row = {
-            'id': item.id,
-            'agent': item.robot,
-            'time': float(item.time),
-            'measurement': item.measurement,
-            **{axis: float(value) for axis, value in zip('xyz', item.position)},
-        }
-        if origin is not None:
-            row |= geodetic(item.position, origin)
-        for i, first in enumerate('xyz'[: len(item.position)]):
-            for j, second in enumerate('xyz'[: i + 1]):
-                row[second + first] = float(item.covariance[j, i])
-        row |= {
-            'class_id': item.label.class_id,
-            'score': float(item.label.score),
-            'identity': item.label.identity,
-            'target': target,
-            'error': error,
-        }
-        rows.append(row)
+        rows.append({**_row(item, origin), 'target': target, 'error': error})
     return rows
+
+
+def _row(item: FoundTarget, origin: OriginSettings | None) -> Row:
+    axes = 'xyz'[: len(item.position)]
+    return {
+        'id': item.id,
+        'agent': item.robot,
+        'time': float(item.time),
+        'measurement': item.measurement,
+        **{axis: float(value) for axis, value in zip(axes, item.position)},
+        **({} if origin is None else geodetic(item.position, origin)),
+        **{
+            second + first: float(item.covariance[j, i])
+            for i, first in enumerate(axes)
+            for j, second in enumerate(axes[: i + 1])
+        },
+        'class_id': item.label.class_id,
+        'score': float(item.label.score),
+        'identity': item.label.identity,
+    }
 
 
 def columns(dimension: int, origin: OriginSettings | None) -> list[str]:
     """Return the columns of the table; dimension is 2 or 3."""
-    names = ['id', 'agent', 'time', 'measurement', *'xyz'[:dimension]]
-    if origin is not None:
-        names += ['latitude', 'longitude', 'altitude']
-    names += [b + a for i, a in enumerate('xyz'[:dimension]) for b in 'xyz'[: i + 1]]
-    return [*names, 'class_id', 'score', 'identity', 'target', 'error']
+    some = FoundTarget(1, np.zeros(dimension), np.eye(dimension), '', 0, 0.0)
+    return [*_row(some, origin), 'target', 'error']
 
 
 def geodetic(position: FloatArray, origin: OriginSettings) -> Row:
@@ -100,28 +96,3 @@ def geojson_text(rows: Sequence[Row]) -> str:
         features.append({'type': 'Feature', 'geometry': geometry, 'properties': properties})
     content = {'type': 'FeatureCollection', 'features': features}
     return json.dumps(content, indent=1, allow_nan=False) + '\n'
-
-
-def data_frame(result: Any, table: str) -> Any:
-    """Return a table of a `SearchResult`, see `SearchResult.to_dataframe`."""
-    if table not in ('found_targets', 'progress'):
-        raise ValueError(f"table: got {table!r}, allowed are 'found_targets', 'progress'")
-    try:
-        pandas = import_module('pandas')
-    except ImportError:
-        raise ImportError(
-            'to_dataframe needs pandas, which is not installed: pip install pandas'
-        ) from None
-    if table == 'found_targets':
-        rows = found_rows(result.found_targets, result.truth, result.pairs, result.origin)
-        names = columns(result.truth.shape[1], result.origin)
-        frame = pandas.DataFrame(rows, columns=names)
-        return frame.astype({'target': 'Int64', 'error': float})
-    rows = []
-    for item in result.progress:
-        counts = ('time', 'step', 'measurements', 'found', 'true_found', 'rmse')
-        row = {name: getattr(item, name) for name in counts}
-        for name, place in item.positions.items():
-            row |= {f'{name}_{axis}': float(value) for axis, value in zip('xyz', place)}
-        rows.append(row | {f'{name}_measures': name in item.members for name in item.positions})
-    return pandas.DataFrame(rows)

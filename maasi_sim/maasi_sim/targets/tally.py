@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import FoundTarget, Label
-from maasi_sim.run.run_record import RunRecord
+from maasi_sim.run.run_record import RunRecord, TeamLog
 from maasi_sim.run.topics import seconds
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
@@ -28,15 +28,6 @@ class FoundCount:
     measurements: int
     found: int
     true_found: int
-
-
-@dataclass
-class Update:
-    """An update of a filter, in a namespace, with the found targets published with it."""
-
-    namespace: str
-    message: Any
-    arrays: list[Any]
 
 
 @dataclass
@@ -59,8 +50,6 @@ class TargetRecord(RunRecord):
         By robot: chosen ones in order, (n, 3) [m].
     measured_from : dict
         By robot: poses at which it measured, in order.
-    explored, expected_number : float
-        Share of the environment, and targets believed not yet found, at the end.
     """
 
     truth: FloatArray
@@ -70,8 +59,6 @@ class TargetRecord(RunRecord):
     decisions: int = 0
     waypoints: dict[str, FloatArray] = field(default_factory=dict)
     measured_from: dict[str, list[Pose]] = field(default_factory=dict)
-    explored: float = 0.0
-    expected_number: float = 0.0
 
     def scores(self) -> Scores:
         """Return the scores at the end."""
@@ -87,26 +74,38 @@ def numbered(found: Sequence[Sequence[FoundTarget]]) -> list[FoundTarget]:
     return [replace(item, id=number) for number, item in enumerate(every, start=1)]
 
 
+def found_target(item: Any, begin: float, dimension: int = 3) -> FoundTarget:
+    """Return the found target of a message, with its time since `begin` [s]."""
+    position = np.array([item.position.x, item.position.y, item.position.z])
+    covariance = np.array(item.covariance, dtype=float).reshape(3, 3)
+    return FoundTarget(
+        int(item.id),
+        position[:dimension],
+        covariance[:dimension, :dimension],
+        item.robot,
+        int(item.measurement),
+        seconds(item.stamp) - begin,
+        label=Label(item.class_id, item.score, item.identity),
+    )
+
+
 class Tally:
     """Counts what the filters have found, update by update."""
 
-    def __init__(self, scenario: Scenario, world: World, begin: float) -> None:
+    def __init__(self, scenario: Scenario, world: World, team: TeamLog) -> None:
         self.scenario = scenario
         self.world = world
         self.truth = np.asarray(world.targets, dtype=float)
-        self.begin = begin
-        self.radius = scoring_radius(scenario, self.truth)
         self.measurements = dict.fromkeys(scenario.names(), 0)
         self.progress: list[FoundCount] = []
         self.completed: FoundCount | None = None
-        self.expected_number = 0.0
-        self._shared = len(scenario.namespaces()) > 1
+        self._team = team
+        self._radius = scoring_radius(scenario, self.truth)
         # By namespace of the filter.
         self._found: dict[str, dict[int, FoundTarget]] = {
             name: {} for name in scenario.namespaces()
         }
-        self._expected: dict[str, float] = {}
-        self._last_scores: Scores | None = None
+        self._scores: Scores | None = None
         self._counted: set[tuple[str, str, int]] = set()
 
     @property
@@ -114,65 +113,46 @@ class Tally:
         """Targets found so far."""
         return numbered([[of[key] for key in sorted(of)] for of in self._found.values()])
 
-    def take(self, update: Update) -> bool:
-        """Count an update; return whether the number of found targets has changed."""
-        message = update.message
-        before = self._found[update.namespace]
-        changed = bool(update.arrays)
-        for array in update.arrays:
-            before = {int(item.id): self._target(item) for item in self._own(update, array.targets)}
-        for item in self._own(update, message.newly_found):
-            if int(item.id) not in before:
-                before[int(item.id)] = self._target(item)
-                changed = True
-        self._found[update.namespace] = before
+    def take(self, space: str, message: Any, every: Any) -> bool:
+        """Count an update of a filter; return whether the number of found targets has changed.
+
+        `every` is the message with all its found targets, None if they have not changed.
+        """
+        before = self._found[space] if every is None else self._own(space, every.targets)
+        new = self._own(space, message.newly_found)
+        changed = every is not None or not new.keys() <= before.keys()
+        self._found[space] = {**new, **before}
         for member in message.members:
             # A restarted filter republishes its last update; ignore duplicates.
-            key = (update.namespace, member.robot, int(member.measurement))
+            key = (space, member.robot, int(member.measurement))
             if key not in self._counted:
                 self._counted.add(key)
                 self.measurements[member.robot] = self.measurements.get(member.robot, 0) + 1
-        # All filters estimate the same targets.
-        self._expected[update.namespace] = float(message.expected_number)
-        self.expected_number = max(self._expected.values())
         if self.world.walk > 0.0:
             self.truth = self.world.targets_at(int(message.step))
             changed = True
-        if changed or self._last_scores is None:
+        if changed or self._scores is None:
             order = self.scenario.scoring.order
-            self._last_scores = score(self.found, self.truth, self.radius, order)
+            self._scores = score(self.found, self.truth, self._radius, order)
         now = FoundCount(
-            seconds(message.header.stamp) - self.begin,
+            self._team.time(message.header.stamp),
             int(message.step),
             sum(self.measurements.values()),
-            sum(len(found) for found in self._found.values()),
-            self._last_scores.match.true_found,
+            sum(map(len, self._found.values())),
+            self._scores.match.true_found,
         )
         news = not self.progress or self.progress[-1].found != now.found
         self.progress.append(now)
-        if (
-            self.completed is None
-            and len(self.truth)
-            and self._last_scores.complete
-            and self.scenario.stop == 'all_found'
-        ):
+        complete = len(self.truth) and self._scores.complete and self.scenario.stop == 'all_found'
+        if complete and self.completed is None:
             self.completed = now
         return news
 
-    def _own(self, update: Update, targets: Any) -> list[Any]:
-        """Return the targets that the filter found itself."""
-        if not self._shared:
-            return list(targets)
-        return [item for item in targets if item.robot == update.namespace]
-
-    def _target(self, item: Any) -> FoundTarget:
-        size = self.scenario.dimension
-        return FoundTarget(
-            int(item.id),
-            np.array([item.position.x, item.position.y, item.position.z])[:size],
-            np.array(item.covariance, dtype=float).reshape(3, 3)[:size, :size],
-            item.robot,
-            int(item.measurement),
-            seconds(item.stamp) - self.begin,
-            label=Label(item.class_id, item.score, item.identity),
-        )
+    def _own(self, space: str, targets: Iterable[Any]) -> dict[int, FoundTarget]:
+        """Return the targets that a filter found itself, not those that others told it."""
+        begin, dimension = self._team.begin or 0.0, self.scenario.dimension
+        return {
+            int(item.id): found_target(item, begin, dimension)
+            for item in targets
+            if len(self._found) == 1 or item.robot == space
+        }

@@ -1,16 +1,17 @@
-"""Makes the events of a run from what its filter, planner and robots say, as plain values."""
+"""Makes the events of a run from what its filter, planner and robots say, as their records."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.records import Cluster, FoundTarget
+from maasi_planner.team import Decision
 from maasi_sim.targets.scoring import score
 from maasi_sim.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning
 
@@ -20,44 +21,30 @@ _NOT_ALLOWED = -1e29
 MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
 # A robot is silent when others say where they are for so long without it [s].
 _SILENCE = 3.0
-_UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+# Points of a planned way that are shown.
+_MOST_POINTS = 40
 
 
-@dataclass(frozen=True)
-class RobotChoice:
-    """The decision of one robot.
-
-    `decision` is its index d, `chosen` that of a candidate (negative: none). Candidates are x, y, z
-    [m], C, T, E, J, K, M; the reason is empty where it is the objective.
-    """
-
-    robot: str
-    decision: int
-    chosen: int
-    waypoint: ArrayLike
-    candidates: Iterable[Sequence[float]]
-    reason: str = ''
-
-
-def padded(position: ArrayLike) -> FloatArray:
-    """Return a position with three coordinates, the third 0 in a planar search."""
-    place = np.zeros(3)
-    given = np.asarray(position, dtype=float).reshape(-1)
-    place[: len(given)] = given
-    return place
-
-
-def upper(covariance: ArrayLike) -> list[float]:
-    """Return the upper triangle of a covariance with three axes: xx, xy, xz, yy, yz, zz."""
-    given = np.asarray(covariance, dtype=float)
-    whole = np.zeros((3, 3))
-    whole[: len(given), : len(given)] = given
-    return [significant(value) for value in whole[_UPPER]]
+def padded(values: ArrayLike) -> FloatArray:
+    """Return a place, or a covariance, of three axes; the third is 0 in a planar search."""
+    given = np.asarray(values, dtype=float)
+    whole = np.zeros((3,) * given.ndim)
+    whole[tuple(map(slice, given.shape))] = given
+    return whole
 
 
 def significant(value: float) -> float:
     """Return a number with five significant digits; one that is not finite becomes 0."""
     return float(f'{value:.5g}') if math.isfinite(value) else 0.0
+
+
+def _upper(covariance: ArrayLike) -> list[float]:
+    """Return the upper triangle of a covariance with three axes: xx, xy, xz, yy, yz, zz."""
+    return [significant(value) for value in padded(covariance)[np.triu_indices(3)]]
+
+
+def _words(place: Sequence[float]) -> str:
+    return f'({", ".join(f"{value:g}" for value in place)})'
 
 
 def _explored(values: FloatArray) -> float:
@@ -102,8 +89,8 @@ class EventMaker:
             self._listener(event)
 
     def _place(self, position: ArrayLike) -> list[float]:
-        place = [round(float(value), self._digits) for value in np.ravel(position)]
-        return [*place, 0.0, 0.0][:3]
+        place = np.asarray(position, dtype=float).tolist()
+        return [*(round(value, self._digits) for value in place), 0.0, 0.0][:3]
 
     def robot(
         self,
@@ -151,17 +138,19 @@ class EventMaker:
         time: float,
         robot: str,
         position: ArrayLike,
-        detections: Iterable[tuple[Sequence[float], ArrayLike | None]],
+        values: Iterable[ArrayLike],
+        covariances: Sequence[ArrayLike | None] | FloatArray | None,
     ) -> None:
-        """Add a measurement: detections (range, bearing, elevation) with covariance or None."""
-        preset = self.scene.get('robots', {}).get(robot, {}).get('deviations') or [0.0, 0.0, 0.0]
+        """Add a measurement: range, bearing and elevation of detections, some with a covariance."""
         rows = []
-        for values, covariance in detections:
-            deviations = list(preset)
-            if covariance is not None:
-                own = np.sqrt(np.maximum(np.diag(np.asarray(covariance, dtype=float)), 0.0))
-                deviations = [*own.tolist(), 0.0][:3]
-            rows.append([significant(value) for value in (*padded(values), *deviations)])
+        for index, detection in enumerate(values):
+            own = None if covariances is None else covariances[index]
+            if own is None:
+                deviations = self.scene.get('robots', {}).get(robot, {}).get('deviations', [0.0])
+            else:
+                deviations = np.sqrt(np.maximum(np.diag(np.asarray(own, dtype=float)), 0.0))
+            row = (*padded(detection), *padded(deviations))
+            rows.append([significant(value) for value in row])
         self._put(time, 'seen', robot, self._place(position), rows)
 
     def filter(
@@ -169,38 +158,30 @@ class EventMaker:
         time: float,
         space: str,
         expected: float,
-        clusters: Iterable[tuple[ArrayLike, float, ArrayLike]],
+        clusters: Iterable[Cluster],
         members: Iterable[tuple[str, int]],
     ) -> None:
-        """Add an update: clusters (position, mass, covariance), members (robot, measurement)."""
+        """Add an update of a filter; members are robots with the index of their measurement."""
         self._measured.update((space, name, index) for name, index in members)
         rows = [
-            [*self._place(position), significant(mass), *upper(covariance)]
-            for position, mass, covariance in clusters
+            [*self._place(item.position), significant(item.mass), *_upper(item.covariance)]
+            for item in clusters
         ]
         self._put(time, 'filter', space, significant(expected), rows, len(self._measured))
 
-    def found(
-        self,
-        time: float,
-        space: str,
-        targets: Iterable[tuple[int, ArrayLike, ArrayLike, str, float]],
-    ) -> None:
-        """Add all found targets of a filter: id, position, covariance, robot, time [s]."""
-        shared = space in self.scene.get('robots', {})
-        before = self._found.get(space, {})
-        now: dict[int, FloatArray] = {}
-        rows = []
+    def found(self, time: float, space: str, targets: Iterable[FoundTarget]) -> None:
+        """Add all found targets of a filter."""
         # A filter that knows what others found counts only what it found itself.
-        for number, position, covariance, robot, when in targets:
-            if shared and robot != space:
-                continue
-            now[number] = padded(position)
-            rows.append([number, *self._place(position), upper(covariance), robot, round(when, 3)])
-            if number not in before:
-                where = ', '.join(f'{value:g}' for value in rows[-1][1:4])
-                self.message(time, robot, 'found', f'target {number} at ({where}) m')
-        self._found[space] = now
+        shared = space in self.scene.get('robots', {})
+        own = [item for item in targets if not shared or item.robot == space]
+        before = self._found.get(space, {})
+        rows = []
+        for item in own:
+            place, when = self._place(item.position), round(max(item.time, 0.0), 3)
+            rows.append([item.id, *place, _upper(item.covariance), item.robot, when])
+            if item.id not in before:
+                self.message(time, item.robot, 'found', f'target {item.id} at {_words(place)} m')
+        self._found[space] = {item.id: padded(item.position) for item in own}
         self._put(time, 'found', space, rows)
         self._score(time)
 
@@ -208,48 +189,49 @@ class EventMaker:
         self,
         time: float,
         space: str,
-        choices: Iterable[RobotChoice],
         planner: str,
+        decision: Decision,
+        indices: Mapping[str, int],
         explored: float,
-        objective: float,
-        reason: str,
     ) -> None:
-        """Add a joint decision."""
+        """Add a joint decision; `indices` number the decisions of each robot."""
         rows = []
-        for choice in choices:
-            candidates = []
-            for values in choice.candidates:
-                x, y, z, *terms, length, measurements = (float(value) for value in values)
-                allowed = math.isfinite(terms[3]) and terms[3] > _NOT_ALLOWED
-                *numbers, objective_of = map(significant, terms)
-                candidates.append(
-                    [
-                        *self._place([x, y, z]),
-                        *numbers,
-                        objective_of if allowed else None,
-                        int(length),
-                        int(measurements),
-                    ]
-                )
-            waypoint = self._place(choice.waypoint)
-            numbers = [int(choice.decision), int(choice.chosen)]
-            rows.append([choice.robot, *numbers, waypoint, candidates, choice.reason])
-            where = ', '.join(f'{value:g}' for value in waypoint)
-            words = f'stays: {choice.reason or reason or "no candidate"}'
-            if choice.chosen >= 0:
-                words = f'to ({where})'
-            self.message(time, choice.robot, 'decision', f'decision {choice.decision}: {words}')
-        if not rows and reason:
-            self.message(time, space or planner, 'decision', reason)
-        total = significant(objective) if objective > _NOT_ALLOWED else None
-        self._put(time, 'plan', space, planner, round(explored, 4), total, reason, rows)
+        for name, robot in sorted(decision.robots.items()):
+            terms = robot.control_cost, robot.target_refinement, robot.exploration, robot.objective
+            columns = [robot.candidates, *terms, robot.lengths, robot.measurements]
+            candidates = [
+                [
+                    *self._place(values[:3]),
+                    *map(significant, values[3:6]),
+                    self._objective(values[6]),
+                    *map(int, values[7:]),
+                ]
+                for values in np.column_stack(columns).tolist()
+            ]
+            waypoint = self._place(robot.waypoint)
+            rows.append([name, indices[name], robot.chosen, waypoint, candidates, robot.reason])
+            words = f'to {_words(waypoint)}'
+            if robot.stays:
+                words = f'stays: {robot.reason or decision.reason or "no candidate"}'
+            self.message(time, name, 'decision', f'decision {indices[name]}: {words}')
+        if not rows and decision.reason:
+            self.message(time, space or planner, 'decision', decision.reason)
+        total = self._objective(decision.objective)
+        self._put(time, 'plan', space, planner, round(explored, 4), total, decision.reason, rows)
+        for name, robot in sorted(decision.robots.items()):
+            if len(robot.positions):
+                self.way(time, name, robot.positions)
 
-    def way(self, time: float, robot: str, positions: ArrayLike, most: int = 40) -> None:
-        """Add the planned way of a robot, (n, 3) [m]."""
-        points = np.asarray(positions, dtype=float).reshape(-1, 3)
-        count = len(points)
-        chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-        self._put(time, 'way', robot, [self._place(points[item]) for item in chosen])
+    @staticmethod
+    def _objective(value: float) -> float | None:
+        allowed = math.isfinite(value) and value > _NOT_ALLOWED
+        return significant(value) if allowed else None
+
+    def way(self, time: float, robot: str, positions: Sequence[ArrayLike] | FloatArray) -> None:
+        """Add the planned way of a robot: places [m]."""
+        count = len(positions)
+        chosen = np.linspace(0, count - 1, min(count, _MOST_POINTS)).round().astype(int)
+        self._put(time, 'way', robot, [self._place(positions[item]) for item in chosen])
 
     def map(
         self,
@@ -273,12 +255,11 @@ class EventMaker:
 
     def truth(self, time: float, targets: ArrayLike) -> None:
         """Add the true targets, (n, 2 or 3) [m]."""
-        rows = [padded(item) for item in np.asarray(targets, dtype=float)]
-        now = np.array(rows).reshape(-1, 3)
+        now = np.asarray(targets, dtype=float)
         if self._truth is not None and np.array_equal(self._truth, now):
             return
         self._truth = now
-        self._put(time, 'truth', '', [self._place(item) for item in rows])
+        self._put(time, 'truth', '', [self._place(item) for item in now])
         self._score(time)
 
     def cuboid(
@@ -323,8 +304,6 @@ class EventMaker:
         found = np.array(positions).reshape(-1, 3)[:, :size]
         scores = score(found, self._truth[:, :size], radius, self.scene.get('scoring_order', 2.0))
         match = scores.match
-        rmse = float(match.rmse)
-        error = significant(rmse) if math.isfinite(rmse) else None
-        numbers = [match.true_found, match.missed, len(found) - match.true_found]
-        total = significant(float(scores.gospa.total))
-        self._put(time, 'score', '', *map(int, numbers), error, total)
+        rmse = significant(match.rmse) if math.isfinite(match.rmse) else None
+        numbers = match.true_found, match.missed, match.false_found
+        self._put(time, 'score', '', *map(int, numbers), rmse, significant(scores.gospa.total))

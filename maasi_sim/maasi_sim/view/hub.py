@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from maasi_sim.view.event_log import STATE_PERIOD, Event, Scene, line, thin
@@ -19,21 +17,6 @@ _MOST_AT_ONCE = 2000
 MOST_WAITING = 50_000
 # Wait for more before the next look, so that the run has the processor [s].
 _PERIOD = 0.05
-
-
-@dataclass(frozen=True)
-class Portion:
-    """What a browser gets next.
-
-    `scene` is JSON where the browser is to start over, else empty; `events` is a JSON list;
-    `generation` and `position` say where the next portion begins, `closed` that nothing follows.
-    """
-
-    scene: str
-    events: str
-    generation: int
-    position: int
-    closed: bool
 
 
 class Hub:
@@ -80,10 +63,14 @@ class Hub:
         """Number of events kept."""
         return len(self._events)
 
-    def next(self, generation: int, position: int, patience: float) -> Portion:
-        """Return what follows a position; nothing new within the patience [s] is an empty portion.
+    def next(
+        self, generation: int, position: int, patience: float
+    ) -> tuple[str, tuple[int, int], bool]:
+        """Return what follows a position, as Server-Sent Events.
 
-        A browser begins with generation -1.
+        And generation and position of the next portion, and whether nothing follows. A browser
+        begins with generation -1; where another one has begun it gets the scene, and starts over.
+        Nothing new within the patience [s] is a comment.
         """
         with self._changed:
             self._changed.wait_for(
@@ -92,16 +79,19 @@ class Hub:
                 ),
                 patience,
             )
-            scene = ''
+            text = ''
             if generation != self._generation:
-                scene, position = line(self._scene), 0
+                text, position = f'event: scene\ndata: {line(self._scene)}\n\n', 0
             events = self._events[position : position + _MOST_AT_ONCE]
             position += len(events)
             closed = self._closed and position == len(self._events)
             generation = self._generation
         # Outside of the lock: a large portion takes a while.
-        text = json.dumps(events, separators=(',', ':'), allow_nan=False)
-        return Portion(scene, text if events else '', generation, position, closed)
+        if events:
+            text += f'event: events\ndata: [{",".join(map(line, events))}]\n\n'
+        if closed:
+            text += 'event: end\ndata:\n\n'
+        return text or ': \n\n', (generation, position), closed
 
     def _thin(self) -> None:
         """Halve what changes gradually, until a tenth of the room is free."""

@@ -6,23 +6,18 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rosbags.typesys.store import Typestore
-
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.view.event_log import Scene
 from maasi_sim.view.event_maker import EventMaker
 from maasi_sim.view.hub import Hub, LiveFeed
-from maasi_sim.view.messages import MessageEvents
+from maasi_sim.view.messages import MARKERS, MessageEvents
 from maasi_sim.view.page_file import open_browser
-from maasi_sim.view.scene import scene_of
-from maasi_sim.view.search_trace import Call, SearchTrace
 from maasi_sim.view.server import Commander, ViewServer
 
 # For browsers to take the last events [s].
 _FAREWELL = 2.0
 _STEP = 'maasi_msgs/msg/LockstepStep'
-_MARKERS = 'visualization_msgs/msg/MarkerArray'
 
 
 class LiveView:
@@ -35,10 +30,11 @@ class LiveView:
         host: str = '127.0.0.1',
         commander: Commander | None = None,
     ) -> None:
-        self._scene = scene
-        self.hub = Hub(scene)
+        self._scene = scene if commander is None else {**scene, 'control': True}
+        self.hub = Hub(self._scene)
         self.maker = EventMaker(dict(scene), self.hub.put)
         self.server = ViewServer(self.hub, port, host, commander)
+        self._feed = LiveFeed(self._take)
 
     def announce(self, say: Callable[[str], object]) -> None:
         """Say where the page is, and open it where there is a browser."""
@@ -48,7 +44,15 @@ class LiveView:
         say(f'view: {server.address}')
         if not server.is_private:
             say('view: other machines see it, by this whole link only')
-        open_browser(self.server.address)
+        open_browser(server.address)
+
+    def put(self, function: Callable[..., object], *arguments: Any) -> None:
+        """Have a function called with the maker of events and further arguments; never wait."""
+        self._feed.put((function, arguments))
+
+    def _take(self, call: tuple[Callable[..., object], tuple[Any, ...]]) -> None:
+        function, arguments = call
+        function(self.maker, *arguments)
 
     def restart(self) -> EventMaker:
         """Forget all events: another run begins."""
@@ -56,8 +60,9 @@ class LiveView:
         self.maker = EventMaker(dict(self._scene), self.hub.put)
         return self.maker
 
-    def end(self, text: str = '') -> None:
-        """Say how the run ended, let browsers take what is left, and stop serving."""
+    def close(self, text: str = '') -> None:
+        """Show what waits, say how the run ended, let browsers take the rest, and stop serving."""
+        self._feed.close()
         if text:
             self.maker.message(self.maker.latest, 'run', 'team', text)
         self.hub.close()
@@ -67,49 +72,11 @@ class LiveView:
         self.server.close()
 
 
-class MessageFeed:
-    """Feeds a page with serialised messages.
-
-    `waits`: the run begins with a `LockstepStep`; what comes before it is shown at its time.
-    """
-
-    def __init__(self, view: LiveView, types: Typestore, waits: bool = True) -> None:
-        self._types = types
-        self._waits = waits
-        self._early: list[tuple[str, str, bytes]] = []
-        self._known = 'bounds' in view.maker.scene
-        self._events = MessageEvents(view.maker, None, None if waits else view.restart)
-        self._feed = LiveFeed(self._take)
-
-    def put(self, topic: str, type_name: str, data: bytes) -> None:
-        """Take a message of a topic that is shown; never waits."""
-        if not (self._known and type_name == _MARKERS):
-            self._feed.put((topic, type_name, data))
-
-    def close(self) -> None:
-        """Take what waits, and end."""
-        self._feed.close()
-
-    def _take(self, item: Any) -> None:
-        if self._waits:
-            self._early.append(item)
-            if item[1] != _STEP:
-                return
-            self._waits = False
-            begun, self._early = [item, *self._early[:-1]], []
-            for one in begun:
-                self._decode(*one)
-        else:
-            self._decode(*item)
-
-    def _decode(self, topic: str, type_name: str, data: bytes) -> None:
-        self._events.take(topic, type_name, self._types.deserialize_cdr(data, type_name))
-
-
-class RunPage:
+class RunPage(LiveView):
     """Serves the page of a scene with serialised messages; OSError if it cannot be served.
 
-    `waits`: as of `MessageFeed`; the page of a run says when that has ended.
+    `waits`: the run begins with a `LockstepStep`; what comes before it is shown at its time, and
+    the page says when the run has ended.
     """
 
     def __init__(
@@ -121,46 +88,32 @@ class RunPage:
             from maasi_sim.view.control_node import Control
 
             self._control = Control(domain, team)
-        self._waits = waits
-        self.view = LiveView(scene, options.port, options.host, self._control)
-        self._feed = MessageFeed(self.view, load_types(), waits)
-        self.put = self._feed.put
+        super().__init__(scene, options.port, options.host, self._control)
+        self._types = load_types()
+        self._waits = self._early = waits
+        self._known = 'bounds' in scene
+        self._messages = MessageEvents(self.maker, None, None if waits else self.restart)
+        self._first: list[tuple[Any, ...]] = []
 
-    def close(self) -> None:
+    def put_message(self, topic: str, type_name: str, data: bytes) -> None:
+        """Take a message of a topic that is shown; never waits."""
+        if not (self._known and type_name == MARKERS):
+            self.put(self._decode, topic, type_name, data)
+
+    def _decode(self, _: EventMaker, *item: Any) -> None:
+        self._first.append(item)
+        if self._early and item[1] != _STEP:
+            return
+        begun = [item, *self._first[:-1]]
+        self._early = False
+        self._first.clear()
+        for topic, type_name, data in begun:
+            self._messages.take(topic, type_name, self._types.deserialize_cdr(data, type_name))
+
+    def end(self) -> None:
         """Show the queued messages, and stop serving."""
-        self._feed.close()
         if self._waits:
-            self.view.maker.end()
-        self.view.end('the run has ended' if self._waits else 'the view was closed')
+            self.put(EventMaker.end)
+        self.close('the run has ended' if self._waits else 'the view was closed')
         if self._control is not None:
             self._control.close()
-
-
-class TraceFeed:
-    """Feeds a page with the calls of a search in this process."""
-
-    def __init__(self, view: LiveView) -> None:
-        self._view = view
-        self._feed = LiveFeed(self._take)
-        self.put = self._feed.put
-
-    def _take(self, call: Call) -> None:
-        function, arguments = call
-        function(self._view.maker, *arguments)
-
-    def close(self, text: str) -> None:
-        """Take what waits, say how the search ended, and stop serving."""
-        self._feed.close()
-        self._view.maker.end()
-        self._view.end(text)
-
-
-def open_view(trace: SearchTrace) -> TraceFeed:
-    """Serve the page of a search in this process, and say where."""
-    view = LiveView(scene_of('search', trace.scenario, trace.seed))
-    view.announce(print)
-    feed = TraceFeed(view)
-    for call in trace.calls:
-        feed.put(call)
-    trace.live = feed.put
-    return feed

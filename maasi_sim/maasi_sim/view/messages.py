@@ -15,25 +15,21 @@ from typing import Any
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.records import Cluster
+from maasi_planner.team import Decision, RobotDecision
 from maasi_sim.run.bag import Bag, BagError
 from maasi_sim.run.topics import STEP, seconds
-from maasi_sim.view.event_log import Event, EventLog, Scene
-from maasi_sim.view.event_maker import EventMaker, RobotChoice
+from maasi_sim.targets.tally import found_target
+from maasi_sim.view.event_log import Event, EventLog
+from maasi_sim.view.event_maker import EventMaker
 from maasi_sim.view.scene import empty_scene, scene_of_facts
 
-_MARKERS = 'visualization_msgs/msg/MarkerArray'
+MARKERS = 'visualization_msgs/msg/MarkerArray'
 # Messages between two words on the progress.
 _PROGRESS = 1000
 _ACTIVITIES = ('searching', 'returning', 'recharging')
-# Of a candidate, besides its place.
-_TERMS = (
-    'control_cost',
-    'target_refinement',
-    'exploration',
-    'objective',
-    'length',
-    'measurements',
-)
+# Of a candidate, besides its place and length.
+_TERMS = ('control_cost', 'target_refinement', 'exploration', 'objective', 'measurements')
 # Levels of rcl_interfaces/msg/Log and of diagnostic_msgs/msg/DiagnosticStatus.
 _WARNING, _ERROR = 30, 40
 _FINE, _STALE = 0, 3
@@ -53,7 +49,7 @@ TOPICS: dict[str, tuple[str, ...]] = {
     'nav_msgs/msg/OccupancyGrid': ('_take_grid', 'exploration'),
     'sensor_msgs/msg/PointCloud2': ('_take_cloud', 'exploration'),
     'geometry_msgs/msg/PoseArray': ('_take_truth', 'ground_truth/targets'),
-    _MARKERS: ('_take_markers', 'ground_truth/markers', 'search_area', 'markers'),
+    MARKERS: ('_take_markers', 'ground_truth/markers', 'search_area', 'markers'),
     'rcl_interfaces/msg/Log': ('_take_log', 'rosout'),
     'diagnostic_msgs/msg/DiagnosticArray': ('_take_diagnostics', 'diagnostics'),
 }
@@ -144,18 +140,21 @@ class MessageEvents:
             )
 
     def _take_detections(self, _: str, message: Any) -> None:
-        detections = []
+        values, covariances = [], []
         for item in message.detections:
             own = np.asarray(item.covariance, dtype=float)
             size = round(len(own) ** 0.5)
-            covariance = own.reshape(size, size) if size in (2, 3) and size**2 == len(own) else None
-            detections.append(((item.range, item.bearing, item.elevation), covariance))
+            usable = size in (2, 3) and size**2 == len(own)
+            covariances.append(own.reshape(size, size) if usable else None)
+            values.append((item.range, item.bearing, item.elevation))
         place = _point(message.pose.pose.position)
-        self.maker.seen(self._time(message), message.robot, place, detections)
+        self.maker.seen(self._time(message), message.robot, place, values, covariances)
 
     def _take_update(self, topic: str, message: Any) -> None:
         clusters = [
-            (_point(item.position), item.mass, _matrix(item.covariance))
+            Cluster(
+                np.array(_point(item.position)), _matrix(item.covariance), item.radius, item.mass
+            )
             for item in message.clusters
         ]
         members = [(item.robot, int(item.measurement)) for item in message.members]
@@ -163,25 +162,28 @@ class MessageEvents:
         self.maker.filter(self._time(message), space, expected, clusters, members)
 
     def _take_found(self, topic: str, message: Any) -> None:
-        time = self._time(message)
-        targets = []
-        for item in message.targets:
-            when = max(seconds(item.stamp) - (self._begin or 0.0), 0.0)
-            place, covariance = _point(item.position), _matrix(item.covariance)
-            targets.append((int(item.id), place, covariance, item.robot, when))
-        self.maker.found(time, _space(topic), targets)
+        targets = [found_target(item, self._begin or 0.0) for item in message.targets]
+        self.maker.found(self._time(message), _space(topic), targets)
 
     def _take_plan(self, topic: str, message: Any) -> None:
-        choices = []
-        for robot in message.robots:
-            rows = [
-                (*_point(item.position), *(getattr(item, name) for name in _TERMS))
-                for item in robot.candidates
-            ]
-            waypoint, chosen = _point(robot.waypoint), int(robot.chosen)
-            choices.append(RobotChoice(robot.robot, int(robot.decision), chosen, waypoint, rows))
-        values = message.planner, message.explored, message.objective, message.reason
-        self.maker.plan(self._time(message), _space(topic), choices, *values)
+        robots = {}
+        for item in message.robots:
+            rows = item.candidates
+            robots[item.robot] = RobotDecision(
+                int(item.chosen),
+                np.array(_point(item.waypoint)),
+                # Planned ways are messages of their own.
+                positions=np.zeros((0, 3)),
+                yaws=np.zeros(0),
+                candidates=np.array([_point(row.position) for row in rows]).reshape(-1, 3),
+                **{name: np.array([getattr(row, name) for row in rows]) for name in _TERMS},
+                lengths=np.array([row.length for row in rows]),
+                reason='',
+            )
+        indices = {item.robot: int(item.decision) for item in message.robots}
+        decision = Decision(message.step, robots, message.objective, reason=message.reason)
+        time, space = self._time(message), _space(topic)
+        self.maker.plan(time, space, message.planner, decision, indices, message.explored)
 
     def _take_cuboid(self, _: str, message: Any) -> None:
         activity = min(int(message.activity), len(_ACTIVITIES) - 1)
@@ -201,7 +203,7 @@ class MessageEvents:
 
     def _take_path(self, topic: str, message: Any) -> None:
         points = [_point(item.pose.position) for item in message.poses]
-        self.maker.way(self._time(message), _owner(topic), np.array(points))
+        self.maker.way(self._time(message), _space(topic).rpartition('/')[2], points)
 
     def _take_grid(self, topic: str, message: Any) -> None:
         info = message.info
@@ -213,12 +215,11 @@ class MessageEvents:
 
     def _take_cloud(self, topic: str, message: Any) -> None:
         rows = np.frombuffer(bytes(message.data), dtype='<f4').reshape(-1, message.point_step // 4)
-        axes = [np.unique(rows[:, axis]) for axis in range(3)]
+        axes = [np.unique(rows[:, axis]).astype(float) for axis in range(3)]
         shape = [len(axis) for axis in axes]
         if np.prod(shape) != len(rows) or min(shape) < 2:
             return
-        corner = np.array([axis[0] for axis in axes], dtype=float)
-        last = np.array([axis[-1] for axis in axes], dtype=float)
+        corner, last = (np.array([axis[end] for axis in axes]) for end in (0, -1))
         self._learn_bounds(corner, last)
         step = (last - corner) / (np.array(shape) - 1)
         values = rows[:, 3].reshape(shape).astype(float)
@@ -236,27 +237,22 @@ class MessageEvents:
 
     def _take_markers(self, topic: str, message: Any) -> None:
         """Take obstacles and buildings of a run without scenario."""
-        scene = self.maker.scene
-        # Of a scenario both are known, and its obstacles, empty or not.
-        if 'obstacles' in scene and topic.endswith('ground_truth/markers'):
-            return
-        obstacles, boxes = [], {'objects': [], 'obstacles': []}  # type: ignore[var-annotated]
-        cuboids = []
+        parts: dict[str, list[Any]] = {}
         for item in message.markers:
             place, size = np.array(_point(item.pose.position)), item.scale
             box = np.stack([place, place], axis=1) + np.outer([size.x, size.y, size.z], [-0.5, 0.5])
             if topic.endswith('ground_truth/markers') and item.ns == 'obstacles':
-                obstacles.append([*place[:2].tolist(), 0.5 * float(size.x)])
-            elif topic.endswith('search_area') and item.ns in boxes:
-                boxes[item.ns].append(box.tolist())
+                circle = [*place[:2].tolist(), 0.5 * float(size.x)]
+                parts.setdefault('obstacles', []).append(circle)
+            elif topic.endswith('search_area') and item.ns in ('objects', 'obstacles'):
+                part = 'objects' if item.ns == 'objects' else 'blocks'
+                parts.setdefault(part, []).append(box.tolist())
             elif item.ns.endswith('/cuboids'):
-                cuboids.append(box.tolist())
-        if obstacles:
-            self.maker.add_to_scene({'obstacles': obstacles})
-        if boxes['objects'] and 'objects' not in scene:
-            self.maker.add_to_scene({'objects': boxes['objects'], 'blocks': boxes['obstacles']})
-        if cuboids and 'cuboids' not in scene:
-            self.maker.add_to_scene({'cuboids': cuboids})
+                parts.setdefault('cuboids', []).append(box.tolist())
+        # What a scenario says is better.
+        news = {part: items for part, items in parts.items() if part not in self.maker.scene}
+        if news:
+            self.maker.add_to_scene(news)
 
     def _take_log(self, _: str, message: Any) -> None:
         level = int(message.level)
@@ -289,11 +285,6 @@ def _space(topic: str) -> str:
     return topic.rpartition('/')[0].strip('/')
 
 
-def _owner(topic: str) -> str:
-    """Return the last part of a topic's namespace: its robot."""
-    return _space(topic).rpartition('/')[2]
-
-
 def read_events(path: Path, progress: Callable[[float], None] | None = None) -> EventLog:
     """Return the event log of a recording, or of the run whose folder holds one.
 
@@ -303,15 +294,17 @@ def read_events(path: Path, progress: Callable[[float], None] | None = None) -> 
         shown = {topic: kind for topic, kind in bag.types.items() if is_shown(topic, kind)}
         if not any(kind.startswith('maasi_msgs/') for kind in shown.values()):
             raise BagError(f'{path}: holds no topic of a search')
-        scene = _scene(bag)
+        try:
+            scene = scene_of_facts(bag.scenario())
+        except (BagError, ValueError, KeyError):
+            scene = empty_scene(bag.path.name)
         events: list[Event] = []
         maker = EventMaker(scene, events.append)
         takes = MessageEvents(maker, _begin(bag, shown))
         # Markers hold what a scenario says better.
         known = 'bounds' in scene
-        topics = [topic for topic, kind in shown.items() if not (known and kind == _MARKERS)]
-        counts = bag.counts
-        total = sum(counts[topic] for topic in topics)
+        topics = [topic for topic, kind in shown.items() if not (known and kind == MARKERS)]
+        total = sum(bag.counts[topic] for topic in topics)
         for index, item in enumerate(bag.messages(topics)):
             if progress is not None and index % _PROGRESS == 0:
                 progress(index / total)
@@ -319,13 +312,6 @@ def read_events(path: Path, progress: Callable[[float], None] | None = None) -> 
         maker.end()
     # Parts that became known later belong to the scene of a replay.
     return EventLog(maker.scene, [event for event in events if event[1] != 'scene'])
-
-
-def _scene(bag: Bag) -> Scene:
-    try:
-        return scene_of_facts(bag.scenario())
-    except (BagError, ValueError, KeyError):
-        return empty_scene(bag.path.name)
 
 
 def _begin(bag: Bag, shown: dict[str, str]) -> float | None:

@@ -15,6 +15,7 @@ import json
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -43,7 +44,7 @@ _PORTION_PERIOD = 0.1
 _BEAT = 5.0
 
 
-class ViewServer:
+class ViewServer(ThreadingHTTPServer):
     """Serve a hub to browsers until it is closed.
 
     Where the port is in use, the next one that is free is taken; 0: any that is free. `commander`
@@ -55,6 +56,9 @@ class ViewServer:
         If the address cannot be listened on.
     """
 
+    daemon_threads = True
+    block_on_close = False
+
     def __init__(
         self,
         hub: Hub,
@@ -65,23 +69,30 @@ class ViewServer:
         self.hub = hub
         self.host = host
         self.commander = commander
-        self.is_private = _is_loopback(host)
+        self.is_private = host == 'localhost' or _is_loopback(host)
         self.token = '' if self.is_private and commander is None else secrets.token_urlsafe(16)
         self.wanted_port = PORT if port is None else port
         self.browsers = 0
-        self._closed = threading.Event()
         self._lock = threading.Lock()
-        self._server = _listen(host, self.wanted_port)
-        self._server.view = self
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, name='view server', daemon=True
-        )
-        self._thread.start()
+        # Connections without a stream or a command, the oldest first.
+        self._idle: dict[socket.socket, None] = {}
+        self._listen()
+        threading.Thread(target=self.serve_forever, name='view server', daemon=True).start()
+
+    def _listen(self) -> None:
+        last = min(self.wanted_port + _MORE_PORTS, 65535)
+        for port in range(self.wanted_port, last + 1):
+            try:
+                super().__init__((self.host, port), _Handler)
+                return
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE or port == last:
+                    raise
 
     @property
     def port(self) -> int:
         """Port that it listens on."""
-        return int(self._server.server_address[1])
+        return int(self.server_address[1])
 
     @property
     def address(self) -> str:
@@ -91,35 +102,49 @@ class ViewServer:
         place = f'http://{host}:{self.port}/'
         return f'{place}?token={self.token}' if self.token else place
 
-    @property
-    def closed(self) -> bool:
-        """Whether it was closed."""
-        return self._closed.is_set()
-
-    def enter(self) -> bool:
-        """Count a browser; return whether there is room for it."""
-        with self._lock:
-            if self.browsers >= MOST_BROWSERS:
-                return False
-            self.browsers += 1
-            return True
-
-    def leave(self) -> None:
-        """Count a browser out."""
-        with self._lock:
-            self.browsers -= 1
-
     def close(self) -> None:
         """Stop serving; browsers get what is left for a moment."""
         self.hub.close()
-        self._closed.set()
-        self._server.shutdown()
-        self._server.server_close()
+        self.shutdown()
+        self.server_close()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection in a thread of its own; close the oldest where there are too many."""
+        with self._lock:
+            self._idle[request] = None
+            oldest = next(iter(self._idle)) if len(self._idle) > MOST_IDLE else None
+            if oldest is not None:
+                del self._idle[oldest]
+        if oldest is not None:
+            # Its thread wakes, and ends.
+            with contextlib.suppress(OSError):
+                oldest.shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        self.keep(request)
+        super().shutdown_request(request)
+
+    def keep(self, connection: Any, browsers: int = 0) -> bool:
+        """Do not close a connection for others: it has a command, or a stream.
+
+        Count so many browsers in; return whether there is room for them.
+        """
+        with self._lock:
+            self._idle.pop(connection, None)
+            if self.browsers + browsers > MOST_BROWSERS:
+                return False
+            self.browsers += browsers
+            return True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Do nothing: a browser that breaks a connection is no error of the run."""
 
 
 def _is_loopback(host: str) -> bool:
     """Return whether only this machine reaches an address."""
-    return host == 'localhost' or (_is_number(host) and ipaddress.ip_address(host).is_loopback)
+    return _is_number(host) and ipaddress.ip_address(host).is_loopback
 
 
 def _is_number(host: str) -> bool:
@@ -141,58 +166,8 @@ def _own_address() -> str:
             return socket.gethostname()
 
 
-def _listen(host: str, port: int) -> _Server:
-    """Return a server on a port, or on one of the next where that is in use."""
-    last = min(port + _MORE_PORTS, 65535)
-    while True:
-        try:
-            return _Server((host, port), _Handler)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE or port == last:
-                raise
-            port += 1
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-    view: ViewServer
-
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._lock = threading.Lock()
-        # Connections without a stream or a command, the oldest first.
-        self._idle: dict[socket.socket, None] = {}
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection in a thread of its own; close the oldest where there are too many."""
-        with self._lock:
-            self._idle[request] = None
-            oldest = next(iter(self._idle)) if len(self._idle) > MOST_IDLE else None
-            if oldest is not None:
-                del self._idle[oldest]
-        if oldest is not None:
-            # Its thread wakes, and ends.
-            with contextlib.suppress(OSError):
-                oldest.shutdown(socket.SHUT_RDWR)
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        """Close a connection."""
-        self.keep(request)
-        super().shutdown_request(request)
-
-    def keep(self, connection: Any) -> None:
-        """Do not close a connection for others: it has a stream, or a command."""
-        with self._lock:
-            self._idle.pop(connection, None)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Do nothing: a browser that breaks a connection is no error of the run."""
-
-
 class _Handler(BaseHTTPRequestHandler):
-    server: _Server
+    server: ViewServer
     server_version = 'maasi'
     sys_version = ''
     protocol_version = 'HTTP/1.1'
@@ -205,7 +180,7 @@ class _Handler(BaseHTTPRequestHandler):
         parts = urlsplit(self.path)
         path = parts.path
         given = parse_qs(parts.query).get('token', [''])[-1]
-        if not (self.server.view.is_private or self._has_token(given)):
+        if not (self.server.is_private or self._has_token(given)):
             self._refuse(HTTPStatus.FORBIDDEN, 'wrong token: use the whole link that was printed')
         elif path == '/':
             self._answer(HTTPStatus.OK, empty_page().encode(), 'text/html; charset=utf-8')
@@ -223,8 +198,8 @@ class _Handler(BaseHTTPRequestHandler):
         if urlsplit(self.path).path != '/control':
             self._refuse(HTTPStatus.NOT_FOUND, 'no such page')
             return
-        view = self.server.view
-        if view.commander is None:
+        commander = self.server.commander
+        if commander is None:
             self._refuse(HTTPStatus.FORBIDDEN, 'read only: started without --control')
         elif not self._has_token(self.headers.get('X-Maasi-Token', '')):
             self._refuse(HTTPStatus.FORBIDDEN, 'wrong token')
@@ -232,7 +207,7 @@ class _Handler(BaseHTTPRequestHandler):
             command = self._read_command()
             if command is not None:
                 self.server.keep(self.connection)
-                done, text = view.commander(*command)
+                done, text = commander(*command)
                 self._answer_json(HTTPStatus.OK, {'done': done, 'message': text})
 
     def _read_command(self) -> tuple[str, str | None] | None:
@@ -242,33 +217,34 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.LENGTH_REQUIRED, 'Content-Length: allowed is a number')
             return None
         if int(length) > LARGEST_BODY:
-            self._refuse(
-                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f'allowed are {LARGEST_BODY} bytes at most'
-            )
+            too_large = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+            self._refuse(too_large, f'allowed are {LARGEST_BODY} bytes at most')
             return None
         try:
             body = json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError):
             body = None
-        if not isinstance(body, dict):
-            self._refuse(HTTPStatus.BAD_REQUEST, 'allowed is a JSON object')
+        given = body if isinstance(body, dict) else {}
+        command, robot = given.get('command'), given.get('robot')
+        problem = ''
+        if body is not given:
+            problem = 'allowed is a JSON object'
+        elif command not in COMMANDS:
+            problem = f'command: allowed are {", ".join(COMMANDS)}'
+        elif robot is not None and not (isinstance(robot, str) and robot.isidentifier()):
+            problem = 'robot: allowed is the name of one, or null'
+        if problem:
+            self._refuse(HTTPStatus.BAD_REQUEST, problem)
             return None
-        command, robot = body.get('command'), body.get('robot')
-        if command not in COMMANDS:
-            self._refuse(HTTPStatus.BAD_REQUEST, f'command: allowed are {", ".join(COMMANDS)}')
-            return None
-        if robot is not None and not (isinstance(robot, str) and robot.isidentifier()):
-            self._refuse(HTTPStatus.BAD_REQUEST, 'robot: allowed is the name of one, or null')
-            return None
-        return command, robot
+        return str(command), robot
 
     def _has_token(self, given: str) -> bool:
-        token = self.server.view.token
+        token = self.server.token
         return hmac.compare_digest(given.encode('utf-8', 'replace'), token.encode())
 
     def _is_for_this_host(self) -> bool:
         """Refuse what another page asks by a name that it made point here."""
-        host = self.server.view.host
+        host = self.server.host
         name = urlsplit(f'//{self.headers.get("Host", "")}').hostname or ''
         allowed = {host, 'localhost', '127.0.0.1', '::1'}
         own = socket.gethostname()
@@ -282,45 +258,26 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _stream(self) -> None:
         """Send events until the run or the browser ends."""
-        view = self.server.view
         self.close_connection = True
-        if not view.enter():
+        if not self.server.keep(self.connection, 1):
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_BROWSERS} browsers are here')
             return
-        self.server.keep(self.connection)
         try:
             self.send_response(HTTPStatus.OK)
             self.send_header('Content-Type', 'text/event-stream')
             self.send_header('Cache-Control', 'no-store')
             self.end_headers()
             self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._send_portions(view)
+            begin, closed = (-1, 0), False
+            while not closed:
+                text, begin, closed = self.server.hub.next(*begin, _BEAT)
+                self.wfile.write(text.encode())
+                time.sleep(0.0 if closed else _PORTION_PERIOD)
         except OSError:
             # The client has disconnected, or does not read.
             pass
         finally:
-            view.leave()
-
-    def _send_portions(self, view: ViewServer) -> None:
-        generation, position = -1, 0
-        pause = threading.Event()
-        while True:
-            portion = view.hub.next(generation, position, _BEAT)
-            text = ''
-            if portion.scene:
-                scene = portion.scene
-                if view.commander is not None:
-                    scene = f'{scene[:-1]},"control":true}}'
-                text += f'event: scene\ndata: {scene}\n\n'
-            if portion.events:
-                text += f'event: events\ndata: {portion.events}\n\n'
-            if portion.closed:
-                text += 'event: end\ndata:\n\n'
-            self.wfile.write((text or ': \n\n').encode())
-            generation, position = portion.generation, portion.position
-            if portion.closed:
-                return
-            pause.wait(_PORTION_PERIOD)
+            self.server.keep(self.connection, -1)
 
     def _refuse(self, status: HTTPStatus, text: str) -> None:
         self.close_connection = True

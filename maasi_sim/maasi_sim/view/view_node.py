@@ -97,15 +97,15 @@ def main(arguments: list[str] | None = None) -> int:
         print(f'error: {options.host}: {error.strerror or error}', file=sys.stderr)
         rclpy.try_shutdown()
         return WRONG_INPUT
-    node = ViewNode(page.put)
-    page.view.announce(partial(print, flush=True))
+    node = ViewNode(page.put_message)
+    page.announce(partial(print, flush=True))
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         node.destroy_node()
-        page.close()
+        page.end()
         rclpy.try_shutdown()
     return DONE
 
