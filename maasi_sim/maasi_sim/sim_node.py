@@ -11,13 +11,10 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
-from maasi_filter.ros.conversions import (
-    stamp_from_ros,
-    stamp_of_step,
-    stamp_to_ros,
-)
+from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, sensor_reader, sensor_writer
 from maasi_filter.ros.run_node import run
@@ -25,10 +22,7 @@ from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.emulators.linked_robots import LinkedRobot, linked_robot
 from maasi_sim.scenario.layering import Key
 from maasi_sim.scenario.loading import load_scenario
-from maasi_sim.scenario.schema import (
-    Scenario,
-    ScenarioError,
-)
+from maasi_sim.scenario.schema import Scenario, ScenarioError
 from maasi_sim.sim_settings import SimNodeSettings
 from maasi_sim.sim_topics import Connections, ExternalRobot, RobotTopics, publish_truth
 from maasi_sim.world.simulation import Simulation
@@ -83,7 +77,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     def __init__(self, **options: Any) -> None:
         super().__init__('sim_node', SimNodeSettings, lockstep_member=False, **options)
         self._stamp = 0
-        self._first = 0
         self._linked: dict[str, LinkedRobot] = {}
 
     def prepare(self) -> None:
@@ -104,7 +97,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._follows = settings.follow_clock or self.scenario.external_clock
         self._length = self.scenario.step
         self._period = self._length / settings.rate if settings.rate > 0.0 else 0.0
-        self._entities: list[Any] = []
         self._stamp = 0
         # First step, and last time of the followed clock [ns].
         self._first = 0
@@ -131,9 +123,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         """Return the robots at the start."""
         return Simulation(self.scenario, self.settings.seed)
 
-    def connect(self) -> list[Any]:
-        """Return publishers and subscriptions beside those of all robots, and of the time."""
-        return []
+    def connect(self) -> None:
+        """Make publishers and subscriptions beside those of all robots, and of the time."""
 
     def on_new_step(self) -> None:
         """Handle a new step of the simulation."""
@@ -148,8 +139,6 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._robots = {
             name: RobotTopics(self, self.simulation, name, qos) for name in self.simulation.robots
         }
-        for topics in self._robots.values():
-            self._entities += topics.publishers
         self._driver_of = {
             name: self.team_topic(f'{name}/{self.robot_node}') for name in self._robots
         }
@@ -168,44 +157,29 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         if self.settings.recorder:
             self._expected[self.team_topic(RECORDER)] = step_topics
         self._connections = Connections(self, self._expected)
-        truth = publish_truth(self, self.simulation.world, self.settings.frame)
-        self._entities += truth
+        publish_truth(self, self.simulation.world, self.settings.frame)
         for name, topics in self._robots.items():
-            if topics.linked:
-                robot = linked_robot(name, self.scenario.robots[name], self.settings.seed)
-                self._linked[name] = robot
-                self.simulation.robots[name].follow(robot)
-                if isinstance(robot, ExternalRobot):
-                    topic = f'{name}/state'
-                    self._entities.append(
-                        self.create_subscription(AgentState, topic, robot.take, 10)
-                    )
+            if not topics.linked:
+                command = partial(self._on_command, name)
+                depth: QoSProfile | int = RELIABLE if lockstep else 10
+                self.create_subscription(TwistStamped, f'{name}/cmd_vel', command, depth)
                 continue
-            self._entities.append(
-                self.create_subscription(
-                    TwistStamped,
-                    f'{name}/cmd_vel',
-                    partial(self._on_command, name),
-                    RELIABLE if lockstep else 10,
-                )
-            )
-        self._entities += self.connect()
+            robot = linked_robot(name, self.scenario.robots[name], self.settings.seed)
+            self._linked[name] = robot
+            self.simulation.robots[name].follow(robot)
+            if isinstance(robot, ExternalRobot):
+                self.create_subscription(AgentState, f'{name}/state', robot.take, 10)
+        self.connect()
         # After all other publishers, which the recorder then knows: it waits for clock and step.
         self._clock_publisher: Publisher | None = None
         if self._follows:
             self.create_subscription(Clock, '/clock', self._on_clock, sensor_reader(False))
         else:
             self._clock_publisher = self.create_publisher(Clock, '/clock', qos)
-            self._entities.append(self._clock_publisher)
         self._step_publisher = self.create_publisher(LockstepStep, 'lockstep/step', qos)
-        self._entities.append(self._step_publisher)
         if lockstep:
-            self._entities.append(
-                self.create_subscription(LockstepDone, 'lockstep/done', self._on_done, RELIABLE)
-            )
-        self._entities.append(
-            self.create_subscription(LockstepDone, 'lockstep/ready', self._on_ready, LATCHED_ALL)
-        )
+            self.create_subscription(LockstepDone, 'lockstep/done', self._on_done, RELIABLE)
+        self.create_subscription(LockstepDone, 'lockstep/ready', self._on_ready, LATCHED_ALL)
         self._look_timer = self.create_wall_timer(_LOOK_PERIOD, self._look_for_nodes)
         self._look_timer.cancel()
         self._step_timer = self.create_wall_timer(self._period or 1.0, self._on_step_timer)
@@ -297,7 +271,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         if self._ready_since is None:
             self._ready_since = now
         unheard = [topic for node in self._expected for topic in self._connections.unheard(node)]
-        unheard += self._connections.unmatched(self._entities)
+        unheard += self._connections.unmatched()
         if unheard and now - self._ready_since < _CONNECTION_PATIENCE:
             return
         for topic in unheard:
@@ -318,7 +292,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         now = time.monotonic()
         for node, since in sorted(self._returned.items()):
             unheard = self._connections.unheard(node)
-            connected = not unheard and not self._connections.unmatched(self._entities)
+            connected = not unheard and not self._connections.unmatched()
             if connected or now - since > _CONNECTION_PATIENCE:
                 del self._returned[node]
                 self._connections.remember()

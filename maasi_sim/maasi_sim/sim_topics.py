@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import array
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -43,6 +42,7 @@ from maasi_sim.world.world import World
 # Period of battery messages [s of simulated time].
 _BATTERY_PERIOD = 1.0
 _LEAST_VARIANCE = 1e-12
+_OF_ALL_NODES = ('/diagnostics', '/rosout', '/parameter_events')
 
 
 class RobotTopics:
@@ -53,12 +53,9 @@ class RobotTopics:
         self.simulation = simulation
         self.robot: SimulatedRobot = simulation.robots[name]
         self._battery_steps = steps_of(_BATTERY_PERIOD, simulation.scenario.step)
-        self.publishers: list[Publisher] = []
 
         def publisher(kind: type, topic: str) -> Publisher:
-            made = node.create_publisher(kind, f'{name}/{topic}', qos)
-            self.publishers.append(made)
-            return made
+            return node.create_publisher(kind, f'{name}/{topic}', qos)
 
         equipment = self.robot.equipment
         # A linked or external robot reports its own pose.
@@ -199,8 +196,8 @@ def scan_message(settings: LaserSettings, frame: str) -> LaserScan:
     )
 
 
-def publish_truth(node: Node, world: World, frame: str) -> list[Publisher]:
-    """Publish `ground_truth/targets` and `ground_truth/markers` once, and return the publishers."""
+def publish_truth(node: Node, world: World, frame: str) -> None:
+    """Publish `ground_truth/targets` and `ground_truth/markers` once."""
     header = Header(frame_id=frame)
     targets = node.create_publisher(PoseArray, 'ground_truth/targets', LATCHED)
     markers = node.create_publisher(MarkerArray, 'ground_truth/markers', LATCHED)
@@ -226,7 +223,6 @@ def publish_truth(node: Node, world: World, frame: str) -> list[Publisher]:
             shape.scale.z = float(high - low)
         shapes.append(shape)
     markers.publish(MarkerBoard().replace(MarkerArray(markers=shapes)))
-    return [targets, markers]
 
 
 class Connections:
@@ -248,14 +244,14 @@ class Connections:
             if not self._subscriptions(name, topic) - self._endpoints.get((name, topic), set())
         ]
 
-    def unmatched(self, entities: Iterable[Any]) -> list[str]:
+    def unmatched(self) -> list[str]:
         """Return the topics of publishers with a known subscription that is not connected yet."""
+        known = self._node.get_subscriptions_info_by_topic
         return [
-            publisher.topic_name
-            for publisher in entities
-            if isinstance(publisher, Publisher)
-            and publisher.get_subscription_count()
-            < len(self._node.get_subscriptions_info_by_topic(publisher.topic_name))
+            item.topic_name
+            for item in self._node.publishers
+            if item.topic_name not in _OF_ALL_NODES
+            and item.get_subscription_count() < len(known(item.topic_name))
         ]
 
     def remember(self) -> None:

@@ -73,20 +73,13 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def chosen_cases(names: Sequence[str] | None) -> list[Case]:
-    """Return the cases of some names or patterns.
-
-    Raises
-    ------
-    ValueError
-        If a pattern matches no case.
-    """
+    """Return the cases of some names or patterns; a pattern without any is a ValueError."""
     cases = all_cases()
-    if names is None:
-        return cases
-    for name in names:
+    for name in names or ():
         if not any(fnmatchcase(case.name, name) for case in cases):
             raise ValueError(f'--case: read {name!r}, allowed are those of --list')
-    return [case for case in cases if any(fnmatchcase(case.name, name) for name in names)]
+    chosen = names or ['*']
+    return [case for case in cases if any(fnmatchcase(case.name, name) for name in chosen)]
 
 
 def run_case(case: Case, folder: Path, seed: int) -> Result:
@@ -102,12 +95,10 @@ def summary(results: Sequence[Result], seed: int, left_out: int) -> dict[str, An
     counts: dict[str, Counter[str]] = {}
     for item in results:
         case = item.case
-        kind = (
-            f'{case.kind} '
-            f'{"lockstep" if case.lockstep else "free"} '
-            f'{"respawn" if case.respawn else "end"} {case.fault} {case.when} '
-            f'{"two" if len(case.nodes) > 1 else "one"}'
-        )
+        mode = 'lockstep' if case.lockstep else 'free'
+        reaction = 'respawn' if case.respawn else 'end'
+        number = 'two' if len(case.nodes) > 1 else 'one'
+        kind = f'{case.kind} {mode} {reaction} {case.fault} {case.when} {number}'
         counts.setdefault(kind, Counter())['passed' if item.passed else 'failed'] += 1
     return {
         'seed': seed,

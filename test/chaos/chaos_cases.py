@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -91,42 +92,27 @@ _BUILDINGS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Case:
-    """A run with a fault.
+    """A run with a fault of some nodes at the same time.
 
-    Attributes
-    ----------
-    fault : {'kill', 'pause', 'hang'}
-        SIGKILL; SIGSTOP and SIGCONT after three seconds; SIGSTOP.
-    nodes : tuple of str
-        Affected nodes, all at the same time.
-    when : {'start', 'middle'}
-        As soon as their processes exist; once a target is found (a cell is visited).
-    lockstep, respawn : bool
-        Mode of the run.
-    kind : {'search', 'mavlink', 'buildings'}
-        What runs: a search by two robots under topics, by a drone under MAVLink, or of buildings.
+    Faults are SIGKILL; SIGSTOP and SIGCONT after three seconds (pause); SIGSTOP (hang). They come
+    as soon as the nodes' processes exist, or once a target is found (a cell is visited). What runs
+    is a search by two robots under topics, by a drone under MAVLink, or of buildings.
     """
 
     fault: Fault
     nodes: tuple[str, ...]
-    when: When
-    lockstep: bool
-    respawn: bool
+    when: When = 'middle'
+    lockstep: bool = False
+    respawn: bool = False
     kind: Kind = 'search'
 
     @property
     def name(self) -> str:
         """Unique name, for the command line."""
-        return '-'.join(
-            (
-                self.kind,
-                'lockstep' if self.lockstep else 'free',
-                'respawn' if self.respawn else 'end',
-                self.fault,
-                self.when,
-                '+'.join(node.strip('/').replace('/', '_') for node in self.nodes),
-            )
-        )
+        mode = 'lockstep' if self.lockstep else 'free'
+        reaction = 'respawn' if self.respawn else 'end'
+        nodes = '+'.join(node.strip('/').replace('/', '_') for node in self.nodes)
+        return '-'.join((self.kind, mode, reaction, self.fault, self.when, nodes))
 
     @property
     def ends_the_run(self) -> bool:
@@ -174,38 +160,35 @@ class Case:
         return ['--rate', '3'] if self.kind == 'buildings' else []
 
 
+def _cases(
+    faults: str, struck: Sequence[tuple[str, ...]], modes: str = 'free lockstep', **more: Any
+) -> list[Case]:
+    """Return the cases of faults and nodes in modes; with both reactions, except for pauses."""
+    reactions = more.pop('respawn', (True, False))
+    return [
+        Case(fault, nodes, lockstep=mode == 'lockstep', respawn=respawn, **more)  # type: ignore[arg-type]
+        for fault in faults.split()
+        for mode in modes.split()
+        for respawn in reactions
+        for nodes in struck
+    ]
+
+
 def all_cases() -> list[Case]:
     """Return the whole campaign; the most important cases come first."""
-    cases: list[Case] = []
-    modes = [(lockstep, respawn) for lockstep in (False, True) for respawn in (True, False)]
-    striking: tuple[Fault, ...] = ('kill', 'hang')
-    for fault in striking:
-        for lockstep, respawn in modes:
-            cases += [Case(fault, (node,), 'middle', lockstep, respawn) for node in SEARCH_NODES]
-    for lockstep in (False, True):
-        cases += [Case('pause', (node,), 'middle', lockstep, False) for node in SEARCH_NODES]
-    for lockstep, respawn in modes:
-        cases += [Case('kill', pair, 'middle', lockstep, respawn) for pair in _PAIRS]
-    for lockstep, respawn in modes:
-        cases += [Case('kill', (node,), 'start', lockstep, respawn) for node in SEARCH_NODES]
-    every: tuple[Fault, ...] = ('kill', 'hang', 'pause')
-    for fault in every:
-        for lockstep, respawn in modes:
-            if fault == 'pause' and respawn:
-                continue
-            cases += [
-                Case(fault, (node,), 'middle', lockstep, respawn, kind='buildings')
-                for node in BUILDING_NODES
-            ]
-    for fault in every:
-        for respawn in (True, False) if fault != 'pause' else (False,):
-            cases += [
-                Case(fault, (node,), 'middle', False, respawn, kind='mavlink')
-                for node in MAVLINK_NODES
-            ]
-    for lockstep in (False, True):
-        cases += [Case('hang', pair, 'middle', lockstep, False) for pair in _PAIRS]
-        cases += [Case('pause', pair, 'middle', lockstep, False) for pair in _PAIRS]
-        cases += [Case('hang', (node,), 'start', lockstep, False) for node in SEARCH_NODES]
-        cases += [Case('pause', (node,), 'start', lockstep, False) for node in SEARCH_NODES]
-    return cases
+    one, vehicles, buildings = (
+        [(node,) for node in nodes] for nodes in (SEARCH_NODES, MAVLINK_NODES, BUILDING_NODES)
+    )
+    end = {'respawn': (False,)}
+    return [
+        *_cases('kill hang', one),
+        *_cases('pause', one, **end),
+        *_cases('kill', _PAIRS),
+        *_cases('kill', one, when='start'),
+        *_cases('kill hang', buildings, kind='buildings'),
+        *_cases('pause', buildings, kind='buildings', **end),
+        *_cases('kill hang', vehicles, 'free', kind='mavlink'),
+        *_cases('pause', vehicles, 'free', kind='mavlink', **end),
+        *_cases('hang pause', _PAIRS, **end),
+        *_cases('hang pause', one, when='start', **end),
+    ]

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,20 +25,7 @@ _FOUND = re.compile(r'(\d+) (?:found|visited)')
 class Outcome:
     """Result of a run.
 
-    Attributes
-    ----------
-    folder : Path
-        Of the run.
-    code : int or None
-        Exit code; None: it did not end.
-    output : str
-        Printed text.
-    struck : bool
-        Whether the fault was injected.
-    ended_after : float
-        From the fault to the end [s].
-    left : list of str
-        Command lines of processes that were still running after the end.
+    The code is None if it did not end; `left` are command lines of processes that still ran then.
     """
 
     folder: Path
@@ -50,28 +36,9 @@ class Outcome:
     left: list[str]
 
 
-class _Output:
-    """Reads the output of a running process."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self._process = process
-        self.lines: list[str] = []
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        self.lines.extend(iter(self._process.stdout.readline, ''))
-
-    def found(self) -> int:
-        """Return the number of targets found, or cells visited, so far."""
-        matches = [_FOUND.search(line) for line in list(self.lines)]
-        return max((int(match.group(1)) for match in matches if match), default=0)
-
-    def text(self) -> str:
-        """Return the whole output, after the end."""
-        self._thread.join(5.0)
-        return ''.join(self.lines)
+def _found(output: Path) -> int:
+    """Return the number of targets found, or cells visited, so far."""
+    return max(map(int, _FOUND.findall(output.read_text())), default=0)
 
 
 def execute(case: Case, folder: Path, seed: int) -> Outcome:
@@ -80,15 +47,15 @@ def execute(case: Case, folder: Path, seed: int) -> Outcome:
     file, run = folder / 'scenario.yaml', folder / 'run'
     file.write_text(to_yaml(case.scenario()), encoding='utf-8')
     command = [sys.executable, '-m', 'maasi_sim.run.run_scenario', str(file), '--out', str(run)]
-    process = subprocess.Popen(
-        [*command, '--seed', str(seed), *case.options()],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    output = _Output(process)
+    output = folder / 'output.txt'
+    with output.open('w') as stream:
+        process = subprocess.Popen(
+            [*command, '--seed', str(seed), *case.options()],
+            stdin=subprocess.DEVNULL,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
     struck, at = False, time.monotonic()
     try:
         victims = _victims(case, run, process, output)
@@ -99,22 +66,21 @@ def execute(case: Case, folder: Path, seed: int) -> Outcome:
         pass
     ended_after = time.monotonic() - at
     code = process.poll()
-    left = processes_of(run)
+    left = processes_of(f'{run}/')
     if code is None:
         process.kill()
         process.wait()
-    for pid in processes_of(run):
+    for pid in processes_of(f'{run}/'):
         _send(pid, signal.SIGKILL)
-    return Outcome(run, code, output.text(), struck, ended_after, list(left.values()))
+    return Outcome(run, code, output.read_text(), struck, ended_after, list(left.values()))
 
 
-def _victims(case: Case, run: Path, process: subprocess.Popen[str], output: _Output) -> list[int]:
+def _victims(case: Case, run: Path, process: subprocess.Popen[bytes], output: Path) -> list[int]:
     """Return the processes of the case's nodes at the moment of the fault; none: the run ended."""
     deadline = time.monotonic() + _TRIGGER_PATIENCE
     while time.monotonic() < deadline and process.poll() is None:
-        if case.when == 'start' or output.found() > 0:
-            found = {name: _pid(run, name) for name in case.nodes}
-            pids = [pid for pid in found.values() if pid is not None]
+        if case.when == 'start' or _found(output) > 0:
+            pids = [pid for node in case.nodes for pid in _pids(run, node)]
             if len(pids) == len(case.nodes):
                 return pids
         time.sleep(_LOOK_PERIOD)
@@ -140,22 +106,20 @@ def _send(pid: int, number: signal.Signals) -> bool:
     return True
 
 
-def _pid(run: Path, node: str) -> int | None:
+def _pids(run: Path, node: str) -> list[int]:
     """Return the process of a node: its parameter file is in its command line."""
-    file = str(run / 'parameters' / f'{node.strip("/").replace("/", "_")}.yaml')
-    return next((pid for pid, line in processes_of(run).items() if file in line), None)
+    file = run / 'parameters' / f'{node.strip("/").replace("/", "_")}.yaml'
+    return list(processes_of(str(file)))
 
 
-def processes_of(run: Path) -> dict[int, str]:
-    """Return the processes with a run's folder in their command line, without zombies."""
+def processes_of(text: str) -> dict[int, str]:
+    """Return the processes with a text in their command line, without this one and zombies."""
     found = {}
-    for entry in Path('/proc').iterdir():
-        if not entry.name.isdigit():
-            continue
+    for entry in Path('/proc').glob('[0-9]*'):
         try:
             line = (entry / 'cmdline').read_bytes().replace(b'\0', b' ').decode(errors='replace')
         except OSError:
             continue
-        if f'{run}/' in line:
+        if text in line and int(entry.name) != os.getpid():
             found[int(entry.name)] = line
     return found

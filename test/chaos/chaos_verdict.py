@@ -52,9 +52,9 @@ def judge(case: Case, outcome: Outcome) -> list[str]:
 def _judge_report(outcome: Outcome) -> list[str]:
     try:
         report = json.loads((outcome.folder / 'report.json').read_text(encoding='utf-8'))
+        return [] if report.get('end_reason') else ['report: without a reason of the end']
     except (OSError, ValueError) as error:
         return [f'report: {error}']
-    return [] if report.get('end_reason') else ['report: without a reason of the end']
 
 
 def _judge_bag(case: Case, bag: Bag) -> list[str]:

@@ -2,7 +2,7 @@
 
 Usage: fake_nodes.py ROLE --ros-args ... with parameters `robots`, `lockstep`, `step`, `fault`
 (none, die, hang, loop, raise, deaf, silent, mute), `fault_step`, `targets` (flat), `finished_step`,
-`marker`, `said` (an error in the diagnostics).
+`marker`.
 """
 
 import os
@@ -16,9 +16,11 @@ from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
+from maasi_filter.ros.conversions import stamp_to_ros
+from maasi_filter.ros.qos import LATCHED_ALL as LATCHED
+from maasi_filter.ros.qos import RELIABLE as ALL
 from maasi_msgs.msg import (
     AgentState,
     BatchMember,
@@ -33,13 +35,6 @@ from maasi_msgs.msg import (
     RobotDecision,
 )
 
-ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=1, reliability=ReliabilityPolicy.RELIABLE)
-LATCHED = QoSProfile(
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
 
 class Fake(Node):
     """What all have in common."""
@@ -51,7 +46,6 @@ class Fake(Node):
         self.length = self.value('step', 0.05)
         self.fault = self.value('fault', 'none')
         self.fault_step = self.value('fault_step', 0)
-        self.said = self.value('said', '')
         self.marker = self.value('marker', '')
         self.full_name = self.get_fully_qualified_name()
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -65,8 +59,7 @@ class Fake(Node):
 
     def beat(self):
         """Publish a sign of life, as all nodes do."""
-        status = DiagnosticStatus(name=self.full_name, message=self.said)
-        status.level = DiagnosticStatus.ERROR if self.said else DiagnosticStatus.OK
+        status = DiagnosticStatus(name=self.full_name)
         self.diagnostics.publish(DiagnosticArray(status=[status]))
 
     def say_ready(self, *peers):
@@ -108,9 +101,8 @@ class Fake(Node):
             pass
         return self.fault == 'hang'
 
-    def stamp(self, message, step):
-        nanoseconds = round(step * self.length * 1e9)
-        message.sec, message.nanosec = divmod(nanoseconds, 10**9)
+    def stamp(self, step):
+        return stamp_to_ros(round(step * self.length * 1e9))
 
 
 class Sim(Fake):
@@ -131,10 +123,7 @@ class Sim(Fake):
         self.returned = set()
         self.create_subscription(LockstepDone, '/lockstep/ready', self.on_ready, LATCHED)
         self.create_subscription(LockstepDone, '/lockstep/done', self.on_done, ALL)
-        if self.lockstep:
-            self.timer = self.create_timer(0.1, self.look)
-        else:
-            self.timer = self.create_timer(0.02, self.tick)
+        self.create_timer(0.1 if self.lockstep else 0.02, self.look if self.lockstep else self.tick)
         self.say_ready()
 
     def on_ready(self, message):
@@ -163,17 +152,13 @@ class Sim(Fake):
         self.publish_step()
 
     def publish_step(self):
-        clock = Clock()
-        self.stamp(clock.clock, self.step)
-        for name in self.robots:
+        stamp = self.stamp(self.step)
+        for publisher in self.odometry.values():
             odometry = Odometry()
-            self.stamp(odometry.header.stamp, self.step)
-            self.odometry[name].publish(odometry)
-        self.clock.publish(clock)
-        if self.lockstep or self.step >= 0:
-            message = LockstepStep(step=self.step, robots=self.robots)
-            self.stamp(message.stamp, self.step)
-            self.steps.publish(message)
+            odometry.header.stamp = stamp
+            publisher.publish(odometry)
+        self.clock.publish(Clock(clock=stamp))
+        self.steps.publish(LockstepStep(step=self.step, robots=self.robots, stamp=stamp))
 
     def on_done(self, message):
         if message.step == self.step and self.lockstep:
@@ -212,10 +197,7 @@ class Driver(Fake):
         for member in batch.members:
             if member.robot == self.name:
                 answer = DetectionArray(
-                    batch_id=batch.id,
-                    step=batch.step,
-                    robot=self.name,
-                    measurement=member.measurement,
+                    batch_id=batch.id, step=batch.step, robot=self.name, measurement=batch.id
                 )
                 answer.header.stamp = batch.stamp
                 self.detections.publish(answer)
@@ -254,15 +236,11 @@ class Filter(Fake):
 
     def process(self, number):
         batch, robots = self.pending[number]
-        if (
-            number in self.answered
-            or batch is None
-            or robots != {member.robot for member in batch.members}
-        ):
+        if batch is None or number in self.answered or len(robots) < len(batch.members):
             return
         self.answered.add(number)
-        new = []
         index = len(self.found)
+        new = []
         if 2 * index < len(self.targets) - 1:
             target = FoundTarget(id=index + 1, robot=self.robots[0], batch_id=number)
             target.position.x, target.position.y = self.targets[2 * index : 2 * index + 2]
@@ -270,16 +248,11 @@ class Filter(Fake):
             new = [target]
             self.found += new
         array = FoundTargetArray(batch_id=number, targets=self.found)
-        array.header.stamp = batch.stamp
+        update = FilterUpdate(batch_id=number, step=batch.step, members=batch.members)
+        update.found, update.newly_found = len(self.found), new
+        for message in (array, update):
+            message.header.stamp = batch.stamp
         self.found_targets.publish(array)
-        update = FilterUpdate(
-            batch_id=number,
-            step=batch.step,
-            members=batch.members,
-            found=len(self.found),
-            newly_found=new,
-        )
-        update.header.stamp = batch.stamp
         self.update.publish(update)
 
 
@@ -308,17 +281,14 @@ class Planner(Fake):
         decision = PlanDecision(step=message.step, planner='maasi', explored=0.5)
         decision.header.stamp = message.stamp
         decision.reason = 'nothing is left to gain' if finished else ''
-        decision.robots = [
-            RobotDecision(robot=name, decision=self.number, chosen=0)
-            for name in ([] if finished else self.robots)
-        ]
+        for name in () if finished else self.robots:
+            decision.robots.append(RobotDecision(robot=name, decision=self.number, chosen=0))
         self.decisions.publish(decision)
         self.number += 1
         batch = MeasurementBatch(id=self.number, step=message.step, stamp=message.stamp)
-        batch.members = [
-            BatchMember(robot=name, decision=self.number, measurement=self.number)
-            for name in self.robots
-        ]
+        for name in self.robots:
+            member = BatchMember(robot=name, decision=self.number, measurement=self.number)
+            batch.members.append(member)
         self.asked = batch
         self.ask()
 

@@ -1,11 +1,7 @@
 """Recordings: what is written can be read, whatever happened to the writer."""
 
-import contextlib
 import json
-import multiprocessing
-import resource
 import shutil
-import time
 from pathlib import Path
 
 import cv2
@@ -15,9 +11,7 @@ import yaml
 from ament_index_python.packages import get_package_share_directory
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from maasi_sim.run.bag import Bag, BagError, BagWriteError, BagWriter, load_types, topic_qos
-
-LIMIT = 60.0
+from maasi_sim.run.bag import Bag, BagError, BagWriter, load_types, topic_qos
 
 
 @pytest.fixture(scope='module')
@@ -54,16 +48,6 @@ def read_steps(bag):
     return [int(item.message.data.split()[0]) for item in bag.messages()]
 
 
-@contextlib.contextmanager
-def in_process(target, *arguments):
-    """Run a function in a process of its own, which is killed in the end."""
-    process = multiprocessing.get_context('fork').Process(target=target, args=arguments)
-    process.start()
-    yield process
-    process.kill()
-    process.join(LIMIT)
-
-
 def test_messages_come_back_in_order_with_rising_times(types, tmp_path):
     with BagWriter(tmp_path / 'bag', types, backlog=100) as writer:
         write_steps(writer, range(300))
@@ -81,45 +65,34 @@ def test_messages_come_back_in_order_with_rising_times(types, tmp_path):
 def test_scenario_is_found_again(types, tmp_path):
     with BagWriter(tmp_path / 'bag', types) as writer:
         writer.write_scenario('seed: 3\nnodes: {}\n', {'seed': '3'})
+        writer.add_topic('/found', 'std_msgs/msg/String', topic_qos(latched=True))
     with Bag(tmp_path / 'bag') as bag:
         assert bag.scenario() == {'seed': 3, 'nodes': {}}
-    assert "seed: '3'" in (tmp_path / 'bag' / 'metadata.yaml').read_text()
-
-
-def test_no_scenario_is_said(types, tmp_path):
-    BagWriter(tmp_path / 'bag', types).close()
-    with Bag(tmp_path) as bag, pytest.raises(BagError, match='holds no scenario'):
+    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
+    for words in ("seed: '3'", 'durability: transient_local', 'reliability: reliable'):
+        assert words in text
+    BagWriter(tmp_path / 'other', types).close()
+    with Bag(tmp_path / 'other') as bag, pytest.raises(BagError, match='holds no scenario'):
         bag.scenario()
 
 
 @pytest.mark.parametrize('encoding', ['bgr8', 'rgb8', 'mono8'])
-@pytest.mark.parametrize('padding', [0, 5])
-def test_png_images_come_back_to_the_bit(types, tmp_path, encoding, padding):
-    shape = (12, 16) if encoding == 'mono8' else (12, 16, 3)
-    pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
-    with BagWriter(tmp_path / 'bag', types, images='png') as writer:
+@pytest.mark.parametrize(('kind', 'padding'), [('png', 0), ('png', 5), ('jpeg', 0)])
+def test_images_come_back(types, tmp_path, encoding, kind, padding):
+    pixels = np.full((24, 32, 3), 120, np.uint8)
+    cv2.circle(pixels, (16, 12), 6, (220, 40, 30), -1)
+    pixels = pixels[:, :, 0] if encoding == 'mono8' else pixels
+    with BagWriter(tmp_path / 'bag', types, images=kind) as writer:
         writer.add_topic('/mambo/camera/image_raw', 'sensor_msgs/msg/Image')
         writer.write_message('/mambo/camera/image_raw', 5, image(types, pixels, encoding, padding))
     with Bag(tmp_path) as bag:
         (item,) = bag.messages()
     assert item.topic == '/mambo/camera/image_raw/compressed'
-    assert item.message.format.startswith(f'{encoding}; png')
+    assert item.message.format.startswith(f'{encoding}; {kind}')
     assert item.message.header.stamp.sec == 1
     read = cv2.imdecode(item.message.data, cv2.IMREAD_UNCHANGED)
     expected = pixels[:, :, ::-1] if encoding == 'rgb8' else pixels
-    np.testing.assert_array_equal(read, expected)
-
-
-def test_jpeg_images_come_back_nearly(types, tmp_path):
-    pixels = np.full((24, 32, 3), 120, np.uint8)
-    cv2.circle(pixels, (16, 12), 6, (220, 40, 30), -1)
-    with BagWriter(tmp_path / 'bag', types) as writer:
-        writer.add_topic('/image', 'sensor_msgs/msg/Image')
-        writer.write_message('/image', 5, image(types, pixels, 'bgr8'))
-    with Bag(tmp_path) as bag:
-        (item,) = bag.messages()
-    read = cv2.imdecode(item.message.data, cv2.IMREAD_COLOR)
-    assert np.abs(read.astype(int) - pixels).mean() < 3.0
+    assert np.abs(read.astype(int) - expected).mean() <= (0.0 if kind == 'png' else 3.0)
 
 
 @pytest.mark.parametrize('height, encoding', [(0, 'bgr8'), (12, 'bayer_rggb8'), (12, '32FC1')])
@@ -132,14 +105,6 @@ def test_images_that_cannot_be_compressed_are_stored_as_they_are(types, tmp_path
         (item,) = bag.messages()
     assert item.topic == '/image'
     assert item.message.encoding == encoding
-
-
-def test_quality_of_service_is_kept(types, tmp_path):
-    with BagWriter(tmp_path / 'bag', types) as writer:
-        writer.add_topic('/found', 'std_msgs/msg/String', topic_qos(latched=True))
-    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
-    assert 'durability: transient_local' in text
-    assert 'reliability: reliable' in text
 
 
 def test_an_existing_folder_is_not_overwritten(types, tmp_path):
@@ -171,28 +136,6 @@ def test_what_is_no_recording_is_refused(tmp_path, name):
     (tmp_path / 'empty').mkdir()
     with pytest.raises(BagError, match=name):
         Bag(tmp_path / name)
-
-
-def _write_and_wait(path, number, size):
-    write_steps(BagWriter(Path(path), load_types()), range(number), size)
-    time.sleep(LIMIT)
-
-
-@pytest.mark.parametrize(('number', 'size'), [(10, 0), (60, 30000)])
-def test_what_is_written_is_in_the_file_soon_also_of_a_killed_writer(tmp_path, number, size):
-    # Less than a chunk, and several.
-    steps, deadline = [], time.monotonic() + LIMIT
-    with in_process(_write_and_wait, tmp_path / 'bag', number, size):
-        while steps != list(range(number)):
-            assert time.monotonic() < deadline and steps == list(range(len(steps))), steps
-            try:
-                with Bag(tmp_path) as bag:
-                    steps = read_steps(bag)
-                    assert 'the end of bag.mcap is missing' in bag.recovered
-            except BagError:
-                steps = []
-    with Bag(tmp_path) as bag:
-        assert read_steps(bag) == steps
 
 
 @pytest.fixture(scope='module')
@@ -229,14 +172,6 @@ def test_a_recording_cut_anywhere_gives_what_is_before_the_cut(whole, tmp_path, 
     assert counts[0] == 0 and counts[-1] == 60 and len(set(counts)) >= 3
 
 
-def test_zeros_after_a_cut_are_no_records(whole, tmp_path):
-    data = (whole / 'bag.mcap').read_bytes()
-    file = tmp_path / 'bag.mcap'
-    file.write_bytes(data[:1000000] + bytes(100000))
-    with Bag(file) as bag:
-        assert len(list(bag.messages())) > 15
-
-
 def test_what_is_damaged_inside_is_said(whole, tmp_path):
     shutil.copytree(whole, tmp_path / 'bag')
     file = tmp_path / 'bag' / 'bag.mcap'
@@ -245,36 +180,6 @@ def test_what_is_damaged_inside_is_said(whole, tmp_path):
     file.write_bytes(data)
     with Bag(tmp_path) as bag, pytest.raises(BagError, match='is damaged'):
         list(bag.messages())
-
-
-def test_only_metadata_is_missing(whole, tmp_path):
-    shutil.copytree(whole, tmp_path / 'bag')
-    (tmp_path / 'bag' / 'metadata.yaml').unlink()
-    with Bag(tmp_path) as bag:
-        assert bag.counts == {'/text': 60}
-        assert bag.recovered.endswith('has no metadata.yaml')
-
-
-def _write_until_full(path, queue):
-    # More than this, and a write fails as on a full disk.
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-    writer = BagWriter(Path(path), load_types(), backlog=50_000)
-    for act in (lambda: write_steps(writer, range(10**6), 4000), writer.close):
-        try:
-            act()
-        except BagWriteError as error:
-            queue.put(str(error))
-
-
-def test_a_full_disk_is_said_and_what_is_whole_can_be_read(tmp_path):
-    queue = multiprocessing.get_context('fork').Queue()
-    with in_process(_write_until_full, tmp_path / 'bag', queue) as process:
-        for _ in range(2):
-            assert 'writing failed: File too large' in queue.get(timeout=LIMIT)
-        process.join(LIMIT)
-    with Bag(tmp_path) as bag:
-        steps = read_steps(bag)
-    assert steps == list(range(len(steps))) and steps
 
 
 def _installed_hash(type_name):

@@ -221,27 +221,6 @@ def test_the_lock_ends_with_the_process(tmp_path):
     Domain(33, str(tmp_path)).release()
 
 
-def test_a_domain_is_locked_without_a_file():
-    """In a shared folder another user could have put a link in the place of one."""
-    code = (
-        'import os, sys\n'
-        'from maasi_sim.run.domain import Domain\n'
-        'def note(event, words):\n'
-        "    made = event == 'open' and isinstance(words[2], int) and words[2] & os.O_CREAT\n"
-        "    if made or event in ('os.mkdir', 'os.chmod', 'os.link', 'os.symlink'):\n"
-        '        print(event, *words)\n'
-        'sys.addaudithook(note)\nDomain().release()\n'
-    )
-    done = subprocess.run(
-        [sys.executable, '-B', '-c', code],
-        check=True,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-    )
-    assert done.stdout == ''
-
-
 def test_a_run_says_that_the_loopback_interface_is_down():
     code = 'from maasi_sim.run.run_scenario import main; raise SystemExit(main(["mambo"]))'
     # A network namespace of its own has a loopback interface that is down.

@@ -144,15 +144,6 @@ def test_signals_get_stronger_until_all_processes_have_ended(tmp_path, code, las
     assert stop([*processes, python(tmp_path, '', '/other')]) == []
 
 
-def test_signals_of_the_run_are_not_those_of_the_node(tmp_path):
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        process = started(python(tmp_path, WAIT))
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert stop([process]) == []
-
-
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
 def test_nodes_do_not_outlive_a_killed_run(tmp_path, number):
     own = find_executable('maasi_filter', 'filter_node')

@@ -7,8 +7,7 @@ from node_kinds import KINDS
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from test_life_cycle import in_graph, made_by
-from waiting import PATIENCE, wait_until
+from waiting import wait_until
 
 from maasi_filter.ros.conversions import stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE, UPDATES
@@ -117,52 +116,3 @@ def test_a_silent_robot_is_left_out_in_simulated_time(world):
     assert 'rover' not in node._away
     world.tell(2 * SECOND)
     world.until(lambda: 'rover' in node._away)
-
-
-def again(world, work):
-    """Let a node work, and take it through its life cycle; each time it has the same entities."""
-    node = world.tested
-
-    def go_through(*steps):
-        for step in steps:
-            assert getattr(node, f'trigger_{step}')().name == 'SUCCESS', (step, node.problem)
-
-    work()
-    # Without the timers of an active node that has just begun.
-    go_through('deactivate')
-    counts = made_by(node), in_graph(node)
-    for _ in range(3):
-        go_through('cleanup', 'configure', 'activate')
-        work()
-        go_through('deactivate')
-        world.until(lambda: (made_by(node), in_graph(node)) == counts)
-
-
-def test_a_filter_answers_batches_after_each_configure(world):
-    world.begin('filter', batch_timeout=TIMEOUT)
-
-    def work():
-        world.updates.clear()
-        world.until(lambda: world.count_publishers('/filter_update'))
-        world.ask()
-        world.until(lambda: any(item.batch_id == world.number for item in world.updates))
-
-    again(world, work)
-
-
-def test_a_planner_searches_again_after_each_configure(world):
-    node = world.begin('planner', state_timeout=PATIENCE, search_on_start=True)
-
-    def work():
-        world.decisions.clear()
-        world.until(world.state.get_subscription_count)
-        steps = iter(range(1, 10_000))
-
-        def decided():
-            world.stand(next(steps))
-            return world.decisions
-
-        world.until(decided)
-        assert node.configured
-
-    again(world, work)

@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+from chaos_execution import processes_of
 from report_check import check_report
 from waiting import wait_until
 
@@ -65,16 +66,7 @@ def wait_for(condition, what):
 
 def processes_with(text):
     """Return the ids of the processes whose command line has a text in it."""
-    found = []
-    for entry in Path('/proc').iterdir():
-        if entry.name.isdigit():
-            try:
-                line = (entry / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
-            except OSError:
-                continue
-            if text in line and int(entry.name) != os.getpid():
-                found.append(int(entry.name))
-    return found
+    return list(processes_of(text))
 
 
 def plain(message):

@@ -9,12 +9,11 @@ import pytest
 import yaml
 from reserved_domain import reserved_domain
 from run_operator import Operator
-from scenario_runs import PATIENCE, command, of_topic, processes_with, run_scenario, wait_for
+from scenario_runs import PATIENCE, command, of_topic, processes_with, run_scenario
 from test_mavlink_scenario import short_search
 
 from maasi_filter.ros.qos import RELIABLE
 from maasi_msgs.msg import AgentState, PlanDecision
-from maasi_sim.run.bag import Bag
 from maasi_sim.scenario.loading import load_scenario
 
 pytestmark = pytest.mark.system
@@ -49,25 +48,6 @@ def test_the_others_plan_on_when_a_robot_leaves(tmp_path):
         for robot in decision['robots']
     ]
     assert 'mambo' in later
-
-
-def under_way(scenario, folder, *options):
-    """Return the process of a run that has recorded something."""
-    process = subprocess.Popen(
-        command(scenario, folder, *options),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    wait_for(
-        lambda: (
-            any((folder / 'bag').glob('*.mcap'))
-            and next((folder / 'bag').glob('*.mcap')).stat().st_size > 300_000
-        ),
-        'the run is under way',
-    )
-    return process
 
 
 def kill(folder, name):
@@ -157,22 +137,3 @@ def test_robots_whose_planner_is_killed_while_they_pass_waypoints_stop_at_the_la
             assert state.goal_status == AgentState.REACHED
             assert math.dist((place.x, place.y), (point.x, point.y)) < 1.0
             assert math.hypot(speed.x, speed.y, speed.z) < 0.3
-
-
-def test_ctrl_c_leaves_no_process_and_a_readable_bag(tmp_path):
-    folder = tmp_path / 'run'
-    process = under_way('mambo_turtlebot', folder)
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130, output
-    assert 'Traceback' not in output
-    assert not processes_with(f'{folder}/')
-    with Bag(folder / 'bag') as bag:
-        assert any(True for _ in bag.raw(['/clock']))
-        # Drivers stop their robots before they go.
-        last = {}
-        for item in bag.messages(['/mambo/cmd_vel', '/turtlebot/cmd_vel']):
-            last[item.topic] = item.message.twist
-    for twist in last.values():
-        assert twist.linear.x == twist.linear.y == twist.linear.z == twist.angular.z == 0.0
-    assert len(last) == 2

@@ -50,28 +50,19 @@ class CuboidSimNode(SimNode):
         """See `SimNode.simulate`."""
         return CuboidSimulation(self.scenario, self.settings.seed)
 
-    def connect(self) -> list[Any]:
+    def connect(self) -> None:
         """See `SimNode.connect`."""
         self._sent: dict[str, SearchLink] = {}
         self._served: set[str] = set()
         self._link_publishers: dict[str, Publisher] = {}
-        entities: list[Any] = []
         for name in self.simulation.robots:
             publisher = self.create_publisher(SearchLinkArray, f'{name}/link/rx', RELIABLE)
             self._link_publishers[name] = publisher
             self._expected[self._driver_of[name]].append(publisher.topic_name)
-            entities.append(publisher)
-            entities.append(
-                self.create_subscription(
-                    SearchLink,
-                    f'{name}/link/tx',
-                    partial(self._on_sent, name),
-                    RELIABLE,
-                )
-            )
+            heard = partial(self._on_sent, name)
+            self.create_subscription(SearchLink, f'{name}/link/tx', heard, RELIABLE)
         self._link_timer = self.create_wall_timer(1.0, self._deliver)
         self._link_timer.cancel()
-        return entities
 
     def on_new_step(self) -> None:
         """See `SimNode.on_new_step`."""

@@ -17,18 +17,6 @@ Record = TypeVar('Record', bound=RunRecord)
 RecordOut = TypeVar('RecordOut', bound=RunRecord, covariant=True)
 
 
-class Completion(Protocol):
-    """When everything was found: simulated time since the first step [s], and step."""
-
-    @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-
-    @property
-    def step(self) -> int:
-        """Step of the simulation."""
-
-
 class Observer(Protocol[RecordOut]):
     """Gathers the data of the report from serialised messages, and detects the end of the run."""
 
@@ -60,8 +48,8 @@ class Observer(Protocol[RecordOut]):
         """Share of the environment explored."""
 
     @property
-    def completed(self) -> Completion | None:
-        """When everything was found, where the scenario stops then."""
+    def completed(self) -> object | None:
+        """Time and step at which all was found, where the scenario stops then."""
 
     @property
     def settled(self) -> str | None:

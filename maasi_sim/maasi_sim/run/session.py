@@ -124,8 +124,8 @@ class Session:
         if time.monotonic() - self._armed_at < _ARMING_PERIOD:
             return
         self._armed_at = time.monotonic()
-        ready = map(self._supervisor.without_team, self.recorder.ready)
-        names = [name for name in self.mission.taking_off() if f'/{name}/driver' not in {*ready}]
+        ready = set(map(self._supervisor.without_team, self.recorder.ready))
+        names = [name for name in self.mission.taking_off() if f'/{name}/driver' not in ready]
         self.recorder.arm(names)
 
     def _check_recording(self) -> None:
