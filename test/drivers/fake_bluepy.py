@@ -11,7 +11,8 @@ import struct
 import sys
 import threading
 import time
-from types import ModuleType
+from functools import partial
+from types import ModuleType, SimpleNamespace
 from typing import ClassVar
 
 from maasi_sim.emulators.mambo.fake_mambo import ALL_STATES, obey
@@ -33,41 +34,16 @@ class DefaultDelegate:
     pass
 
 
-class Characteristic:
-    def __init__(self, peripheral, name, handle):
-        self.uuid = f'9a66{name}-0800-9191-11e4-012d1540cb8e'
-        self.name = name
-        self.handle = handle
-        self._peripheral = peripheral
-
-    def getHandle(self):
-        return self.handle
-
-    def write(self, data):
-        self._peripheral.hear(self.name, data)
-
-
-class Service:
-    def __init__(self, name, characteristics):
-        self.uuid = f'9a66{name}-0800-9191-11e4-012d1540cb8e'
-        self._characteristics = characteristics
-
-    def getCharacteristics(self):
-        return self._characteristics
+def part(name, **methods):
+    """Return a service or characteristic of the drone."""
+    return SimpleNamespace(uuid=f'9a66{name}-0800-9191-11e4-012d1540cb8e', **methods)
 
 
 class Peripheral:
-    """
-    The radio, and a drone in real time at its other end.
+    """The radio, and a drone in real time at its other end: `firmware`, set by a test.
 
-    Attributes
-    ----------
-    firmware : MamboFirmware
-        Of the drone that all find; set by a test.
-    cut : bool
-        Whether nothing gets through; a write without response then still succeeds.
-    heard : list
-        Channel and command of what came through.
+    While `cut` nothing gets through; a write without response then still succeeds. `heard` has
+    channel and command of what came through.
     """
 
     firmware = None
@@ -80,9 +56,7 @@ class Peripheral:
         self._lock = threading.Lock()
         self._sequence = 0
         names = [name for group in _SERVICES.values() for name in group]
-        self._characteristics = {
-            name: Characteristic(self, name, 10 + 3 * n) for n, name in enumerate(names)
-        }
+        self._handles = {name: 10 + 3 * number for number, name in enumerate(names)}
         self._said = None
         self._ended = threading.Event()
 
@@ -95,9 +69,13 @@ class Peripheral:
 
     def getServices(self):
         return [
-            Service(name, [self._characteristics[key] for key in keys])
+            part(name, getCharacteristics=lambda keys=keys: list(map(self._characteristic, keys)))
             for name, keys in _SERVICES.items()
         ]
+
+    def _characteristic(self, name):
+        handle = self._handles[name]
+        return part(name, handle=handle, getHandle=lambda: handle, write=partial(self.hear, name))
 
     def writeCharacteristic(self, handle, data):
         pass
@@ -110,7 +88,7 @@ class Peripheral:
             name, data = self._waiting.get(timeout=timeout)
         except queue.Empty:
             return False
-        self._delegate.handleNotification(self._characteristics[name].handle, data)
+        self._delegate.handleNotification(self._handles[name], data)
         return True
 
     # ---- the drone ---------------------------------------------------------------------------

@@ -70,6 +70,11 @@ class Play:
         """Call the service `arm`."""
         return self.vehicle.permit(self.now)
 
+    def permitted(self):
+        """Return itself, once the service `arm` is granted."""
+        assert self.permit() == ''
+        return self
+
     def restart_driver(self):
         """Start another driver in the place of the one before, which was killed."""
         old = self.vehicle
@@ -129,8 +134,33 @@ class Play:
             position = self.vehicle.estimate.telemetry.position
             self.vehicle.set_target(position + ahead * np.array(direction), 0.3)
 
-    def until_lost(self):
-        self.until(lambda: self.vehicle.fault)
+    @property
+    def fault(self):
+        return self.vehicle.fault
+
+    @property
+    def phase(self):
+        return self.vehicle.phase
+
+    @property
+    def estimate(self):
+        return self.vehicle.estimate
+
+    @property
+    def mode(self):
+        return self.autopilot.mode_name
+
+    @property
+    def armed(self):
+        return self.autopilot.armed
+
+    @property
+    def position(self):
+        return self.autopilot.body.position
+
+    @property
+    def level_speed(self):
+        return float(np.linalg.norm(self.autopilot.body.velocity[:2]))
 
     @property
     def speed(self):

@@ -21,21 +21,10 @@ GROUND, AIR, LANDING = range(3)
 
 
 class OnboardProgram:
-    """
-    The drone; z is up from where it stands, x forward, y left.
+    """The drone; z is up from where it stands, x forward, y left.
 
-    Attributes
-    ----------
-    silent, deaf : bool
-        Whether nothing of it gets through, and nothing to it.
-    charge : float
-        Of its battery.
-    blobs : bytes
-        Of the next images, as the feed has them.
-    kinds : list of int
-        Orders that it has heard.
-    take_offs : int
-        How often it left the ground.
+    `silent` and `deaf`: nothing of it gets through, and nothing to it. `blobs` are those of the
+    next images, as the feed has them; `kinds` the orders that it has heard.
     """
 
     def __init__(self, address, feed):

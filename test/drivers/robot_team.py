@@ -122,7 +122,8 @@ class Team(Node):
         self.ranges = self.create_publisher(RangeArray, 'ranges', RELIABLE)
         self.used = [self.battery, self.batches]
         self.used += [self.odometry] if self.settings.poses == 'odometry' else []
-        self.used += [self.images] if self.settings.camera else [self.ranges]
+        topic = self.settings.image_source == 'topic'
+        self.used += [self.images] * topic if self.settings.camera else [self.ranges]
         if lockstep:
             self.steps = self.create_publisher(LockstepStep, '/lockstep/step', RELIABLE)
             self.create_subscription(LockstepDone, '/lockstep/done', self.done.append, RELIABLE)

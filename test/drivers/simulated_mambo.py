@@ -12,12 +12,7 @@ from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion import make_motion
 from maasi_planner.settings import MotionSettings
-from maasi_sim.emulators.mambo.firmware import (
-    FirmwareSettings,
-    FlyingState,
-    MamboFirmware,
-    Piloting,
-)
+from maasi_sim.emulators.mambo.firmware import FirmwareSettings, MamboFirmware, Piloting
 from maasi_sim.world.odometry import OdometrySettings
 from maasi_sim.world.robots import BatterySettings
 
@@ -26,14 +21,6 @@ TILT = 0.1
 MOTION = MotionSettings(model='mambo', speed=0.4, tilt=TILT)
 HOME = Pose.from_yaw([1.0, 1.2, 1.0], 0.6)
 FENCE = np.array([[-0.4, 2.5], [-0.4, 2.5], [0.0, 2.0]])
-NAMES = {
-    FlyingState.LANDED: 'landed',
-    FlyingState.TAKING_OFF: 'takingoff',
-    FlyingState.HOVERING: 'hovering',
-    FlyingState.FLYING: 'flying',
-    FlyingState.LANDING: 'landing',
-    FlyingState.EMERGENCY: 'emergency',
-}
 
 
 def full_speed(drag):
@@ -46,17 +33,15 @@ class Flight:
 
     def __init__(
         self,
-        arm=True,
         battery=1.0,
         drag=0.5,
         firmware_delay=0.1,
-        fence=FENCE,
         lost_link='land',
+        permitted=True,
         **settings,
     ):
-        start = Pose.from_yaw([*HOME.position[:2], 0.0], HOME.yaw)
         self.firmware = MamboFirmware(
-            start,
+            Pose.from_yaw([*HOME.position[:2], 0.0], HOME.yaw),
             FirmwareSettings(delay=firmware_delay, lost_link=lost_link, drag=drag),
             BatterySettings(charge=battery),
             OdometrySettings(position_noise=0.002, heading_noise=0.002),
@@ -69,28 +54,32 @@ class Flight:
         self.cut_up = self.cut_down = False
         self.sent = 'true'
         self.time = self.heard_at = 0.0
-        self._flying_state, self._battery = 'landed', battery
+        self._heard = 'landed', battery
         self.motion = make_motion(MOTION)
-        settings = {'full_speed': full_speed(drag), 'arm': arm} | settings
-        self.pilot = MamboPilot(self, self.motion, MamboSettings(**settings), HOME, fence)
+        permitted = settings.pop('permitted', True)
+        settings = MamboSettings(**{'full_speed': full_speed(drag), 'arm': True} | settings)
+        self.pilot = MamboPilot(self, self.motion, settings, HOME, FENCE)
         self.pilot.update(self.time)
-        self.pilot.permit(self.time)
+        if permitted:
+            self.pilot.permit(self.time)
         self.goal = None
-        self.problems = []
 
     # ---- what the pilot sees of a link -------------------------------------------------------
 
     @property
-    def flying_state(self):
+    def heard(self):
         if not self.cut_down:
-            self._flying_state = NAMES[self.firmware.flying_state]
-        return self._flying_state
+            name = self.firmware.flying_state.name.lower().replace('_', '')
+            self._heard = name, self.firmware.charge.charge
+        return self._heard
+
+    @property
+    def flying_state(self):
+        return self.heard[0]
 
     @property
     def battery(self):
-        if not self.cut_down:
-            self._battery = self.firmware.charge.charge
-        return self._battery
+        return self.heard[1]
 
     def take_off(self):
         if not self.cut_up:
@@ -120,7 +109,6 @@ class Flight:
                 self.heard_at = self.time
                 self._send_position()
             self.pilot.update(self.time)
-            self.problems.append(self.pilot.problem)
             if self.goal is not None and self.pilot.phase is Phase.FLYING:
                 self.pilot.fly(self.motion.command(self.pilot.ahead(), self.goal))
 
@@ -128,8 +116,7 @@ class Flight:
         if self.sent == 'none':
             return
         estimate = self.firmware.estimate()
-        position = estimate.position.copy()
-        position[2] = round(position[2], 2)
+        position = np.array([*estimate.position[:2], round(estimate.position[2], 2)])
         if self.sent == 'stuck':
             position = self.position.position
         yaw = math.radians(round(math.degrees(estimate.yaw)))
@@ -141,10 +128,20 @@ class Flight:
             assert self.time < end, (self.pilot.phase, self.pilot.problem)
             self.step()
 
+    def until_it_is(self, state):
+        """Go on until the firmware is in a flying state; return for how long [s]."""
+        began = self.time
+        self.until(lambda: self.firmware.flying_state == state)
+        return self.time - began
+
+    def up(self):
+        """Return itself, in the air."""
+        self.until(lambda: self.pilot.phase is Phase.FLYING)
+        return self
+
     def flown(self):
         """Return itself, in the air and on the way."""
-        self.until(lambda: self.pilot.phase is Phase.FLYING)
-        self.goal = HOME.position + np.array([0.9, -0.6, 0.0])
+        self.up().goal = HOME.position + np.array([0.9, -0.6, 0.0])
         self.step(30)
         return self
 
@@ -156,6 +153,11 @@ class Flight:
     def speed(self):
         return float(np.linalg.norm(self.firmware.state.velocity))
 
+    @property
+    def left(self):
+        """Way left to its goal [m]."""
+        return float(np.linalg.norm(self.where - self.goal))
+
 
 # The field of the scenarios on the floor and what its candidates reach: x and y [m].
 FIELD = np.array([[-0.3, 2.4], [-0.3, 2.4]])
@@ -164,29 +166,14 @@ WAYPOINTS = [[2.2, 2.2], [-0.1, 2.2], [2.2, -0.1], [-0.1, -0.1], [1.05, 1.05], [
 
 @dataclass
 class Flown:
-    """
-    How a flight over the field went.
-
-    Attributes
-    ----------
-    measured : MeasuredSpeed
-        Of the measuring flight before.
-    overshoot : float
-        Farthest beyond a waypoint, in the direction of the leg [m].
-    outside : float
-        Farthest outside the field; negative: inside [m].
-    way, straight : float
-        Flown, and from waypoint to waypoint [m].
-    time : float
-        Until it has stayed at the last one for a second [s].
-    """
+    """How a flight over the field went."""
 
     measured: MeasuredSpeed
-    overshoot: float = 0.0
-    outside: float = -math.inf
-    way: float = 0.0
-    straight: float = 0.0
-    time: float = 0.0
+    overshoot: float = 0.0  # farthest beyond a waypoint, in the direction of the leg [m]
+    outside: float = -math.inf  # farthest outside the field; negative: inside [m]
+    way: float = 0.0  # flown [m]
+    straight: float = 0.0  # from waypoint to waypoint [m]
+    time: float = 0.0  # until it has stayed at the last one for a second [s]
 
 
 def measure(drag, delay, way=1.0, legs=6):
@@ -204,8 +191,7 @@ def measure_and_fly(drag, delay):
     """Return how a Mambo flies over the field with what its measuring flight says."""
     flown = Flown(measure(drag, delay)[0])
     speed, late = flown.measured.full_speed, flown.measured.delay
-    flight = Flight(drag=drag, firmware_delay=delay, full_speed=speed, delay=late)
-    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    flight = Flight(drag=drag, firmware_delay=delay, full_speed=speed, delay=late).up()
     began = flight.time
     for x, y in WAYPOINTS:
         start, goal = flight.where, np.array([x, y, HOME.position[2]])
@@ -221,10 +207,7 @@ def measure_and_fly(drag, delay):
             flown.overshoot = max(flown.overshoot, beyond)
             sides = [there[:2] - FIELD[:, 1], FIELD[:, 0] - there[:2]]
             flown.outside = max(flown.outside, float(np.max(sides)))
-            if np.linalg.norm(there - goal) > MOTION.tolerance:
-                arrived = math.inf
-            elif math.isinf(arrived):
-                arrived = flight.time
+            arrived = min(arrived, flight.time) if flight.left <= MOTION.tolerance else math.inf
             assert flight.time - began < 300.0, 'it does not come to rest'
     flown.time = flight.time - began
     return flown

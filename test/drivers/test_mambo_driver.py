@@ -1,4 +1,8 @@
-"""The Mambo's driver through pyparrot over loopback, to a fake that flies in real time."""
+"""The Mambo's driver through pyparrot over loopback, to a fake that flies in real time.
+
+What the pilot does about faults is in test_mambo_pilot.py; here is what only topics and processes
+show.
+"""
 
 import math
 import os
@@ -13,10 +17,9 @@ import pytest
 import yaml
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
-from mambo_flights import GOAL, START, YAW, Flight, noise_image, send_feed
 from numpy.testing import assert_allclose
 from rclpy.executors import SingleThreadedExecutor
-from robot_team import MAMBO, parameters_of, rendered
+from robot_team import MAMBO, Team, image_message, parameters_of, rendered
 from waiting import wait_until
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
@@ -25,253 +28,233 @@ from maasi_drivers.drivers import MamboDriver, TurtlebotDriver
 from maasi_drivers.links.mambo.mambo_robot_link import POLL_PERIOD
 from maasi_drivers.settings.driver import DriverSettings
 from maasi_drivers.settings.vehicles import MamboSettings
-from maasi_drivers.vision.camera_model import Camera
-from maasi_drivers.vision.detector import Blobs
-from maasi_drivers.vision.measurement_feed import FeedPacket
 from maasi_filter.models.pose import Pose
-from maasi_filter.ros.conversions import pose_to_ros, stamp_from_ros, stamp_to_ros
+from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_filter.ros.parameters import flatten
 from maasi_msgs.msg import AgentState
 from maasi_sim.emulators.mambo.fake_mambo import FakeMambo, free_address, free_port
-from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState
+from maasi_sim.emulators.mambo.firmware import FirmwareSettings, FlyingState, MamboFirmware
+from maasi_sim.world.odometry import OdometrySettings
 
+START, YAW = [1.0, 1.2, 0.4], 0.6
+GOAL = [1.7, 0.8, 0.5]
+FULL_SPEED = 9.81 * math.tan(MAMBO['motion']['tilt']) / FirmwareSettings().drag
 # After a fault the drone hovers or lands by then [s].
 LATEST = 1.5
 
 
-@pytest.fixture
-def fly(context):
-    """Return a function that starts a driver in this process, and all around it."""
-    started = []
-    executor = SingleThreadedExecutor(context=context)
+class Flight:
+    """A fake Mambo, the settings of its driver, and the team around it."""
 
-    def start(**changes):
-        flight = Flight(**changes)
-        driver = MamboDriver(
-            context=context,
-            namespace='/rover',
-            parameter_overrides=parameters_of(flight.settings),
+    def __init__(self, context, executor, mambo, **settings):
+        self.fake = FakeMambo(
+            MamboFirmware(
+                Pose.from_yaw([*START[:2], 0.0], YAW),
+                FirmwareSettings(take_off_height=0.3, lost_link='land'),
+                odometry=OdometrySettings(position_noise=0.002, heading_noise=0.002),
+            ),
+            free_address(),
         )
-        started.extend([driver, flight])
-        executor.add_node(driver)
-        flight.meet(context, executor)
-        assert driver.trigger_configure().name == 'SUCCESS'
-        assert driver.trigger_activate().name == 'SUCCESS'
+        link = {'arm': True, 'full_speed': FULL_SPEED, 'address': self.fake.address}
+        # The machine may be busy.
+        link |= {'port': free_port(), 'link_timeout': 2.0} | mambo
+        self.settings = MAMBO | {
+            'start': START,
+            'yaw': YAW,
+            'link': 'mambo_wifi',
+            'mambo': link,
+            'odometry_timeout': 0.5,
+            'battery_minimum': 0.0,
+            **settings,
+        }
+        self.team = Team(context, self.settings, executor, deaf=True)
+        # It is not reached by topics.
+        self.team.used = [self.team.batches]
+
+    @property
+    def flying_state(self):
+        return self.fake.firmware.flying_state
+
+    @property
+    def speed(self):
+        """Over the ground [m/s]."""
+        return float(np.linalg.norm(self.fake.state.velocity[:2]))
+
+    @property
+    def where(self):
+        return self.fake.state.pose.position
+
+    @property
+    def reason(self):
+        return self.team.state.reason if self.team.states else 'silent'
+
+    @property
+    def status(self):
+        return self.team.state.goal_status if self.team.states else None
+
+    def until(self, condition, what=''):
+        self.team.until(condition, what or f'{self.flying_state!r}, {self.reason!r}')
+
+    def permit(self):
+        while not self.team.call('arm', self.until).success:
+            pass
+        return self
+
+    def up(self):
+        """Let it take off, and wait until it takes goals."""
+        self.permit().until(lambda: self.status in (AgentState.IDLE, AgentState.ABORTED))
+        return self
+
+    def on_its_way(self):
+        """Wait until it flies to a goal; return the goal's handle and result to come."""
+        handle, result = self.up().team.send_accepted(GOAL)
+        self.until(lambda: np.linalg.norm(self.where[:2] - START[:2]) > 0.1)
+        return handle, result
+
+    def gives_up(self, result, reason):
+        """Check that the planner hears why the way has ended, and that it is not sent on."""
+        self.until(lambda: self.status == AgentState.UNAVAILABLE and reason in self.reason)
+        self.until(result.done)
+        assert result.result().status == GoalStatus.STATUS_ABORTED
+        assert self.team.refused(GOAL)
+
+
+@pytest.fixture
+def fly(context, tmp_path):
+    """Return a function that starts a driver, in this process or its own, and all around it."""
+    executor = SingleThreadedExecutor(context=context)
+    ends = [executor.shutdown]
+
+    def start(mambo=None, own_process=False, **changes):
+        flight = Flight(context, executor, mambo or {}, **changes)
+        ends.append(lambda: flight.fake.close())
+        ends.append(flight.team.destroy_node)
+        if own_process:
+            file = tmp_path / 'parameters.yaml'
+            flat = flatten(DriverSettings.model_validate(flight.settings))
+            file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
+            command = ['mambo_driver', '--ros-args', '--remap', '__ns:=/rover']
+            driver = subprocess.Popen([*command, '--params-file', str(file)], env=os.environ)
+            ends.extend([driver.wait, driver.kill])
+        else:
+            parameters = parameters_of(flight.settings)
+            driver = MamboDriver(
+                context=context, namespace='/rover', parameter_overrides=parameters
+            )
+            ends.extend([driver.destroy_node, driver.halt])
+            executor.add_node(driver)
+            assert driver.trigger_configure().name == 'SUCCESS'
+            assert driver.trigger_activate().name == 'SUCCESS'
         flight.team.connect()
         flight.driver = driver
         return flight
 
     yield start
-    for item in started:
-        if isinstance(item, Flight):
-            item.close()
-        else:
-            item.halt()
-            item.destroy_node()
-    executor.shutdown()
-
-
-@pytest.fixture
-def process(context, tmp_path):
-    """Return a function that starts a driver in a process of its own, and all around it."""
-    started = []
-    executor = SingleThreadedExecutor(context=context)
-
-    def start(**changes):
-        flight = Flight(**changes)
-        flight.meet(context, executor)
-        file = tmp_path / 'parameters.yaml'
-        flat = flatten(DriverSettings.model_validate(flight.settings))
-        file.write_text(yaml.safe_dump({'/**': {'ros__parameters': flat}}))
-        command = ['mambo_driver', '--ros-args']
-        command += ['--remap', '__ns:=/rover', '--params-file', str(file)]
-        driver = subprocess.Popen(command, env=os.environ)
-        started.extend([driver, flight])
-        flight.team.connect()
-        return driver, flight
-
-    yield start
-    for item in started:
-        if isinstance(item, Flight):
-            item.close()
-        else:
-            item.kill()
-            item.wait()
-    executor.shutdown()
-
-
-def hears_why(flight, result, reason):
-    """Check that the planner hears why the way has ended, and that it is not sent on."""
-    flight.until(lambda: flight.status == AgentState.UNAVAILABLE and reason in flight.reason)
-    flight.until(result.done)
-    assert result.result().status == GoalStatus.STATUS_ABORTED
-    assert flight.team.refused(GOAL)
+    for end in reversed(ends):
+        end()
 
 
 # ---- a flight --------------------------------------------------------------------------------
 
 
-def test_it_takes_off_goes_where_it_is_sent_and_lands(fly):
+def test_it_takes_off_goes_where_it_is_sent_and_lands(fly, monkeypatch):
     flight = fly()
     flight.until(lambda: flight.status == AgentState.UNAVAILABLE)
-    flight.up()
+    team = flight.up().team
     assert_allclose(flight.where, START, atol=0.15)
-    assert flight.fake.firmware.take_offs == 1
-    for point in (GOAL, [1.2, 1.5, 0.5]):
-        _, result = flight.team.send_accepted(point)
-        flight.until(result.done)
-        assert result.result().status == GoalStatus.STATUS_SUCCEEDED
-        assert np.linalg.norm(flight.where - point) < 0.1
-    state = flight.team.state
-    place = state.pose.pose.position
-    assert_allclose([place.x, place.y, place.z], flight.where, atol=0.06)
-    assert state.battery == pytest.approx(1.0, abs=0.02)
-    flight.driver.trigger_deactivate()
-    assert flight.flying_state in (FlyingState.LANDING, FlyingState.LANDED)
-    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
-    assert flight.fake.firmware.take_offs == 1
-    assert flight.fake.refused == 0
-
-
-def test_the_next_waypoint_replaces_one_without_a_stop(fly, monkeypatch):
-    flight = fly().up()
+    for point in ([1.7, 0.8, 1.6], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5]):
+        assert team.refused(point)
+    assert flight.driver.dropped['goal'] == 4
     shares = []
     link = flight.driver.link._link
     steer = link.steer
     monkeypatch.setattr(link, 'steer', lambda *item: (shares.append(item), steer(*item)))
-    _, replaced = flight.team.send_accepted([1.0, 0.4, START[2]], number=1)
+    _, replaced = team.send_accepted([1.0, 0.4, START[2]], number=1)
     flight.until(lambda: flight.where[1] < 0.75)
     shares.clear()
-    _, result = flight.team.send_accepted([1.0, -0.1, START[2]], number=2)
+    _, result = team.send_accepted([1.0, -0.1, START[2]], number=2)
     slowest = []
     flight.until(lambda: slowest.append(flight.speed) or flight.where[1] < 0.3)
     assert replaced.done() and replaced.result().result.reason == 'replaced'
     # It is never made to hover in between.
-    assert len(shares) > 5 and (0.0, 0.0, 0.0, 0.0) not in [tuple(item) for item in shares]
+    assert len(shares) > 5 and (0.0, 0.0, 0.0, 0.0) not in shares
     assert min(slowest) > 0.1
     # Nobody sends it further: it stops at its last waypoint.
     flight.until(result.done)
     assert result.result().result.reached
     flight.until(lambda: flight.speed < 0.05)
-    assert_allclose(flight.where, [1.0, -0.1, START[2]], atol=0.15)
-
-
-def test_nothing_takes_off_without_arm(fly):
-    flight = fly(mambo={'arm': False})
-    flight.until(lambda: 'mambo.arm' in flight.reason)
-    assert flight.status == AgentState.UNAVAILABLE
-    assert flight.team.refused(GOAL)
-    known = len(flight.team.states)
-    flight.until(lambda: len(flight.team.states) > known + 20)
-    assert flight.fake.firmware.take_offs == 0
-    assert (2, 0, 1) not in flight.fake.heard and flight.where[2] == 0.0
+    assert_allclose(flight.where, [1.0, -0.1, START[2]], atol=0.1)
+    place = team.state.pose.pose.position
+    assert_allclose([place.x, place.y, place.z], flight.where, atol=0.06)
+    assert team.state.battery == pytest.approx(1.0, abs=0.02)
+    flight.driver.trigger_deactivate()
+    assert flight.flying_state in (FlyingState.LANDING, FlyingState.LANDED)
+    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
+    assert flight.fake.firmware.take_offs == 1 and flight.fake.refused == 0
 
 
 @pytest.mark.parametrize('source', ['pose', 'odometry'])
 def test_it_flies_by_another_system(fly, source):
     """Its own position events do not come at all."""
-    flight = fly(mambo={'pose': source})
+    flight = fly({'pose': source})
     flight.fake.position_sent = 'none'
     team = flight.team
     publisher = team.create_publisher(PoseStamped, 'pose', 10)
-    silent = False
 
     def tell():
-        if not silent:
-            stamp = team.get_clock().now().nanoseconds
-            state = flight.fake.state
-            if source == 'pose':
-                message = PoseStamped(pose=pose_to_ros(state.pose))
-                message.header.frame_id = 'map'
-                message.header.stamp = stamp_to_ros(stamp)
-                publisher.publish(message)
-            else:
-                # The robot of the team is where the fake is.
-                team.body = team.motion.body(state)
-                message = team.odometry_message(stamp)
-                offset = START[2] - team.start.position[2]
-                message.pose.pose.position.z += offset
-                team.odometry.publish(message)
+        stamp, state = team.get_clock().now().nanoseconds, flight.fake.state
+        if source == 'pose':
+            message = PoseStamped(pose=pose_to_ros(state.pose))
+            message.header.frame_id = 'map'
+            message.header.stamp = stamp_to_ros(stamp)
+            publisher.publish(message)
+        else:
+            # The robot of the team is where the fake is.
+            team.body = team.motion.body(state)
+            message = team.odometry_message(stamp)
+            message.pose.pose.position.z += START[2] - team.start.position[2]
+            team.odometry.publish(message)
 
     team.create_timer(0.04, tell)
-    flight.up()
-    _, result = team.send_accepted(GOAL)
+    _, result = flight.up().team.send_accepted(GOAL)
     flight.until(result.done)
     assert result.result().status == GoalStatus.STATUS_SUCCEEDED
     assert np.linalg.norm(flight.where - GOAL) < 0.1
-    _, result = team.send_accepted(START)
-    silent = True
-    hears_why(flight, result, 'no position for')
-    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
 
 
-# ---- what it sees ----------------------------------------------------------------------------
-
-
-def test_images_of_a_topic_are_placed_where_the_drone_was(fly):
-    flight = fly()
-    flight.up()
-    team, target = flight.team, np.array([1.03, 1.24])
-    stamp = team.get_clock().now().nanoseconds
-    message = rendered(team, [target.tolist()], flight.fake.state.pose)
-    message.header.stamp = stamp_to_ros(stamp)
-    team.images.publish(message)
-    team.ask(stamp)
-    found_at(team, target)
-
-
-def found_at(team, target):
-    answer = team.answer()
-    assert len(answer.detections) == 1
-    pose = answer.pose.pose.position
-    seen = answer.detections[0]
-    place = [pose.x + seen.range * math.cos(seen.bearing)]
-    place += [pose.y + seen.range * math.sin(seen.bearing)]
-    assert_allclose(place, target, atol=0.06)
-    covariance = np.array(seen.covariance)
-    assert np.isfinite(covariance).all() and covariance[0] > 0.0
-    return answer
-
-
-def test_blobs_found_on_board_come_by_the_measurement_feed(fly):
-    port = free_port()
-    flight = fly(image_source='feed', feed_port=port)
-    flight.up()
-    team, target = flight.team, np.array([1.03, 1.24])
-    camera = Camera.from_settings(team.settings.camera)
-    pixels = camera.project(np.array([[*target, 0.0]]), flight.fake.state.pose)
-    blobs = Blobs(
-        centroids=np.asarray(pixels, dtype=float).reshape(1, 2),
-        areas=np.array([200.0]),
-        extents=np.array([[16.0, 16.0]]),
-        border_cut=np.array([False]),
-        covariances=np.zeros((1, 2, 2)),
-    )
-    sent = team.get_clock().now().nanoseconds
-    send_feed(port, FeedPacket(1, 0.02, 160, 120, blobs))
-    send_feed(port, FeedPacket(2, 0.02, 320, 240, blobs))
-    team.ask(sent - 100_000_000)
-    answer = found_at(team, target)
-    assert abs(stamp_from_ros(answer.header.stamp) - (sent - 20_000_000)) < 1_000_000_000
-    # That of another size.
-    flight.until(lambda: flight.driver.dropped['image'] == 1)
-
-
-def test_images_of_a_video(fly, tmp_path):
-    target = np.array([1.03, 1.24])
-    path = tmp_path / 'flight.avi'
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 10.0, (160, 120))
+@pytest.mark.parametrize('source', ['topic', 'video'])
+def test_images_are_placed_where_the_drone_was(play, tmp_path, source):
+    pose, target = Pose.from_yaw(START, YAW), np.array([1.03, 1.24])
     robot = SimpleNamespace(settings=DriverSettings.model_validate(MAMBO))
-    message = rendered(robot, [target.tolist()], Pose.from_yaw(START, YAW))
-    image = np.asarray(message.data, dtype=np.uint8).reshape(120, 160, 3)
-    for _ in range(300):
-        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    writer.release()
-    flight = fly(image_source='video', video=str(path))
-    flight.up()
-    team = flight.team
-    team.ask(team.get_clock().now().nanoseconds)
-    found_at(team, target)
+    message = rendered(robot, [target.tolist()], pose)
+    options = {}
+    if source == 'video':
+        path = tmp_path / 'flight.avi'
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 10.0, (160, 120))
+        image = np.asarray(message.data, dtype=np.uint8).reshape(120, 160, 3)
+        for _ in range(300):
+            writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        writer.release()
+        options = {'image_source': 'video', 'video': str(path)}
+    _, team = play('mambo', start=START, yaw=YAW, **options)
+
+    def say():
+        now = team.get_clock().now().nanoseconds
+        team.odometry.publish(team.odometry_message(now))
+        return now
+
+    now = say()
+    team.until(lambda: say() and team.states)
+    message.header.stamp = stamp_to_ros(say())
+    team.ask(now)
+    if source == 'topic':
+        team.images.publish(message)
+    team.until(lambda: say() and team.detections)
+    (seen,) = team.detections[0].detections
+    there = team.detections[0].pose.pose.position
+    angles = math.cos(seen.bearing), math.sin(seen.bearing)
+    place = [there.x, there.y] + seen.range * np.array(angles)
+    assert_allclose(place, target, atol=0.06)
 
 
 # ---- safety ----------------------------------------------------------------------------------
@@ -287,27 +270,16 @@ def test_what_is_waited_for_is_short_enough():
     assert firmware.command_timeout <= LATEST
 
 
-@pytest.mark.parametrize(
-    ('fault', 'reason'),
-    [
-        ({'cut_up': True, 'cut_down': True}, 'link lost: nothing from the Mambo for'),
-        ({'position_sent': 'stuck'}, 'the position has not changed for'),
-        ({'position_sent': 'nan'}, 'no position for'),
-    ],
-)
-def test_what_is_lost_has_it_hover_then_land(fly, fault, reason):
+def test_what_is_lost_has_it_hover_then_land(fly):
     flight = fly()
     _, result = flight.on_its_way()
-    for name, value in fault.items():
-        setattr(flight.fake, name, value)
-    hears_why(flight, result, reason)
-    flight.until(lambda: flight.flying_state != FlyingState.FLYING)
+    flight.fake.cut()
+    reason = 'link lost: nothing from the Mambo for'
+    flight.gives_up(result, reason)
     flight.until(lambda: flight.flying_state == FlyingState.LANDED)
     # The drone may have landed by itself before its driver gives up.
-    ends = f'landing: {reason}', f'landed: {reason}'
-    flight.until(lambda: flight.reason.startswith(ends))
-    flight.fake.cut_up = flight.fake.cut_down = False
-    flight.fake.position_sent = 'true'
+    flight.until(lambda: flight.reason.startswith((f'landing: {reason}', f'landed: {reason}')))
+    flight.fake.cut(False)
     flight.until(lambda: flight.reason.startswith(f'landed: {reason}'))
     assert flight.fake.firmware.take_offs == 1
 
@@ -325,7 +297,7 @@ def test_a_clock_that_jumps_back_stops_it_and_begins_anew(fly, set_back):
 
 
 def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
-    flight = fly(mambo={'land_after': 1.0})
+    flight = fly({'land_after': 1.0})
     firmware = flight.fake.firmware
     # Not by its own watchdog: the last command would be flown for ever.
     firmware.settings = replace(firmware.settings, command_timeout=math.inf)
@@ -341,7 +313,7 @@ def test_a_driver_whose_executor_hangs_has_it_hover_then_land(fly):
 
 
 def test_a_cancelled_goal_has_it_hover_then_land(fly):
-    flight = fly(mambo={'cancel_landing': 3.0})
+    flight = fly({'cancel_landing': 3.0})
     handle, result = flight.on_its_way()
     handle.cancel_goal_async()
     flight.until(result.done)
@@ -354,102 +326,74 @@ def test_a_cancelled_goal_has_it_hover_then_land(fly):
     assert UNTIL_ARM in flight.team.refused(GOAL)
 
 
-def test_a_goal_outside_the_geofence_is_refused_and_leaves_it_where_it_is(fly):
-    flight = fly()
-    flight.up()
-    points = [[1.7, 0.8, 1.6], [1.7, 0.8, -0.1], [2.6, 0.8, 0.5], [math.nan, 0.8, 0.5]]
-    for number, point in enumerate(points, start=1):
-        assert flight.team.refused(point)
-        assert flight.driver.dropped['goal'] == number
-    flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
-    assert flight.status in (AgentState.IDLE, AgentState.ABORTED)
-
-
-@pytest.mark.parametrize('fault', ['silent', 'repeats itself'])
-def test_a_camera_that_hangs_has_it_hover(fly, fault):
+def test_a_camera_that_repeats_itself_has_it_hover(fly):
     flight = fly(sensor_timeout=None)
-    team = flight.team
-    last = noise_image(1)
-    hangs = False
+    image, hangs = None, False
 
     def photograph():
-        nonlocal last
-        stamp = team.get_clock().now().nanoseconds
+        nonlocal image
+        stamp = flight.team.get_clock().now().nanoseconds
         if not hangs:
-            last = noise_image(stamp)
-        elif fault == 'silent':
-            return
-        last.header.stamp = stamp_to_ros(stamp)
-        team.images.publish(last)
+            noise = np.random.default_rng(stamp % 2**32).integers(110, 130, (120, 160, 3))
+            image = image_message(noise.astype(np.uint8))
+        image.header.stamp = stamp_to_ros(stamp)
+        flight.team.images.publish(image)
 
-    team.create_timer(0.1, photograph)
+    flight.team.create_timer(0.1, photograph)
     _, result = flight.on_its_way()
     hangs = True
-    hears_why(flight, result, 'no new image for')
+    flight.gives_up(result, 'no new image for')
     flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
     hangs = False
-    flight.up()
+    flight.until(lambda: flight.status == AgentState.ABORTED)
     assert flight.team.takes(GOAL)
 
 
-def test_when_its_driver_is_killed_the_firmware_has_it_hover_then_land(process):
-    driver, flight = process()
-    flight.on_its_way()
-    assert flight.flying_state == FlyingState.FLYING
-    driver.send_signal(signal.SIGKILL)
-    driver.wait()
-    flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
-    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
-
-
-def test_a_driver_that_is_told_to_end_lands_it(process):
-    driver, flight = process()
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
+def test_a_driver_that_ends_or_is_killed(fly, number):
+    """With SIGKILL only the firmware is left."""
+    flight = fly(own_process=True)
     _, result = flight.on_its_way()
-    driver.send_signal(signal.SIGINT)
-    flight.until(lambda: driver.poll() is not None)
-    assert driver.returncode == 0
-    # It has waited for the drone to say so.
-    assert flight.flying_state in (FlyingState.LANDING, FlyingState.LANDED)
-    flight.until(result.done)
-    assert result.result().result.reason == 'the driver stops'
+    flight.driver.send_signal(number)
+    flight.until(lambda: flight.driver.poll() is not None)
+    if number == signal.SIGINT:
+        assert flight.driver.returncode == 0
+        # It has waited for the drone to say so.
+        assert flight.flying_state in (FlyingState.LANDING, FlyingState.LANDED)
+        flight.until(result.done)
+        assert result.result().result.reason == 'the driver stops'
+    else:
+        flight.until(lambda: flight.flying_state == FlyingState.HOVERING)
+    flight.until(lambda: flight.flying_state == FlyingState.LANDED)
 
 
 # ---- what cannot be --------------------------------------------------------------------------
 
 
-def refused(context, made, settings):
-    node = made(context=context, namespace='/rover', parameter_overrides=parameters_of(settings))
-    assert node.trigger_configure().name == 'FAILURE'
-    problem = node.problem
-    node.destroy_node()
-    return problem
-
-
-def test_a_link_that_cannot_be_is_said(context, monkeypatch):
+@pytest.mark.parametrize(
+    ('kind', 'changes', 'bluetooth', 'text'),
+    [
+        (TurtlebotDriver, {}, False, "read 'mambo_wifi', allowed with this driver is topics"),
+        (MamboDriver, {'link': 'mambo_ble'}, False, 'bluepy is not installed'),
+        (MamboDriver, {'link': 'mambo_ble'}, True, 'address of a Mambo by Bluetooth: read'),
+        (MamboDriver, {'image_source': 'video', 'video': '/no/such/file.avi'}, False, 'video'),
+        (MamboDriver, {'motion': {'model': 'unicycle'}}, False, "motion.model: read 'unicycle'"),
+    ],
+)
+def test_a_link_that_cannot_be_is_said(context, monkeypatch, kind, changes, bluetooth, text):
     from pyparrot import Minidrone
 
-    flight = Flight()
-    flight.close()
-    settings = flight.settings
-    assert "read 'mambo_wifi', allowed with this driver is topics" in refused(
-        context, TurtlebotDriver, settings
-    )
-    monkeypatch.setattr(Minidrone, 'BLEAvailable', False)
-    assert 'bluepy is not installed' in refused(
-        context, MamboDriver, settings | {'link': 'mambo_ble'}
-    )
-    monkeypatch.setattr(Minidrone, 'BLEAvailable', True)
-    assert 'address of a Mambo by Bluetooth: read' in refused(
-        context, MamboDriver, settings | {'link': 'mambo_ble'}
-    )
-    assert 'video' in refused(
-        context, MamboDriver, settings | {'image_source': 'video', 'video': '/no/such/file.avi'}
-    )
+    monkeypatch.setattr(Minidrone, 'BLEAvailable', bluetooth)
+    settings = MAMBO | {'link': 'mambo_wifi', 'mambo': {'port': free_port()}} | changes
+    node = kind(context=context, namespace='/rover', parameter_overrides=parameters_of(settings))
+    assert node.trigger_configure().name == 'FAILURE'
+    assert text in node.problem
+    node.destroy_node()
 
 
 def test_a_drone_that_is_not_there_is_said_and_awaited(fly):
     address = free_address()
-    flight = fly(mambo={'address': address})
+    flight = fly({'address': address})
     flight.until(lambda: f'no Mambo at {address}' in flight.reason)
     assert flight.status == AgentState.UNAVAILABLE
     firmware = flight.fake.firmware

@@ -20,17 +20,16 @@ AT_MOST = 1.5
 
 
 def test_it_takes_off_flies_to_waypoints_and_lands():
-    flight = Flight()
-    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    flight = Flight().up()
     assert flight.pilot.problem == ''
     assert_allclose(flight.where, HOME.position, atol=0.12)
     for goal in ([2.0, 0.3, 1.0], [0.1, 0.2, 1.2], [0.1, 2.0, 1.0]):
         flight.goal = np.array(goal)
-        flight.until(lambda: np.linalg.norm(flight.where - flight.goal) < 0.03)
+        flight.until(lambda: flight.left < 0.03)
         flight.step(60)
-        assert np.linalg.norm(flight.where - flight.goal) < 0.04
+        assert flight.left < 0.04
     flight.pilot.end('the search is over')
-    flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
+    flight.until_it_is(FlyingState.LANDED)
     flight.step(5)
     assert flight.pilot.problem == f'landed: the search is over, {UNTIL_ARM}'
     flight.step(100)
@@ -39,22 +38,20 @@ def test_it_takes_off_flies_to_waypoints_and_lands():
 
 @pytest.mark.parametrize('share', [0.6, 1.6])
 def test_events_correct_a_speed_that_was_measured_wrong(share):
-    flight = Flight(full_speed=share * full_speed(0.5))
-    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    flight = Flight(full_speed=share * full_speed(0.5)).up()
     errors = []
     for goal in ([2.0, 0.3, 1.0], [0.1, 0.2, 1.0]):
         flight.goal = np.array(goal)
         for _ in range(300):
             flight.step()
             errors.append(np.linalg.norm(flight.pilot.state.pose.position - flight.where))
-        assert np.linalg.norm(flight.where - flight.goal) < 0.05
+        assert flight.left < 0.05
     assert np.sqrt(np.mean(np.square(errors))) < 0.05
     assert max(errors) < 0.12
 
 
 def test_dead_reckoning_between_events_is_where_it_is():
-    flight = Flight()
-    flight.flown()
+    flight = Flight().flown()
     errors, tilts = [], []
     for _ in range(60):
         flight.step()
@@ -69,22 +66,21 @@ def test_dead_reckoning_between_events_is_where_it_is():
 
 
 def test_an_event_corrects_the_time_that_it_is_of():
-    settings = MamboSettings(latency=0.2, delay=0.0)
     model = TiltModel(TILT, 0.8, 0.5, 2.6)
-    reckoning = DeadReckoning(model, Pose(np.zeros(3)), settings)
+    reckoning = DeadReckoning(model, Pose(np.zeros(3)), MamboSettings(latency=0.2, delay=0.0))
     reckoning.correct(PositionEvent(np.array([0.0, 0.0, 1.0]), 0.0, 0.0), flying=False)
     shares = np.array([0.4, 0.0, 0.0, 0.0])
     reckoning.command(0.0, shares)
     truth = Course(np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0)
     places = {}
     for step in range(1, 61):
-        now = step * STEP
         truth = model.advance(truth, shares, STEP)
         places[step] = truth.position
-        reckoning.go_on(now, flying=True)
+        reckoning.go_on(step * STEP, flying=True)
         if step % 10 == 0:
             # Four steps late.
-            reckoning.correct(PositionEvent(places[step - 4], 0.0, now), flying=True)
+            event = PositionEvent(places[step - 4], 0.0, step * STEP)
+            reckoning.correct(event, flying=True)
     assert_allclose(reckoning.state.pose.position, places[60], atol=0.02)
 
 
@@ -105,18 +101,6 @@ def test_a_command_acts_after_its_delay():
     assert reckoning.covariance()[3, 3] > 0.05**2 > MamboSettings().attitude_noise ** 2
 
 
-def test_it_does_not_take_off_until_its_speed_is_measured():
-    flight = Flight(full_speed=None)
-    flight.step(200)
-    assert flight.firmware.take_offs == 0
-    assert 'mambo.full_speed' in flight.pilot.problem
-    # Nor does it fly one that is in the air.
-    flight.firmware.take_off()
-    flight.goal = HOME.position + np.array([0.9, -0.6, 0.0])
-    flight.step(200)
-    assert flight.pilot.phase is Phase.GROUND and flight.speed < 1e-6
-
-
 # Drag [1/s] and delay [s]; test/drivers/mambo_table.py prints more.
 @pytest.mark.parametrize(('drag', 'delay'), [(0.3, 0.0), (0.3, 0.3), (3.0, 0.0), (3.0, 0.3)])
 def test_it_stays_inside_the_field_with_what_the_measuring_flight_says(drag, delay):
@@ -127,8 +111,7 @@ def test_it_stays_inside_the_field_with_what_the_measuring_flight_says(drag, del
 
 
 def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown():
-    flight = Flight(drag=0.3, firmware_delay=0.3, delay=0.4)
-    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    flight = Flight(drag=0.3, firmware_delay=0.3, delay=0.4).up()
     for _ in range(400):
         flight.step()
         # Along the map's x axis.
@@ -140,42 +123,48 @@ def test_a_velocity_that_cannot_be_stopped_before_the_geofence_is_not_flown():
 # ---- safety ----------------------------------------------------------------------------------
 
 
-def test_nothing_takes_off_before_the_service_is_called():
-    flight = Flight()
-    flight.pilot.goal_cancelled(0.0)
-    flight.step(100)
-    assert flight.pilot.problem == f'on the ground, {UNTIL_ARM}'
-    assert flight.firmware.take_offs == 0
+@pytest.mark.parametrize(
+    ('changes', 'text'),
+    [
+        ({'arm': False}, 'mambo.arm'),
+        ({'full_speed': None}, 'mambo.full_speed'),
+        ({'battery': 0.05}, 'battery at 0.05, below 0.10'),
+        ({'permitted': False}, f'on the ground, {UNTIL_ARM}'),
+    ],
+)
+def test_what_keeps_it_on_the_ground(changes, text):
+    flight = Flight(**changes)
+    flight.pilot.fly(np.array([0.1, 0.0, 0.0, 0.0]))
+    flight.step(200)
+    assert text in flight.pilot.problem
+    assert flight.firmware.take_offs == 0 and flight.firmware.height == 0.0
+    if 'permitted' not in changes:
+        assert text in flight.pilot.permit(flight.time)
+    # Nor does it fly one that is in the air.
+    flight.firmware.take_off()
+    flight.goal = HOME.position + np.array([0.9, -0.6, 0.0])
+    flight.step(200)
+    assert flight.pilot.phase is Phase.GROUND and flight.speed < 1e-6
+
+
+def test_each_call_of_the_service_is_for_one_take_off():
+    flight = Flight(permitted=False)
+    flight.step(20)
     # A permission that is not used ends.
-    flight.cut_down = True
-    assert flight.pilot.permit(flight.time) == ''
     flight.pilot._permission.timeout = 1.0
     assert flight.pilot.permit(flight.time - 2.0) == ''
-    flight.cut_down = False
     flight.step(100)
     assert flight.firmware.take_offs == 0
     assert flight.pilot.permit(flight.time) == ''
-    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    flight.up()
     assert flight.pilot.permit(flight.time) == 'it is in the air already'
     # A driver before this one left it in the air.
     flight.pilot.phase = Phase.GROUND
     flight.step(20)
     assert flight.pilot.problem == f'in the air, not by this driver, {UNTIL_ARM}'
     assert flight.pilot.permit(flight.time) == ''
-    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    flight.up()
     assert flight.firmware.take_offs == 1
-
-
-def test_nothing_takes_off_without_arm():
-    flight = Flight(arm=False)
-    flight.step(200)
-    assert flight.firmware.take_offs == 0
-    assert 'mambo.arm' in flight.pilot.problem
-    with pytest.raises(ValueError, match='finite'):
-        flight.pilot.fly(np.array([math.nan, 0.0, 0.0, 0.0]))
-    flight.pilot.fly(np.array([0.1, 0.0, 0.0, 0.0]))
-    flight.step(20)
-    assert flight.firmware.height == 0.0
 
 
 @pytest.mark.parametrize(
@@ -199,8 +188,8 @@ def test_what_is_lost_stops_it_then_lands_it(fault, reason):
     flight.goal = HOME.position
     flight.step(40)
     assert flight.speed > 0.2
-    for name, value in fault.items():
-        setattr(flight, name, value)
+    before = {name: getattr(flight, name) for name in fault}
+    vars(flight).update(fault)
     began = flight.time
     flight.until(lambda: flight.pilot.problem)
     assert flight.pilot.problem.startswith(reason)
@@ -208,10 +197,9 @@ def test_what_is_lost_stops_it_then_lands_it(fault, reason):
     # Without new commands, or with those to hover.
     flight.until(lambda: flight.firmware.flying_state in (FlyingState.HOVERING, FlyingState.LANDED))
     assert flight.time - began <= AT_MOST
-    flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
+    flight.until_it_is(FlyingState.LANDED)
     assert flight.time - began <= 10.0
-    for name in fault:
-        setattr(flight, name, 'true' if name == 'sent' else False)
+    vars(flight).update(before)
     flight.step(100)
     assert flight.pilot.problem.startswith(f'landed: {reason}')
     assert flight.firmware.take_offs == 1
@@ -220,15 +208,10 @@ def test_what_is_lost_stops_it_then_lands_it(fault, reason):
 def test_a_low_battery_lands_it_and_keeps_it_down():
     flight = Flight().flown()
     flight.firmware.charge.charge = 0.08
-    began = flight.time
-    flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDING)
-    assert flight.time - began <= AT_MOST
-    flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
+    assert flight.until_it_is(FlyingState.LANDING) <= AT_MOST
+    flight.until_it_is(FlyingState.LANDED)
     flight.step(2)
     assert flight.pilot.problem == f'landed: battery at 0.08, below 0.10, {UNTIL_ARM}'
-    other = Flight(battery=0.05)
-    other.step(100)
-    assert other.firmware.take_offs == 0 and 'battery' in other.pilot.problem
 
 
 def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
@@ -237,9 +220,7 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     # No number is no command: it hovers as after a cancelled goal.
     with pytest.raises(ValueError, match='finite'):
         flight.pilot.fly(np.array([0.1, math.nan, 0.0, 0.0]))
-    began = flight.time
-    flight.until(lambda: flight.firmware.flying_state == FlyingState.HOVERING)
-    assert flight.time - began <= AT_MOST
+    assert flight.until_it_is(FlyingState.HOVERING) <= AT_MOST
     # A new goal soon after a cancelled one keeps it up.
     flight.pilot.goal_cancelled(flight.time)
     flight.step(20)
@@ -248,18 +229,21 @@ def test_a_cancelled_goal_stops_it_then_lands_it_and_another_one_takes_it_up():
     assert flight.pilot.phase is Phase.FLYING
     flight.flown().goal = None
     flight.pilot.goal_cancelled(flight.time)
-    began = flight.time
-    flight.until(lambda: flight.firmware.flying_state == FlyingState.HOVERING)
-    assert flight.time - began <= AT_MOST
-    flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
-    assert flight.time - began >= flight.pilot.settings.cancel_landing
+    hovers = flight.until_it_is(FlyingState.HOVERING)
+    assert hovers <= AT_MOST
+    assert hovers + flight.until_it_is(FlyingState.LANDED) >= flight.pilot.settings.cancel_landing
     flight.step(50)
     flight.pilot.goal_taken()
     flight.step(50)
     assert flight.pilot.problem == f'on the ground, {UNTIL_ARM}'
     assert flight.firmware.take_offs == 1
     assert flight.pilot.permit(flight.time) == ''
-    flight.until(lambda: flight.pilot.phase is Phase.FLYING)
+    # On the ground it ends the permission.
+    flight.pilot.goal_cancelled(flight.time)
+    flight.step(50)
+    assert flight.firmware.take_offs == 1
+    assert flight.pilot.permit(flight.time) == ''
+    flight.up()
     assert flight.firmware.take_offs == 2
 
 
@@ -276,26 +260,12 @@ def test_it_lands_when_it_drifts_out_of_the_geofence():
     assert flight.where[0] < FENCE[0, 1] + 0.5 + 0.4 * AT_MOST
 
 
-def test_a_caller_that_stands_still_is_a_drone_that_hovers_then_lands():
+@pytest.mark.parametrize(('event', 'text'), [('land', 'by itself'), ('emergency', 'emergency')])
+def test_a_drone_that_lands_by_itself_is_noticed(event, text):
     flight = Flight().flown()
-    began = flight.firmware.time
-    while flight.firmware.flying_state == FlyingState.FLYING:
-        flight.firmware.advance(STEP)
-        assert flight.firmware.time - began <= AT_MOST
-    while flight.firmware.flying_state != FlyingState.LANDED:
-        flight.firmware.advance(STEP)
-        assert flight.firmware.time - began <= 10.0
-
-
-def test_a_drone_that_lands_by_itself_is_noticed():
-    flight = Flight().flown()
-    flight.firmware.land()
+    getattr(flight.firmware, event)()
     flight.step(2)
-    assert 'by itself' in flight.pilot.problem
-    emergency = Flight().flown()
-    emergency.firmware.emergency()
-    emergency.step(2)
-    assert 'emergency' in emergency.pilot.problem
+    assert text in flight.pilot.problem
 
 
 def test_it_flies_by_the_pose_of_another_system():
@@ -308,12 +278,7 @@ def test_it_flies_by_the_pose_of_another_system():
 
     flight.until(tell)
     flight.goal = np.array([2.0, 0.5, 1.0])
-
-    def arrived():
-        tell()
-        return np.linalg.norm(flight.where - flight.goal) < 0.05
-
-    flight.until(arrived)
+    flight.until(lambda: tell() and flight.left < 0.05)
     flight.goal = np.array([0.0, 0.5, 1.0])
     for _ in range(30):
         tell()
@@ -328,24 +293,21 @@ def test_a_stop_ends_a_take_off(phase):
     flight = Flight()
     flight.until(lambda: flight.pilot.phase is phase)
     flight.pilot.stop(flight.time)
-    height = flight.where[2]
-    flight.until(lambda: flight.firmware.flying_state == FlyingState.LANDED)
+    assert flight.where[2] < HOME.position[2] - 0.1
+    flight.until_it_is(FlyingState.LANDED)
     flight.step(5)
     assert flight.pilot.problem == f'landed: its take-off was stopped, {UNTIL_ARM}'
-    assert height < HOME.position[2] - 0.1
     flight.step(200)
     assert flight.firmware.take_offs == 1
 
 
 def test_a_permission_needs_a_drone_that_is_heard():
-    flight = Flight(arm_timeout=1e3)
-    flight.pilot.permit(flight.time)
+    flight = Flight(permitted=False)
+    flight.step(20)
     flight.cut_down = True
     flight.step(60)
     assert 'link lost' in flight.pilot.permit(flight.time)
-    flight.cut_down = False
-    flight.step(200)
-    flight.connected = False
+    flight.cut_down = flight.connected = False
     other = MamboPilot(flight, flight.motion, flight.pilot.settings, HOME, FENCE)
     assert other.permit(flight.time) == 'connecting to the Mambo'
 
@@ -380,7 +342,7 @@ def test_a_steady_push_does_not_keep_it_off_its_goal(pose, drag):
         if pose == 'pose':
             flight.pilot.take_pose(flight.time, flight.firmware.state)
         flight.step()
-        return np.linalg.norm(flight.where - flight.goal)
+        return flight.left
 
     flight.goal = np.array([1.5, 0.3, 1.0])
     while flight.time < 30.0:

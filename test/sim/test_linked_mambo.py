@@ -12,33 +12,28 @@ from maasi_sim.emulators.linked_robots import linked_robot, with_addresses
 from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.scenario.schema import ScenarioError
 
-SCENARIO = {
-    'version': 1,
-    'environment': {'bounds': [[-0.3, 1.2], [-0.3, 1.2]]},
-    'targets': {'positions': [[0.5, 0.5]]},
-    'robots': {
-        'mambo': {
-            'type': 'mambo',
-            'link': 'mambo_wifi',
-            'mambo': {'arm': True, 'full_speed': 1.97, 'ground': 0.1},
-            'start': [0.2, 0.6, 0.6],
-            'yaw': 0.5,
-            'candidates': {'grid': [2, 2], 'spacing': 0.5, 'corner': [0.0, 0.0]},
-        },
-    },
+MAMBO = {
+    'type': 'mambo',
+    'link': 'mambo_wifi',
+    'mambo': {'arm': True, 'full_speed': 1.97, 'ground': 0.1},
+    'start': [0.2, 0.6, 0.6],
+    'yaw': 0.5,
+    'candidates': {'grid': [2, 2], 'spacing': 0.5, 'corner': [0.0, 0.0]},
 }
 
 
-def changed(**changes):
-    content = deepcopy(SCENARIO)
-    for key, value in changes.items():
-        content['robots']['mambo'][key] = value
-    return content
+def scenario(**robots):
+    content = {
+        'version': 1,
+        'environment': {'bounds': [[-0.3, 1.2], [-0.3, 1.2]]},
+        'targets': {'positions': [[0.5, 0.5]]},
+        'robots': deepcopy(robots),
+    }
+    return scenario_from_values(content, 'test')
 
 
 def test_it_stands_below_its_start_and_flies_as_its_link_says():
-    scenario = with_addresses(scenario_from_values(SCENARIO, 'test'))
-    robot = scenario.robots['mambo']
+    robot = with_addresses(scenario(mambo=MAMBO)).robots['mambo']
     drone = linked_robot('mambo', robot, 1)
     link = MamboLink('wifi', robot.mambo.address, robot.mambo.port)
     link.connect()
@@ -65,11 +60,9 @@ def test_it_stands_below_its_start_and_flies_as_its_link_says():
 
 
 def test_each_drone_has_an_address_of_this_host():
-    values = changed()
-    values['robots']['other'] = deepcopy(values['robots']['mambo'])
-    values['robots']['other']['mambo'] |= {'address': '127.0.0.9', 'port': 5555}
-    scenario = with_addresses(scenario_from_values(values, 'test'))
-    first, second = (scenario.robots[name].mambo for name in ('mambo', 'other'))
+    other = MAMBO | {'mambo': MAMBO['mambo'] | {'address': '127.0.0.9', 'port': 5555}}
+    robots = with_addresses(scenario(mambo=MAMBO, other=other)).robots
+    first, second = robots['mambo'].mambo, robots['other'].mambo
     assert first.address.startswith('127.') and first.address != '192.168.99.3'
     assert first.arm and first.ground == 0.1
     # One that was asked for stays.
@@ -91,4 +84,4 @@ def test_each_drone_has_an_address_of_this_host():
 )
 def test_what_cannot_be_is_said_before_anything_starts(changes, text):
     with pytest.raises(ScenarioError, match=text):
-        scenario_from_values(changed(**changes), 'test')
+        scenario(mambo=MAMBO | changes)

@@ -473,15 +473,15 @@ def test_a_linked_robot_is_where_its_autopilot_is(make_team, vehicle_link):
     team = make_team(content, robots=('drone',), lockstep=False, rate=1.0)
 
     def permitted():
-        with vehicle_link.vehicle() as vehicle:
+        with vehicle_link.lock:
+            vehicle = vehicle_link.vehicle
             vehicle.active = True
             return vehicle.permit(time.monotonic()) == ''
 
     team.spin_until(permitted)
 
     def flies():
-        with vehicle_link.vehicle() as vehicle:
-            return vehicle.flying
+        return vehicle_link.vehicle.flying
 
     # It lives before the time starts.
     team.spin_until(flies)
@@ -490,14 +490,16 @@ def test_a_linked_robot_is_where_its_autopilot_is(make_team, vehicle_link):
     team.spin_until(lambda: drone.of('ranges'))
     assert drone.of('ranges')[0].ranges[0].range == pytest.approx(4.0, abs=2.0)
     assert drone.command.get_subscription_count() == 0
-    with vehicle_link.vehicle() as vehicle:
+    with vehicle_link.lock:
+        vehicle = vehicle_link.vehicle
         # A metre to the east.
         vehicle.set_target([1.0, 0.0, 1.0], 0.0)
     robot = team.sim.simulation.robots['drone']
     team.spin_until(lambda: abs(robot.state.pose.position[0] - 3.0) < 0.2)
     # While it is away nothing is heard from it.
     team.spin_until(lambda: not flies())
-    with vehicle_link.vehicle() as vehicle:
+    with vehicle_link.lock:
+        vehicle = vehicle_link.vehicle
         assert vehicle.fault == 'link: nothing heard from system 1'
     team.spin_until(flies)
     assert not drone.of('odom') and not drone.of('battery_state')

@@ -111,6 +111,7 @@ class MamboLink:
         self._asked_at = -math.inf
         self._called_at = math.inf
         self._probed_at = -math.inf
+        self._was_silent = False
         self._thread: threading.Thread | None = None
 
     # ---- what the caller asks for ------------------------------------------------------------
@@ -259,6 +260,7 @@ class MamboLink:
             self._connected.set()
             while not self._closing.is_set():
                 self._watch_caller()
+                self._ask_again()
                 self._do_wanted()
                 self._send_steering()
                 if self.kind == 'ble':
@@ -284,6 +286,13 @@ class MamboLink:
         else:
             with self._lock:
                 self._steering = [0, 0, 0, 0]
+
+    def _ask_again(self) -> None:
+        """Ask for the drone's state when the link is back: it tells each change once."""
+        silent = math.isfinite(self.heard_at) and time.monotonic() - self.heard_at > _OUTDATED
+        if self._was_silent and not silent:
+            self._drone.ask_for_state_update()
+        self._was_silent = silent
 
     def _try_to_connect(self, drone: Any) -> str:
         """Return why there is no connection, or nothing."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -69,7 +69,7 @@ class MamboRobotLink(RobotLink):
                 f"parameter motion.model: read 'unicycle', allowed with link {settings.link} "
                 'is that of a flying robot, as mambo'
             )
-        kind = 'ble' if settings.link == 'mambo_ble' else 'wifi'
+        kind: Literal['wifi', 'ble'] = 'ble' if settings.link == 'mambo_ble' else 'wifi'
         tilt = tilt_limit(settings.motion)
         self._link = MamboLink(kind, mambo.address, mambo.port, tilt, mambo.climb, mambo.land_after)
         try:

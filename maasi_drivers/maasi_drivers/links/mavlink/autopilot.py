@@ -4,23 +4,14 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from maasi_drivers.links.mavlink.estimate import Estimate, FlightOrigin
 from maasi_drivers.links.mavlink.firmware import FailsafeCheck, Firmware, identify
-from maasi_drivers.links.mavlink.protocol import (
-    DEBUG,
-    ERROR,
-    INFO,
-    WARNING,
-    CommandQueue,
-    ReportLog,
-    command_name,
-    mavlink,
-    result_name,
-)
+from maasi_drivers.links.mavlink.protocol import DEBUG, ERROR, INFO, WARNING, ReportLog, mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
 
 _HEARTBEAT_PERIOD = 1.0
@@ -37,10 +28,11 @@ _MESSAGES = {
     'GPS_RAW_INT': 2.0,
     'GPS2_RAW': 2.0,
 }
+# Period and number of tries of a command that is not answered [s, 1].
+_ANSWER_PATIENCE, _TRIES = 0.5, 5
 
 
-@dataclass(frozen=True)
-class ModeChange:
+class ModeChange(NamedTuple):
     """What a heartbeat says, and what the one before said: armed or not, and custom mode."""
 
     was_armed: bool
@@ -49,8 +41,17 @@ class ModeChange:
     mode: int
 
 
+@dataclass
+class _Command:
+    number: int
+    parameters: tuple[float, ...]
+    on_accepted: Callable[[], None] | None
+    sent: float = -math.inf
+    tries: int = 0
+
+
 class Autopilot:
-    """One autopilot, as its messages describe it."""
+    """One autopilot, as its messages describe it; times are of the steady clock [s]."""
 
     def __init__(
         self,
@@ -67,7 +68,8 @@ class Autopilot:
         self.mode = -1
         self.lost = False
         self.estimate = Estimate(settings, place, on_restart)
-        self.commands = CommandQueue(settings.system, sender)
+        #: Commands that were not answered yet.
+        self.commands: deque[_Command] = deque()
         self._settings = settings
         self._sender = sender
         self._log = log
@@ -91,15 +93,12 @@ class Autopilot:
 
         Of other systems only messages with the driver's own id count.
         """
-        kind = message.get_type()
+        kind, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if self._shows_own_id(message):
             if self.failsafes is not None:
                 self.failsafes.hear_own_id(now)
             return None
-        if (
-            message.get_srcSystem() != self._settings.system
-            or message.get_srcComponent() != mavlink.MAV_COMP_ID_AUTOPILOT1
-        ):
+        if source != (self._settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1):
             return None
         self._received_at = now
         if kind == 'HEARTBEAT':
@@ -109,7 +108,7 @@ class Autopilot:
         elif kind == 'PARAM_VALUE':
             self._take_parameter(message)
         elif kind == 'COMMAND_ACK':
-            self.commands.take_answer(message, now)
+            self._take_answer(message, now)
         elif self.firmware is not None:
             self.estimate.take(message, now, self.armed)
         return None
@@ -157,7 +156,7 @@ class Autopilot:
         if self.firmware is None or self.failsafes is None:
             return
         value = float(message.param_value)
-        if self.firmware.name == 'PX4' and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:
+        if self.firmware.px4 and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:
             # PX4 sends the bytes of an integer in the place of a float.
             value = float(struct.unpack('<i', struct.pack('<f', value))[0])
         self.failsafes.take(message.param_id.rstrip('\0'), value)
@@ -176,16 +175,15 @@ class Autopilot:
         """Update `lost`; return whether it changed."""
         silence, before = now - self._received_at, self.lost
         self.lost = silence > self._settings.link_timeout
-        if self.lost and not before:
-            self._log.add(WARNING, f'link: nothing heard for {silence:.1f} s')
-        elif before and not self.lost:
-            self._log.add(WARNING, 'link: it is back')
+        if self.lost != before:
+            text = f'nothing heard for {silence:.1f} s' if self.lost else 'it is back'
+            self._log.add(WARNING, f'link: {text}')
         return self.lost != before
 
     def read_failsafes(self) -> None:
         """Read the failsafe parameters from the beginning."""
         assert self.firmware is not None
-        self.failsafes = FailsafeCheck(self.firmware, self._settings, self._sender, self._log.add)
+        self.failsafes = FailsafeCheck(self.firmware, self._settings, self._sender, self._log)
 
     def forget_requests(self) -> None:
         """Discard open commands, and request messages anew: a restart resets their rates."""
@@ -209,12 +207,9 @@ class Autopilot:
     def request_mode(self, mode: int, on_accepted: Callable[[], None] | None = None) -> None:
         """Request a custom mode."""
         assert self.firmware is not None
-        flag = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
-        if self.firmware.name == 'PX4':
-            parameters = (flag, float(mode >> 16 & 0xFF), float(mode >> 24 & 0xFF))
-        else:
-            parameters = (flag, float(mode), 0.0)
-        self.command(mavlink.MAV_CMD_DO_SET_MODE, parameters, on_accepted)
+        numbers = (mode >> 16 & 0xFF, mode >> 24 & 0xFF) if self.firmware.px4 else (mode, 0)
+        flag = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        self.command(mavlink.MAV_CMD_DO_SET_MODE, (flag, *numbers), on_accepted)
 
     def command(
         self,
@@ -222,16 +217,50 @@ class Autopilot:
         parameters: tuple[float, ...],
         on_accepted: Callable[[], None] | None = None,
     ) -> None:
-        """Send a command until it is answered; report a refusal."""
+        """Send a command until it is answered, after those before it; report a refusal."""
+        self.commands.append(_Command(number, parameters, on_accepted))
 
-        def answer(result: int | None) -> None:
-            if result == mavlink.MAV_RESULT_ACCEPTED:
-                if on_accepted is not None:
-                    on_accepted()
-            elif number == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-                name = mavlink.mavlink_map[int(parameters[0])].msgname
-                self._log.add(DEBUG, f'{name} at another rate: {result_name(result)}')
-            else:
-                self._log.add(WARNING, f'{command_name(number)}: {result_name(result)}')
+    def _take_answer(self, message: Any, now: float) -> None:
+        if not self.commands or self.commands[0].number != message.command:
+            return
+        if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
+            self.commands[0].sent = now
+        else:
+            self._conclude(int(message.result))
 
-        self.commands.ask(number, parameters, answer)
+    def _conclude(self, result: int | None) -> None:
+        """Take the result of the oldest command; None: it was not answered."""
+        command = self.commands.popleft()
+        if result == mavlink.MAV_RESULT_ACCEPTED:
+            if command.on_accepted is not None:
+                command.on_accepted()
+            return
+        known = mavlink.enums['MAV_RESULT'].get(result)
+        why = f'result {result}' if known is None else known.name.removeprefix('MAV_RESULT_')
+        why = 'not answered' if result is None else why
+        if command.number == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            name = mavlink.mavlink_map[int(command.parameters[0])].msgname
+            self._log.add(DEBUG, f'{name} at another rate: {why}')
+        else:
+            self._log.add(WARNING, f'{mavlink.enums["MAV_CMD"][command.number].name}: {why}')
+
+    def send_commands(self, now: float) -> None:
+        """Send what is due."""
+        if not self.commands:
+            return
+        command = self.commands[0]
+        if now - command.sent < _ANSWER_PATIENCE:
+            return
+        if command.tries == _TRIES:
+            self._conclude(None)
+            return
+        parameters = [*command.parameters, *[0.0] * (7 - len(command.parameters))]
+        self._sender.command_long_send(
+            self._settings.system,
+            mavlink.MAV_COMP_ID_AUTOPILOT1,
+            command.number,
+            command.tries,
+            *parameters,
+        )
+        command.sent = now
+        command.tries += 1

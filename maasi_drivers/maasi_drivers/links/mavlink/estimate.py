@@ -60,8 +60,6 @@ class FlightOrigin:
 
     A local frame lasts as long as its autopilot is on: a file has the place for a driver that is
     started again meanwhile, in the air or after a landing elsewhere.
-
-    Units: start [m].
     """
 
     def __init__(
@@ -76,7 +74,7 @@ class FlightOrigin:
     def find(self, position: FloatArray, booted: float, armed: bool) -> FloatArray | None:
         """Return the place (3,), ENU [m], or None where it cannot be known.
 
-        Units: booted [s].
+        `booted` is when the autopilot was switched on, on the steady clock [s].
         """
         kept = self._load(booted)
         if kept is not None:
@@ -140,30 +138,15 @@ _STATUS_AGE = 3.0
 _EKF, _RECEIVERS = 'EKF_STATUS_REPORT', ('GPS_RAW_INT', 'GPS2_RAW')
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Telemetry:
-    """Pose of a vehicle, in the local frame of its autopilot turned to ENU.
+    """Pose of a vehicle, in the local frame of its autopilot turned to ENU."""
 
-    Attributes
-    ----------
-    number : int
-        Of the message; one without new data does not count.
-    arrival : float
-        On the steady clock [s].
-    position, velocity : ndarray, shape (3,)
-        [m, m/s].
-    orientation : ndarray, shape (4,)
-        Of FLU in ENU, w first.
-    rates : ndarray, shape (3,)
-        Angular velocity in FLU [rad/s].
-    """
-
-    number: int
-    arrival: float
-    position: FloatArray
-    velocity: FloatArray
-    orientation: FloatArray
-    rates: FloatArray
+    arrival: float  # on the steady clock [s]
+    position: FloatArray  # (3,) [m]
+    velocity: FloatArray  # (3,) [m/s]
+    orientation: FloatArray  # (4,) of FLU in ENU, w first
+    rates: FloatArray  # (3,) angular velocity in FLU [rad/s]
 
 
 class Estimate:
@@ -176,7 +159,6 @@ class Estimate:
         self._place = place
         self._on_restart = on_restart
         self.dropped: Counter[str] = Counter()
-        self._number = -1
         self.charge_reports = 0
         self.clear()
 
@@ -204,6 +186,11 @@ class Estimate:
         return self.telemetry is not None and not self.problem(False)
 
     @property
+    def on_ground(self) -> bool:
+        """Whether it says that it stands on the ground."""
+        return bool(self.landed == mavlink.MAV_LANDED_STATE_ON_GROUND)
+
+    @property
     def has_fix(self) -> bool:
         """Whether one GNSS receiver has a fix."""
         return any(fix >= _FIX_3D and not self._silence(name) for name, fix in self._fixes.items())
@@ -211,9 +198,8 @@ class Estimate:
     @property
     def silent_since(self) -> float:
         """Since when something that was heard is missing, on the steady clock [s]."""
-        status = [self._status_at[_EKF]] if _EKF in self._status_at else []
-        fixes = [self._status_at[name] for name in self._fixes]
-        return min([self.heard_at, *status, *([max(fixes)] if fixes else [])])
+        fixes = max((self._status_at[name] for name in self._fixes), default=math.inf)
+        return min(self.heard_at, self._status_at.get(_EKF, math.inf), fixes)
 
     def _silence(self, name: str) -> str:
         """Return that a status does not come any more, or nothing."""
@@ -297,16 +283,14 @@ class Estimate:
             if origin is None:
                 return
             self.origin = origin
-        self._number += 1
-        self.telemetry = Telemetry(
-            self._number, now, swap_enu_ned(values[:3]), swap_enu_ned(values[3:]), *self._attitude
-        )
+        place, velocity = swap_enu_ned(values[:3]), swap_enu_ned(values[3:])
+        self.telemetry = Telemetry(now, place, velocity, *self._attitude)
 
     def _take_attitude(self, message: Any, now: float) -> None:
         quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
         rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
-        norm = float(np.sqrt((quaternion * quaternion).sum()))
-        if not (np.isfinite(rates).all() and math.isfinite(norm) and 0.9 < norm < 1.1):
+        norm = float(np.linalg.norm(quaternion))
+        if not (np.isfinite(rates).all() and 0.9 < norm < 1.1):
             self.dropped['ATTITUDE_QUATERNION that is none'] += 1
             return
         self._note_time(message.time_boot_ms, now)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from maasi_drivers.links.mavlink.protocol import INFO, WARNING, mavlink
+from maasi_drivers.links.mavlink.protocol import INFO, WARNING, ReportLog, mavlink, mavutil
 from maasi_drivers.settings.vehicles import MavlinkSettings
 
 # Of MAVLink's MAV_AUTOPILOT and MAV_TYPE.
@@ -19,68 +19,31 @@ COPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
 
 @dataclass(frozen=True)
 class Failsafe:
-    """A parameter of an autopilot that defines its reaction to a fault.
+    """A parameter of an autopilot that defines its reaction to a fault."""
 
-    Attributes
-    ----------
-    meaning : str
-        When it acts.
-    off : tuple of float
-        Values with which it does nothing that helps.
-    guards_link : bool
-        Whether it acts on the loss of the driver's heartbeats.
-    """
-
-    meaning: str
-    off: tuple[float, ...] = (0.0,)
-    guards_link: bool = False
+    meaning: str  # when it acts
+    off: tuple[float, ...] = (0.0,)  # values with which it does nothing that helps
+    guards_link: bool = False  # whether it acts on the loss of the driver
 
 
 @dataclass(frozen=True)
 class Firmware:
-    """An autopilot's firmware.
-
-    Attributes
-    ----------
-    name : str
-        For people.
-    autopilot : int
-        Of MAVLink's MAV_AUTOPILOT.
-    kind : str
-        Of vehicle.
-    modes : mapping
-        Custom mode to its name.
-    external : int
-        Mode in which it follows setpoints.
-    hold, land : int
-        Modes in which it holds its position, and in which it lands or surfaces.
-    rise : str
-        How it leaves its place: by a take-off command, or by a setpoint at another height.
-    streams_first : bool
-        Whether setpoints must come before the mode does.
-    returns : bool
-        Whether a pilot can give the mode back.
-    failsafes : mapping
-        By the name of the parameter.
-    ground_station : tuple of str
-        Parameters, one of which holds the system id of the ground station it listens to.
-    ground_station_high : str
-        Parameter with the highest of these ids, where newer versions have a range.
-    """
+    """An autopilot's firmware."""
 
     name: str
-    autopilot: int
+    autopilot: int  # of MAV_AUTOPILOT
     kind: Literal['copter', 'submarine']
     modes: Mapping[int, str]
-    external: int
-    hold: int
+    external: int  # mode in which it follows setpoints
+    hold: int  # modes in which it holds its position, and in which it lands or surfaces
     land: int
-    rise: Literal['command', 'setpoint']
-    streams_first: bool
-    returns: bool
-    failsafes: Mapping[str, Failsafe]
-    ground_station: tuple[str, ...] = ()
-    ground_station_high: str = ''
+    rise: Literal['command', 'setpoint']  # how it leaves its place
+    failsafes: Mapping[str, Failsafe]  # by parameter
+
+    @property
+    def px4(self) -> bool:
+        """Whether it is PX4: its mode needs setpoints first, and a pilot does not give it back."""
+        return self.autopilot == PX4
 
     def mode_name(self, mode: int) -> str:
         """Return a mode's name."""
@@ -96,30 +59,11 @@ ARDUCOPTER = Firmware(
     name='ArduCopter',
     autopilot=ARDUPILOT,
     kind='copter',
-    modes={
-        0: 'STABILIZE',
-        1: 'ACRO',
-        2: 'ALT_HOLD',
-        3: 'AUTO',
-        4: 'GUIDED',
-        5: 'LOITER',
-        6: 'RTL',
-        7: 'CIRCLE',
-        9: 'LAND',
-        11: 'DRIFT',
-        13: 'SPORT',
-        16: 'POSHOLD',
-        17: 'BRAKE',
-        18: 'THROW',
-        20: 'GUIDED_NOGPS',
-        21: 'SMART_RTL',
-    },
+    modes=mavutil.mode_mapping_acm,
     external=4,
     hold=17,
     land=9,
     rise='command',
-    streams_first=False,
-    returns=True,
     failsafes={
         'FS_GCS_ENABLE': Failsafe('the heartbeats of the driver stop', guards_link=True),
         'FS_THR_ENABLE': Failsafe('the remote control is lost'),
@@ -127,33 +71,17 @@ ARDUCOPTER = Firmware(
         'BATT_FS_LOW_ACT': Failsafe('the battery is low'),
         'FENCE_ENABLE': Failsafe('it leaves the fence of the autopilot'),
     },
-    ground_station=('SYSID_MYGCS', 'MAV_GCS_SYSID'),
-    ground_station_high='MAV_GCS_SYSID_HI',
 )
 
 ARDUSUB = Firmware(
     name='ArduSub',
     autopilot=ARDUPILOT,
     kind='submarine',
-    modes={
-        0: 'STABILIZE',
-        1: 'ACRO',
-        2: 'ALT_HOLD',
-        3: 'AUTO',
-        4: 'GUIDED',
-        7: 'CIRCLE',
-        9: 'SURFACE',
-        16: 'POSHOLD',
-        19: 'MANUAL',
-        20: 'MOTOR_DETECT',
-        21: 'SURFTRAK',
-    },
+    modes=mavutil.mode_mapping_sub | {20: 'MOTOR_DETECT', 21: 'SURFTRAK'},
     external=4,
     hold=16,
     land=9,
     rise='setpoint',
-    streams_first=False,
-    returns=True,
     failsafes={
         # 1 only warns, 2 disarms: it drifts.
         'FS_GCS_ENABLE': Failsafe('the heartbeats of the driver stop', (0.0, 1.0, 2.0), True),
@@ -161,8 +89,6 @@ ARDUSUB = Firmware(
         'FS_LEAK_ENABLE': Failsafe('water comes in', (0.0, 1.0)),
         'BATT_FS_LOW_ACT': Failsafe('the battery is low'),
     },
-    ground_station=('SYSID_MYGCS', 'MAV_GCS_SYSID'),
-    ground_station_high='MAV_GCS_SYSID_HI',
 )
 
 PX4_COPTER = Firmware(
@@ -187,9 +113,6 @@ PX4_COPTER = Firmware(
     hold=px4_mode(4, 3),
     land=px4_mode(4, 6),
     rise='setpoint',
-    streams_first=True,
-    # OFFBOARD needs setpoints before it, and after the pilot took over none are sent.
-    returns=False,
     failsafes={
         # Acts once the setpoints stop for COM_OF_LOSS_T; 6 terminates the flight, 7 disarms: it
         # falls (`Failsafe::fromOffboardLossActParam`).
@@ -216,6 +139,9 @@ def identify(autopilot: int, vehicle_type: int) -> Firmware:
     )
 
 
+# Parameters of ArduPilot of which one holds the system id of the ground station that it listens
+# to, and the one with the highest of these ids, where newer versions have a range.
+_STATION, _HIGHEST = ('SYSID_MYGCS', 'MAV_GCS_SYSID'), 'MAV_GCS_SYSID_HI'
 # Period and number of requests for a parameter that is not answered [s, 1].
 _ANSWER_TIMEOUT, _TRIES = 0.5, 5
 # A message with our system id counts for this time [s].
@@ -230,24 +156,19 @@ class FailsafeCheck:
     """
 
     def __init__(
-        self,
-        firmware: Firmware,
-        settings: MavlinkSettings,
-        sender: Any,
-        report: Callable[[int, str], None],
+        self, firmware: Firmware, settings: MavlinkSettings, sender: Any, log: ReportLog
     ) -> None:
+        #: Of the parameters; None where the autopilot does not have it.
         self.values: dict[str, float | None] = {}
         self.complete = False
         self._firmware = firmware
         self._settings = settings
         self._sender = sender
-        self._report = report
-        self._names = [*firmware.failsafes, *firmware.ground_station]
-        if firmware.ground_station_high:
-            self._names.append(firmware.ground_station_high)
+        self._log = log
+        self._station = () if firmware.px4 else _STATION
+        self._names = [*firmware.failsafes, *self._station, *([_HIGHEST] if self._station else [])]
         self._asked: Counter[str] = Counter()
-        self._asked_at = -math.inf
-        self._foreign_at = -math.inf
+        self._asked_at = self._foreign_at = -math.inf
 
     def take(self, name: str, value: float) -> None:
         """Take the value of a parameter."""
@@ -256,8 +177,9 @@ class FailsafeCheck:
 
     def hear_own_id(self, now: float) -> None:
         """Note a message of another program that has the driver's system id."""
-        if now - self._foreign_at > _FOREIGN_AGE:
-            self._report(WARNING, self._foreign_text())
+        if not self._foreign(now):
+            self._foreign_at = now
+            self._log.add(WARNING, self._foreign(now))
         self._foreign_at = now
 
     def read(self, now: float) -> None:
@@ -265,9 +187,9 @@ class FailsafeCheck:
         if self.complete or now - self._asked_at < _ANSWER_TIMEOUT:
             return
         self._asked_at = now
-        if self._station() is not None:
+        if any(self.values.get(name) is not None for name in self._station):
             # Older and newer versions have other names for it.
-            for name in self._firmware.ground_station:
+            for name in self._station:
                 self.values.setdefault(name, None)
         for name in self._names:
             if name in self.values:
@@ -290,47 +212,34 @@ class FailsafeCheck:
         for name, failsafe in self._firmware.failsafes.items():
             value = self.values.get(name)
             if failsafe.guards_link and (value is None or value in failsafe.off):
-                text = 'is not known' if value is None else f'is {value:g}'
-                return f'failsafe {name} {text}, and require_failsafe is true'
-        return self.foreign(now) or self._station_problem()
+                return f'failsafe {name} {_state(value)}, and require_failsafe is true'
+        return self._foreign(now) or self._station_problem()
 
-    def foreign(self, now: float) -> str:
+    def _foreign(self, now: float) -> str:
         """Return that another program has the driver's system id, or nothing."""
-        return self._foreign_text() if now - self._foreign_at <= _FOREIGN_AGE else ''
-
-    def _foreign_text(self) -> str:
+        if now - self._foreign_at > _FOREIGN_AGE:
+            return ''
         return (
             f'another program sends with system id {self._settings.own_system}: the '
             'autopilot would not miss the driver; mavlink.own_system must be its alone'
         )
 
-    def _station(self) -> tuple[str, float] | None:
-        """Return the parameter that names the ground station, and its value."""
-        for name in self._firmware.ground_station:
-            value = self.values.get(name)
-            if value is not None:
-                return name, value
-        return None
-
     def _station_problem(self) -> str:
         """Return why the autopilot would not miss the driver alone, or nothing."""
-        names = self._firmware.ground_station
-        if not names:
-            return ''
-        station, own = self._station(), self._settings.own_system
-        if station is None:
-            return f'{" or ".join(names)} is not known, and require_failsafe is true'
-        name, low = station
+        known = [(name, self.values.get(name)) for name in self._station]
+        name, low = next((item for item in known if item[1] is not None), ('', None))
+        if low is None:
+            names = ' or '.join(self._station)
+            return f'{names} is not known, and require_failsafe is true' if names else ''
+        own, high = self._settings.own_system, self.values.get(_HIGHEST)
         if low != own:
             return (
                 f'{name} is {low:g}, mavlink.own_system is {own}: the autopilot would not miss '
                 f'the driver; set {name} to {own}'
             )
-        high_name = self._firmware.ground_station_high
-        high = self.values.get(high_name)
         if high is not None and high > low:
             return (
-                f'{high_name} is {high:g}: any ground station with an id from {low:g} to {high:g} '
+                f'{_HIGHEST} is {high:g}: any ground station with an id from {low:g} to {high:g} '
                 'keeps the failsafe from acting; set it to 0'
             )
         return ''
@@ -339,11 +248,12 @@ class FailsafeCheck:
         for name, failsafe in self._firmware.failsafes.items():
             value = self.values[name]
             off = value is None or value in failsafe.off
-            state = 'is not known' if value is None else f'is {value:g}'
-            state += ', which does not help' if value is not None and off else ''
-            self._report(
-                WARNING if off else INFO, f'failsafe for when {failsafe.meaning}: {name} {state}'
-            )
-        problem = self._station_problem()
-        if problem:
-            self._report(WARNING, problem)
+            rest = ', which does not help' if value is not None and off else ''
+            text = f'failsafe for when {failsafe.meaning}: {name} {_state(value)}{rest}'
+            self._log.add(WARNING if off else INFO, text)
+        if problem := self._station_problem():
+            self._log.add(WARNING, problem)
+
+
+def _state(value: float | None) -> str:
+    return 'is not known' if value is None else f'is {value:g}'

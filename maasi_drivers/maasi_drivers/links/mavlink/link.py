@@ -5,8 +5,6 @@ from __future__ import annotations
 import random
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +55,9 @@ def open_connection(url: str, system: int, component: int, baud: int = 57600) ->
 
 
 class VehicleLink:
-    """A vehicle on a wire.
+    """A vehicle on a wire; `failure` says why the wire cannot be opened, which is retried.
 
-    A wire that cannot be opened is retried; `failure` has the cause meanwhile.
-
-    Units: start [m].
+    Its thread holds `lock` while it works on `vehicle`, and so has everybody else, but for a flag.
     """
 
     def __init__(self, settings: MavlinkSettings, start: list[float], memory: Path) -> None:
@@ -70,33 +66,25 @@ class VehicleLink:
         self._connection: Any = None
         # It writes to the wire, once that is there.
         self._sender = make_sender(settings.own_system)
-        self._vehicle = Vehicle(settings, start, self._sender, memory)
-        self._lock = threading.Lock()
+        self.vehicle = Vehicle(settings, start, self._sender, memory)
+        self.lock = threading.Lock()
         self._end = threading.Event()
         self._open()
         self._thread = threading.Thread(target=self._run, name='mavlink', daemon=True)
         self._thread.start()
-
-    @contextmanager
-    def vehicle(self) -> Iterator[Vehicle]:
-        """Give the vehicle to one thread at a time."""
-        with self._lock:
-            yield self._vehicle
 
     def finish(self, ending: Ending, patience: float) -> bool:
         """Have it hold or land; return whether it confirms within `patience` seconds.
 
         Where nothing flies there is nothing to wait for.
         """
-        with self._lock:
-            self._vehicle.finish(ending)
+        with self.lock:
+            self.vehicle.finish(ending)
         deadline = time.monotonic() + patience
-        while time.monotonic() < deadline:
-            with self._lock:
-                if self._vehicle.at_rest:
+        while time.monotonic() < deadline and self._thread.is_alive():
+            with self.lock:
+                if self.vehicle.at_rest:
                     return True
-            if not self._thread.is_alive():
-                break
             time.sleep(_PERIOD)
         return False
 
@@ -107,17 +95,15 @@ class VehicleLink:
         self._shut()
 
     def _open(self) -> None:
+        settings, component = self.settings, self._sender.srcComponent
         try:
-            self._connection = open_connection(
-                self.settings.url,
-                self.settings.own_system,
-                self._sender.srcComponent,
-                self.settings.baud,
+            connection = open_connection(
+                settings.url, settings.own_system, component, settings.baud
             )
         except LinkError as error:
             self.failure = str(error)
             return
-        self._sender.file = self._connection
+        self._connection = self._sender.file = connection
         self.failure = ''
 
     def _shut(self) -> None:
@@ -141,8 +127,7 @@ class VehicleLink:
     def _turn(self) -> None:
         connection = self._connection
         connection.select(_PERIOD)
-        while (message := connection.recv_msg()) is not None:
-            with self._lock:
-                self._vehicle.handle(message, time.monotonic())
-        with self._lock:
-            self._vehicle.tick(time.monotonic())
+        with self.lock:
+            while (message := connection.recv_msg()) is not None:
+                self.vehicle.handle(message, time.monotonic())
+            self.vehicle.tick(time.monotonic())

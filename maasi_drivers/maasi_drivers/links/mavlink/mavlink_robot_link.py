@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import fence_problem, make_fence
+from maasi_drivers.agent.flight_rules import MARGIN, fence_problem, make_fence
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_link import RobotLink
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, ArrivalClock, RobotNode
@@ -22,11 +22,9 @@ from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose, compose
 
-_POLL_PERIOD = 0.02
+POLL_PERIOD = 0.02
 # Kinds of faults.
 _VEHICLE, _GEOFENCE = 'vehicle', 'geofence'
-# Farther outside the geofence is a fault [m].
-_FENCE_MARGIN = 0.5
 # At the end: longest wait until the autopilot confirms that it holds or lands [s].
 _STOP_TIME = 1.0
 # Between a localiser's pose and the autopilot's for the same instant, at most [ns].
@@ -58,21 +56,14 @@ class MavlinkRobotLink(RobotLink):
         self._charge_reports = 0
         # Not the one of the driver: telemetry and images have different delays.
         self._arrivals = ArrivalClock()
-        self._map_from_local = Pose.from_yaw(
-            [*settings.start[:2], self._mavlink.ground], -self._mavlink.map_yaw
-        )
+        place = [*settings.start[:2], self._mavlink.ground]
+        self._map_from_local = Pose.from_yaw(place, -self._mavlink.map_yaw)
         self._local_origin = np.zeros(3)
-        # Number of the last telemetry.
-        self._taken = -1
+        self._telemetry: Telemetry | None = None
         self._heading: float | None = None
         self._ending = False
-        self._fence = make_fence(
-            self._mavlink.geofence,
-            driver.bounds,
-            settings.radius,
-            self._mavlink.ground,
-            settings.start[2],
-        )
+        ground, fence = self._mavlink.ground, self._mavlink.geofence
+        self._fence = make_fence(fence, driver.bounds, settings.radius, ground, settings.start[2])
 
     # ---- link and life cycle -----------------------------------------------------------------
 
@@ -83,19 +74,9 @@ class MavlinkRobotLink(RobotLink):
         name = f'{driver.namespace.replace("/", "_")}_flight_origin.json'
         link = VehicleLink(self._mavlink, driver.settings.start, folder / 'maasi' / name)
         self._link = link
-        driver.create_wall_timer(_POLL_PERIOD, self._update)
-
-        def in_air() -> bool:
-            with link.vehicle() as vehicle:
-                return vehicle.in_air
-
-        driver.offer_arm(self._arm, in_air)
-
-        def flying() -> bool:
-            with link.vehicle() as vehicle:
-                return vehicle.flying
-
-        driver.expect(flying)
+        driver.create_wall_timer(POLL_PERIOD, self._update)
+        driver.offer_arm(self._arm, lambda: link.vehicle.in_air)
+        driver.expect(lambda: link.vehicle.flying)
 
     def close(self) -> None:
         """Close the connection."""
@@ -106,15 +87,13 @@ class MavlinkRobotLink(RobotLink):
     def _arm(self) -> str:
         """Let the vehicle take off; return why not, empty where it may."""
         driver, link = self.driver, self._link
-        problem = driver.arm_problem()
-        if link is None or problem:
-            return problem or 'the driver is not active'
+        if link is None:
+            return 'the driver is not active'
         if self._localised and (driver.history.latest is None or ODOMETRY in driver.health):
             return f'no {driver.pose_name}'
-        with link.vehicle() as vehicle:
-            problem = vehicle.permit(time.monotonic())
-        if not problem:
-            self._ending = False
+        with link.lock:
+            problem = link.vehicle.permit(time.monotonic())
+        self._ending &= bool(problem)
         return problem
 
     def send(self, placed: StampedPose, command: Sequence[float]) -> None:
@@ -162,8 +141,8 @@ class MavlinkRobotLink(RobotLink):
     def latch_stop(self) -> None:
         """End the permission to take off, and a take-off."""
         if self._link is not None:
-            with self._link.vehicle() as vehicle:
-                vehicle.stop()
+            with self._link.lock:
+                self._link.vehicle.stop()
 
     def poll(self) -> None:
         """Report why the vehicle does not start."""
@@ -177,7 +156,8 @@ class MavlinkRobotLink(RobotLink):
         """Return the state of the vehicle."""
         if self._link is None:
             return {}
-        with self._link.vehicle() as vehicle:
+        with self._link.lock:
+            vehicle = self._link.vehicle
             return {
                 'vehicle': vehicle.phase.name,
                 'in the air': vehicle.in_air,
@@ -193,8 +173,8 @@ class MavlinkRobotLink(RobotLink):
         if self._link is None:
             return
         goal = compose(self._map_from_local.inverse(), Pose.from_yaw(self._inside(position), yaw))
-        with self._link.vehicle() as vehicle:
-            vehicle.set_target(goal.position + self._local_origin, goal.yaw)
+        with self._link.lock:
+            self._link.vehicle.set_target(goal.position + self._local_origin, goal.yaw)
 
     # ---- what comes in -----------------------------------------------------------------------
 
@@ -202,13 +182,12 @@ class MavlinkRobotLink(RobotLink):
         driver, link = self.driver, self._link
         if link is None:
             return
-        with link.vehicle() as vehicle:
+        with link.lock:
+            vehicle, estimate = link.vehicle, link.vehicle.estimate
             vehicle.active = driver.active and not self._ending
-            fault, estimate = vehicle.fault, vehicle.estimate
+            fault = f'link: {link.failure}' if link.failure else vehicle.fault
             charge, reports = estimate.charge, estimate.charge_reports
             telemetry, self._local_origin = estimate.telemetry, estimate.origin
-        if link.failure:
-            fault = f'link: {link.failure}'
         self._log_reports()
         self._arrivals.observe(time.monotonic(), driver.get_clock().now().nanoseconds)
         if not driver.active:
@@ -221,17 +200,18 @@ class MavlinkRobotLink(RobotLink):
             # Again and again: a vehicle that the pilot has meanwhile may be given back.
             self._ending = True
             link.finish(self._mavlink.on_low_battery, 0.0)
-        if telemetry is not None and telemetry.number != self._taken:
-            self._taken = telemetry.number
+        if telemetry is not None and telemetry is not self._telemetry:
+            self._telemetry = telemetry
             self._take_telemetry(telemetry)
 
     def _log_reports(self) -> None:
         """Log the reports of the vehicle."""
         if self._link is None:
             return
-        with self._link.vehicle() as vehicle:
-            reports = vehicle.reports()
+        with self._link.lock:
+            reports = self._link.vehicle.reports()
         logger = self.driver.get_logger()
+        # The logger tells severities by the line that it is called from.
         for severity, text in reports:
             if severity <= ERROR:
                 logger.error(text)
@@ -263,14 +243,11 @@ class MavlinkRobotLink(RobotLink):
         latest = (self._local_poses if self._localised else driver.history).latest
         if latest is not None and stamp <= latest.stamp:
             return
-        local = Pose(telemetry.position - self._local_origin, telemetry.orientation)
-        placed = StampedPose(
-            stamp,
-            local if self._localised else compose(self._map_from_local, local),
-            np.zeros((6, 6)),
-            self._map_from_local.rotation() @ telemetry.velocity,
-            telemetry.rates,
-        )
+        pose = Pose(telemetry.position - self._local_origin, telemetry.orientation)
+        if not self._localised:
+            pose = compose(self._map_from_local, pose)
+        velocity = self._map_from_local.rotation() @ telemetry.velocity
+        placed = StampedPose(stamp, pose, np.zeros((6, 6)), velocity, telemetry.rates)
         if self._localised:
             self._local_poses.add(placed)
         else:
@@ -292,17 +269,13 @@ class MavlinkRobotLink(RobotLink):
         self._map_from_local = Pose(position, turn.orientation)
 
     def _check_fence(self, position: FloatArray) -> None:
-        driver = self.driver
-        outside = float(np.abs(position - self._inside(position)).max())
-        if outside <= _FENCE_MARGIN:
-            if not outside and driver.health.end(_GEOFENCE):
-                driver.get_logger().info('inside the geofence again')
-                driver.follower.stay()
-            return
-        if _VEHICLE not in driver.health:
-            text = f'{outside:.1f} m outside the geofence, at {np.round(position, 2).tolist()} m'
-            if driver.health.begin(_GEOFENCE, text):
-                driver.get_logger().error(f'{text}: it returns')
+        health, outside = self.driver.health, float(np.abs(position - self._inside(position)).max())
+        if outside > MARGIN and _VEHICLE not in health:
+            there = np.round(position, 2).tolist()
+            text = f'{outside:.1f} m outside the geofence, at {there} m: it returns'
+            health.begin(_GEOFENCE, text)
+        elif not outside and health.end(_GEOFENCE, 'inside the geofence again'):
+            self.driver.follower.stay()
 
     def _inside(self, position: FloatArray) -> FloatArray:
         return np.clip(position, self._fence[:, 0], self._fence[:, 1])

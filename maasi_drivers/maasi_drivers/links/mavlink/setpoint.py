@@ -1,4 +1,4 @@
-"""The set-point of a vehicle, and its progress on the way to its height."""
+"""The set-point of a vehicle."""
 
 from __future__ import annotations
 
@@ -12,41 +12,6 @@ from maasi_drivers.links.mavlink.estimate import swap_enu_ned, swap_yaw
 from maasi_drivers.links.mavlink.protocol import mavlink
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.arrays import FloatArray
-
-# The height is reached within this; a smaller change is no progress [m].
-_REACHED, _PROGRESS = 0.2, 0.1
-
-
-class Climb:
-    """Detects the end or a stall of a climb or dive.
-
-    Units: timeout [s].
-    """
-
-    def __init__(self, timeout: float) -> None:
-        self.timeout = timeout
-        self.begin(-math.inf)
-
-    def begin(self, now: float) -> None:
-        """Begin, at `now` on the steady clock [s]."""
-        self.accepted = False
-        # Smallest distance left so far [m], and its time [s].
-        self._least = math.inf
-        self._progress_at = now
-
-    def update(self, left: float, now: float) -> None:
-        """Update with the distance left [m]."""
-        if left < self._least - _PROGRESS:
-            self._least, self._progress_at = left, now
-
-    def is_over(self, left: float) -> bool:
-        """Return whether the height is reached, with this way left [m]."""
-        return left <= _REACHED
-
-    def is_stalled(self, now: float) -> bool:
-        """Return whether there was no progress for the timeout."""
-        return now - self._progress_at > self.timeout
-
 
 # Position only, and yaw: no velocity, acceleration, yaw rate; and no yaw either.
 _POSITION_AND_YAW, _NO_YAW = 0x9F8, 0x400
@@ -72,16 +37,13 @@ class Setpoint:
         if self.position is None or now - self._sent_at < period - 1e-6:
             return
         self._sent_at = now
-        north, east, down = swap_enu_ned(self.position).tolist()
         self._sender.set_position_target_local_ned_send(
             int(now * 1000.0) & 0xFFFFFFFF,
             self._settings.system,
             mavlink.MAV_COMP_ID_AUTOPILOT1,
             mavlink.MAV_FRAME_LOCAL_NED,
             _POSITION_AND_YAW | (_NO_YAW if self.yaw is None else 0),
-            north,
-            east,
-            down,
+            *swap_enu_ned(self.position).tolist(),
             *[0.0] * 6,
             0.0 if self.yaw is None else swap_yaw(self.yaw),
             0.0,
@@ -89,7 +51,7 @@ class Setpoint:
 
 
 def checked_target(position: ArrayLike, yaw: float) -> FloatArray:
-    """Return a position (3,) [m]."""
+    """Return a position (3,) [m]; `ValueError` for numbers that are not finite."""
     target = np.array(position, dtype=float)
     if target.shape != (3,) or not np.isfinite([*target, yaw]).all():
         raise ValueError(

@@ -16,7 +16,7 @@ from maasi_drivers.links.mavlink.autopilot import Autopilot, ModeChange
 from maasi_drivers.links.mavlink.estimate import FlightOrigin
 from maasi_drivers.links.mavlink.firmware import Firmware
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, ReportLog, mavlink
-from maasi_drivers.links.mavlink.setpoint import Climb, Setpoint, checked_target
+from maasi_drivers.links.mavlink.setpoint import Setpoint, checked_target
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 from maasi_filter.arrays import FloatArray
 
@@ -47,15 +47,14 @@ _ENDING_PERIOD = 0.3
 _ARMING_PERIOD = 2.0
 # Time for which set-points are sent before a mode that needs them [s].
 _STREAM_AHEAD = 1.2
+# The height is reached within this; a smaller change is no progress [m].
+_REACHED, _PROGRESS = 0.2, 0.1
 # Phases in which the service `arm` is refused with the fault.
 _UNABLE = (Phase.CONNECTING, Phase.RELEASED, Phase.ENDING, Phase.REFUSED)
 
 
 class Vehicle:
-    """One vehicle, from the first heartbeat to the end.
-
-    Units: start [m].
-    """
+    """One vehicle, from the first heartbeat to the end; times are of the steady clock [s]."""
 
     def __init__(
         self,
@@ -75,7 +74,9 @@ class Vehicle:
         self.estimate = self._autopilot.estimate
         self._permission = ArmPermission(settings.arm_timeout)
         self._setpoint = Setpoint(settings, sender)
-        self._climb = Climb(settings.rise_timeout)
+        # Smallest distance to its height so far [m], and the time at which it became less.
+        self._least_left, self._nearer_at = math.inf, -math.inf
+        self._take_off_accepted = False
         self._detail = ''
         self._phase_at = self._tried_at = -math.inf
         self._fix_needed = False
@@ -96,8 +97,7 @@ class Vehicle:
     @property
     def in_air(self) -> bool:
         """Whether it is armed, and not on the ground."""
-        on_ground = self.estimate.landed == mavlink.MAV_LANDED_STATE_ON_GROUND
-        return self._autopilot.armed and not on_ground
+        return self._autopilot.armed and not self.estimate.on_ground
 
     @property
     def parameters(self) -> Mapping[str, float | None]:
@@ -121,11 +121,9 @@ class Vehicle:
             return f'link: nothing heard from system {self.settings.system}'
         if self._place.problem:
             return f'vehicle: {self._place.problem}'
-        if self.phase is Phase.FLYING:
-            problem = self.estimate.problem(self._fix_needed)
-            if problem:
-                return f'vehicle: {problem}'
-        what = ': '.join(part for part in (self.phase.value, self._detail) if part)
+        flying = self.phase is Phase.FLYING
+        problem = self.estimate.problem(self._fix_needed) if flying else ''
+        what = problem or ': '.join(part for part in (self.phase.value, self._detail) if part)
         return f'vehicle: {what}' if what else ''
 
     @property
@@ -153,20 +151,13 @@ class Vehicle:
     # ---- what the driver wants ---------------------------------------------------------------
 
     def set_target(self, position: ArrayLike, yaw: float) -> None:
-        """Have it go to a position and stay there.
-
-        Shapes and units: position (3,) [m]; yaw [rad].
-        """
+        """Have it go to a position (3,) [m], with a yaw [rad], and stay there."""
         target = checked_target(position, yaw)
         if self.phase is Phase.FLYING:
             self._setpoint.position, self._setpoint.yaw = target, float(yaw)
 
     def permit(self, now: float) -> str:
-        """
-        Let it take off once, or be taken over where it flies; return why not, empty where it may.
-
-        Units: now [s].
-        """
+        """Let it take off once, or be taken over where it flies; return why not, or nothing."""
         problem = self._permission.ask(now, self._objection(now))
         if not problem and self.phase is Phase.STOPPED:
             self._enter(Phase.PREPARING)
@@ -239,7 +230,7 @@ class Vehicle:
             self._let_go(mode)
         elif self.phase is Phase.RELEASED:
             name = firmware.mode_name(mode)
-            if mode == firmware.external and change.armed and firmware.returns:
+            if mode == firmware.external and change.armed and not firmware.px4:
                 self._log.add(WARNING, f'the pilot gives {name} back')
                 self._begin_flying()
             elif mode == firmware.external and not change.armed:
@@ -308,7 +299,7 @@ class Vehicle:
                 self._begin_flying()
         autopilot.request_data(now)
         self._continue(now)
-        autopilot.commands.send(now)
+        autopilot.send_commands(now)
         if self._streams_setpoints:
             self._setpoint.send(now)
 
@@ -318,7 +309,7 @@ class Vehicle:
             return True
         if self.phase is Phase.RISING:
             return self._firmware.rise == 'setpoint'
-        return self._firmware.streams_first and self.phase in (Phase.STARTING, Phase.ARMING)
+        return self._firmware.px4 and self.phase in (Phase.STARTING, Phase.ARMING)
 
     def _continue(self, now: float) -> None:
         """Do what the present phase needs."""
@@ -393,7 +384,7 @@ class Vehicle:
             self._detail = f'{problem}, {UNTIL_ARM}' if problem else UNTIL_ARM
 
     def _take_mode(self, now: float) -> None:
-        if self._firmware.streams_first and now - self._phase_at < _STREAM_AHEAD:
+        if self._firmware.px4 and now - self._phase_at < _STREAM_AHEAD:
             return
         if self._autopilot.in_external_mode:
             self._enter(Phase.ARMING)
@@ -414,40 +405,35 @@ class Vehicle:
             # On the ground; the barometer may have drifted since the estimator started.
             self.estimate.origin[2] = self._setpoint.position[2]
             self._place.keep(self.estimate.origin, self.estimate.booted)
-        self._climb.begin(now)
+        self._least_left, self._nearer_at = math.inf, now
+        self._take_off_accepted = False
         self._enter(Phase.RISING)
 
     def _rise(self, now: float) -> None:
-        firmware, climb = self._firmware, self._climb
-        telemetry = self.estimate.telemetry
-        assert telemetry is not None and self._setpoint.position is not None
-        height = float(telemetry.position[2])
-        left = abs(height - self._top)
-        climb.update(left, now)
+        estimate, top, timeout = self.estimate, self._top, self.settings.rise_timeout
+        assert self._setpoint.position is not None
+        height = float(self._position()[2])
+        left = abs(height - top)
+        if left < self._least_left - _PROGRESS:
+            self._least_left, self._nearer_at = left, now
+        by_command = self._firmware.rise == 'command'
         # The autopilot's home may be elsewhere: the rest after its take-off is flown by set-point.
-        taken_off = (
-            firmware.rise == 'command' and self.estimate.landed == mavlink.MAV_LANDED_STATE_IN_AIR
-        )
-        if climb.is_over(left) or taken_off:
+        taken_off = by_command and estimate.landed == mavlink.MAV_LANDED_STATE_IN_AIR
+        if left <= _REACHED or taken_off:
             self._begin_flying()
-        elif climb.is_stalled(now):
-            reason = (
-                f'it came no nearer to its height in {climb.timeout:g} s: at '
-                f'{height:.1f} m of {self._top:.1f} m'
-            )
+        elif now - self._nearer_at > timeout:
+            way = f'at {height:.1f} m of {top:.1f} m'
+            reason = f'it came no nearer to its height in {timeout:g} s: {way}'
             self._log.add(ERROR, f'{reason}: it lands')
             self.finish('land', reason)
-        elif firmware.rise == 'setpoint':
-            self._setpoint.position[2] = self._top
-        elif not climb.accepted and self._is_due(now, _ARMING_PERIOD):
-            self._autopilot.command(
-                mavlink.MAV_CMD_NAV_TAKEOFF,
-                (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.height),
-                self._on_take_off_accepted,
-            )
+        elif not by_command:
+            self._setpoint.position[2] = top
+        elif not self._take_off_accepted and self._is_due(now, _ARMING_PERIOD):
+            take_off = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.height)
+            self._autopilot.command(mavlink.MAV_CMD_NAV_TAKEOFF, take_off, self._on_take_off)
 
-    def _on_take_off_accepted(self) -> None:
-        self._climb.accepted = True
+    def _on_take_off(self) -> None:
+        self._take_off_accepted = True
 
     def _begin_flying(self) -> None:
         position = self._position()

@@ -398,7 +398,7 @@ class FakeAutopilot:
         refusal = ''
         if mode == self.firmware.external and not self.ready:
             refusal = 'requires position'
-        elif mode == self.firmware.external and self.firmware.streams_first:
+        elif mode == self.firmware.external and self.firmware.px4:
             too_short = self.now - self._streaming_since < _OFFBOARD_STREAM
             if too_short or self.now - self._streamed_at > _OFFBOARD_AGE:
                 refusal = 'no offboard signal'
