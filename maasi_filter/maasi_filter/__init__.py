@@ -8,7 +8,7 @@ from maasi_filter.models.detection import (
     DetectionModel,
     ExponentialDetection,
     GaussianDetection,
-    detection_probability,
+    detection_probability_at,
 )
 from maasi_filter.models.measurement import (
     MeasurementModel,
@@ -58,7 +58,7 @@ __all__ = [
     'StateFileError',
     'UnexploredMap',
     'compose',
-    'detection_probability',
+    'detection_probability_at',
     'gospa',
     'inverse',
     'load_filter',

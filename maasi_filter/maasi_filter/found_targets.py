@@ -40,30 +40,25 @@ class FoundTargets:
         self.last_id += 1
         return self.last_id
 
-    def take_over(
-        self, robot: str, targets: Sequence[FoundTarget]
-    ) -> tuple[list[FoundTarget], list[FoundTarget]]:
-        """Merge targets found by another filter; return those that are new, and that changed."""
-        added: list[FoundTarget] = []
-        changed: list[FoundTarget] = []
+    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
+        """Merge targets found by another filter; return those that are new or changed."""
+        added, changed = [], []
         for target in targets:
-            indices = {(item.robot, item.origin): f for f, item in enumerate(self.targets)}
-            f = indices.get((robot, target.id), -1)
-            if f < 0:
-                f = self._nearest(target)
-                if f >= 0 and self._is_older(f, target.time, robot):
-                    continue
-            number = self.targets[f].id if f >= 0 else self.next_id()
-            taken = replace(target, id=number, robot=robot, origin=target.id)
-            if f < 0:
-                self.targets.append(taken)
-                added.append(taken)
-            elif _is_equal(taken, self.targets[f]):
+            known = [(item.robot, item.origin) == (robot, target.id) for item in self.targets]
+            f = known.index(True) if any(known) else self._nearest(target)
+            old = self.targets[f] if f >= 0 else None
+            if old is not None and not any(known) and (old.time, old.robot) <= (target.time, robot):
+                # Another one found it first.
                 continue
-            else:
-                self.targets[f] = taken
-                changed.append(taken)
-        return added, changed
+            number = self.next_id() if old is None else old.id
+            new = replace(target, id=number, robot=robot, origin=target.id)
+            if old is None:
+                self.targets.append(new)
+                added.append(new)
+            elif not _is_equal(new, old):
+                self.targets[f] = new
+                changed.append(new)
+        return added + changed
 
     def keep(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets that were found before a restart; return the new ones."""
@@ -87,9 +82,6 @@ class FoundTargets:
         apart = [distance(target.position, target.covariance, known) for known in self.targets]
         best = int(np.argmin(apart)) if apart else -1
         return best if apart and apart[best] < SAME_TARGET else -1
-
-    def _is_older(self, f: int, time: float, robot: str) -> bool:
-        return (self.targets[f].time, self.targets[f].robot) <= (time, robot)
 
 
 def _is_equal(one: FoundTarget, other: FoundTarget) -> bool:

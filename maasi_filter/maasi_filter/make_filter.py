@@ -12,7 +12,6 @@ from pydantic import TypeAdapter
 
 from maasi_filter.arrays import ByteArray
 from maasi_filter.ic_phd.filter import IcPhdFilter
-from maasi_filter.models.detection import PARAMETERS, detection_probability
 from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.records import AgentMeasurement
@@ -109,5 +108,3 @@ def warm_up() -> None:
                         [AgentMeasurement('warm_up', pose, sensor, values, None, step)], 1, step
                     )
                 search.exploration.at(np.full((1, 3), 3.0))
-    origin = np.zeros(3)
-    detection_probability(0, np.zeros(PARAMETERS), origin, origin, 0.0)

@@ -88,11 +88,11 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
         raise ValueError(f'{name}: values: got shape {values.shape}, allowed is (m, {d})')
     if not np.isfinite(values).all():
         raise ValueError(f'{name}: values: got {values.tolist()}, allowed are finite numbers')
-    own = bool(settings.use_detection_covariances) and measurement.covariances is not None
-    covariances = np.empty((len(values), d, d))
-    covariances[:] = sensor.covariance
-    if own:
-        covariances = _own_covariances(name, measurement.covariances, len(values), d)
+    covariances = np.tile(sensor.covariance, (len(values), 1, 1))
+    given = measurement.covariances if settings.use_detection_covariances else None
+    own = given is not None
+    if given is not None:
+        covariances = _own_covariances(name, given, len(values), d)
     pose_error = pose_error_of(sensor, settings, d)
     if measurement.position_covariance is not None:
         reported = _reported_error(name, measurement.position_covariance, d)
@@ -116,7 +116,7 @@ def _checked(measurement: AgentMeasurement, settings: FilterSettings, d: int) ->
     )
 
 
-def _own_covariances(name: str, given: FloatArray | None, count: int, d: int) -> FloatArray:
+def _own_covariances(name: str, given: FloatArray, count: int, d: int) -> FloatArray:
     covariances = np.array(given, dtype=float)
     if covariances.size == 0:
         covariances = covariances.reshape(0, d, d)
@@ -124,21 +124,22 @@ def _own_covariances(name: str, given: FloatArray | None, count: int, d: int) ->
         raise ValueError(
             f'{name}: covariances: got shape {covariances.shape}, allowed is ({count}, {d}, {d})'
         )
-    for covariance in covariances:
-        if not is_covariance(covariance):
-            raise ValueError(
-                f'{name}: covariances: got {covariance.tolist()}, allowed is a symmetric positive '
-                'definite matrix of finite numbers'
-            )
+    wrong = [covariance for covariance in covariances if not is_covariance(covariance)]
+    if wrong:
+        raise ValueError(
+            f'{name}: covariances: got {wrong[0].tolist()}, allowed is a symmetric positive '
+            'definite matrix of finite numbers'
+        )
     return covariances
 
 
 def _reported_error(name: str, reported: FloatArray, d: int) -> float:
-    variances = np.diagonal(np.asarray(reported, dtype=float))
+    matrix = np.asarray(reported, dtype=float)
+    variances = np.diagonal(matrix)
     if variances.shape != (3,) or not (np.isfinite(variances).all() and min(variances) >= 0):
         raise ValueError(
-            f'{name}: position_covariance: got {np.asarray(reported).tolist()}, allowed is a '
-            '(3, 3) matrix with finite variances from 0'
+            f'{name}: position_covariance: got {matrix.tolist()}, allowed is a (3, 3) matrix with '
+            'finite variances from 0'
         )
     return math.sqrt(float(variances[:d].max()))
 

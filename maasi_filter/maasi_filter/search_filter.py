@@ -1,10 +1,11 @@
-"""Interface of a search filter for nodes, planners and searches in one process; what all share."""
+"""A search filter, for nodes, planners and searches in one process; what all filters share."""
 
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +20,16 @@ from maasi_filter.settings import FilterSettings
 from maasi_filter.state_file import SavedGenerator, write_state
 from maasi_filter.unexplored_map import UnexploredMap
 
+# What of every filter is saved, with its type, beside e.
+_SAVED: dict[str, Any] = {
+    'settings': FilterSettings,
+    'bounds': FloatArray,
+    'generator': SavedGenerator,
+    'clusters': list[Cluster],
+}
 
-class SearchFilter(Protocol):
+
+class SearchFilter(ABC):
     """A filter that finds targets from the detections of several robots.
 
     Attributes
@@ -37,28 +46,41 @@ class SearchFilter(Protocol):
         Potential targets that are not found, heaviest first.
     """
 
-    settings: FilterSettings
-    bounds: FloatArray
-    dimension: int
-    exploration: UnexploredMap
-    clusters: list[Cluster]
+    method: ClassVar[str]
+    #: Types of what is saved of one method only, by attribute.
+    saved: ClassVar[dict[str, Any]]
+
+    def __init__(
+        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
+    ) -> None:
+        self.settings = settings
+        self.exploration = UnexploredMap(bounds, settings.exploration_spacing)
+        self.bounds = self.exploration.bounds
+        self.dimension = self.exploration.dimension
+        self.generator = generator
+        self.clusters: list[Cluster] = []
 
     @property
+    @abstractmethod
     def found_targets(self) -> list[FoundTarget]:
         """Targets found so far, in the order of being found."""
 
     @property
+    @abstractmethod
     def particles(self) -> FloatArray:
-        """(n, d), metres."""
+        """Of targets that are not found yet, (n, d), metres."""
 
     @property
+    @abstractmethod
     def weights(self) -> FloatArray:
-        """(n,); they sum to the expected number of targets that are not found yet."""
+        """Of the particles, (n,); they sum to `expected_number`."""
 
     @property
+    @abstractmethod
     def expected_number(self) -> float:
         """Expected number of targets that are not found yet, of those that were detected."""
 
+    @abstractmethod
     def step(
         self, measurements: Sequence[AgentMeasurement], steps: int, time: float
     ) -> FilterResult:
@@ -80,27 +102,35 @@ class SearchFilter(Protocol):
             do not fit, or a robot appears twice. The filter is then unchanged.
         """
 
+    @abstractmethod
+    def register(self) -> FoundTargets:
+        """Return the found targets with the ids given so far."""
+
+    @abstractmethod
+    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
+        """Take found targets into the state, of which some are new or changed."""
+
     def own_found_targets(self) -> list[FoundTarget]:
         """Return the found targets that this filter found itself."""
+        return [target for target in self.found_targets if not target.origin]
 
     def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
         """Merge targets found by the filter of another robot; return whether anything changed.
 
         A target that two robots found belongs to the robot that found it first (ties: first by
-        name), and follows the estimate of that robot (002, section 4).
-
-        Parameters
-        ----------
-        robot : str
-            Robot of that filter.
-        targets : sequence of FoundTarget
-            All targets that its filter found itself; call before `step`.
+        name), and follows the estimate of that robot (002, section 4). Call it before `step`, with
+        all targets that the filter of `robot` found itself.
 
         Raises
         ------
         ValueError
             If a number is not finite, or dimensions do not fit. The filter is then unchanged.
         """
+        check_taken(robot, targets, self.dimension)
+        found = self.register()
+        taken = found.take_over(robot, targets)
+        self.place(found, taken)
+        return bool(taken)
 
     def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
         """Add targets found before this filter was created; return those that are new.
@@ -112,65 +142,6 @@ class SearchFilter(Protocol):
         ValueError
             As of `take_over`.
         """
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the whole state, random generator included, to one file.
-
-        The file is replaced atomically: a crash leaves the old one or the new one.
-        """
-
-    def state(self) -> dict[str, dict[str, Any]]:
-        """Return the whole state, random generator included, by the method, for `write_state`."""
-
-
-# What of every filter is saved, with its type, beside e.
-_SAVED: dict[str, Any] = {
-    'settings': FilterSettings,
-    'bounds': FloatArray,
-    'generator': SavedGenerator,
-    'clusters': list[Cluster],
-}
-
-
-class FilterBase:
-    """What the filters share: exploration, found targets from elsewhere, and the saved state."""
-
-    method: ClassVar[str]
-    #: Types of what is saved of one method only, by attribute.
-    saved: ClassVar[dict[str, Any]]
-
-    def __init__(
-        self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
-    ) -> None:
-        self.settings = settings
-        self.exploration = UnexploredMap(bounds, settings.exploration_spacing)
-        self.bounds = self.exploration.bounds
-        self.dimension = self.exploration.dimension
-        self.generator = generator
-        self.clusters: list[Cluster] = []
-
-    def register(self) -> FoundTargets:
-        """Return the found targets with the ids given so far."""
-        raise NotImplementedError
-
-    def place(self, found: FoundTargets, changed: Sequence[FoundTarget]) -> None:
-        """Take found targets into the state, of which some are new or changed."""
-        raise NotImplementedError
-
-    def own_found_targets(self) -> list[FoundTarget]:
-        """Return the found targets that this filter found itself."""
-        return [target for target in self.register().targets if not target.origin]
-
-    def take_over(self, robot: str, targets: Sequence[FoundTarget]) -> bool:
-        """Merge targets found by the filter of another robot; return whether anything changed."""
-        check_taken(robot, targets, self.dimension)
-        found = self.register()
-        added, changed = found.take_over(robot, targets)
-        self.place(found, added + changed)
-        return bool(added or changed)
-
-    def keep_found(self, targets: Sequence[FoundTarget]) -> list[FoundTarget]:
-        """Add targets that were found before this filter was created; return the new ones."""
         check_taken('kept', targets, self.dimension)
         found = self.register()
         added = found.keep(targets)
@@ -178,7 +149,10 @@ class FilterBase:
         return added
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the whole state, random generator included, to one file."""
+        """Write the whole state, random generator included, to one file.
+
+        The file is replaced atomically: a crash leaves the old one or the new one.
+        """
         write_state(path, self.state())
 
     def state(self) -> dict[str, dict[str, Any]]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import (
@@ -421,13 +420,6 @@ class FilterSettings(Settings):
     )
     pmb: PmbSettings = Field(default_factory=PmbSettings, description='pmb: what only it has')
 
-    @field_validator('preset', mode='before')
-    @classmethod
-    def _gone(cls, value: Any) -> Any:
-        if value == 'recommended':
-            raise ValueError("'recommended' is gone, write method: pmb in its place")
-        return value
-
     def resolved(self) -> FilterSettings:
         """Return a copy with None replaced by the value of the method or preset."""
         filled = PRESETS[self.preset] if self.method == 'ic_phd' else _PMB
@@ -473,28 +465,3 @@ def unused_settings(settings: FilterSettings) -> str:
     if not names:
         return ''
     return f'filter: {", ".join(names)}: of method {other}; {settings.method} does not use them'
-
-
-@dataclass(frozen=True)
-class IcPhdNumbers:
-    """Resolved settings of the PHD filter; see `FilterSettings`."""
-
-    expected_targets: float
-    found_radius: float
-    particles: int
-    particles_minimum: int
-    particles_per_target: int
-    survival_probability: float
-    births: str
-    birth_particles: int
-    birth_targets: float
-    jitter_deviation: float
-    found_mass: float
-    removal: str
-    removal_distance: float
-    kmeans_iterations: int
-
-    @classmethod
-    def of(cls, settings: FilterSettings) -> IcPhdNumbers:
-        """Return the numbers of resolved settings."""
-        return cls(**{item.name: getattr(settings, item.name) for item in fields(cls)})

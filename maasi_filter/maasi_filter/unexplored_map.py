@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.detection import DetectionModel, fill_probabilities
+from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 
 # Cells along the mean side of the environment, in 2D and 3D.
@@ -22,29 +22,14 @@ MAXIMUM_NODES = 20_000_000
 
 
 @njit(cache=True, error_model='numpy')
-def interpolate(
-    values: FloatArray, lower: FloatArray, step: FloatArray, position: FloatArray
-) -> float:
-    """Return the multilinear interpolation of a grid at one position.
-
-    Parameters
-    ----------
-    values : (nx, ny, nz) array
-        Node values; nz is 1 in 2D.
-    lower, step : (3,) arrays
-        Position of node (0, 0, 0) and spacing of the nodes, metres.
-    position : (d,) array
-        Clamped to the grid, metres.
-    """
-    height = position[2] if position.shape[0] == 3 else 0.0
-    return interpolate_at(values, lower, step, position[0], position[1], height)
-
-
-@njit(cache=True, error_model='numpy')
 def interpolate_at(
     values: FloatArray, lower: FloatArray, step: FloatArray, x: float, y: float, z: float
 ) -> float:
-    """Return the same as `interpolate` for a position x, y, z; z plays no part in 2D."""
+    """Return the multilinear interpolation of a grid at one position, clamped to it.
+
+    `values` (nx, ny, nz) are of nodes from `lower` (3,) on, `step` (3,) apart, metres; in 2D nz is
+    1, and z plays no part.
+    """
     u = min(max((x - lower[0]) / step[0], 0.0), values.shape[0] - 1.0)
     i = min(np.int64(u), values.shape[0] - 2)
     u -= i
@@ -75,31 +60,6 @@ def _interpolate_many(
         z = positions[i, 2] if solid else 0.0
         out[i] = interpolate_at(values, lower, step, positions[i, 0], positions[i, 1], z)
     return out
-
-
-@njit(cache=True, error_model='numpy')
-def _decrease(  # type: ignore[no-untyped-def]
-    values, lower, step, kind, parameters, sensor_position, yaw, dimension
-):
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    # A plane at a time.
-    size = values.shape[1] * values.shape[2]
-    x = np.empty(size)
-    y = np.empty(size)
-    z = np.zeros(size)
-    probability = np.empty(size)
-    for j in range(values.shape[1]):
-        for k in range(values.shape[2]):
-            y[j * values.shape[2] + k] = lower[1] + j * step[1] - sensor_position[1]
-            if dimension == 3:
-                z[j * values.shape[2] + k] = lower[2] + k * step[2] - sensor_position[2]
-    for i in range(values.shape[0]):
-        x[:] = lower[0] + i * step[0] - sensor_position[0]
-        fill_probabilities(kind, parameters, x, y, z, size, cos_yaw, sin_yaw, probability)
-        plane = values[i].reshape(size)
-        for j in range(size):
-            plane[j] *= 1.0 - probability[j]
 
 
 def check_bounds(bounds: ArrayLike) -> FloatArray:
@@ -175,7 +135,14 @@ class UnexploredMap:
         self._lower[: self.dimension] = self.bounds[:, 0]
         self._step = np.zeros(3)
         self._step[: self.dimension] = self.step
-        self._volumes = self._trapezoid()
+        grids = np.meshgrid(*self.axes(), indexing='ij')
+        # One row for each axis, as kernels read them.
+        self._nodes = np.array([grid.ravel() for grid in grids]).T
+        self._volumes = np.ones(())
+        for number, step in zip(shape, self.step):
+            lengths = np.full(number, step)
+            lengths[[0, -1]] *= 0.5
+            self._volumes = np.multiply.outer(self._volumes, lengths)
 
     @property
     def values(self) -> FloatArray:
@@ -184,33 +151,21 @@ class UnexploredMap:
 
     def axes(self) -> list[FloatArray]:
         """Return the coordinates of the nodes along each axis, metres."""
-        return [
-            self._lower[axis] + self._step[axis] * np.arange(self._values.shape[axis])
-            for axis in range(self.dimension)
-        ]
+        parts = zip(self._lower, self._step, self.values.shape)
+        return [lower + step * np.arange(number) for lower, step, number in parts]
 
     def nodes(self) -> FloatArray:
         """Return the positions of all nodes, (n, d), in the order of `values.ravel()`."""
-        grids = np.meshgrid(*self.axes(), indexing='ij')
-        return np.stack([grid.ravel() for grid in grids], axis=1)
+        return self._nodes
 
     def kernel(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return (values (nx, ny, nz), lower (3,), step (3,)) for `interpolate`."""
+        """Return (values (nx, ny, nz), lower (3,), step (3,)) for `interpolate_at`."""
         return self._values, self._lower, self._step
 
     def update(self, detection: DetectionModel, pose: Pose) -> None:
         """Multiply e by 1 - pi for one measurement at `pose` (000, eq. (20))."""
-        kind, parameters = detection.kernel()
-        _decrease(
-            self._values,
-            self._lower,
-            self._step,
-            kind,
-            parameters,
-            pose.position,
-            pose.yaw,
-            self.dimension,
-        )
+        missed = 1.0 - detection.probability(self._nodes, pose)
+        self._values *= missed.reshape(self._values.shape)
 
     def diffuse(self, variance: float) -> None:
         """Diffuse e as for targets in a random walk, `variance` [m^2], with reflecting bounds."""
@@ -241,15 +196,6 @@ class UnexploredMap:
             raise ValueError('positions: got a number that is not finite')
         return _interpolate_many(self._values, self._lower, self._step, array)
 
-    def _trapezoid(self) -> FloatArray:
-        volumes = np.ones(())
-        for axis in range(self.dimension):
-            lengths = np.full(self._values.shape[axis], self._step[axis])
-            lengths[0] *= 0.5
-            lengths[-1] *= 0.5
-            volumes = np.multiply.outer(volumes, lengths)
-        return np.asarray(volumes)
-
     def cell_volumes(self) -> FloatArray:
         """Return the volume (2D: area) each node stands for, same shape as `values`.
 
@@ -259,8 +205,7 @@ class UnexploredMap:
 
     def explored_fraction(self) -> float:
         """Return 1 - mean of e over the environment, in [0, 1]."""
-        volumes = self.cell_volumes()
-        return 1.0 - float((volumes * self.values).sum() / volumes.sum())
+        return 1.0 - float((self._volumes * self.values).sum() / self._volumes.sum())
 
     def copy(self) -> UnexploredMap:
         """Return an independent copy."""

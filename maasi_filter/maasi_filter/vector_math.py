@@ -21,30 +21,6 @@ LOG_2_LOW = 1.90821492927058770002e-10
 LEAST_EXPONENT = -708.0
 
 
-def _generate_bits_of(context: Any, x: Any) -> Any:
-    """Return the 64 bits of a float as an integer."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], context.get_value_type(types.int64))
-
-    return types.int64(types.float64), generate
-
-
-_bits_of: Any = intrinsic(_generate_bits_of)
-
-
-def _generate_float_of(context: Any, bits: Any) -> Any:
-    """Return the float that has these 64 bits."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], context.get_value_type(types.float64))
-
-    return types.float64(types.int64), generate
-
-
-_float_of: Any = intrinsic(_generate_float_of)
-
-
 def _generate_wide_vectors(context: Any) -> Any:
     """Have the loops of the kernel that calls this use the widest vectors there are.
 
@@ -120,7 +96,8 @@ def exponential(x: float) -> float:
     value = value * r + 0.5
     value = value * r + 1.0
     value = value * r + 1.0
-    scaled = value * _float_of((_bits_of(shifted) + 1023) << 52)
+    power = (np.float64(shifted).view(np.int64) + 1023) << 52
+    scaled = value * np.int64(power).view(np.float64)
     return scaled if x >= LEAST_EXPONENT else 0.0
 
 

@@ -11,7 +11,7 @@ from maasi_filter import (
     ExponentialDetection,
     GaussianDetection,
     Pose,
-    detection_probability,
+    detection_probability_at,
 )
 
 
@@ -62,8 +62,8 @@ def test_the_kernel_agrees_with_the_model(model):
     pose = Pose.from_yaw([1.0, 2.0, 3.0], 0.7)
     kind, parameters = model.kernel()
     inline = [
-        detection_probability(kind, parameters, position, pose.position, pose.yaw)
-        for position in positions
+        detection_probability_at(kind, parameters, *offset, np.cos(pose.yaw), np.sin(pose.yaw))
+        for offset in positions - pose.position
     ]
     values = model.probability(positions, pose)
     # Two forms of the exponential function, each to a unit in the last place.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -13,21 +12,6 @@ from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.models.detection import DetectionModel
 from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
-
-
-@dataclass
-class MeasurementBirths:
-    """Births at each of m measurements, J for each."""
-
-    particles: FloatArray  # (m J, d): Metres; grouped by measurement
-    #: (m, J): b, the birth intensity times psi_z over the density of the draw, divided by J,
-    #: per unit of measurement space. b / C(z) is the posterior weight.
-    intensity: FloatArray
-
-    @property
-    def totals(self) -> FloatArray:
-        """<psi_z, Y>, the contribution of births to C(z), (m,)."""
-        return np.asarray(self.intensity.sum(axis=1))
 
 
 def measurement_births(
@@ -39,12 +23,13 @@ def measurement_births(
     number: int,
     generator: np.random.Generator,
     before: Sequence[tuple[DetectionModel, Pose]] = (),
-) -> MeasurementBirths:
-    """Draw births at each measurement: x = g^-1(z + N(0, R)), inside E.
+) -> tuple[FloatArray, FloatArray]:
+    """Return J births at each of m measurements, x = g^-1(z + N(0, R)), (m J, d), and b (m, J).
 
     Their intensity is N0 / V. Divided by the density of the draw and multiplied by the probability
     that earlier robots missed them, b = (N0 / V) pi(x, q) |dx/dz| prod(1 - pi_before) / J, where
-    |dx/dz| = r in 2D and r^2 cos(elevation) in 3D. A birth counts for its own measurement only.
+    |dx/dz| = r in 2D and r^2 cos(elevation) in 3D; 0 outside E. b / C(z) is the posterior weight. A
+    birth counts for its own measurement only: the sum of its b is <psi_z, Y>.
     """
     count, d = values.shape
     noise = generator.standard_normal((count, number, d)) @ np.linalg.cholesky(sensor.covariance).T
@@ -60,7 +45,7 @@ def measurement_births(
     intensity *= sensor.detection.probability(particles, pose)
     for detection, place in before:
         intensity *= 1.0 - detection.probability(particles, place)
-    return MeasurementBirths(particles, np.where(inside, intensity, 0.0).reshape(count, number))
+    return particles, np.where(inside, intensity, 0.0).reshape(count, number)
 
 
 def uniform_births(

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.found_targets import SAME_TARGET, FoundTargets, distance
 from maasi_filter.ic_phd.births import (
-    MeasurementBirths,
     gaussian_births,
     jittered,
     measurement_births,
@@ -40,8 +39,8 @@ from maasi_filter.records import (
     FoundTarget,
     Label,
 )
-from maasi_filter.search_filter import FilterBase
-from maasi_filter.settings import FilterSettings, IcPhdNumbers
+from maasi_filter.search_filter import SearchFilter
+from maasi_filter.settings import FilterSettings
 
 # Particle sets below this size are faster on one thread.
 PARALLEL_PARTICLES = 65_536
@@ -49,13 +48,15 @@ PARALLEL_PARTICLES = 65_536
 LEAST_BIRTHS = 20
 
 
-class IcPhdFilter(FilterBase):
+class IcPhdFilter(SearchFilter):
     """Particle PHD filter with an iterated corrector, K-means, and removal of found targets.
 
     Settings that are None have the value of the preset. Everything is as of `SearchFilter`.
     """
 
     method = 'ic_phd'
+    particles: FloatArray = np.empty((0, 0))
+    weights: FloatArray = np.empty(0)
     saved: ClassVar[dict[str, Any]] = {
         'particles': FloatArray,
         'weights': FloatArray,
@@ -67,10 +68,10 @@ class IcPhdFilter(FilterBase):
         self, settings: FilterSettings, bounds: ArrayLike, generator: np.random.Generator
     ) -> None:
         super().__init__(settings, bounds, generator)
-        self._settings = settings.resolved()
-        self._numbers = IcPhdNumbers.of(self._settings)
-        self.particles: FloatArray = np.empty((0, self.dimension))
-        self.weights: FloatArray = np.empty(0)
+        # Nothing is None in it.
+        self._numbers: Any = settings.resolved()
+        self.particles = np.empty((0, self.dimension))
+        self.weights = np.empty(0)
         self._found = FoundTargets()
         self._centres: FloatArray = np.empty((0, self.dimension))
         self._pool: ThreadPoolExecutor | None = None
@@ -94,7 +95,7 @@ class IcPhdFilter(FilterBase):
     ) -> FilterResult:
         """Predict over `steps` control steps, correct with every robot of M_k, extract and mark."""
         dropped: dict[str, int] = {}
-        members = check_measurements(measurements, steps, time, self._settings, self.dimension)
+        members = check_measurements(measurements, steps, time, self._numbers, self.dimension)
         members = [self._without_found(member, dropped) for member in members]
         # Prediction, 000 (12): targets stand still and survive with p_s.
         self.weights = self.weights * self._numbers.survival_probability**steps
@@ -120,15 +121,15 @@ class IcPhdFilter(FilterBase):
         D^o(x) = (1 - pi(x) + sum over z of psi_z(x) / C(z)) D^{o-1}(x), where
         C(z) = kappa(z) + <psi_z, D^{o-1}>, and births are part of D^{o-1}.
         """
-        births = self._births(member, before)
+        births, intensity = self._births(member, before)
         space = member.sensor.measurement_space(self.bounds)
         clutter = max(member.sensor.clutter, LEAST_PER_SCAN / space)
         scan = make_scan(member.values, member.sensor, member.pose)
         factor, normaliser = phd_correct(
-            self.particles, self.weights, scan, clutter + births.totals, self._threads()
+            self.particles, self.weights, scan, clutter + intensity.sum(axis=1), self._threads()
         )
         self.weights = self.weights * factor
-        self._append(births.particles, (births.intensity / normaliser[:, None]).ravel())
+        self._append(births, (intensity / normaliser[:, None]).ravel())
         self.exploration.update(member.sensor.detection, member.pose)
         unexplained = member.values[normaliser <= clutter]
         centres = member.sensor.measurement.inverse(unexplained, member.pose)
@@ -136,12 +137,12 @@ class IcPhdFilter(FilterBase):
 
     def _births(
         self, member: CheckedMeasurement, before: Sequence[CheckedMeasurement]
-    ) -> MeasurementBirths:
-        """Return births at the detections of a robot; none with other kinds of births."""
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return births at the detections of a robot, if that is the kind, and their b (m, J)."""
         numbers = self._numbers
         count = len(member.values)
         if numbers.births != 'measurement' or not count:
-            return MeasurementBirths(np.empty((0, self.dimension)), np.zeros((count, 0)))
+            return np.empty((0, self.dimension)), np.zeros((count, 0))
         room = numbers.particles // (2 * count)
         return measurement_births(
             member.values,
@@ -229,7 +230,7 @@ class IcPhdFilter(FilterBase):
                 credit.robot,
                 credit.index,
                 time,
-                label=nearest_label(position, members, numbers.removal_distance),
+                label=_nearest_label(position, members, numbers.removal_distance),
             )
             self._found.targets.append(target)
             newly_found.append(target)
@@ -275,17 +276,18 @@ class IcPhdFilter(FilterBase):
             self.particles, self.weights = self.particles[keep], self.weights[keep]
 
 
+def _distances(position: FloatArray, member: CheckedMeasurement) -> FloatArray:
+    """Return how far from a position each detection points (m,), metres."""
+    centres = member.sensor.measurement.inverse(member.values, member.pose)
+    return np.sqrt(np.square(centres - position).sum(axis=1))
+
+
 def _nearest_member(
     position: FloatArray, members: Sequence[CheckedMeasurement]
 ) -> CheckedMeasurement:
     """Return the robot with the detection nearest to a position; the last one if there is none."""
-    apart = []
-    for member in members:
-        centres = member.sensor.measurement.inverse(member.values, member.pose)
-        squares = ((centres - position) ** 2).sum(axis=1)
-        apart.append(float(squares.min()) if len(squares) else math.inf)
-    best = int(np.argmin(apart))
-    return members[best] if math.isfinite(apart[best]) else members[-1]
+    apart = [_distances(position, member).min(initial=math.inf) for member in members]
+    return members[int(np.argmin(apart)) if math.isfinite(min(apart)) else -1]
 
 
 def kept_measurements(
@@ -307,19 +309,17 @@ def kept_measurements(
     return keep
 
 
-def nearest_label(
+def _nearest_label(
     position: FloatArray, members: Sequence[CheckedMeasurement], limit: float
 ) -> Label:
     """Return the label of the detection nearest to a position, within T_z = `limit` metres.
 
     The PHD filter does not associate detections with targets.
     """
-    best, least = UNLABELLED, limit
-    for member in members:
-        if not member.labels:
-            continue
-        centres = member.sensor.measurement.inverse(member.values, member.pose)
-        for label, apart in zip(member.labels, np.linalg.norm(centres - position, axis=1).tolist()):
-            if apart <= least:
-                best, least = label, apart
-    return best
+    seen = [
+        (apart, label)
+        for member in members
+        for apart, label in zip(_distances(position, member).tolist(), member.labels)
+    ]
+    apart, label = min(seen, key=lambda item: item[0], default=(math.inf, UNLABELLED))
+    return label if apart <= limit else UNLABELLED

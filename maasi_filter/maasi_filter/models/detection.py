@@ -12,7 +12,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import carray, cfunc, njit, types
@@ -30,18 +30,10 @@ CUSTOM = 3
 REACH, NUMBER, ADDRESS = 4, 5, 6
 
 
-class _Block(NamedTuple):
-    """A function with its values, which must outlive all kernels that know its address."""
-
-    function: Callable[..., float]
-    compiled: Any
-    values: FloatArray
-    #: Addresses of the function and of the values, and their number.
-    entries: IntArray
-
-
-_blocks: dict[int, _Block] = {}
-_retired: list[_Block] = []
+# Functions with the addresses of function and values, and the number of these; what kernels may
+# still call, by its address, must not be freed.
+_blocks: dict[int, tuple[Callable[..., float], IntArray]] = {}
+_alive: list[Any] = []
 
 
 @intrinsic
@@ -85,15 +77,14 @@ def register(function: Callable[..., float], values: FloatArray) -> tuple[int, i
     digest = hashlib.sha256(name.encode() + b'\0' + values.tobytes()).digest()
     # Floats are exact up to 2^53.
     number = int.from_bytes(digest[:6], 'little')
-    block = _blocks.get(number)
-    if block is None or block.function is not function:
-        if block is not None:
-            # Redefined, as in a notebook; the old one may still be in use.
-            _retired.append(block)
+    known = _blocks.get(number)
+    # A notebook may define it again.
+    if known is None or known[0] is not function:
         compiled, own = _compiled(function), np.array(values, dtype=float)
         entries = np.array([compiled.address, own.ctypes.data, len(own)], np.int64)
-        block = _blocks[number] = _Block(function, compiled, own, entries)
-    return number, block.entries.ctypes.data
+        _alive.extend([compiled, own, entries])
+        known = _blocks[number] = (function, entries)
+    return number, known[1].ctypes.data
 
 
 def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
@@ -105,7 +96,7 @@ def renew_addresses(kinds: FloatArray, parameters: FloatArray) -> None:
                 'it was saved with a detection model of your own, which no sensor of this process '
                 'has: make the sensors, with the same settings, before it is loaded'
             )
-        parameters[row, ADDRESS] = block.entries.ctypes.data
+        parameters[row, ADDRESS] = block[1].ctypes.data
 
 
 @cache
@@ -126,26 +117,6 @@ EXPONENTIAL = 0
 GAUSSIAN = 1
 BOX = 2
 PARAMETERS = 9
-
-
-@njit(cache=True, error_model='numpy')
-def detection_probability(
-    kind: int,
-    parameters: FloatArray,
-    position: FloatArray,
-    sensor_position: FloatArray,
-    yaw: float,
-) -> float:
-    """Return pi(x, q) of one target; see `detection_probability_at` for the arguments."""
-    return detection_probability_at(
-        kind,
-        parameters,
-        position[0] - sensor_position[0],
-        position[1] - sensor_position[1],
-        position[2] - sensor_position[2],
-        math.cos(yaw),
-        math.sin(yaw),
-    )
 
 
 @njit(cache=True, error_model='numpy')

@@ -43,7 +43,7 @@ from maasi_filter.pmb.learnt import Learnt
 from maasi_filter.pmb.offsets import Offsets
 from maasi_filter.pmb.scan import Scan, make_scan
 from maasi_filter.records import AgentMeasurement, Cluster, FilterResult, FoundTarget
-from maasi_filter.search_filter import FilterBase
+from maasi_filter.search_filter import SearchFilter
 from maasi_filter.settings import FilterSettings
 
 LEAST_EXISTENCE = 1e-4
@@ -59,7 +59,7 @@ SURELY_REFLECTING = 0.5
 CERTAIN = 0.999
 
 
-class PmbFilter(FilterBase):
+class PmbFilter(SearchFilter):
     """Poisson multi-Bernoulli filter for a set M_k of measuring robots.
 
     Settings that are None are derived from the measuring sensor. `components` are the potential
