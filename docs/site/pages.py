@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from maasi_filter.ros.parameters import choices, constraints, parameters_of, settings_of
+from maasi_filter.ros.parameters import ParameterField, choices, parameters_of
 from maasi_sim.buildings.scenario import CuboidScenario
 from maasi_sim.run.launch_arguments import ending
 from maasi_sim.scenario.schema import Scenario
@@ -165,7 +165,7 @@ def settings_rows(model: type[BaseModel], prefix: str = '') -> Iterator[tuple[st
             models = [kind for part in element for kind in choices(part) if is_model(kind)]
             inner += [(kind, {list: '[]', dict: '.NAME'}.get(origin, '')) for kind in models]
             kinds += [KINDS[origin]] if origin in KINDS and not models else []
-        allowed = constraints(info)
+        allowed = ParameterField('', (), info).constraints
         if not allowed.startswith('one of'):
             allowed = ' '.join(filter(None, [' or '.join(dict.fromkeys(kinds)), allowed]))
         default = info.default
@@ -216,7 +216,7 @@ def parameters_page() -> str:
                 '' if item.default is None else code(item.default),
                 item.description,
             )
-            for item in parameters_of(settings_of(node))
+            for item in parameters_of(node)
         ]
         text += [
             f'## {title}\n',

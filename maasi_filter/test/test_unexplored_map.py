@@ -30,14 +30,6 @@ def test_update_is_equation_20_at_every_node():
     np.testing.assert_allclose(exploration.values.ravel(), expected, rtol=1e-12)
 
 
-def test_a_function_of_the_user_updates_alike():
-    compiled = UnexploredMap(BOUNDS, 12.0)
-    pose = Pose([10.0, 10.0, 10.0])
-    compiled.update(MODEL, pose)
-    missed = 1.0 - MODEL.probability(compiled.nodes(), pose)
-    np.testing.assert_allclose(compiled.values.ravel(), missed, rtol=1e-12)
-
-
 @pytest.mark.parametrize('dimension', [2, 3])
 def test_interpolation_is_multilinear_and_clamped(dimension):
     generator = np.random.default_rng(0)

@@ -77,44 +77,6 @@ def wander(generator, number, centre=130.0, size=110.0, stride=12.0):
         yield position
 
 
-def follow_one_target(
-    seed, noise, settings=None, after=15, most=300, position_deviation=0.0, told=True
-):
-    """Return error and covariance of one target: when found, and `after` measurements later.
-
-    The robot believes to be `position_deviation` from where it is, another way each time, and
-    tells so, or not.
-    """
-    generator = np.random.default_rng([seed, 5])
-    sensor = cube_sensor(noise)
-    target = 130.0 + 40.0 * (generator.random((1, 3)) - 0.5)
-    search = make_filter(settings or FilterSettings(), CUBE, np.random.default_rng([seed, 6]))
-    first = None
-    left = after
-    for step, position in enumerate(wander(generator, most)):
-        values = observe(generator, sensor, target, Pose(position))
-        pose = Pose(position)
-        reported = None
-        if position_deviation > 0.0:
-            pose = Pose(position + position_deviation * generator.standard_normal(3))
-            reported = position_deviation**2 * np.eye(3) if told else None
-        result = search.step(
-            [AgentMeasurement('drone', pose, sensor, values, None, step, reported)], 1, float(step)
-        )
-        if result.newly_found and first is None:
-            first = result.newly_found[0]
-        if first is not None:
-            left -= 1
-            if left < 0:
-                break
-    if first is None:
-        return None
-    last = search.found_targets[0]
-    return [(found.position - target[0], found.covariance) for found in (first, last)], len(
-        search.found_targets
-    )
-
-
 def separated(generator, number, lower, upper, apart, dimension):
     """Return random targets at least `apart` from each other."""
     targets = []
@@ -125,41 +87,25 @@ def separated(generator, number, lower, upper, apart, dimension):
     return np.array(targets)
 
 
-def mow_floor(seed, pose_error=0.0, camera=False, search=None, settings=None):
+def mow_floor(seed, settings=None):
     """Search the floor along a lawnmower, there and back; return the filter and the targets.
 
-    The true field of view is a hard box; `pose_error` is the deviation of a slowly changing error
-    of the robot's position. With `camera` detections carry covariances from a Cartesian error.
+    The true field of view is a hard box.
     """
     generator = np.random.default_rng([seed, 1])
     targets = separated(generator, 12, -0.2, 2.3, 0.15, 2)
     sensor = floor_sensor()
     true_view = BoxDetection([-0.2, -0.2], [0.2, 0.2], 1.0)
-    if search is None:
-        generator_of_filter = np.random.default_rng([seed, 2])
-        search = make_filter(settings or FilterSettings(), FLOOR, generator_of_filter)
+    search = make_filter(settings or FilterSettings(), FLOOR, np.random.default_rng([seed, 2]))
     path = []
     for row, y in enumerate(np.arange(-0.15, 2.41, 0.3)):
         line = np.arange(-0.3, 2.41, 0.1)
         path += [(x, y) for x in (line if row % 2 == 0 else line[::-1])]
-    error = np.zeros(2)
     for step, (x, y) in enumerate(path + path[::-1]):
-        error = 0.95 * error + pose_error * np.sqrt(1 - 0.95**2) * generator.standard_normal(2)
-        true_pose = Pose([x, y, 1.0])
-        pose = Pose([x + error[0], y + error[1], 1.0])
-        seen = targets[true_view.probability(targets, true_pose) > 0.0]
-        covariances = None
-        if camera:
-            deviation = 0.005
-            placed = seen + error + deviation * generator.standard_normal(seen.shape)
-            values = sensor.measurement.measure(placed, pose)
-            jacobian = sensor.measurement.jacobian(placed, pose)
-            covariances = deviation**2 * np.einsum('nij,nkj->nik', jacobian, jacobian)
-        else:
-            values = sensor.measurement.measure(seen, true_pose)
-            values += generator.standard_normal(values.shape) * [0.016, 0.052]
-            values[:, 1] = wrap_angle(values[:, 1])
-        search.step(
-            [AgentMeasurement('mambo', pose, sensor, values, covariances, step)], 1, float(step)
-        )
+        pose = Pose([x, y, 1.0])
+        seen = targets[true_view.probability(targets, pose) > 0.0]
+        values = sensor.measurement.measure(seen, pose)
+        values += generator.standard_normal(values.shape) * [0.016, 0.052]
+        values[:, 1] = wrap_angle(values[:, 1])
+        search.step([AgentMeasurement('mambo', pose, sensor, values, None, step)], 1, float(step))
     return search, targets

@@ -8,7 +8,6 @@ from searches import (
     CUBE,
     FLOOR,
     FLOOR_LENGTHS,
-    RADIANS,
     cube_sensor,
     floor_sensor,
     mow_floor,
@@ -37,17 +36,6 @@ def cube_search(seed=0, **options):
 def drone(values, position=(100.0, 100.0, 100.0), name='drone', sensor=None, **options):
     return AgentMeasurement(
         name, Pose(np.array(position)), sensor or cube_sensor(), np.array(values), **options
-    )
-
-
-def state(search):
-    """Return everything a step may change, as bytes."""
-    return (
-        search.particles.tobytes(),
-        search.weights.tobytes(),
-        [(t.id, t.position.tobytes(), t.covariance.tobytes()) for t in search.found_targets],
-        search.exploration.values.tobytes(),
-        str(search.generator.bit_generator.state),
     )
 
 
@@ -86,40 +74,6 @@ def test_targets_in_the_cube_are_found():
     assert false_found <= 2
 
 
-def test_robots_are_processed_by_name_whatever_their_order():
-    generator = np.random.default_rng(3)
-    targets = generator.uniform(80.0, 180.0, (6, 3))
-    poses = flight(generator, 15, robots=3)
-    sensors = [cube_sensor(), cube_sensor(RADIANS), cube_sensor()]
-    searches = [cube_search(5), cube_search(5)]
-    for step, row in enumerate(poses):
-        members = [
-            drone(observe(generator, sensors[r], targets, Pose(p)), p, f'robot_{r}', sensors[r])
-            for r, p in enumerate(row)
-        ]
-        searches[0].step(members, 1, float(step))
-        searches[1].step(members[::-1], 1, float(step))
-    assert state(searches[0]) == state(searches[1])
-    assert len(searches[0].found_targets) >= 4
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.permutations(range(5)), st.integers(0, 1000))
-def test_the_order_of_detections_is_irrelevant_to_the_bit(order, seed):
-    generator = np.random.default_rng(seed)
-    values = cube_sensor().measurement.measure(
-        generator.uniform(60.0, 140.0, (5, 3)), Pose([100.0, 100.0, 100.0])
-    )
-    covariances = cube_sensor().covariance * (1.0 + generator.random((5, 1, 1)))
-    searches = [cube_search(2), cube_search(2)]
-    for index in (np.arange(5), np.array(order)):
-        search = searches.pop()
-        for step in range(3):
-            search.step([drone(values[index], covariances=covariances[index])], 1, float(step))
-        searches.insert(0, search)
-    assert state(searches[0]) == state(searches[1])
-
-
 def test_threads_change_nothing():
     generator = np.random.default_rng(4)
     targets = generator.uniform(80.0, 180.0, (4, 3))
@@ -129,8 +83,9 @@ def test_threads_change_nothing():
         search = cube_search(3, threads=threads, particles=150_000, particles_per_target=150_000)
         visit(search, targets, poses, np.random.default_rng(0))
         assert len(search.particles) > 70_000
-        outcome.append(state(search))
-    assert outcome[0] == outcome[1]
+        outcome.append(search)
+    np.testing.assert_array_equal(outcome[0].particles, outcome[1].particles)
+    np.testing.assert_array_equal(outcome[0].weights, outcome[1].weights)
 
 
 def test_seeing_nothing_lowers_mass_and_exploration_by_what_was_missed():
@@ -196,23 +151,12 @@ def test_detections_that_nothing_explains_are_counted():
 
 def test_a_target_right_below_the_robot_is_found():
     generator = np.random.default_rng(0)
-    for camera in (False, True):
-        search = IcPhdFilter(FilterSettings(), FLOOR, np.random.default_rng(1))
-        sensor = floor_sensor()
-        target = np.array([[1.0, 1.0]])
-        for step in range(5):
-            pose = Pose([1.0, 1.0, 1.0])
-            if camera:
-                placed = target + 0.005 * generator.standard_normal((1, 2))
-                values = sensor.measurement.measure(placed, pose)
-                jacobian = sensor.measurement.jacobian(placed, pose)
-                covariances = 0.005**2 * np.einsum('nij,nkj->nik', jacobian, jacobian)
-            else:
-                values = np.array([[0.016 * generator.standard_normal(), 3.0]])
-                covariances = None
-            search.step([AgentMeasurement('mambo', pose, sensor, values, covariances)], 1, step)
-        assert len(search.found_targets) == 1
-        np.testing.assert_allclose(search.found_targets[0].position, target[0], atol=0.02)
+    search = IcPhdFilter(FilterSettings(), FLOOR, np.random.default_rng(1))
+    for step in range(5):
+        values = np.array([[0.016 * generator.standard_normal(), 3.0]])
+        search.step([drone(values, [1.0, 1.0, 1.0], sensor=floor_sensor())], 1, step)
+    assert len(search.found_targets) == 1
+    np.testing.assert_allclose(search.found_targets[0].position, [1.0, 1.0], atol=0.02)
 
 
 def test_bad_sensors_are_refused():
@@ -221,22 +165,6 @@ def test_bad_sensors_are_refused():
         Sensor('bad', good.detection, good.measurement, np.zeros((3, 3)))
     with pytest.raises(ValueError, match='clutter'):
         Sensor('bad', good.detection, good.measurement, np.eye(3), clutter=np.nan)
-
-
-def test_no_particles_are_a_state_like_any_other():
-    search = cube_search()
-    result = search.step([drone(np.empty((0, 3)))], 1, 0.0)
-    assert (result.clusters, result.expected_number) == ([], 0.0)
-    later = search.step([drone([[20.0, 0.3, 0.1]])], 1, 1.0)
-    # The floor of the clutter has its share.
-    assert later.expected_number == pytest.approx(1.0, abs=0.05)
-
-
-def test_clutter_shares_a_detection():
-    sensor = cube_sensor()
-    sensor.clutter = 1e6
-    result = cube_search().step([drone([[20.0, 0.3, 0.1]], sensor=sensor)], 1, 0.0)
-    assert result.expected_number < 1e-3
 
 
 @pytest.mark.parametrize('preset', ['paper_000', 'paper_001', 'paper_002', 'paper_003'])

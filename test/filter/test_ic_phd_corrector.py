@@ -1,12 +1,9 @@
-"""The PHD corrector against its equations, summed densely, and against Stone Soup."""
+"""The PHD corrector against its equations, summed densely."""
 
 from __future__ import annotations
 
-import datetime
-
 import numpy as np
 import pytest
-from scipy.special import logsumexp
 from searches import log_density
 
 from maasi_filter import (
@@ -79,83 +76,6 @@ def test_no_particles_leave_a_detection_to_the_background():
     factor, normaliser = phd_correct(positions[:0], weights[:0], scan, background)
     assert factor.shape == (0,)
     np.testing.assert_array_equal(normaliser, background)
-
-
-def test_weights_equal_stone_soups():
-    from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
-    from stonesoup.types.angle import Bearing, Elevation
-    from stonesoup.types.array import CovarianceMatrix, StateVector, StateVectors
-    from stonesoup.types.detection import Detection
-    from stonesoup.types.hypothesis import SingleHypothesis
-    from stonesoup.types.multihypothesis import MultipleHypothesis
-    from stonesoup.types.numeric import Probability
-    from stonesoup.types.prediction import ParticleStatePrediction
-    from stonesoup.updater.particle import SMCPHDUpdater
-
-    class Noiseless(CartesianToElevationBearingRange):
-        """Release 1.9.1 adds random noise to what it predicts before it evaluates the density."""
-
-        def logpdf(self, state1, state2, **options):
-            return super().logpdf(state1, state2, noise=False)
-
-    _, _, positions, weights, _, _ = case(3)
-    # From far below no elevations are a right angle apart, where Stone Soup wraps them.
-    pose = Pose([0.0, 0.0, -40.0])
-    now = datetime.datetime(2024, 1, 1)
-    clutter = 1e-3
-    # Stone Soup has a constant probability of detection, and no heading of the sensor.
-    flat = SensorSettings(
-        detection=DetectionSettings(
-            kind='box', probability=0.85, lower=[-1e3] * 2, upper=[1e3] * 2
-        ),
-        noise=NoiseSettings(range=1.0, bearing=0.2, elevation=0.3),
-    ).build('any', 3)
-    values = flat.measurement.measure(positions[:5], pose) + 0.05
-    model = Noiseless(
-        3,
-        (0, 1, 2),
-        CovarianceMatrix(np.diag([0.3, 0.2, 1.0]) ** 2),
-        translation_offset=StateVector(pose.position),
-    )
-    prediction = ParticleStatePrediction(
-        state_vector=StateVectors(positions.T), weight=weights, timestamp=now
-    )
-    hypotheses = MultipleHypothesis(
-        [
-            SingleHypothesis(
-                prediction,
-                Detection(
-                    StateVector([Elevation(z[2]), Bearing(z[1]), z[0]]),
-                    timestamp=now,
-                    measurement_model=model,
-                ),
-            )
-            for z in values
-        ]
-    )
-    updater = SMCPHDUpdater(
-        measurement_model=model,
-        prob_detect=Probability(0.85),
-        clutter_intensity=clutter,
-        resampler=None,
-    )
-    theirs = logsumexp(updater.get_log_weights_per_hypothesis(hypotheses).astype(float), axis=1)
-    scan = make_scan(values, flat, pose)
-    factor, _ = phd_correct(positions, weights, scan, np.full(5, clutter))
-    np.testing.assert_allclose(weights * factor, np.exp(theirs), rtol=1e-8)
-
-
-def test_mass_of_a_target_tends_to_one_over_pi():
-    """Detected at rate pi, a mass m becomes (1 - pi) m + pi on average: 1 / pi in the end."""
-    sensor = sensor_of(2, np.random.default_rng(0))
-    position, pose = np.array([[5.0, 5.0]]), Pose([4.0, 4.0, 0.0])
-    probability = float(sensor.detection.probability(position, pose)[0])
-    scan = make_scan(sensor.measurement.measure(position, pose), sensor, pose)
-    factor, _ = phd_correct(position, np.ones(1), scan, np.full(1, 1e-300))
-    mass = 0.0
-    for _ in range(200):
-        mass = (1.0 - probability) * mass + probability * (factor[0] - (1.0 - probability))
-    assert mass == pytest.approx(1.0)
 
 
 # Two robots, births included.

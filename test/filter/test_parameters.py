@@ -42,23 +42,14 @@ def test_every_field_is_a_parameter_with_a_description():
     assert fields['filter.found_mass'].default is None
 
 
-def test_bounds_are_read_as_strings_of_numbers_too():
-    settings = FilterNodeSettings.model_validate(CONTENT)
-    flat = {**flatten(settings), 'environment.bounds': ['-0.3 2.4', '0.0 2.0']}
-    assert FilterNodeSettings.model_validate(unflatten(FilterNodeSettings, flat)) == settings
-
-
-def test_bounds_of_a_wrong_number_are_named():
+@pytest.mark.parametrize(
+    ('bounds', 'problem'),
+    [([0.0, 2.0, 0.0], 'got 3 numbers, .* of 2'), (['zero one'], ".*'zero one'")],
+)
+def test_bounds_that_are_none_are_named(bounds, problem):
     flat = flatten(FilterNodeSettings.model_validate(CONTENT))
-    flat['environment.bounds'] = [0.0, 2.0, 0.0]
-    with pytest.raises(ValueError, match=r'environment\.bounds: got 3 numbers, .* of 2'):
-        unflatten(FilterNodeSettings, flat)
-
-
-def test_a_list_that_is_no_numbers_is_named():
-    flat = flatten(FilterNodeSettings.model_validate(CONTENT))
-    flat['environment.bounds'] = ['zero one']
-    with pytest.raises(ValueError, match=r'environment\.bounds.*zero one'):
+    flat['environment.bounds'] = bounds
+    with pytest.raises(ValueError, match=rf'environment\.bounds: {problem}'):
         unflatten(FilterNodeSettings, flat)
 
 

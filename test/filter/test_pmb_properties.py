@@ -8,12 +8,10 @@ from searches import CUBE, cube_sensor, observe, same, wander
 from maasi_filter import (
     AgentMeasurement,
     FilterSettings,
-    FoundTarget,
     Pose,
     wrap_angle,
 )
-from maasi_filter.ic_phd.filter import IcPhdFilter
-from maasi_filter.make_filter import load_filter, make_filter
+from maasi_filter.make_filter import make_filter
 from maasi_filter.metrics import match_targets
 from maasi_filter.pmb.filter import PmbFilter
 from maasi_filter.state_file import pack
@@ -47,9 +45,12 @@ def play(search, measurements, first=0):
     return search
 
 
-def test_order_of_detections_and_of_robots_does_not_matter():
-    one = play(plane_filter(particles=200), scans(1))
-    other = play(plane_filter(particles=200), scans(1, order=np.random.default_rng(5)))
+@pytest.mark.parametrize('method', ['pmb', 'ic_phd'])
+def test_order_of_detections_and_of_robots_does_not_matter(method):
+    settings = FilterSettings(method=method)
+    one, other = (make_filter(settings, PLANE, np.random.default_rng(0)) for _ in range(2))
+    play(one, scans(1))
+    play(other, scans(1, order=np.random.default_rng(5)))
     same(one, other)
     first, second = scans(2, number=2)
     one.step([first, second], 1, 99.0)
@@ -105,23 +106,6 @@ def test_numbers_are_finite_and_not_negative(seed):
         assert len(search.particles) == len(weights)
 
 
-def test_repeatable_to_the_bit():
-    same(play(plane_filter(particles=200), scans(4)), play(plane_filter(particles=200), scans(4)))
-
-
-def test_method_is_chosen_by_the_settings(tmp_path):
-    generator = np.random.default_rng(0)
-    assert isinstance(make_filter(FilterSettings(), PLANE, generator), IcPhdFilter)
-    phd = make_filter(FilterSettings(method='ic_phd'), PLANE, generator)
-    assert isinstance(make_filter(FilterSettings(method='pmb'), PLANE, generator), PmbFilter)
-    phd.save(tmp_path / 'state')
-    assert isinstance(load_filter(tmp_path / 'state'), IcPhdFilter)
-    with pytest.raises(ValueError, match='method'):
-        FilterSettings(method='phd')
-    with pytest.raises(ValueError, match='particles'):
-        FilterSettings(pmb={'particles': 3})
-
-
 @pytest.mark.parametrize('method', ['pmb', 'ic_phd'])
 @pytest.mark.parametrize(
     ('change', 'text'),
@@ -165,36 +149,6 @@ def test_detections_that_nothing_explains_are_counted():
     sensor.maximum_range = 90.0
     result = search.step([measured(sensor, (10.0, 10.0), [[95.0, 0.3], [80.0, -2.0]])], 1, 0.0)
     assert result.dropped == {'range': 1, 'outside': 1}
-
-
-def test_what_another_filter_found_is_taken_over():
-    search = play(plane_filter(particles=200), scans(3, number=20))
-    own = search.found_targets[0]
-    far = FoundTarget(4, np.array([5.0, 90.0]), 0.1 * np.eye(2), 'x', 2, 1.0)
-    assert search.take_over('x', [far])
-    assert not search.take_over('x', [far])
-    (taken,) = [item for item in search.found_targets if item.origin]
-    assert (taken.robot, taken.origin) == ('x', 4)
-    assert taken.id not in [item.id for item in search.own_found_targets()]
-    moved = FoundTarget(4, np.array([5.5, 90.0]), 0.1 * np.eye(2), 'x', 2, 1.0)
-    assert search.take_over('x', [moved])
-    (taken,) = [item for item in search.found_targets if item.origin]
-    np.testing.assert_array_equal(taken.position, moved.position)
-    # Who was first keeps a target that both have found.
-    later = FoundTarget(5, own.position, own.covariance, 'x', 2, own.time + 1.0)
-    assert not search.take_over('x', [moved, later])
-    earlier = FoundTarget(5, own.position, own.covariance, 'x', 2, own.time - 1.0)
-    assert search.take_over('x', [moved, earlier])
-    assert own.id not in [item.id for item in search.own_found_targets()]
-    with pytest.raises(ValueError, match='dimensions'):
-        search.take_over('x', [FoundTarget(9, np.zeros(3), np.eye(3), 'x', 0, 0.0)])
-    # Its detections make nothing new.
-    sensor = plane_sensor(range_noise=0.3, bearing=0.01)
-    before = len(search.found_targets)
-    for step in range(20, 25):
-        values = sensor.measurement.measure(np.array([[5.5, 90.0]]), Pose([30.0, 80.0, 0.0]))
-        search.step([measured(sensor, (30.0, 80.0), values, step)], 1, float(step))
-    assert len(search.found_targets) == before
 
 
 def test_what_was_found_before_a_restart_is_kept():

@@ -55,7 +55,16 @@ class ParameterField:
     @property
     def constraints(self) -> str:
         """What is allowed, in words."""
-        return constraints(self.info)
+        words = {'ge': 'at least', 'gt': 'above', 'le': 'at most', 'lt': 'below'}
+        limits = {key: self.bound(key) for key in words}
+        parts = [f'{words[key]} {limit}' for key, limit in limits.items() if limit is not None]
+        for part in (self.info.annotation, *get_args(self.info.annotation)):
+            if get_origin(part) is Literal:
+                parts.append('one of ' + ', '.join(str(item) for item in get_args(part)))
+        for item in self.info.metadata:
+            if isinstance(item, PluginGroup):
+                parts.append(f'one of {", ".join(item.names())}, or module:Class')
+        return ' and '.join(parts)
 
     @property
     def number(self) -> type | None:
@@ -63,10 +72,10 @@ class ParameterField:
         kinds = [item for item in choices(self.info.annotation) if item is not type(None)]
         return kinds[0] if len(kinds) == 1 and kinds[0] in (int, float) else None
 
-    def bound(self, *kinds: str) -> float | None:
-        """Return the first bound of these kinds, such as 'ge'."""
+    def bound(self, *kinds: str) -> Any:
+        """Return the first bound of these kinds, such as 'ge', or None."""
         found = (getattr(item, kind, None) for item in self.info.metadata for kind in kinds)
-        return next((float(value) for value in found if value is not None), None)
+        return next((value for value in found if value is not None), None)
 
 
 def parameter_fields(model: type[BaseModel], given: Mapping[str, Any]) -> Iterator[ParameterField]:
@@ -86,7 +95,7 @@ def _walk(
         if by_name is not None:
             yield ParameterField(full, place, info)
             for item in given.get(full) or []:
-                inner = f'{prefix}{_singular(name)}.{item}'
+                inner = f'{_robot(full)}.{item}'
                 yield ParameterField(inner, (*place, item), info, part=True)
                 yield from _walk(by_name, given, f'{inner}.', (*place, item))
         elif nested is None:
@@ -112,7 +121,7 @@ def flatten(settings: BaseModel, prefix: str = '') -> dict[str, ParameterValue]:
             if value:
                 flat[key] = sorted(value)
             for item in sorted(value):
-                flat.update(flatten(value[item], f'{prefix}{_singular(name)}.{item}.'))
+                flat.update(flatten(value[item], f'{_robot(key)}.{item}.'))
         elif not isinstance(value, (list, tuple)):
             flat[key] = value
         elif len(value):
@@ -152,24 +161,6 @@ def parameter_name(
     return max(found, key=lambda item: len(item.keys)).name if found else '.'.join(keys)
 
 
-def constraints(info: FieldInfo) -> str:
-    """Return in words what a field allows."""
-    words = {'gt': 'above', 'ge': 'at least', 'lt': 'below', 'le': 'at most'}
-    parts = [
-        f'{words[key]} {getattr(item, key)}'
-        for item in info.metadata
-        for key in words
-        if getattr(item, key, None) is not None
-    ]
-    for part in (info.annotation, *get_args(info.annotation)):
-        if get_origin(part) is Literal:
-            parts.append('one of ' + ', '.join(str(item) for item in get_args(part)))
-    for item in info.metadata:
-        if isinstance(item, PluginGroup):
-            parts.append(f'one of {", ".join(item.names())}, or module:Class')
-    return ' and '.join(parts)
-
-
 # Lists.
 
 
@@ -202,90 +193,84 @@ def _from_list(key: str, value: Sequence[Any], annotation: Any) -> list[Any]:
 
 
 def _from_text(key: str, item: Any, annotation: Any) -> Any:
-    elements = [get_args(kind)[0] for kind in choices(annotation) if get_origin(kind) is list]
-    element = _bare(elements[0]) if elements else str
-    if not isinstance(item, str) or element is str or get_origin(element) is Literal:
+    element = _element(annotation)
+    model = _nested(element)
+    if not isinstance(item, str) or (model is None and _element(element) is None):
         return item
     try:
         numbers = [float(word) for word in item.split()]
     except ValueError as error:
         raise ValueError(f'{key}: got {item!r}, allowed are numbers with spaces between') from error
-    if isinstance(element, type) and issubclass(element, BaseModel):
-        # All but the last number belong to the list, such as the centre of an obstacle.
-        names = list(element.model_fields)
-        return {names[0]: numbers[:-1], names[1]: numbers[-1] if numbers else None}
-    return numbers
+    if model is None:
+        return numbers
+    # All but the last number belong to the list, such as the centre of an obstacle.
+    names = list(model.model_fields)
+    return {names[0]: numbers[:-1], names[1]: numbers[-1] if numbers else None}
 
 
 # Types of fields.
 
 
-def _bare(annotation: Any) -> Any:
-    while get_origin(annotation) is Annotated:
-        annotation = get_args(annotation)[0]
-    return annotation
-
-
 def choices(annotation: Any) -> list[Any]:
     """Return the types of an annotation: the members of a union, without metadata."""
-    annotation = _bare(annotation)
+    while get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
     if get_origin(annotation) in (Union, types.UnionType):
         return [inner for item in get_args(annotation) for inner in choices(item)]
     return [annotation]
 
 
+def _argument(annotation: Any, kind: type) -> Any:
+    """Return the type of the elements of a list, or of the values of a dictionary, or None."""
+    found = [get_args(item)[-1] for item in choices(annotation) if get_origin(item) is kind]
+    return found[0] if found else None
+
+
+def _element(annotation: Any) -> Any:
+    return _argument(annotation, list)
+
+
 def _width(annotation: Any) -> int | None:
     """Return the length of the lists in a list, if it is fixed."""
-    for choice in choices(annotation):
-        element = get_args(choice)[0] if get_origin(choice) is list else None
-        limits = [item for item in get_args(element)[1:] if isinstance(item, FieldInfo)]
-        lengths = [
-            getattr(part, kind)
-            for item in limits
-            for part in item.metadata
-            for kind in ('min_length', 'max_length')
-            if hasattr(part, kind)
-        ]
-        if get_origin(_bare(element)) is list and len(lengths) == 2 and lengths[0] == lengths[1]:
-            return int(lengths[0])
-    return None
+    element = _element(annotation)
+    if _element(element) is None:
+        return None
+    parts = FieldInfo.from_annotation(element).metadata
+    lengths = [getattr(part, 'min_length', getattr(part, 'max_length', None)) for part in parts]
+    return lengths[0] if len(lengths) == 2 and lengths[0] == lengths[1] else None
+
+
+def _robot(robots: str) -> str:
+    """Return the prefix of the parameters of one item of a table."""
+    return robots.removesuffix('s')
 
 
 def _nested(annotation: Any) -> type[BaseModel] | None:
-    for choice in choices(annotation):
-        if isinstance(choice, type) and issubclass(choice, BaseModel):
-            return choice
-    return None
+    models = [item for item in choices(annotation) if inspect.isclass(item)]
+    return next((item for item in models if issubclass(item, BaseModel)), None)
 
 
 def _model_by_name(annotation: Any) -> type[BaseModel] | None:
-    for choice in choices(annotation):
-        if get_origin(choice) is dict:
-            return _nested(get_args(choice)[1])
-    return None
-
-
-def _singular(name: str) -> str:
-    return name.removesuffix('s')
+    return _nested(_argument(annotation, dict))
 
 
 # Help.
 
 
-def parameters_of(model: type[BaseModel]) -> Iterator[ParameterField]:
-    """Yield the parameters of a node's settings; those of each robot as of one named NAME."""
-    tables = [item for item in _walk(model, {}) if _model_by_name(item.info.annotation) is not None]
+def parameters_of(node: type) -> Iterator[ParameterField]:
+    """Yield the parameters of a class of nodes; those of each robot as of one named NAME.
+
+    Its settings are the type argument of one of its bases.
+    """
+    model = next(
+        argument
+        for kind in node.__mro__
+        for base in kind.__dict__.get('__orig_bases__', ())
+        for argument in get_args(base)
+        if inspect.isclass(argument) and issubclass(argument, BaseModel)
+    )
+    tables = [item for item in _walk(model, {}) if _model_by_name(item.info.annotation)]
     return parameter_fields(model, {item.name: ['NAME'] for item in tables})
-
-
-def settings_of(node: type) -> type[BaseModel]:
-    """Return the settings of a class of nodes: the type argument of their base."""
-    for kind in node.__mro__:
-        for base in kind.__dict__.get('__orig_bases__', ()):
-            for argument in get_args(base):
-                if inspect.isclass(argument) and issubclass(argument, BaseModel):
-                    return argument
-    raise TypeError(f'{node.__name__}: has no settings')
 
 
 def node_help(node: type, name: str, base: type) -> str:
@@ -300,7 +285,7 @@ def node_help(node: type, name: str, base: type) -> str:
         doc = inspect.cleandoc(kind.__dict__.get('__doc__') or '')
         # Without the sections for who writes code.
         text.append(re.split(r'\n(?:Parameters|Attributes)\n-+\n', doc)[0].strip())
-    rows = [_row(item) for item in parameters_of(settings_of(node))]
+    rows = [_row(item) for item in parameters_of(node)]
     text.append('\n'.join(['ROS parameters', '--------------', *rows]))
     text.append('Exit codes: 0 ended, 1 failed, 2 wrong parameters.')
     return '\n\n'.join(filter(None, text))
