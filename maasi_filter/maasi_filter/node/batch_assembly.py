@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -127,20 +126,20 @@ class BatchAssembly:
         number = int(message.batch_id)
         problem = self._problem(name, message)
         pending = self.pending.get(number)
-        expected = pending is not None and name in pending.missing
-        problem = problem or self._stamp_problem(name, message, pending if expected else None)
+        expected = pending if pending is not None and name in pending.missing else None
+        problem = problem or self._stamp_problem(name, message, expected)
         if problem is not None:
             node.drop('bad detections', f'{name}/detections.{problem}')
-            if pending is not None and expected:
-                pending.failed.add(name)
+            if expected is not None:
+                expected.failed.add(name)
             return None
         key = (number, int(message.measurement), stamp_from_ros(message.header.stamp))
         if self.heard.get(name) == key:
             # Duplicate: drivers also republish.
             return None
         self.heard[name] = key
-        if pending is not None and expected:
-            self._take(pending, message)
+        if expected is not None:
+            self._take(expected, message)
         elif number > self.last and pending is None:
             # Its batch has not arrived yet.
             self._early[(number, name)] = message
@@ -191,13 +190,6 @@ class BatchAssembly:
             )
         if message.measurement > batch_id_limit(0):
             return f'measurement: read {message.measurement}, allowed is up to {batch_id_limit(0)}'
-        pose = message.pose.pose
-        numbers = (
-            *(pose.position.x, pose.position.y, pose.position.z),
-            *(pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w),
-        )
-        if not all(math.isfinite(number) for number in numbers):
-            return f'pose: read {numbers}, allowed are finite numbers'
         return None
 
     def _stamp_problem(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import traceback
 from collections import Counter
@@ -101,7 +102,9 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self.step = -1
         self._warned: dict[str, float] = {}
         self._peers: list[Callable[[], bool]] = []
-        self._timers_of_start: dict[str, Any] = {}
+        self._peers_timer: Any = None
+        # When to say what nobody publishes [s of wall time].
+        self._notice_at = math.inf
         self.step_subscription: Subscription | None = None
         self._ready_publisher: Publisher | None = None
         self._done_publisher: Publisher | None = None
@@ -191,10 +194,8 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         """Start operation."""
         self.active = True
         self.start()
-        self._timers_of_start = {
-            'peers': self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers),
-            'notice': self.create_wall_timer(_NOTICE_DELAY, self._say_what_is_missing),
-        }
+        self._peers_timer = self.create_wall_timer(_PEERS_PERIOD, self._look_for_peers)
+        self._notice_at = time.monotonic() + _NOTICE_DELAY
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -225,14 +226,14 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         if self.configured:
             self.halt()
         self.active = False
-        self._end_timer('peers')
-        self._end_timer('notice')
+        self._notice_at = math.inf
+        self._end_peers_timer()
 
-    def _end_timer(self, name: str) -> None:
-        timer = self._timers_of_start.pop(name, None)
-        if timer is not None:
-            timer.cancel()
-            self.destroy_timer(timer)
+    def _end_peers_timer(self) -> None:
+        if self._peers_timer is not None:
+            self._peers_timer.cancel()
+            self.destroy_timer(self._peers_timer)
+            self._peers_timer = None
 
     def _disconnect(self) -> None:
         self.active = False
@@ -247,7 +248,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
         self._peers.clear()
         self._entities_made.clear()
         self._ready_publisher = self._done_publisher = self.step_subscription = None
-        self._timers_of_start.clear()
+        self._peers_timer = None
         self._parameters_read.release()
 
     def permanent(self, key: Hashable, make: Callable[[], T]) -> T:
@@ -299,19 +300,20 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
     def _look_for_peers(self) -> None:
         if not self.active or not all(condition() for condition in self._peers):
             return
-        self._end_timer('peers')
+        self._end_peers_timer()
         self.on_ready()
         if self._ready_publisher is not None:
             self._ready_publisher.publish(LockstepDone(node=self.get_fully_qualified_name()))
 
     def _say_what_is_missing(self) -> None:
         """Name, once after activation, the topics that nobody publishes."""
-        self._end_timer('notice')
-        missing = unpublished_topics(self)
-        if not self.active or not missing:
+        if time.monotonic() < self._notice_at:
             return
-        self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
-        if fault := loopback_fault():
+        self._notice_at = math.inf
+        missing = unpublished_topics(self)
+        if missing:
+            self.get_logger().info(f'active, waiting for publishers of {", ".join(missing)}')
+        if missing and (fault := loopback_fault()):
             self.get_logger().warning(fault)
 
     def on_ready(self) -> None:
@@ -458,6 +460,7 @@ class LockstepLifecycleNode(LifecycleNode, Generic[SettingsT]):
 
     def _publish_diagnostics(self) -> None:
         self._clock_watch.look()
+        self._say_what_is_missing()
         fault = self.fault() if self.active else ''
         warnings = [*(self.warnings() if self.active else []), *self._unconnected.look()]
         if sum(self.dropped.values()):
