@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,6 +20,8 @@ from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.settings import Obstacle
 
 CORNERS = 12
+
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -66,281 +69,217 @@ class Obstacles:
         return np.sqrt((offset * offset).sum(axis=1)) - self.radii
 
 
-@njit(cache=True)
-def segment_distance(
-    px: float, py: float, pz: float, qx: float, qy: float, qz: float, circle: FloatArray
-) -> float:
-    """Return the distance of the centre of `circle` (x, y, z, radius, sphere) from a segment."""
-    flat = 1.0 if circle[4] > 0.5 else 0.0
-    dx = qx - px
-    dy = qy - py
-    dz = (qz - pz) * flat
-    ox = circle[0] - px
-    oy = circle[1] - py
-    oz = (circle[2] - pz) * flat
-    square = dx * dx + dy * dy + dz * dz
-    part = 0.0
-    if square > 0.0:
-        part = min(max((ox * dx + oy * dy + oz * dz) / square, 0.0), 1.0)
-    ox -= part * dx
-    oy -= part * dy
-    oz -= part * dz
-    return math.sqrt(ox * ox + oy * oy + oz * oz)
+class Surroundings(NamedTuple):
+    """Obstacles of a robot, inflated by its radius.
+
+    circles (n, 5): x, y, z, radius [m, map], 1 for a sphere; vertices (m, 2): of the visibility
+    graph [m, map]; clearance: kept beyond the radius by planned ways [m].
+    """
+
+    circles: FloatArray
+    vertices: FloatArray
+    clearance: float
+
+
+@njit(cache=True, forceinline=True)
+def minus(a: Vector, b: Vector) -> Vector:
+    """Return a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True, forceinline=True)
+def plus(a: Vector, factor: float, b: Vector) -> Vector:
+    """Return a + factor b."""
+    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
+
+
+@njit(cache=True, forceinline=True)
+def dot(a: Vector, b: Vector) -> float:
+    """Return the inner product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, forceinline=True)
+def norm(a: Vector) -> float:
+    """Return the length."""
+    return math.sqrt(dot(a, a))
+
+
+# Inlined: counting references to array arguments costs more than these functions themselves.
+@njit(cache=True, forceinline=True)
+def from_centre(point: Vector, circles: FloatArray, i: int) -> Vector:
+    """Return the offset of a point from the centre of a circle, level for a cylinder."""
+    height = point[2] - circles[i, 2] if circles[i, 4] > 0.5 else 0.0
+    return point[0] - circles[i, 0], point[1] - circles[i, 1], height
+
+
+@njit(cache=True, forceinline=True)
+def segment_distance(start: Vector, end: Vector, circles: FloatArray, i: int) -> float:
+    """Return the distance of the centre of a circle from a segment."""
+    way = minus(end, start)
+    if circles[i, 4] <= 0.5:
+        way = (way[0], way[1], 0.0)
+    offset = from_centre(start, circles, i)
+    square = dot(way, way)
+    part = min(max(-dot(offset, way) / square, 0.0), 1.0) if square > 0.0 else 0.0
+    return norm(plus(offset, part, way))
 
 
 @njit(cache=True)
 def is_clear(
-    px: float,
-    py: float,
-    pz: float,
-    qx: float,
-    qy: float,
-    qz: float,
-    circles: FloatArray,
-    extra: float,
-    cylinders_only: bool,
+    start: Vector, end: Vector, circles: FloatArray, extra: float, cylinders_only: bool
 ) -> bool:
     """Return whether a segment keeps `extra` beyond the radius from every circle."""
     for i in range(circles.shape[0]):
         if cylinders_only and circles[i, 4] > 0.5:
             continue
-        if segment_distance(px, py, pz, qx, qy, qz, circles[i]) < circles[i, 3] + extra:
+        if segment_distance(start, end, circles, i) < circles[i, 3] + extra:
             return False
     return True
 
 
 @njit(cache=True)
 def _all_pairs(vertices: FloatArray, circles: FloatArray, extra: float) -> FloatArray:
+    """Return the lengths of the shortest clear ways between vertices, or inf (Floyd, Warshall)."""
     number = vertices.shape[0]
     distance = np.full((number, number), np.inf)
     for i in range(number):
         distance[i, i] = 0.0
         for j in range(i):
-            if is_clear(
-                vertices[i, 0],
-                vertices[i, 1],
-                0.0,
-                vertices[j, 0],
-                vertices[j, 1],
-                0.0,
-                circles,
-                extra,
-                True,
-            ):
-                length = math.hypot(
-                    vertices[i, 0] - vertices[j, 0], vertices[i, 1] - vertices[j, 1]
-                )
-                distance[i, j] = length
-                distance[j, i] = length
+            a, b = (vertices[i, 0], vertices[i, 1], 0.0), (vertices[j, 0], vertices[j, 1], 0.0)
+            if is_clear(a, b, circles, extra, True):
+                distance[i, j] = distance[j, i] = math.hypot(a[0] - b[0], a[1] - b[1])
     for k in range(number):
         for i in range(number):
-            through = distance[i, k]
-            if through < np.inf:
+            if distance[i, k] < np.inf:
                 for j in range(number):
-                    total = through + distance[k, j]
-                    if total < distance[i, j]:
-                        distance[i, j] = total
+                    distance[i, j] = min(distance[i, j], distance[i, k] + distance[k, j])
     return distance
 
 
 @njit(cache=True)
-def goal_distances(
-    goal: FloatArray, circles: FloatArray, vertices: FloatArray, pairs: FloatArray
+def _goal_distances(
+    goal: Vector, circles: FloatArray, vertices: FloatArray, pairs: FloatArray
 ) -> FloatArray:
     """Return the length of the shortest clear way from each vertex to `goal`, (m,), or inf."""
-    number = vertices.shape[0]
-    out = np.full(number, np.inf)
-    for j in range(number):
-        if is_clear(vertices[j, 0], vertices[j, 1], 0.0, goal[0], goal[1], 0.0, circles, 0.0, True):
-            last = math.hypot(vertices[j, 0] - goal[0], vertices[j, 1] - goal[1])
-            for i in range(number):
-                total = pairs[i, j] + last
-                if total < out[i]:
-                    out[i] = total
+    out = np.full(vertices.shape[0], np.inf)
+    for j in range(vertices.shape[0]):
+        vertex = (vertices[j, 0], vertices[j, 1], 0.0)
+        if is_clear(vertex, (goal[0], goal[1], 0.0), circles, 0.0, True):
+            last = math.hypot(vertex[0] - goal[0], vertex[1] - goal[1])
+            for i in range(out.shape[0]):
+                out[i] = min(out[i], pairs[i, j] + last)
     return out
-
-
-# Inlined: counting references to array arguments costs more than these functions themselves.
-@njit(cache=True, forceinline=True)
-def _leave_circle(
-    position: FloatArray, goal: FloatArray, circles: FloatArray, clearance: float, out: FloatArray
-) -> bool:
-    """Write the way out of the first circle that the position is in; return whether there is one.
-
-    A robot can be in one if it was pushed.
-    """
-    for i in range(circles.shape[0]):
-        sphere = circles[i, 4] > 0.5
-        ox = position[0] - circles[i, 0]
-        oy = position[1] - circles[i, 1]
-        oz = (position[2] - circles[i, 2]) if sphere else 0.0
-        distance = math.sqrt(ox * ox + oy * oy + oz * oz)
-        if distance < circles[i, 3]:
-            if distance < 1e-9:
-                ox, oy, oz, distance = 1.0, 0.0, 0.0, 1.0
-            reach = (circles[i, 3] + clearance) / distance
-            out[0] = circles[i, 0] + ox * reach
-            out[1] = circles[i, 1] + oy * reach
-            out[2] = circles[i, 2] + oz * reach if sphere else goal[2]
-            return True
-    return False
 
 
 @njit(cache=True, forceinline=True)
 def _best_vertex(
-    px: float,
-    py: float,
-    circles: FloatArray,
-    vertices: FloatArray,
-    to_goal: FloatArray,
-    clearance: float,
+    position: Vector, to_goal: FloatArray, around: Surroundings
 ) -> tuple[int, float, bool]:
     """Return the visible vertex on the shortest way, its length, and whether to approach closely.
 
     A vertex that is as good as reached gives way to the next one, if that is visible already;
     otherwise it must be approached closely. -1 where no vertex is visible.
     """
-    best = np.inf
-    index = -1
-    beyond = np.inf
-    beyond_index = -1
-    for i in range(vertices.shape[0]):
-        vx = vertices[i, 0]
-        vy = vertices[i, 1]
+    px, py, _ = position
+    best = beyond = np.inf
+    index = beyond_index = -1
+    for i in range(around.vertices.shape[0]):
+        vx, vy = around.vertices[i, 0], around.vertices[i, 1]
         near = math.sqrt((vx - px) * (vx - px) + (vy - py) * (vy - py))
         total = near + to_goal[i]
-        if total < best or (near >= 0.5 * clearance and total < beyond):
-            if not is_clear(px, py, 0.0, vx, vy, 0.0, circles, 0.0, True):
+        far = near >= 0.5 * around.clearance
+        if total < best or (far and total < beyond):
+            if not is_clear((px, py, 0.0), (vx, vy, 0.0), around.circles, 0.0, True):
                 continue
             if total < best:
-                best = total
-                index = i
-            if near >= 0.5 * clearance and total < beyond:
-                beyond = total
-                beyond_index = i
+                best, index = total, i
+            if far and total < beyond:
+                beyond, beyond_index = total, i
     if beyond_index == index:
         return index, best, False
-    if beyond <= best + 0.5 * clearance:
+    if beyond <= best + 0.5 * around.clearance:
         return beyond_index, beyond, False
     return index, best, True
 
 
 @njit(cache=True, forceinline=True)
-def _first_sphere(
-    position: FloatArray, target: FloatArray, circles: FloatArray
-) -> tuple[int, float]:
-    """Return the nearest sphere that the way to `target` hits, or -1, and its centre's distance."""
-    px, py, pz = position[0], position[1], position[2]
-    first = -1
-    nearest = np.inf
-    for i in range(circles.shape[0]):
-        if circles[i, 4] > 0.5:
-            gap = segment_distance(px, py, pz, target[0], target[1], target[2], circles[i])
-            if gap < circles[i, 3]:
-                away = math.sqrt(
-                    (circles[i, 0] - px) ** 2
-                    + (circles[i, 1] - py) ** 2
-                    + (circles[i, 2] - pz) ** 2
-                )
-                if away < nearest:
-                    nearest = away
-                    first = i
-    return first, nearest
-
-
-@njit(cache=True, forceinline=True)
-def _pass_sphere(
-    position: FloatArray, sphere: FloatArray, distance: float, clearance: float, target: FloatArray
-) -> float:
-    """Move `target` beside a sphere, on the side where the line passes its centre; return its way.
-
-    `distance`: of the centre [m].
-    """
-    px, py, pz = position[0], position[1], position[2]
-    tx = target[0] - px
-    ty = target[1] - py
-    tz = target[2] - pz
-    length = math.sqrt(tx * tx + ty * ty + tz * tz)
-    tx /= length
-    ty /= length
-    tz /= length
-    cx = sphere[0] - px
-    cy = sphere[1] - py
-    cz = sphere[2] - pz
-    along = cx * tx + cy * ty + cz * tz
-    nx = along * tx - cx
-    ny = along * ty - cy
-    nz = along * tz - cz
-    size = math.sqrt(nx * nx + ny * ny + nz * nz)
+def _beside_sphere(
+    position: Vector, target: Vector, sphere: int, around: Surroundings
+) -> tuple[Vector, float]:
+    """Return a target beside a sphere, where the line passes its centre, and the way to it."""
+    way = minus(target, position)
+    length = norm(way)
+    way = (way[0] / length, way[1] / length, way[2] / length)
+    offset = from_centre(position, around.circles, sphere)
+    along = -dot(offset, way)
+    # From the centre to where the line passes it.
+    side = plus(offset, along, way)
+    size = norm(side)
     if size < 1e-6:
         # Through the centre: choose a fixed side.
-        nx, ny, nz = -ty, tx, 0.0
-        size = math.hypot(nx, ny)
+        side = (-way[1], way[0], 0.0)
+        size = math.hypot(side[0], side[1])
         if size < 1e-6:
-            nx, ny, size = 1.0, 0.0, 1.0
-    reach = sphere[3] + clearance
+            side, size = (1.0, 0.0, 0.0), 1.0
+    radius = around.circles[sphere, 3]
+    reach = radius + around.clearance
     # Head for the tangent cone: the point beside the centre, scaled out when close.
-    away = max(distance, reach * 1.0000001)
-    widen = reach * away / math.sqrt(away * away - sphere[3] ** 2)
-    widen = min(widen, 5.0 * reach)
-    ax = cx + widen * nx / size
-    ay = cy + widen * ny / size
-    az = cz + widen * nz / size
-    target[0] = px + ax
-    target[1] = py + ay
-    target[2] = pz + az
-    return math.sqrt(ax * ax + ay * ay + az * az)
+    away = max(norm(offset), reach * 1.0000001)
+    widen = min(reach * away / math.sqrt(away * away - radius**2), 5.0 * reach)
+    way = plus((-offset[0], -offset[1], -offset[2]), widen / size, side)
+    return plus(position, 1.0, way), norm(way)
 
 
 @njit(cache=True)
 def next_point(
-    position: FloatArray,
-    goal: FloatArray,
-    circles: FloatArray,
-    vertices: FloatArray,
-    to_goal: FloatArray,
-    clearance: float,
-    out: FloatArray,
-) -> float:
-    """Write the point to head for into `out` (3,) and return the length of the way left.
+    position: Vector, goal: Vector, to_goal: FloatArray, around: Surroundings
+) -> tuple[Vector, float]:
+    """Return the point to head for and the length of the way left.
 
     The point is the goal itself where the straight line is clear.
     """
-    px, py, pz = position[0], position[1], position[2]
-    dx = goal[0] - px
-    dy = goal[1] - py
-    dz = goal[2] - pz
-    straight = math.sqrt(dx * dx + dy * dy + dz * dz)
-    out[0] = goal[0]
-    out[1] = goal[1]
-    out[2] = goal[2]
-    if circles.shape[0] == 0:
-        return straight
-    if _leave_circle(position, goal, circles, clearance, out):
-        return straight + clearance
-    left = straight
-    if not is_clear(px, py, pz, goal[0], goal[1], goal[2], circles, 0.0, True):
-        index, best, closely = _best_vertex(px, py, circles, vertices, to_goal, clearance)
+    circles = around.circles
+    way = minus(goal, position)
+    left, target = norm(way), goal
+    for i in range(circles.shape[0]):
+        # A robot that was pushed into a circle leaves it.
+        offset = from_centre(position, circles, i)
+        distance = norm(offset)
+        if distance < circles[i, 3]:
+            if distance < 1e-9:
+                offset, distance = (1.0, 0.0, 0.0), 1.0
+            reach = (circles[i, 3] + around.clearance) / distance
+            target = plus((circles[i, 0], circles[i, 1], circles[i, 2]), reach, offset)
+            if circles[i, 4] <= 0.5:
+                target = (target[0], target[1], goal[2])
+            return target, left + around.clearance
+    if not is_clear(position, goal, circles, 0.0, True):
+        index, best, closely = _best_vertex(position, to_goal, around)
         if index >= 0:
-            vx = vertices[index, 0]
-            vy = vertices[index, 1]
-            near = math.sqrt((vx - px) * (vx - px) + (vy - py) * (vy - py))
+            vx, vy = around.vertices[index, 0], around.vertices[index, 1]
+            near = math.sqrt((vx - position[0]) ** 2 + (vy - position[1]) ** 2)
             share = near / best if best > 0.0 else 1.0
-            out[0] = vx
-            out[1] = vy
-            out[2] = pz + share * dz
-            left = math.sqrt(best * best + dz * dz)
+            target = (vx, vy, position[2] + share * way[2])
+            left = math.sqrt(best * best + way[2] * way[2])
             if closely:
                 left = min(left, 2.0 * near)
-    first, distance = _first_sphere(position, out, circles)
+    first, nearest = -1, np.inf
+    for i in range(circles.shape[0]):
+        away = norm(from_centre(position, circles, i))
+        if circles[i, 4] <= 0.5 or away >= nearest:
+            continue
+        if segment_distance(position, target, circles, i) < circles[i, 3]:
+            first, nearest = i, away
     if first >= 0:
-        left = max(left, _pass_sphere(position, circles[first], distance, clearance, out))
-    return left
+        target, beside = _beside_sphere(position, target, first, around)
+        left = max(left, beside)
+    return target, left
 
 
 @njit(cache=True)
-def hold_back(position: FloatArray, circles: FloatArray, rate: float, velocity: FloatArray) -> None:
-    """Limit in place the part of `velocity` (3,) that points into circles.
+def hold_back(position: Vector, circles: FloatArray, rate: float, velocity: Vector) -> Vector:
+    """Return `velocity` with limits on its part that points into circles.
 
     Towards a circle at distance d at most `rate` * d is left, and inside of one at least that
     much outwards.
@@ -349,30 +288,23 @@ def hold_back(position: FloatArray, circles: FloatArray, rate: float, velocity: 
     for attempt in range(9):
         changed = False
         for i in range(circles.shape[0]):
-            nx = position[0] - circles[i, 0]
-            ny = position[1] - circles[i, 1]
-            nz = (position[2] - circles[i, 2]) if circles[i, 4] > 0.5 else 0.0
-            size = math.sqrt(nx * nx + ny * ny + nz * nz)
+            offset = from_centre(position, circles, i)
+            size = norm(offset)
             if size < 1e-9:
                 continue
-            outwards = (velocity[0] * nx + velocity[1] * ny + velocity[2] * nz) / size
+            outwards = dot(velocity, offset) / size
             least = -rate * (size - circles[i, 3])
             if outwards >= least:
                 continue
             changed = True
             if attempt < 8:
-                change = (least - outwards) / size
-                velocity[0] += change * nx
-                velocity[1] += change * ny
-                velocity[2] += change * nz
+                velocity = plus(velocity, (least - outwards) / size, offset)
             elif least <= 0.0:
                 # The limits conflict: scale down, as standing still satisfies all.
                 shrink = min(shrink, least / outwards)
         if not changed:
             break
-    velocity[0] *= shrink
-    velocity[1] *= shrink
-    velocity[2] *= shrink
+    return velocity[0] * shrink, velocity[1] * shrink, velocity[2] * shrink
 
 
 class KeepOut:
@@ -380,8 +312,8 @@ class KeepOut:
 
     obstacles: in their own size; radius: of the robot, metres; clearance: kept beyond that by
     planned ways and by waypoints, metres; circles (n, 5): x, y, z, inflated radius with a tenth of
-    the clearance, and 1 for a sphere. Robots stop short of these, so that rounding does not put
-    them into an obstacle.
+    the clearance, and 1 for a sphere; around: the same with the ways. Robots stop short of
+    `circles`, so that rounding does not put them into an obstacle.
     """
 
     def __init__(self, obstacles: Obstacles, radius: float, clearance: float) -> None:
@@ -396,17 +328,16 @@ class KeepOut:
         self.circles[:, 3] = obstacles.radii + radius + 0.1 * clearance
         self.circles[:, 4] = obstacles.spheres
         corners = []
-        for circle in self.circles:
-            if circle[4] > 0.5:
-                continue
+        for circle in self.circles[self.circles[:, 4] < 0.5]:
             reach = (circle[3] + 0.9 * clearance) / math.cos(math.pi / CORNERS)
             for corner in range(CORNERS):
                 angle = 2.0 * math.pi * corner / CORNERS
-                point = (circle[0] + reach * math.cos(angle), circle[1] + reach * math.sin(angle))
-                if is_clear(*point, 0.0, *point, 0.0, self.circles, 0.5 * clearance, True):
-                    corners.append(point)
-        self.vertices = np.array(corners, dtype=float).reshape(-1, 2)
-        self.pairs = _all_pairs(self.vertices, self.circles, 0.4 * clearance)
+                x, y = circle[0] + reach * math.cos(angle), circle[1] + reach * math.sin(angle)
+                if is_clear((x, y, 0.0), (x, y, 0.0), self.circles, 0.5 * clearance, True):
+                    corners.append((x, y))
+        vertices = np.array(corners, dtype=float).reshape(-1, 2)
+        self.around = Surroundings(self.circles, vertices, self.clearance)
+        self._pairs = _all_pairs(vertices, self.circles, 0.4 * clearance)
 
     def __len__(self) -> int:
         return len(self.circles)
@@ -414,11 +345,11 @@ class KeepOut:
     def is_free(self, position: ArrayLike) -> bool:
         """Return whether a robot at `position` (3,) touches no obstacle."""
         x, y, z = (float(value) for value in np.asarray(position, dtype=float))
-        return bool(is_clear(x, y, z, x, y, z, self.circles, 0.0, False))
+        return bool(is_clear((x, y, z), (x, y, z), self.circles, 0.0, False))
 
-    def to_goal(self, goal: FloatArray) -> FloatArray:
-        """Return the table that `next_point` needs for a goal (3,)."""
-        return goal_distances(goal, self.circles, self.vertices, self.pairs)
+    def to_goal(self, goal: Vector) -> FloatArray:
+        """Return the table that `next_point` needs for a goal."""
+        return _goal_distances(goal, self.circles, self.around.vertices, self._pairs)
 
     def moved_out(self, robot: ArrayLike, waypoint: ArrayLike) -> FloatArray | None:
         """Return a waypoint moved to the minimum admissible distance (001, section 4.3).

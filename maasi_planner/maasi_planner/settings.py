@@ -35,10 +35,10 @@ MOTIONS = PluginGroup(
     'motion model',
     'maasi_planner.motion.base:MotionModel',
     {
-        'constant_speed': 'maasi_planner.motion.constant_speed:ConstantSpeed',
-        'mambo': 'maasi_planner.motion.mambo:Mambo',
-        'unicycle': 'maasi_planner.motion.unicycle:Unicycle',
-        'quadrotor': 'maasi_planner.motion.quadrotor:Quadrotor',
+        'constant_speed': 'maasi_planner.motion.models:ConstantSpeed',
+        'mambo': 'maasi_planner.motion.models:Mambo',
+        'unicycle': 'maasi_planner.motion.models:Unicycle',
+        'quadrotor': 'maasi_planner.motion.models:Quadrotor',
     },
 )
 _MOTION = OwnSettings(MOTIONS, 'model')

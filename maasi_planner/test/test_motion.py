@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 from maasi_planner import MotionSettings, Obstacles, RobotState, make_motion
-from maasi_planner.motion.mambo_dynamics import (
+from maasi_planner.motion.mambo import (
     GRAVITY,
     INERTIA,
     MASS,

@@ -16,10 +16,9 @@ from maasi_drivers.settings.driver import ScanSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.conversions import stamp_from_ros
 from maasi_filter.ros.qos import sensor_reader
-from maasi_planner.motion import RobotState
-from maasi_planner.motion.base import check_waypoints
+from maasi_planner.motion import RobotState, Unicycle
+from maasi_planner.motion.base import check_waypoint
 from maasi_planner.motion.dynamic_window import window_command
-from maasi_planner.motion.unicycle import Unicycle, as_tuple, five_states
 from maasi_planner.obstacles import Obstacles, is_clear, next_point
 from maasi_planner.settings import MotionSettings
 
@@ -76,7 +75,7 @@ def _is_free(x: float, y: float, heading: float, reach: float, circles: FloatArr
     """Return whether a heading is free of circles for `reach` metres."""
     end_x = x + reach * math.cos(heading)
     end_y = y + reach * math.sin(heading)
-    return is_clear(x, y, 0.0, end_x, end_y, 0.0, circles, 0.0, False)
+    return is_clear((x, y, 0.0), (end_x, end_y, 0.0), circles, 0.0, False)
 
 
 @njit(cache=True)
@@ -149,24 +148,15 @@ class ScanUnicycle(Unicycle):
 
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
         """See `MotionModel.command`."""
-        here = as_tuple(five_states(state))
-        x, y = here[:2]
+        here = self._to_array(state)
+        x, y = here[:2].tolist()
         away = np.hypot(self.points[:, 0] - x, self.points[:, 1] - y)
         near = away <= self.scan.reach + self.keep_out.radius
         if not near.any():
             self._heading = math.nan
             return super().command(state, waypoint)
-        goal = check_waypoints(np.asarray(waypoint, dtype=float)[None, :])[0]
-        position, target = np.array([x, y, goal[2]]), np.empty(3)
-        left = next_point(
-            position,
-            goal,
-            self.keep_out.circles,
-            self.keep_out.vertices,
-            self._table(goal),
-            self.keep_out.clearance,
-            target,
-        )
+        goal = tuple(check_waypoint(waypoint).tolist())
+        target, left = next_point((x, y, goal[2]), goal, self.table(goal), self.keep_out.around)
         seen = np.zeros((int(near.sum()), 5))
         seen[:, :2] = self.points[near]
         seen[:, 3] = np.minimum(
@@ -176,11 +166,9 @@ class ScanUnicycle(Unicycle):
         target_x, target_y, self._heading = way_around(
             x, y, target[0], target[1], circles, self.scan.reach, self._heading
         )
-        out = np.zeros(4)
-        out[0], out[3] = window_command(
-            here, target_x, target_y, left, self.limits, circles, self.keep_out.clearance
-        )
-        return out
+        target, clearance = (target_x, target_y, 0.0), self.keep_out.clearance
+        forward, turn = window_command(here, target, left, self.steering, circles, clearance)
+        return np.array([forward, 0.0, 0.0, turn])
 
 
 # Kind of fault.

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 from maasi_planner.motion.base import Body, MotionModel, RobotState, Trajectories
-from maasi_planner.motion.constant_speed import ConstantSpeed, ConstantSpeedBody
-from maasi_planner.motion.mambo import Mambo, MamboBody
-from maasi_planner.motion.quadrotor import Quadrotor, QuadrotorBody
-from maasi_planner.motion.unicycle import Unicycle, UnicycleBody
+from maasi_planner.motion.models import ConstantSpeed, Mambo, Quadrotor, Unicycle
 from maasi_planner.obstacles import Obstacles
 from maasi_planner.settings import MOTIONS, MotionSettings
 
 __all__ = [
     'Body',
     'ConstantSpeed',
-    'ConstantSpeedBody',
     'Mambo',
-    'MamboBody',
     'MotionModel',
     'Quadrotor',
-    'QuadrotorBody',
     'RobotState',
     'Trajectories',
     'Unicycle',
-    'UnicycleBody',
     'make_motion',
 ]
 

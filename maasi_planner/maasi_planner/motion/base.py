@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
@@ -14,8 +14,7 @@ from pydantic import BaseModel
 
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.pose import Pose
-from maasi_planner.motion.steering import Steering, Surroundings, sideways_command
-from maasi_planner.obstacles import KeepOut, Obstacles
+from maasi_planner.obstacles import KeepOut, Obstacles, Vector
 from maasi_planner.settings import MotionSettings
 
 STEPS_LIMIT = 20_000
@@ -57,15 +56,6 @@ class RobotState:
         return cls(Pose.from_yaw(position, yaw))
 
 
-class TrajectoryArrays(NamedTuple):
-    """Arrays of `Trajectories` that kernels fill."""
-
-    positions: FloatArray
-    yaws: FloatArray
-    lengths: IntArray
-    control_cost: FloatArray
-
-
 @dataclass
 class Trajectories:
     """Predicted trajectories to W waypoints.
@@ -90,10 +80,6 @@ class Trajectories:
     lengths: IntArray
     control_cost: FloatArray
     reached: BoolArray
-
-    def arrays(self) -> TrajectoryArrays:
-        """Return the arrays that a roll-out fills."""
-        return TrajectoryArrays(self.positions, self.yaws, self.lengths, self.control_cost)
 
     def distances(self) -> FloatArray:
         """Return the length of each trajectory in metres, (W,)."""
@@ -153,10 +139,7 @@ class MotionModel(ABC):
     ) -> None:
         self.settings = settings
         self.keep_out = KeepOut(obstacles or Obstacles.none(), radius, settings.clearance)
-        self.surroundings = Surroundings(
-            self.keep_out.circles, self.keep_out.vertices, self.keep_out.clearance
-        )
-        self._goal: FloatArray | None = None
+        self._goal: Vector | None = None
         self._goal_table = np.zeros(0)
 
     def predict(self, state: RobotState, waypoints: ArrayLike, step: float) -> Trajectories:
@@ -183,7 +166,10 @@ class MotionModel(ABC):
             np.zeros(number, dtype=bool),
         )
         self.roll_out(state, goals, dt, out)
-        return trimmed(out)
+        longest = _trim(out.positions, out.yaws, out.lengths, out.reached)
+        out.positions = out.positions[:, : longest + 1]
+        out.yaws = out.yaws[:, : longest + 1]
+        return out
 
     def roll_out(
         self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
@@ -243,48 +229,11 @@ class MotionModel(ABC):
         seconds = 2.0 * (farthest + around) / self.settings.speed + 30.0
         return min(math.ceil(seconds / step), STEPS_LIMIT)
 
-    def _tables(self, waypoints: FloatArray) -> FloatArray:
-        """Return the way tables of all waypoints, (W, m)."""
-        tables = np.zeros((len(waypoints), len(self.keep_out.vertices)))
-        if tables.shape[1]:
-            for index, waypoint in enumerate(waypoints):
-                tables[index] = self.keep_out.to_goal(waypoint)
-        return tables
-
-    def _table(self, waypoint: FloatArray) -> FloatArray:
+    def table(self, waypoint: Vector) -> FloatArray:
         """Return the way table of one waypoint, remembered until the waypoint changes."""
-        if self._goal is None or not np.array_equal(self._goal, waypoint):
-            self._goal = waypoint.copy()
-            self._goal_table = self.keep_out.to_goal(waypoint)
+        if self._goal != waypoint:
+            self._goal, self._goal_table = waypoint, self.keep_out.to_goal(waypoint)
         return self._goal_table
-
-
-class SteeredMotion(MotionModel):
-    """Motion model of a robot that can move in any direction.
-
-    Attributes
-    ----------
-    steering : Steering
-        How it approaches its waypoint.
-    """
-
-    steering: Steering
-
-    def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
-        """See `MotionModel.command`."""
-        goal = check_waypoint(waypoint)
-        out = np.zeros(4)
-        sideways_command(
-            np.array(state.pose.position),
-            state.pose.yaw,
-            goal,
-            self._table(goal),
-            self.steering,
-            self.surroundings,
-            np.zeros((2, 3)),
-            out,
-        )
-        return out
 
 
 def check_waypoint(waypoint: ArrayLike) -> FloatArray:
@@ -319,44 +268,19 @@ def check_step(step: float) -> float:
 
 
 @njit(cache=True)
-def add_position(
-    out: TrajectoryArrays, w: int, k: int, x: float, y: float, z: float, yaw: float
-) -> None:
-    """Write step k of trajectory w."""
-    out.positions[w, k, 0] = x
-    out.positions[w, k, 1] = y
-    out.positions[w, k, 2] = z
-    out.yaws[w, k] = yaw
-
-
-@njit(cache=True)
 def _trim(positions: FloatArray, yaws: FloatArray, lengths: IntArray, reached: BoolArray) -> int:
-    """Fill what was reached, cut lengths, extend trajectories; return the longest length."""
-    limit = positions.shape[1] - 1
-    longest = 0
-    for w in range(positions.shape[0]):
-        reached[w] = lengths[w] <= limit
-        lengths[w] = min(lengths[w], limit)
-        longest = max(longest, lengths[w])
-    for w in range(positions.shape[0]):
-        last = lengths[w]
-        for k in range(last + 1, longest + 1):
-            for axis in range(3):
-                positions[w, k, axis] = positions[w, last, axis]
-            yaws[w, k] = yaws[w, last]
-    return longest
-
-
-def trimmed(out: Trajectories) -> Trajectories:
-    """Return trajectories of equal width, each extended by its last position.
+    """Fill what was reached, cut lengths, extend trajectories; return the longest length.
 
     A length beyond the last column marks a waypoint that was not reached.
     """
-    longest = _trim(out.positions, out.yaws, out.lengths, out.reached)
-    return Trajectories(
-        out.positions[:, : longest + 1],
-        out.yaws[:, : longest + 1],
-        out.lengths,
-        out.control_cost,
-        out.reached,
-    )
+    limit = positions.shape[1] - 1
+    for w in range(positions.shape[0]):
+        reached[w] = lengths[w] <= limit
+        lengths[w] = min(lengths[w], limit)
+    longest = lengths.max() if lengths.size else 0
+    for w in range(positions.shape[0]):
+        last = lengths[w]
+        for k in range(last + 1, longest + 1):
+            positions[w, k] = positions[w, last]
+            yaws[w, k] = yaws[w, last]
+    return longest

@@ -13,12 +13,8 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
-
-# x, y [m, map], heading [rad], forward speed [m/s], turn rate [rad/s].
-UnicycleState = tuple[float, float, float, float, float]
-
-# Entries of the array of limits.
-RATE, SPEED, BRAKING, YAW_RATE, ACCELERATION, YAW_ACCELERATION = range(6)
+from maasi_planner.motion.steering import Steering, wrapped
+from maasi_planner.obstacles import Vector
 
 # Seconds until the next command at which the window is taken, and for which arcs are followed.
 WINDOW = 0.2
@@ -47,18 +43,13 @@ def way_ahead(x: float, y: float, yaw: float, reach: float, circles: FloatArray)
 
 @njit(cache=True)
 def _arc(
-    state: UnicycleState,
-    v: float,
-    w: float,
-    time: float,
-    stopping: float,
-    circles: FloatArray,
+    state: FloatArray, v: float, w: float, time: float, stopping: float, circles: FloatArray
 ) -> tuple[float, float, float, float]:
     """Return x, y and heading at the end of an arc, and the least distance from circles on it.
 
     Minus infinity if the robot could not stop within `stopping` before a circle.
     """
-    px, py, heading = state[0], state[1], state[2]
+    px, py, heading = state[0], state[1], state[3]
     room = np.inf
     dt = time / ARC_STEPS
     for k in range(ARC_STEPS):
@@ -79,50 +70,42 @@ def _arc(
 
 @njit(cache=True)
 def window_command(
-    state: UnicycleState,
-    target_x: float,
-    target_y: float,
+    state: FloatArray,
+    target: Vector,
     left: float,
-    limits: FloatArray,
+    steering: Steering,
     circles: FloatArray,
     clearance: float,
 ) -> tuple[float, float]:
-    """Return forward speed and turn rate."""
-    x, y, yaw, forward, turn = state
-    fastest = min(limits[SPEED], limits[RATE] * left)
-    deceleration = min(limits[ACCELERATION], 2.0 * limits[SPEED])
-    low = max(0.0, forward - limits[ACCELERATION] * WINDOW)
-    high = max(low, min(fastest, forward + limits[ACCELERATION] * WINDOW))
-    low = min(low, high)
-    turn_low = max(-limits[YAW_RATE], turn - limits[YAW_ACCELERATION] * WINDOW)
-    turn_high = min(limits[YAW_RATE], turn + limits[YAW_ACCELERATION] * WINDOW)
-    away = math.hypot(target_x - x, target_y - y)
-    time = min(LOOK_AHEAD, max(0.3, away / max(limits[SPEED], 1e-9)))
+    """Return forward speed and turn rate of a unicycle with `left` metres to go by `target`."""
+    x, y, _, yaw, forward, turn = state
+    speed, change = steering.speed, steering.acceleration * WINDOW
+    deceleration = min(steering.acceleration, 2.0 * speed)
+    low = max(0.0, forward - change)
+    high = max(low, min(speed, steering.rate * left, forward + change))
+    turn_low = max(-steering.yaw_rate, turn - steering.yaw_acceleration * WINDOW)
+    turn_high = min(steering.yaw_rate, turn + steering.yaw_acceleration * WINDOW)
+    away = math.hypot(target[0] - x, target[1] - y)
+    time = min(LOOK_AHEAD, max(0.3, away / max(speed, 1e-9)))
     best = -np.inf
-    best_forward = 0.0
-    best_turn = 0.0
+    best_forward = best_turn = 0.0
     for i in range(FORWARD_SAMPLES + 1):
         # Zero forward speed is always a choice: turning on the spot is safe.
-        v = 0.0
-        if i > 0:
-            v = low + (high - low) * (i - 1) / (FORWARD_SAMPLES - 1)
+        v = low + (high - low) * (i - 1) / (FORWARD_SAMPLES - 1) if i > 0 else 0.0
         stopping = 0.5 * v * v / deceleration + v * WINDOW
         for j in range(TURN_SAMPLES):
             w = turn_low + (turn_high - turn_low) * j / (TURN_SAMPLES - 1)
             px, py, heading, room = _arc(state, v, w, time, stopping, circles)
             if room == -np.inf:
                 continue
-            gap = math.hypot(target_x - px, target_y - py)
-            off = math.atan2(target_y - py, target_x - px) - heading
-            off -= 2.0 * math.pi * math.floor((off + math.pi) / (2.0 * math.pi))
-            closer = (away - gap) / (limits[SPEED] * time)
-            score = closer - 0.3 * abs(off) / math.pi * min(1.0, gap / clearance)
+            gap = math.hypot(target[0] - px, target[1] - py)
+            off = wrapped(math.atan2(target[1] - py, target[0] - px) - heading)
+            score = (away - gap) / (speed * time)
+            score -= 0.3 * abs(off) / math.pi * min(1.0, gap / clearance)
             score += 0.2 * min(max(room, -clearance), clearance) / clearance
-            score -= 0.01 * abs(w) / limits[YAW_RATE]
+            score -= 0.01 * abs(w) / steering.yaw_rate
             if score > best:
-                best = score
-                best_forward = v
-                best_turn = w
+                best, best_forward, best_turn = score, v, w
     # Limit the speed by the free distance straight ahead.
-    ahead = way_ahead(x, y, yaw, 4.0 * clearance + limits[SPEED], circles)
-    return min(best_forward, limits[BRAKING] * ahead), best_turn
+    ahead = way_ahead(x, y, yaw, 4.0 * clearance + speed, circles)
+    return min(best_forward, steering.barrier * ahead), best_turn

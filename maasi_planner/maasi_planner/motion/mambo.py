@@ -8,12 +8,13 @@ waypoint into the velocity command that a driver publishes, and the body flies a
 Frames: `map` is ENU, body axes are forward, left, up; roll and pitch are right-handed about
 them, so that pitch > 0 accelerates forward and roll > 0 to the right.
 
-The obstacle term of 001, eq. (14) and (15), for a robot that flies velocity commands.
+state (12,): position [m, map], yaw, roll, pitch [rad], velocity [m/s, map], angular velocity
+[rad/s].
 
-The paper subtracts k_obs from the input whenever an obstacle is nearer than d_l. With
-u = K_v (v - velocity) - ... that equals a change of the velocity command by k_obs / K_v,
-so it needs no access to the torques. As printed the term has no direction; `away` gives it the
-direction from the obstacle to the robot.
+The obstacle term of 001, eq. (14) and (15), subtracts k_obs from the input whenever an obstacle is
+nearer than d_l. With u = K_v (v - velocity) - ... that equals a change of the velocity command by
+k_obs / K_v, so it needs no access to the torques. As printed the term has no direction; `away`
+gives it the direction from the obstacle to the robot.
 """
 
 from __future__ import annotations
@@ -23,46 +24,181 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.models.pose import Pose
-from maasi_planner.motion.base import (
-    Body,
-    RobotState,
-    SteeredMotion,
-    Trajectories,
-    TrajectoryArrays,
-    add_position,
-    check_command,
-    check_step,
-)
-from maasi_planner.motion.mambo_dynamics import (
-    ENTRIES,
-    GRAVITY,
-    K_Q,
-    K_VX,
-    SPEED,
-    TILT,
-    YAW_RATE,
-    closed_loop,
-    control_periods,
-    lqr_gains,
-    mambo_parameters,
-    mambo_step,
-)
-from maasi_planner.motion.steering import Steering, Surroundings, sideways_command
-from maasi_planner.obstacles import Obstacles
+from maasi_planner.motion.steering import Command, turned
+from maasi_planner.obstacles import Vector, from_centre, norm
 from maasi_planner.settings import MotionSettings
 
-KINDS = ('none', 'printed', 'away')
-PRINTED = 1
+GRAVITY = 9.81
+MASS = 0.063
+INERTIA = (0.5829e-4, 0.7169e-4, 1.0e-4)
+PERIOD = 0.005
+
+
+@njit(cache=True)
+def _riccati(a: FloatArray, b: FloatArray, q: FloatArray, r: float) -> FloatArray:
+    """Return the gain of a discrete LQR with one input, by iterating the Riccati equation.
+
+    Plain loops in a fixed order, so that the gain does not depend on a linear algebra library.
+    """
+    n = a.shape[0]
+    p = np.zeros((n, n))
+    for i in range(n):
+        p[i, i] = q[i]
+    gain = np.zeros(n)
+    pa = np.zeros((n, n))
+    pb = np.zeros(n)
+    for _ in range(200_000):
+        for i in range(n):
+            pb[i] = 0.0
+            for k in range(n):
+                pb[i] += p[i, k] * b[k]
+            for j in range(n):
+                pa[i, j] = 0.0
+                for k in range(n):
+                    pa[i, j] += p[i, k] * a[k, j]
+        size = r
+        for i in range(n):
+            size += b[i] * pb[i]
+        change = 0.0
+        for j in range(n):
+            value = 0.0
+            for k in range(n):
+                value += b[k] * pa[k, j]
+            value /= size
+            change = max(change, abs(value - gain[j]) / (abs(value) + 1e-300))
+            gain[j] = value
+        for i in range(n):
+            for j in range(i + 1):
+                value = 0.0
+                for k in range(n):
+                    value += a[k, i] * pa[k, j]
+                value -= gain[j] * gain[i] * size
+                if i == j:
+                    value += q[i]
+                p[i, j] = value
+                p[j, i] = value
+        if change < 1e-13:
+            break
+    return gain
+
+
+def lateral_system(inertia: float, sign: float) -> tuple[FloatArray, FloatArray]:
+    """Return A (4, 4) and B (4,) of position, velocity, angle and rate on one axis, per PERIOD."""
+    h = PERIOD
+    g = sign * GRAVITY
+    a = np.array(
+        [
+            [1.0, h, g * h**2 / 2, g * h**3 / 6],
+            [0.0, 1.0, g * h, g * h**2 / 2],
+            [0.0, 0.0, 1.0, h],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    b = np.array([g * h**4 / 24, g * h**3 / 6, h**2 / 2, h]) / inertia
+    return a, b
+
+
+def double_integrator(inertia: float) -> tuple[FloatArray, FloatArray]:
+    """Return A (2, 2) and B (2,) of a position and its velocity, per PERIOD."""
+    h = PERIOD
+    return np.array([[1.0, h], [0.0, 1.0]]), np.array([h**2 / 2, h]) / inertia
+
+
+def lqr_gains(settings: MotionSettings) -> dict[str, FloatArray]:
+    """Return the LQR gains by chain: `pitch` and `roll` (4,), `yaw` and `height` (2,).
+
+    The 12-state model decomposes into these chains, and with diagonal weights so does its LQR.
+    The paper prints four weights, 1/15, 1000, 1000, 100, and does not say which; read here as
+    those of the inputs with the first one garbled (it would make roll 15,000 times cheaper than
+    pitch), so that roll has the weight of pitch, and states have weight 1.
+    """
+    q = settings.state_weights
+    r = settings.input_weights
+    a, b = lateral_system(INERTIA[1], 1.0)
+    pitch = _riccati(a, b, np.array([q[0], q[6], q[4], q[10]]), r[1])
+    a, b = lateral_system(INERTIA[0], -1.0)
+    roll = _riccati(a, b, np.array([q[1], q[7], q[3], q[9]]), r[0])
+    a, b = double_integrator(MASS)
+    height = _riccati(a, b, np.array([q[2], q[8]]), r[3])
+    a, b = double_integrator(INERTIA[2])
+    yaw = _riccati(a, b, np.array([q[5], q[11]]), r[2])
+    return {'pitch': pitch, 'roll': roll, 'height': height, 'yaw': yaw}
+
+
+def _dot(a: list[float], b: list[float]) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _response_size(a: FloatArray, b: FloatArray, gain: FloatArray) -> tuple[FloatArray, float]:
+    """Return the impulse response from velocity command to velocity, and the tilt's peak gain."""
+    # Lists: many small steps are slow in NumPy.
+    rows, inputs, weights = a[1:, 1:].tolist(), b[1:].tolist(), gain.tolist()
+    state = [0.0, 0.0, 0.0]
+    responses = []
+    tilt = 0.0
+    for k in range(40_000):
+        push = -_dot(weights, state) + (weights[0] if k == 0 else 0.0)
+        state = [_dot(row, state) + size * push for row, size in zip(rows, inputs, strict=True)]
+        responses.append(state[0])
+        if k > 400 and max(map(abs, state)) < 1e-12:
+            break
+    angle, rate = 0.0, 0.0
+    for k in range(4000):
+        push = -(weights[1] * angle + weights[2] * rate)
+        if k == 0:
+            push += weights[1]
+        angle, rate = angle + rows[1][2] * rate + inputs[1] * push, rate + inputs[2] * push
+        tilt += abs(angle)
+    return np.array(responses), tilt
+
+
+# Entries of the parameter array of `mambo_step`.
+K_VX, K_PITCH, K_Q, K_VY, K_ROLL, K_P, K_VZ, K_R = range(8)
+TILT, LIFT, SPEED, YAW_RATE, COUNT_FORCE = range(8, 13)
+
+
+_PARAMETERS: dict[str, FloatArray] = {}
+
+
+def mambo_parameters(settings: MotionSettings) -> FloatArray:
+    """Return the parameter array of `mambo_step` for settings."""
+    key = settings.model_dump_json()
+    if key not in _PARAMETERS:
+        _PARAMETERS[key] = _mambo_parameters(settings)
+    return _PARAMETERS[key].copy()
+
+
+def _mambo_parameters(settings: MotionSettings) -> FloatArray:
+    gains = lqr_gains(settings)
+    out = np.zeros(13)
+    out[K_VX], out[K_PITCH], out[K_Q] = gains['pitch'][1:]
+    # Roll to the right is positive, left is positive: the sign of the velocity gain turns.
+    out[K_VY], out[K_ROLL], out[K_P] = gains['roll'][1:]
+    out[K_VZ] = gains['height'][1]
+    out[K_R] = gains['yaw'][1]
+    pitch_response, pitch_tilt = _response_size(
+        *lateral_system(INERTIA[1], 1.0), gains['pitch'][1:]
+    )
+    roll_response, roll_tilt = _response_size(*lateral_system(INERTIA[0], -1.0), gains['roll'][1:])
+    overshoot = max(float(np.abs(pitch_response).sum()), float(np.abs(roll_response).sum()), 1.0)
+    acceleration = settings.acceleration or math.inf
+    # Both axes together stay below the limits.
+    tilt = min(settings.tilt, acceleration / GRAVITY / math.sqrt(2.0))
+    out[TILT] = tilt / max(pitch_tilt, roll_tilt)
+    out[LIFT] = MASS * min(acceleration, GRAVITY)
+    # A little less, as the axes differ and may turn under a command.
+    out[SPEED] = settings.speed / (1.015 * overshoot)
+    out[YAW_RATE] = settings.yaw_rate
+    out[COUNT_FORCE] = 1.0 if settings.control_inputs == 'all' else 0.0
+    return out
 
 
 class ObstacleTerm(NamedTuple):
     """Obstacle term of a robot.
 
-    kind: index in KINDS: none; the same k_obs off every input; k_obs along the way out; distance,
+    kind: index in TERMS: none; the same k_obs off every input; k_obs along the way out; distance,
     gain: d_l [m] and k_obs [N m and N]; circles (n, 5): obstacles: x, y, z, radius, 1 for a sphere;
     the nearest surface counts.
     """
@@ -73,213 +209,224 @@ class ObstacleTerm(NamedTuple):
     circles: FloatArray
 
 
+TERMS = ('none', 'printed', 'away')
+PRINTED = 1
+
+
 @njit(cache=True)
-def add_obstacle_term(
-    position: FloatArray,
-    yaw: float,
-    term: ObstacleTerm,
-    parameters: FloatArray,
-    command: FloatArray,
-) -> None:
-    """Add the term to `command` (4,) in place."""
-    circles = term.circles
-    gain = term.gain
-    nearest = np.inf
-    nx = 0.0
-    ny = 0.0
-    nz = 0.0
-    for i in range(circles.shape[0]):
-        ox = position[0] - circles[i, 0]
-        oy = position[1] - circles[i, 1]
-        oz = (position[2] - circles[i, 2]) if circles[i, 4] > 0.5 else 0.0
-        size = math.sqrt(ox * ox + oy * oy + oz * oz)
-        if size - circles[i, 3] < nearest:
-            nearest = size - circles[i, 3]
-            size = max(size, 1e-9)
-            nx = ox / size
-            ny = oy / size
-            nz = oz / size
+def with_obstacle_term(
+    position: Vector, yaw: float, command: Command, term: ObstacleTerm, parameters: FloatArray
+) -> Command:
+    """Return a command with the obstacle term."""
+    nearest, way = np.inf, (0.0, 0.0, 0.0)
+    for i in range(term.circles.shape[0]):
+        offset = from_centre(position, term.circles, i)
+        size = norm(offset)
+        if size - term.circles[i, 3] < nearest:
+            nearest, size = size - term.circles[i, 3], max(size, 1e-9)
+            way = (offset[0] / size, offset[1] / size, offset[2] / size)
     if nearest >= term.distance:
-        return
+        return command
+    x, y, z, turn = command
+    # A roll torque of -k_obs tips the robot to its left: the roll gain has the other sign.
+    by_x, by_y = term.gain / parameters[K_VX], term.gain / parameters[K_VY]
+    by_z, by_turn = term.gain / parameters[K_VZ], term.gain / parameters[K_R]
     if term.kind == PRINTED:
-        command[0] -= gain / parameters[0]
-        # A roll torque of -k_obs tips the robot to its left: the roll gain has the other sign.
-        command[1] -= gain / parameters[3]
-        command[2] -= gain / parameters[6]
-        command[3] -= gain / parameters[7]
-        return
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    command[0] += gain / abs(parameters[0]) * (cos_yaw * nx + sin_yaw * ny)
-    command[1] += gain / abs(parameters[3]) * (cos_yaw * ny - sin_yaw * nx)
-    command[2] += gain / abs(parameters[6]) * nz
+        return x - by_x, y - by_y, z - by_z, turn - by_turn
+    forward, left = turned(way[0], way[1], -yaw)
+    return x + abs(by_x) * forward, y + abs(by_y) * left, z + by_z * way[2], turn
+
+
+# Rows of the tables of `closed_loop`: the chains, and the entries of each.
+PITCH_CHAIN, ROLL_CHAIN, HEIGHT_CHAIN = range(3)
+MATRIX, TRAVEL, COST, BOUND, ENTRIES = 0, 9, 12, 21, 24
 
 
 @njit(cache=True)
-def _roll_out(
-    start: FloatArray,
-    waypoints: FloatArray,
-    tables: FloatArray,
-    steering: Steering,
-    around: Surroundings,
-    term: ObstacleTerm,
-    parameters: FloatArray,
-    periods: int,
-    h: float,
-    out: TrajectoryArrays,
+def _chain(
+    row: FloatArray, gains: FloatArray, gravity: float, inertia: float, periods: int, h: float
 ) -> None:
-    work = np.zeros((2, 3))
-    command = np.zeros(4)
-    state = np.zeros(12)
-    table = closed_loop(parameters, periods, h)
-    limit = out.positions.shape[1] - 1
-    for w in range(waypoints.shape[0]):
-        state[:] = start
-        goal = waypoints[w]
-        length = limit + 1
-        cost = 0.0
-        for k in range(limit + 1):
-            add_position(out, w, k, state[0], state[1], state[2], state[5])
-            gap = math.sqrt(
-                (state[0] - goal[0]) ** 2 + (state[1] - goal[1]) ** 2 + (state[2] - goal[2]) ** 2
+    """Fill one row of `closed_loop` from the response to each unit deviation."""
+    states = np.zeros((3, 3))
+    inputs = np.zeros(3)
+    for j in range(3):
+        states[j, j] = 1.0
+    for _ in range(periods):
+        for j in range(3):
+            v, a, w = states[j, 0], states[j, 1], states[j, 2]
+            row[BOUND + j] = max(row[BOUND + j], abs(v))
+            u = -gains[0] * v - gains[1] * a - gains[2] * w
+            inputs[j] = u
+            s = u / inertia
+            row[TRAVEL + j] += v * h + gravity * (
+                a * h * h / 2.0 + w * h * h * h / 6.0 + s * h * h * h * h / 24.0
             )
-            if gap <= steering.tolerance:
-                length = k
-                break
-            sideways_command(state, state[5], goal, tables[w], steering, around, work, command)
-            if term.kind > 0:
-                add_obstacle_term(state, state[5], term, parameters, command)
-            cost += mambo_step(state, command, parameters, table, periods, h)
-        out.lengths[w] = length
-        out.control_cost[w] = cost
+            states[j, 0] = v + gravity * (a * h + w * h * h / 2.0 + s * h * h * h / 6.0)
+            states[j, 1] = a + w * h + s * h * h / 2.0
+            states[j, 2] = w + s * h
+        for i in range(3):
+            for j in range(3):
+                row[COST + 3 * i + j] += inputs[i] * inputs[j]
+    for i in range(3):
+        for j in range(3):
+            row[MATRIX + 3 * i + j] = states[j, i]
 
 
-class MamboBody(Body):
-    """The 12-state linear Mambo, its attitude and velocity loops at 200 Hz, and its limits.
+@njit(cache=True)
+def closed_loop(parameters: FloatArray, periods: int, h: float) -> FloatArray:
+    """Return what `periods` control periods do at once while nothing is cut off, (3, 24).
 
-    Speed, acceleration and tilt stay within the settings: commands are cut to a speed that the
-    loop's overshoot cannot carry beyond `speed`, and the tilt asked for to the smaller of `tilt`
-    and what `acceleration` allows; the tilt follows it without overshoot.
-
-    state (12,): position [m, map], roll pitch yaw [rad], velocity [m/s, map], angular velocity
-    [rad/s].
+    For deviations s = (velocity - command, angle, rate) of a chain: the matrix of the deviations
+    afterwards, the travel beyond command times time, the sum of u'u as a quadratic form, and the
+    largest |velocity - command| on the way for each unit deviation.
     """
-
-    def __init__(self, settings: MotionSettings, state: RobotState) -> None:
-        self.settings = settings
-        self.parameters = mambo_parameters(settings)
-        self.state = twelve_states(state)
-        self._periods = (0, 0.0)
-        self._table = np.zeros((3, ENTRIES))
-
-    def step(self, velocity_command: ArrayLike, dt: float) -> None:
-        """See `Body.step`."""
-        periods, h = control_periods(check_step(dt))
-        if (periods, h) != self._periods:
-            self._periods = (periods, h)
-            self._table = closed_loop(self.parameters, periods, h)
-        mambo_step(
-            self.state, check_command(velocity_command), self.parameters, self._table, periods, h
-        )
-
-    def robot_state(self) -> RobotState:
-        """See `Body.robot_state`."""
-        return RobotState(pose_of(self.state), self.state[6:9].copy(), self.state[9:12].copy())
-
-
-def pose_of(state: FloatArray) -> Pose:
-    """Return the pose of a (12,) state."""
-    half = 0.5 * state[3:6]
-    (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
-    return Pose(
-        state[:3].copy(),
-        np.array(
-            [
-                cr * cp * cy + sr * sp * sy,
-                sr * cp * cy - cr * sp * sy,
-                cr * sp * cy + sr * cp * sy,
-                cr * cp * sy - sr * sp * cy,
-            ]
-        ),
-    )
-
-
-def twelve_states(state: RobotState) -> FloatArray:
-    """Return the (12,) state of a robot state."""
-    w, x, y, z = state.pose.orientation
-    out = np.zeros(12)
-    out[:3] = state.pose.position
-    out[3] = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    out[4] = math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
-    out[5] = state.pose.yaw
-    out[6:9] = state.velocity
-    out[9:12] = state.angular_velocity
+    out = np.zeros((3, ENTRIES))
+    gains = np.zeros(3)
+    gains[:] = parameters[0:3]
+    _chain(out[PITCH_CHAIN], gains, GRAVITY, INERTIA[1], periods, h)
+    gains[:] = parameters[3:6]
+    _chain(out[ROLL_CHAIN], gains, -GRAVITY, INERTIA[0], periods, h)
+    # The height has one deviation only.
+    v = 1.0
+    height = out[HEIGHT_CHAIN]
+    for _ in range(periods):
+        force = -parameters[6] * v
+        height[COST] += force * force
+        height[TRAVEL] += v * h + force / MASS * h * h / 2.0
+        v += force / MASS * h
+    height[MATRIX] = v
+    height[BOUND] = 1.0
     return out
 
 
-class Mambo(SteeredMotion):
-    """Controller and prediction of `MamboBody`."""
+@njit(cache=True)
+def _most(row: FloatArray, v: float, a: float, w: float) -> float:
+    """Return the largest |velocity - command| of one chain on the way."""
+    return row[BOUND] * abs(v) + row[BOUND + 1] * abs(a) + row[BOUND + 2] * abs(w)
 
-    def __init__(
-        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
-    ) -> None:
-        super().__init__(settings, obstacles, radius)
-        self.parameters = mambo_parameters(settings)
-        gains = lqr_gains(settings)
-        own = min(
-            gains['pitch'][0] / gains['pitch'][1],
-            gains['roll'][0] / gains['roll'][1],
-            gains['height'][0] / gains['height'][1],
-        )
-        slowing = GRAVITY * self.parameters[TILT] / settings.speed
-        self.rate = float(min(settings.approach_rate or own, slowing))
-        natural = math.sqrt(GRAVITY * self.parameters[K_VX] / self.parameters[K_Q])
-        self.barrier = float(min(0.18 * natural, 0.5 * slowing))
-        self.steering = Steering(
-            self.rate,
-            float(self.parameters[SPEED]),
-            self.barrier,
-            math.inf,
-            settings.heading == 'travel',
-            float(self.parameters[YAW_RATE]),
-            settings.tolerance,
-        )
-        self._term = ObstacleTerm(
-            KINDS.index(settings.obstacle_term),
-            settings.obstacle_distance,
-            settings.obstacle_gain,
-            self.keep_out.circles,
-        )
-        if self._term.kind:
-            # The term takes the place of ways around obstacles.
-            self.surroundings = self.surroundings._replace(circles=np.zeros((0, 5)))
 
-    def roll_out(
-        self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
-    ) -> None:
-        """See `MotionModel.roll_out`."""
-        periods, h = control_periods(step)
-        _roll_out(
-            twelve_states(state),
-            waypoints,
-            self._tables(waypoints),
-            self.steering,
-            self.surroundings,
-            self._term,
-            self.parameters,
-            periods,
-            h,
-            out.arrays(),
-        )
+@njit(cache=True)
+def _lateral(
+    row: FloatArray, v: float, a: float, w: float
+) -> tuple[float, float, float, float, float]:
+    """Return the deviations afterwards, the travel, and the sum of u'u of one chain."""
+    return (
+        row[0] * v + row[1] * a + row[2] * w,
+        row[3] * v + row[4] * a + row[5] * w,
+        row[6] * v + row[7] * a + row[8] * w,
+        row[9] * v + row[10] * a + row[11] * w,
+        row[12] * v * v
+        + row[16] * a * a
+        + row[20] * w * w
+        + 2.0 * (row[13] * v * a + row[14] * v * w + row[17] * a * w),
+    )
 
-    def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
-        """See `MotionModel.command`: the LQR's set-point as a velocity command."""
-        out = super().command(state, waypoint)
-        if self._term.kind:
-            position = np.array(state.pose.position)
-            add_obstacle_term(position, state.pose.yaw, self._term, self.parameters, out)
-        return out
 
-    def body(self, state: RobotState) -> MamboBody:
-        """See `MotionModel.body`."""
-        return MamboBody(self.settings, state)
+@njit(cache=True)
+def mambo_step(
+    state: FloatArray,
+    command: Command,
+    parameters: FloatArray,
+    table: FloatArray,
+    periods: int,
+    h: float,
+) -> float:
+    """Fly `periods` control periods of `h` seconds, in place; return the sum of u'u."""
+    size = norm(command[:3])
+    scale = parameters[SPEED] / size if size > parameters[SPEED] else 1.0
+    turn = min(max(command[3], -parameters[YAW_RATE]), parameters[YAW_RATE])
+    wanted = (command[0] * scale, command[1] * scale, command[2] * scale, turn)
+    if turn == 0.0 and state[11] == 0.0:
+        cost = _step_at_once(state, wanted, parameters, table, periods * h)
+        if cost >= 0.0:
+            return cost
+    return _step_in_periods(state, wanted, parameters, periods, h)
+
+
+@njit(cache=True)
+def _step_at_once(
+    state: FloatArray, wanted: Command, parameters: FloatArray, table: FloatArray, time: float
+) -> float:
+    """Fly all periods without turning, in place; return the sum of u'u.
+
+    -1, with the state as it was, if a limit would act on the way.
+    """
+    cx, cy, cz, _ = wanted
+    yaw, roll, pitch = state[3], state[4], state[5]
+    # Deviations of the velocity along the heading, to its left, and upwards.
+    df, dl = turned(state[6], state[7], -yaw)
+    df, dl, dz = df - cx, dl - cy, state[8] - cz
+    front, side, up = table[PITCH_CHAIN], table[ROLL_CHAIN], table[HEIGHT_CHAIN]
+    most_pitch = abs(parameters[K_VX] / parameters[K_PITCH]) * _most(front, df, pitch, state[10])
+    most_roll = abs(parameters[K_VY] / parameters[K_ROLL]) * _most(side, dl, roll, state[9])
+    tilt, most_force = parameters[TILT], parameters[K_VZ] * abs(dz)
+    if not (most_pitch <= tilt and most_roll <= tilt and most_force <= parameters[LIFT]):
+        return -1.0
+    df, state[5], state[10], forward, pitch_cost = _lateral(front, df, pitch, state[10])
+    dl, state[4], state[9], left, roll_cost = _lateral(side, dl, roll, state[9])
+    dx, dy = turned(forward + cx * time, left + cy * time, yaw)
+    state[0] += dx
+    state[1] += dy
+    state[2] += cz * time + up[TRAVEL] * dz
+    state[6], state[7] = turned(cx + df, cy + dl, yaw)
+    state[8] = cz + up[MATRIX] * dz
+    return pitch_cost + roll_cost + parameters[COUNT_FORCE] * up[COST] * dz * dz
+
+
+@njit(cache=True)
+def _step_in_periods(
+    state: FloatArray, wanted: Command, parameters: FloatArray, periods: int, h: float
+) -> float:
+    """Fly one period after the other within the limits, in place; return the sum of u'u."""
+    cx, cy, cz, cr = wanted
+    x, y, z, yaw, roll, pitch = state[0], state[1], state[2], state[3], state[4], state[5]
+    p, q, r = state[9], state[10], state[11]
+    # Velocity along the heading, to its left, and upwards.
+    vf, vl = turned(state[6], state[7], -yaw)
+    vz = state[8]
+    to_pitch = parameters[K_VX] / parameters[K_PITCH]
+    to_roll = parameters[K_VY] / parameters[K_ROLL]
+    tilt, lift = parameters[TILT], parameters[LIFT]
+    h2 = h * h / 2.0
+    h3 = h * h * h / 6.0
+    h4 = h * h * h * h / 24.0
+    turning = cr != 0.0 or r != 0.0
+    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    cost = 0.0
+    for _ in range(periods):
+        pitch_wanted = min(max(to_pitch * (cx - vf), -tilt), tilt)
+        roll_wanted = min(max(to_roll * (cy - vl), -tilt), tilt)
+        u_pitch = parameters[K_PITCH] * (pitch_wanted - pitch) - parameters[K_Q] * q
+        u_roll = parameters[K_ROLL] * (roll_wanted - roll) - parameters[K_P] * p
+        force = min(max(parameters[K_VZ] * (cz - vz), -lift), lift)
+        u_yaw = parameters[K_R] * (cr - r)
+        cost += u_roll * u_roll + u_pitch * u_pitch + u_yaw * u_yaw
+        cost += parameters[COUNT_FORCE] * force * force
+        aq = u_pitch / INERTIA[1]
+        ap = u_roll / INERTIA[0]
+        ar = u_yaw / INERTIA[2]
+        az = force / MASS
+        forward = vf * h + GRAVITY * (pitch * h2 + q * h3 + aq * h4)
+        left = vl * h - GRAVITY * (roll * h2 + p * h3 + ap * h4)
+        x += cos_yaw * forward - sin_yaw * left
+        y += sin_yaw * forward + cos_yaw * left
+        z += vz * h + az * h2
+        vf += GRAVITY * (pitch * h + q * h2 + aq * h3)
+        vl -= GRAVITY * (roll * h + p * h2 + ap * h3)
+        vz += az * h
+        pitch += q * h + aq * h2
+        q += aq * h
+        roll += p * h + ap * h2
+        p += ap * h
+        if turning:
+            turn = r * h + ar * h2
+            yaw += turn
+            r += ar * h
+            # The velocity stays what it is in the map while the axes turn under it.
+            vf, vl = turned(vf, vl, -turn)
+            cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    state[0], state[1], state[2], state[3], state[4], state[5] = x, y, z, yaw, roll, pitch
+    state[6] = cos_yaw * vf - sin_yaw * vl
+    state[7] = sin_yaw * vf + cos_yaw * vl
+    state[8], state[9], state[10], state[11] = vz, p, q, r
+    return cost

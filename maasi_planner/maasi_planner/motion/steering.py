@@ -9,142 +9,108 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.obstacles import hold_back, next_point, segment_distance
+from maasi_planner.obstacles import (
+    Surroundings,
+    Vector,
+    hold_back,
+    minus,
+    next_point,
+    norm,
+    segment_distance,
+)
 
-
-class Surroundings(NamedTuple):
-    """Obstacles of a robot, inflated by its radius.
-
-    circles (n, 5): x, y, z, radius [m, map], 1 for a sphere; vertices (m, 2): of the visibility
-    graph [m, map]; clearance: kept beyond the radius by planned ways [m].
-    """
-
-    circles: FloatArray
-    vertices: FloatArray
-    clearance: float
+# vx, vy, vz [m/s, axes turned by the heading], yaw rate [rad/s].
+Command = tuple[float, float, float, float]
 
 
 class Steering(NamedTuple):
     """How a robot approaches its waypoint.
 
     rate: speed per distance left [1/s]; speed: at most [m/s]; barrier: speed towards an obstacle
-    per distance to it, at most [1/s]; deceleration: next to obstacles the speed is what this can
-    stop [m/s^2]; infinite: no such limit; face_travel: whether the heading turns to the direction
-    of travel; yaw_rate: at most [rad/s]; tolerance: distance at which the waypoint is reached [m].
+    per distance to it, at most [1/s]; acceleration: at most [m/s^2], next to obstacles the speed
+    is what it can stop; yaw_rate, yaw_acceleration: at most [rad/s and rad/s^2]; infinite: no such
+    limit; face_travel: whether the heading turns to the direction of travel; window: whether a
+    ground robot avoids obstacles by the dynamic window.
     """
 
     rate: float
     speed: float
     barrier: float
-    deceleration: float
-    face_travel: bool
+    acceleration: float
     yaw_rate: float
-    tolerance: float
-
-
-@njit(cache=True)
-def turn_towards(dx: float, dy: float, yaw: float, yaw_rate: float) -> float:
-    """Return the yaw rate that turns the heading towards (dx, dy)."""
-    turn = math.atan2(dy, dx) - yaw
-    turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
-    return min(max(2.0 * turn, -yaw_rate), yaw_rate)
-
-
-@njit(cache=True)
-def straight_command(
-    dx: float, dy: float, dz: float, yaw: float, steering: Steering
-) -> tuple[float, float, float, float]:
-    """Return the command vx, vy, vz (body axes), yaw rate towards a waypoint at (dx, dy, dz).
-
-    The speed is `rate` times the distance, at most `speed`.
-    """
-    size = math.sqrt(dx * dx + dy * dy + dz * dz)
-    scale = steering.rate
-    if scale * size > steering.speed:
-        scale = steering.speed / size
-    vx = scale * dx
-    vy = scale * dy
-    turn = 0.0
-    if steering.face_travel and dx * dx + dy * dy > 1e-6:
-        turn = turn_towards(dx, dy, yaw, steering.yaw_rate)
-    if yaw == 0.0:
-        return vx, vy, scale * dz, turn
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    return cos_yaw * vx + sin_yaw * vy, cos_yaw * vy - sin_yaw * vx, scale * dz, turn
+    yaw_acceleration: float
+    face_travel: bool
+    window: bool
 
 
 @njit(cache=True, forceinline=True)
-def _room(position: FloatArray, circles: FloatArray) -> float:
-    """Return the distance of a position (3,) from the nearest circle, negative inside."""
-    x, y, z = position[0], position[1], position[2]
+def wrapped(angle: float) -> float:
+    """Return an angle from -pi to below pi."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@njit(cache=True, forceinline=True)
+def turned(x: float, y: float, yaw: float) -> tuple[float, float]:
+    """Return a level vector turned by `yaw`."""
+    if yaw == 0.0:
+        return x, y
+    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    return cos_yaw * x - sin_yaw * y, sin_yaw * x + cos_yaw * y
+
+
+@njit(cache=True, forceinline=True)
+def _stoppable(position: Vector, steering: Steering, circles: FloatArray) -> float:
+    """Return the speed that can be stopped before the nearest circle, at most the largest."""
     room = np.inf
     for i in range(circles.shape[0]):
-        room = min(room, segment_distance(x, y, z, x, y, z, circles[i]) - circles[i, 3])
-    return room
-
-
-@njit(cache=True)
-def sideways_command(
-    position: FloatArray,
-    yaw: float,
-    goal: FloatArray,
-    to_goal: FloatArray,
-    steering: Steering,
-    around: Surroundings,
-    work: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write the command of a robot that can move in any direction into `out` (4,), body axes."""
-    if around.circles.shape[0] == 0:
-        out[0], out[1], out[2], out[3] = straight_command(
-            goal[0] - position[0], goal[1] - position[1], goal[2] - position[2], yaw, steering
-        )
-    else:
-        _command_among(position, yaw, goal, to_goal, steering, around, work, out)
+        room = min(room, segment_distance(position, position, circles, i) - circles[i, 3])
+    speed = steering.speed
+    return min(speed, math.sqrt(steering.acceleration * max(room, 0.0)) + 0.05 * speed)
 
 
 @njit(cache=True, forceinline=True)
-def _command_among(
-    position: FloatArray,
+def _towards(way: Vector, velocity: Vector, yaw: float, steering: Steering) -> Command:
+    """Return the command of a velocity in the map, on a way."""
+    turn = 0.0
+    if steering.face_travel and way[0] * way[0] + way[1] * way[1] > 1e-6:
+        turn = 2.0 * wrapped(math.atan2(way[1], way[0]) - yaw)
+        turn = min(max(turn, -steering.yaw_rate), steering.yaw_rate)
+    forward, side = turned(velocity[0], velocity[1], -yaw)
+    return forward, side, velocity[2], turn
+
+
+@njit(cache=True, forceinline=True)
+def fly_freely(position: Vector, yaw: float, goal: Vector, steering: Steering) -> Command:
+    """Return the command straight towards a waypoint.
+
+    The speed is `rate` times the distance left, at most `speed`.
+    """
+    way = minus(goal, position)
+    size, scale = norm(way), steering.rate
+    if scale * size > steering.speed:
+        scale = steering.speed / size
+    return _towards(way, (scale * way[0], scale * way[1], scale * way[2]), yaw, steering)
+
+
+@njit(cache=True)
+def fly_among(
+    position: Vector,
     yaw: float,
-    goal: FloatArray,
+    goal: Vector,
     to_goal: FloatArray,
     steering: Steering,
     around: Surroundings,
-    work: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write the command among obstacles, see `sideways_command`."""
-    circles = around.circles
-    speed = steering.speed
-    target = work[0]
-    velocity = work[1]
-    left = next_point(position, goal, circles, around.vertices, to_goal, around.clearance, target)
-    dx = target[0] - position[0]
-    dy = target[1] - position[1]
-    dz = target[2] - position[2]
-    size = math.sqrt(dx * dx + dy * dy + dz * dz)
-    if steering.deceleration < np.inf:
-        room = max(_room(position, circles), 0.0)
-        speed = min(speed, math.sqrt(steering.deceleration * room) + 0.05 * speed)
-    scale = 0.0
-    if size > 0.0:
-        scale = min(steering.rate * left, speed) / size
-    velocity[0] = scale * dx
-    velocity[1] = scale * dy
-    velocity[2] = scale * dz
-    hold_back(position, circles, steering.barrier, velocity)
-    after = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
-    if after > speed:
-        velocity[0] *= speed / after
-        velocity[1] *= speed / after
-        velocity[2] *= speed / after
-    cos_yaw = math.cos(yaw)
-    sin_yaw = math.sin(yaw)
-    out[0] = cos_yaw * velocity[0] + sin_yaw * velocity[1]
-    out[1] = cos_yaw * velocity[1] - sin_yaw * velocity[0]
-    out[2] = velocity[2]
-    out[3] = 0.0
-    if steering.face_travel and dx * dx + dy * dy > 1e-6:
-        out[3] = turn_towards(dx, dy, yaw, steering.yaw_rate)
+) -> Command:
+    """Return the command towards a waypoint around obstacles."""
+    target, left = next_point(position, goal, to_goal, around)
+    way, speed = minus(target, position), steering.speed
+    size = norm(way)
+    if steering.acceleration < np.inf:
+        speed = _stoppable(position, steering, around.circles)
+    scale = min(steering.rate * left, speed) / size if size > 0.0 else 0.0
+    velocity = (scale * way[0], scale * way[1], scale * way[2])
+    velocity = hold_back(position, around.circles, steering.barrier, velocity)
+    fastest = norm(velocity)
+    share = speed / fastest if fastest > speed else 1.0
+    velocity = (velocity[0] * share, velocity[1] * share, velocity[2] * share)
+    return _towards(way, velocity, yaw, steering)

@@ -1,0 +1,472 @@
+"""The motion models of the suite: one compiled closed loop of controller and body for all."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.models.pose import Pose
+from maasi_planner.motion import mambo, quadrotor
+from maasi_planner.motion.base import (
+    Body,
+    MotionModel,
+    RobotState,
+    Trajectories,
+    check_command,
+    check_step,
+    check_waypoint,
+)
+from maasi_planner.motion.mambo import ObstacleTerm, mambo_step, with_obstacle_term
+from maasi_planner.motion.quadrotor import quadrotor_step
+from maasi_planner.motion.steering import Command, Steering, fly_among, fly_freely, turned
+from maasi_planner.motion.unicycle import K_RHO, drive_among, drive_freely, unicycle_step
+from maasi_planner.obstacles import Obstacles, Surroundings, Vector, dot, norm
+from maasi_planner.settings import MotionSettings
+
+POINT, UNICYCLE, MAMBO, QUADROTOR = range(4)
+APPROACH_RATE = 5.0
+
+
+class Kernel(NamedTuple):
+    """What the compiled functions of a model need for steps of `periods` times `h` seconds.
+
+    States are arrays that begin with the position [m, map] and the heading [rad]. parameters: of a
+    flying robot's body; table: what `periods` do at once (Mambo); tolerance: distance at which a
+    waypoint is reached [m].
+    """
+
+    kind: int
+    steering: Steering
+    around: Surroundings
+    term: ObstacleTerm
+    parameters: FloatArray
+    table: FloatArray
+    tolerance: float
+    periods: int
+    h: float
+
+
+@njit(cache=True, forceinline=True)
+def _point_step(state: FloatArray, command: Command, steering: Steering, dt: float) -> None:
+    """Move a point for `dt`, in place; state: position, heading, velocity and turn rate.
+
+    The velocity changes by at most the acceleration, and the position by its mean.
+    """
+    x, y = turned(command[0], command[1], state[3])
+    wanted = (x, y, command[2])
+    if dot(wanted, wanted) > steering.speed * steering.speed:
+        scale = steering.speed / norm(wanted)
+        wanted = (x * scale, y * scale, command[2] * scale)
+    bounded = steering.acceleration < np.inf
+    share = 1.0
+    if bounded:
+        change = norm((wanted[0] - state[4], wanted[1] - state[5], wanted[2] - state[6]))
+        if change > steering.acceleration * dt:
+            share = steering.acceleration * dt / change
+    for axis in range(3):
+        before = state[4 + axis]
+        after = before + share * (wanted[axis] - before) if share < 1.0 else wanted[axis]
+        state[axis] += 0.5 * dt * (before + after) if bounded else dt * after
+        state[4 + axis] = after
+    state[7] = min(max(command[3], -steering.yaw_rate), steering.yaw_rate)
+    state[3] += dt * state[7]
+
+
+# Arrays are arguments only of what needs them: counting references to them costs more than a step.
+@njit(cache=True, forceinline=True)
+def _freely(kind: int, steering: Steering, state: FloatArray, goal: Vector) -> Command:
+    if kind == UNICYCLE:
+        return drive_freely(state, goal, steering)
+    return fly_freely((state[0], state[1], state[2]), state[3], goal, steering)
+
+
+@njit(cache=True)
+def _among(
+    kind: int,
+    steering: Steering,
+    around: Surroundings,
+    state: FloatArray,
+    goal: Vector,
+    to_goal: FloatArray,
+) -> Command:
+    if kind == UNICYCLE:
+        return drive_among(state, goal, to_goal, steering, around)
+    return fly_among((state[0], state[1], state[2]), state[3], goal, to_goal, steering, around)
+
+
+@njit(cache=True, forceinline=True)
+def _move(kind: int, steering: Steering, state: FloatArray, command: Command, dt: float) -> float:
+    if kind == UNICYCLE:
+        unicycle_step(state, command, steering, dt)
+    else:
+        _point_step(state, command, steering, dt)
+    return command[0] ** 2 + command[1] ** 2 + command[2] ** 2 + command[3] ** 2
+
+
+@njit(cache=True)
+def _fly(
+    kind: int,
+    parameters: FloatArray,
+    table: FloatArray,
+    periods: int,
+    h: float,
+    state: FloatArray,
+    command: Command,
+) -> float:
+    if kind == MAMBO:
+        return mambo_step(state, command, parameters, table, periods, h)
+    return quadrotor_step(state, command, parameters, periods, h)
+
+
+@njit(cache=True)
+def steer(kernel: Kernel, state: FloatArray, goal: Vector, to_goal: FloatArray) -> Command:
+    """Return the command of a robot's controller towards a waypoint."""
+    if kernel.around.circles.shape[0]:
+        command = _among(kernel.kind, kernel.steering, kernel.around, state, goal, to_goal)
+    else:
+        command = _freely(kernel.kind, kernel.steering, state, goal)
+    if kernel.term.kind:
+        position = (state[0], state[1], state[2])
+        return with_obstacle_term(position, state[3], command, kernel.term, kernel.parameters)
+    return command
+
+
+@njit(cache=True)
+def advance(kernel: Kernel, state: FloatArray, command: Command) -> float:
+    """Move a body for a step under a command, in place; return the sum of its squared inputs."""
+    if kernel.kind >= MAMBO:
+        h, parameters, table = kernel.h, kernel.parameters, kernel.table
+        return _fly(kernel.kind, parameters, table, kernel.periods, h, state, command)
+    return _move(kernel.kind, kernel.steering, state, command, kernel.h)
+
+
+@njit(cache=True)
+def _close_loop(
+    kernel: Kernel,
+    state: FloatArray,
+    goal: Vector,
+    to_goal: FloatArray,
+    positions: FloatArray,
+    yaws: FloatArray,
+) -> tuple[int, float]:
+    """Run controller and body against each other, `state` in place.
+
+    Return the steps to the waypoint, one too many where it is not reached, and the sum of squared
+    inputs.
+    """
+    kind, steering, around, term, parameters, table, tolerance, periods, h = kernel
+    obstacles, flies, termed = around.circles.shape[0] > 0, kind >= MAMBO, term.kind > 0
+    cost = 0.0
+    for k in range(yaws.shape[0]):
+        x, y, z = state[0], state[1], state[2]
+        positions[k, 0], positions[k, 1], positions[k, 2], yaws[k] = x, y, z, state[3]
+        height = 0.0 if kind == UNICYCLE else goal[2] - z
+        square = (goal[0] - x) ** 2 + (goal[1] - y) ** 2 + height * height
+        if square <= tolerance * tolerance:
+            return k, cost
+        if obstacles:
+            command = _among(kind, steering, around, state, goal, to_goal)
+        else:
+            command = _freely(kind, steering, state, goal)
+        if termed:
+            command = with_obstacle_term((x, y, z), yaws[k], command, term, parameters)
+        if flies:
+            cost += _fly(kind, parameters, table, periods, h, state, command)
+        else:
+            cost += _move(kind, steering, state, command, h)
+    return yaws.shape[0], cost
+
+
+@njit(cache=True)
+def _go_straight(
+    kernel: Kernel, state: FloatArray, goal: Vector, positions: FloatArray, yaws: FloatArray
+) -> tuple[int, float]:
+    """Do as `_close_loop` for a point that nothing diverts: its speed depends on what is left."""
+    steering = kernel.steering
+    x, y, z = goal[0] - state[0], goal[1] - state[1], goal[2] - state[2]
+    left, cost = norm((x, y, z)), 0.0
+    scale = 1.0 / left if left > 0.0 else 0.0
+    x, y, z = x * scale, y * scale, z * scale
+    for k in range(yaws.shape[0]):
+        positions[k, 0], positions[k, 1] = goal[0] - x * left, goal[1] - y * left
+        positions[k, 2], yaws[k] = goal[2] - z * left, state[3]
+        if left <= kernel.tolerance:
+            return k, cost
+        forward = min(steering.rate * left, steering.speed)
+        cost += forward * forward
+        left -= kernel.h * forward
+    return yaws.shape[0], cost
+
+
+@njit(cache=True)
+def _roll_out(
+    kernel: Kernel,
+    start: FloatArray,
+    waypoints: FloatArray,
+    tables: FloatArray,
+    positions: FloatArray,
+    yaws: FloatArray,
+    lengths: IntArray,
+    control_cost: FloatArray,
+) -> None:
+    state, steering = start.copy(), kernel.steering
+    straight = kernel.kind == POINT and steering.acceleration == np.inf
+    straight = straight and not (steering.face_travel or kernel.around.circles.shape[0])
+    for w in range(waypoints.shape[0]):
+        goal = (waypoints[w, 0], waypoints[w, 1], waypoints[w, 2])
+        if straight:
+            way = _go_straight(kernel, start, goal, positions[w], yaws[w])
+        else:
+            state[:] = start
+            way = _close_loop(kernel, state, goal, tables[w], positions[w], yaws[w])
+        lengths[w], control_cost[w] = way
+        positions[w, 0] = start[:3]
+
+
+class CompiledBody(Body):
+    """Body of a robot of the suite."""
+
+    def __init__(self, motion: CompiledMotion, state: RobotState) -> None:
+        self.motion = motion
+        self.state = motion._to_array(state)
+
+    def step(self, velocity_command: ArrayLike, dt: float) -> None:
+        """See `Body.step`."""
+        x, y, z, turn = check_command(velocity_command).tolist()
+        kernel = self.motion.kernel(check_step(dt))
+        advance(kernel, self.state, (x, y, z, turn))
+
+    def robot_state(self) -> RobotState:
+        """See `Body.robot_state`."""
+        return self.motion._to_state(self.state)
+
+
+class CompiledMotion(MotionModel):
+    """Motion model of the suite: its controller and its body are compiled.
+
+    Attributes
+    ----------
+    kind : int
+        Which functions its steps use.
+    steering : Steering
+        How it approaches its waypoint.
+    """
+
+    kind: int
+    steering: Steering
+
+    def __init__(
+        self, settings: MotionSettings, obstacles: Obstacles | None = None, radius: float = 0.0
+    ) -> None:
+        super().__init__(settings, obstacles, radius)
+        self.parameters = np.zeros(0)
+        self.kernel = lru_cache(maxsize=4)(self._make_kernel)
+        speed, barrier, acceleration = self._limits()
+        self.steering = Steering(
+            self.rate,
+            speed,
+            barrier,
+            acceleration,
+            settings.yaw_rate,
+            settings.yaw_acceleration or math.inf,
+            settings.heading == 'travel',
+            settings.avoidance == 'dynamic_window',
+        )
+
+    @abstractmethod
+    def _limits(self) -> tuple[float, float, float]:
+        """Set parameters and approach rate; return speed, barrier and acceleration of steering."""
+
+    @abstractmethod
+    def _to_array(self, state: RobotState) -> FloatArray:
+        """Return the array of a state."""
+
+    @abstractmethod
+    def _to_state(self, array: FloatArray) -> RobotState:
+        """Return the state in an array."""
+
+    def _make_kernel(self, step: float) -> Kernel:
+        """Return what the compiled functions need for steps of `step` seconds."""
+        periods = max(1, round(step / mambo.PERIOD)) if self.kind >= MAMBO else 1
+        h = step / periods
+        settings, keep_out = self.settings, self.keep_out
+        term, table = settings.obstacle_term if self.kind == MAMBO else 'none', np.zeros((0, 0))
+        if self.kind == MAMBO:
+            table = mambo.closed_loop(self.parameters, periods, h)
+        around = keep_out.around
+        if term != 'none':
+            # The term takes the place of ways around obstacles.
+            around = around._replace(circles=np.zeros((0, 5)))
+        return Kernel(
+            self.kind,
+            self.steering,
+            around,
+            ObstacleTerm(
+                mambo.TERMS.index(term),
+                settings.obstacle_distance,
+                settings.obstacle_gain,
+                keep_out.circles,
+            ),
+            self.parameters,
+            table,
+            settings.tolerance,
+            periods,
+            h,
+        )
+
+    def roll_out(
+        self, state: RobotState, waypoints: FloatArray, step: float, out: Trajectories
+    ) -> None:
+        """See `MotionModel.roll_out`."""
+        tables = np.zeros((len(waypoints), len(self.keep_out.around.vertices)))
+        if tables.shape[1]:
+            for table, waypoint in zip(tables, waypoints.tolist()):
+                table[:] = self.keep_out.to_goal(tuple(waypoint))
+        start, costs = self._to_array(state), out.control_cost
+        kernel = self.kernel(step)
+        _roll_out(kernel, start, waypoints, tables, out.positions, out.yaws, out.lengths, costs)
+
+    def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
+        """See `MotionModel.command`."""
+        x, y, z = check_waypoint(waypoint).tolist()
+        kernel = self.kernel(mambo.PERIOD)
+        return np.array(steer(kernel, self._to_array(state), (x, y, z), self.table((x, y, z))))
+
+    def body(self, state: RobotState) -> CompiledBody:
+        """See `MotionModel.body`."""
+        return CompiledBody(self, state)
+
+
+class ConstantSpeed(CompiledMotion):
+    """A point with a largest speed and, if wanted, a largest acceleration.
+
+    Its input is the velocity command.
+    """
+
+    kind = POINT
+
+    def _limits(self) -> tuple[float, float, float]:
+        settings = self.settings
+        self.rate = settings.approach_rate or APPROACH_RATE
+        if settings.acceleration is None:
+            return settings.speed, self.rate, math.inf
+        # Slow enough that braking at the limit follows the approach.
+        self.rate = min(self.rate, settings.acceleration / settings.speed)
+        return settings.speed, 0.25 * self.rate, settings.acceleration
+
+    def _to_array(self, state: RobotState) -> FloatArray:
+        pose = state.pose
+        return np.array([*pose.position, pose.yaw, *state.velocity, state.angular_velocity[2]])
+
+    def _to_state(self, array: FloatArray) -> RobotState:
+        pose = Pose.from_yaw(array[:3], array[3])
+        return RobotState(pose, array[4:7], np.array([0.0, 0.0, array[7]]))
+
+
+class Unicycle(CompiledMotion):
+    """A robot that drives forward and turns; the tolerance is horizontal."""
+
+    kind = UNICYCLE
+
+    def _limits(self) -> tuple[float, float, float]:
+        settings = self.settings
+        self.rate, braking = settings.approach_rate or K_RHO, 2.0
+        if settings.acceleration is None:
+            return settings.speed, braking, math.inf
+        slowing = settings.acceleration / settings.speed
+        self.rate = min(self.rate, slowing)
+        return settings.speed, min(braking, 0.5 * slowing), settings.acceleration
+
+    def _to_array(self, state: RobotState) -> FloatArray:
+        yaw = state.pose.yaw
+        forward = state.velocity[0] * math.cos(yaw) + state.velocity[1] * math.sin(yaw)
+        return np.array([*state.pose.position, yaw, forward, state.angular_velocity[2]])
+
+    def _to_state(self, array: FloatArray) -> RobotState:
+        yaw, forward, turn = array[3:].tolist()
+        velocity = np.array([forward * math.cos(yaw), forward * math.sin(yaw), 0.0])
+        return RobotState(Pose.from_yaw(array[:3], yaw), velocity, np.array([0.0, 0.0, turn]))
+
+    def squared_distance(self, position: ArrayLike, waypoint: ArrayLike) -> float:
+        """Return the squared horizontal distance of two points (3,) [m^2]."""
+        offset = np.asarray(position, dtype=float)[:2] - np.asarray(waypoint, dtype=float)[:2]
+        return float(offset[0] * offset[0] + offset[1] * offset[1])
+
+
+class Mambo(CompiledMotion):
+    """The 12-state linear Mambo, its attitude and velocity loops at 200 Hz, and its limits.
+
+    Speed, acceleration and tilt stay within the settings: commands are cut to a speed that the
+    loop's overshoot cannot carry beyond `speed`, and the tilt asked for to the smaller of `tilt`
+    and what `acceleration` allows; the tilt follows it without overshoot.
+    """
+
+    kind = MAMBO
+
+    def _limits(self) -> tuple[float, float, float]:
+        settings = self.settings
+        self.parameters = mambo.mambo_parameters(settings)
+        gains = mambo.lqr_gains(settings)
+        own = min(gains[chain][0] / gains[chain][1] for chain in ('pitch', 'roll', 'height'))
+        slowing = mambo.GRAVITY * self.parameters[mambo.TILT] / settings.speed
+        self.rate = float(min(settings.approach_rate or own, slowing))
+        natural = mambo.GRAVITY * self.parameters[mambo.K_VX] / self.parameters[mambo.K_Q]
+        barrier = float(min(0.18 * math.sqrt(natural), 0.5 * slowing))
+        return float(self.parameters[mambo.SPEED]), barrier, math.inf
+
+    def _to_array(self, state: RobotState) -> FloatArray:
+        w, x, y, z = state.pose.orientation.tolist()
+        roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+        pitch = math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
+        return np.array(
+            [
+                *state.pose.position,
+                state.pose.yaw,
+                roll,
+                pitch,
+                *state.velocity,
+                *state.angular_velocity,
+            ]
+        )
+
+    def _to_state(self, array: FloatArray) -> RobotState:
+        yaw, roll, pitch = array[3:6].tolist()
+        return RobotState(Pose.from_rpy(array[:3], [roll, pitch, yaw]), array[6:9], array[9:])
+
+
+class Quadrotor(CompiledMotion):
+    """A rigid body with thrust along its axis and torques, and its inner loops at 200 Hz."""
+
+    kind = QUADROTOR
+
+    def _limits(self) -> tuple[float, float, float]:
+        settings = self.settings
+        self.parameters = limits = np.zeros(6)
+        acceleration = settings.acceleration or math.inf
+        limits[quadrotor.SPEED] = settings.speed / 1.08
+        # Level and vertical acceleration share the limit, so that together they stay within it.
+        limits[quadrotor.LEVEL] = min(0.8 * acceleration, 100.0)
+        limits[quadrotor.VERTICAL] = min(0.5 * acceleration, 0.5 * mambo.GRAVITY)
+        limits[quadrotor.SLOPE] = math.tan(settings.tilt / 1.03)
+        limits[quadrotor.YAW_RATE] = settings.yaw_rate
+        limits[quadrotor.COUNT_FORCE] = settings.control_inputs == 'all'
+        level, vertical, slope = limits[1:4]
+        slowing = min(level, mambo.GRAVITY * slope, vertical)
+        self.rate = float(min(settings.approach_rate or quadrotor.C1, slowing / settings.speed))
+        barrier = float(min(0.15 * quadrotor.C2, 0.5 * slowing / settings.speed))
+        return float(limits[quadrotor.SPEED]), barrier, math.inf
+
+    def _to_array(self, state: RobotState) -> FloatArray:
+        pose = state.pose
+        rest = [pose.orientation, state.velocity, state.angular_velocity]
+        return np.concatenate([pose.position, [pose.yaw], *rest])
+
+    def _to_state(self, array: FloatArray) -> RobotState:
+        return RobotState(Pose(array[:3], array[4:8]), array[8:11], array[11:])
