@@ -19,7 +19,7 @@ from search_regimes import KINDS, REGIMES, prepared
 from maasi_sim.experiments.campaign import carry_out_all, plan, run_command
 from maasi_sim.experiments.experiment import Case, Experiment, Results
 from maasi_sim.experiments.searches import comparison_of, search_settings
-from maasi_sim.experiments.tables import compared_markdown
+from maasi_sim.experiments.tables import SearchTable
 
 # What differences are to.
 REFERENCE = 'before'
@@ -40,7 +40,7 @@ def tables(every: Sequence[Results]) -> str:
     """Return the tables of all regimes in Markdown."""
     return '\n'.join(
         f'**{item.experiment.name}** (limit {REGIMES[item.experiment.name].limit:g} s)\n\n'
-        f'{compared_markdown(item)}'
+        f'{SearchTable(item).markdown()}'
         for item in every
     )
 

@@ -21,11 +21,10 @@ from maasi_sim.experiments.campaign import (
     plan,
     run_command,
 )
-from maasi_sim.experiments.experiment import Results
 from maasi_sim.experiments.figures import as_png, draw_comparison
 from maasi_sim.experiments.runs import runs_text, write_file
 from maasi_sim.experiments.searches import compared
-from maasi_sim.experiments.tables import compared_facts, compared_page, compared_text, verdicts
+from maasi_sim.experiments.tables import SearchTable, compared_facts, compared_page, compared_text
 from maasi_sim.scenario.layering import ScenarioError
 
 _RUNS = Path('runs')
@@ -127,12 +126,12 @@ def compare(options: argparse.Namespace) -> int:
     print(f'results: {out}', file=sys.stderr)
     write_file(out / 'request.json', json.dumps(wanted, indent=2) + '\n')
     problems = carry_out_all(campaigns, options.workers, options.cluster, options.mixed_workers)
-    results = [work.results() for work in campaigns if work.done]
-    if results:
+    tables = [SearchTable(work.results()) for work in campaigns if work.done]
+    if tables:
         seeds = range(options.first_seed, options.first_seed + options.seeds)
-        _write(out, results, seeds)
-        for item in results:
-            print(f'\n{item.experiment.name}', *verdicts(item), sep='\n  ')
+        _write(out, tables, seeds)
+        for table in tables:
+            print(f'\n{table.name}', *table.verdicts(), sep='\n  ')
         print(f'\n{out}/comparison.md')
     return SOME_FAILED if problems else DONE
 
@@ -172,14 +171,14 @@ def _refuse_others(campaigns: Sequence[Campaign], out: Path) -> None:
         )
 
 
-def _write(out: Path, results: Sequence[Results], seeds: Sequence[int]) -> None:
+def _write(out: Path, tables: Sequence[SearchTable], seeds: Sequence[int]) -> None:
     """Write tables, picture and JSON; NoRoom is raised if one cannot be written."""
-    for item in results:
-        write_file(out / item.experiment.name / 'runs.csv', runs_text(item.every()))
-    write_file(out / 'comparison.csv', compared_text(results))
-    write_file(out / 'comparison.png', as_png(lambda figure: draw_comparison(figure, results)))
-    write_file(out / 'comparison.md', compared_page(results, seeds))
-    text = json.dumps(compared_facts(results, seeds), indent=2, allow_nan=False)
+    for table in tables:
+        write_file(out / table.name / 'runs.csv', runs_text(table.results.every()))
+    write_file(out / 'comparison.csv', compared_text(tables))
+    write_file(out / 'comparison.png', as_png(lambda figure: draw_comparison(figure, tables)))
+    write_file(out / 'comparison.md', compared_page(tables, seeds))
+    text = json.dumps(compared_facts(tables, seeds), indent=2, allow_nan=False)
     write_file(out / 'comparison.json', text + '\n')
 
 

@@ -14,7 +14,7 @@ from scipy import stats
 from maasi_filter.arrays import FloatArray
 from maasi_sim.experiments.experiment import Results, Run
 from maasi_sim.experiments.statistics import mean_interval
-from maasi_sim.experiments.tables import COMPLETE, TIME, difference, interval, shown
+from maasi_sim.experiments.tables import COMPLETE, TIME, SearchTable, interval, shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -293,14 +293,14 @@ def draw_table(
             cell.set_facecolor((1.0, 1.0 - 0.45 * share, 1.0 - 0.55 * share))
 
 
-def draw_comparison(figure: Figure, every: Sequence[Results]) -> None:
+def draw_comparison(figure: Figure, tables: Sequence[SearchTable]) -> None:
     """Draw a row for each scenario: survival curves, and paired differences to the first case."""
-    most = max(len(results.names()) for results in every)
-    figure.set_size_inches(11.0, max(3.6, 1.6 + 0.4 * most) * len(every))
-    axes = figure.subplots(len(every), 2, squeeze=False)
-    for results, (left, right) in zip(every, axes):
-        _draw_survival(left, results)
-        _draw_differences(right, results)
+    most = max(len(table.cases) for table in tables)
+    figure.set_size_inches(11.0, max(3.6, 1.6 + 0.4 * most) * len(tables))
+    axes = figure.subplots(len(tables), 2, squeeze=False)
+    for table, (left, right) in zip(tables, axes):
+        _draw_survival(left, table.results)
+        _draw_differences(right, table)
 
 
 def _draw_survival(axes: Axes, results: Results) -> None:
@@ -332,16 +332,16 @@ def _draw_survival(axes: Axes, results: Results) -> None:
     axes.legend(fontsize=8, frameon=False)
 
 
-def _draw_differences(axes: Axes, results: Results) -> None:
-    names = results.names()
+def _draw_differences(axes: Axes, table: SearchTable) -> None:
+    names = table.cases
     axes.axvline(0.0, color='#222222', lw=0.8)
     for row, name in enumerate(names[1:]):
         colour = _COMPARED[(row + 1) % len(_COMPARED)]
-        gaps = np.subtract(*results.pairs(name, names[0], TIME.name))
+        gaps = np.subtract(*table.results.pairs(name, names[0], TIME.name))
         # Spread, always the same way, so that equal values can be seen.
         lift = np.random.default_rng(0).uniform(0.12, 0.3, len(gaps))
         axes.plot(gaps, row + lift, 'o', color=colour, ms=4, alpha=0.45, mew=0)
-        mean = difference(results, name, TIME)
+        mean = table.differences[name][TIME.name]
         axes.plot([mean.low, mean.high], [row, row], '-', color=colour, lw=3, solid_capstyle='butt')
         axes.plot([mean.mean], [row], 'D', color=colour, ms=7, mec='white')
     axes.set_yticks(range(len(names) - 1), names[1:])

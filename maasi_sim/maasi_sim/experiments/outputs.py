@@ -16,7 +16,13 @@ from maasi_sim.experiments.experiment import Experiment, OpenPoint, Results
 from maasi_sim.experiments.figures import as_png
 from maasi_sim.experiments.papers import experiments, introduction, title_of
 from maasi_sim.experiments.runs import runs_text, steps_text, write_file
-from maasi_sim.experiments.tables import by_case, markdown_table, table_cells, table_text
+from maasi_sim.experiments.tables import (
+    beside_paper,
+    case_cells,
+    markdown_table,
+    pair_cells,
+    table_text,
+)
 
 _PICTURE_DPI = 130
 _COLUMNS = 118
@@ -56,11 +62,8 @@ def configuration_text(results: Results, seed: int) -> str:
 def write_outputs(work: Campaign, seed: int) -> None:
     """Write raw runs, tables, figure and configuration."""
     experiment, results = work.experiment, work.results()
-    parts = [
-        f'# {experiment.name}: {experiment.title}\n',
-        *_described(experiment, table_cells(results)),
-        listed(experiment.choices),
-    ]
+    described = _described(experiment, case_cells(results), pair_cells(results))
+    parts = [f'# {experiment.name}: {experiment.title}\n', *described, listed(experiment.choices)]
     for name, content in (
         ('steps.csv', steps_text(results.every())),
         ('runs.csv', runs_text(results.every())),
@@ -72,10 +75,11 @@ def write_outputs(work: Campaign, seed: int) -> None:
         write_file(work.folder / name, content)
 
 
-def _described(experiment: Experiment, tables: list[list[list[str]]]) -> list[str]:
+def _described(
+    experiment: Experiment, cases: dict[str, dict[str, str]], pairs: list[list[str]]
+) -> list[str]:
     """Return tables, note and causes in Markdown."""
-    shown = [by_case(table) if table[0][0] == 'case' else table for table in tables]
-    parts = [*map(markdown_table, shown), experiment.note and f'{experiment.note}\n']
+    parts = [*beside_paper(cases, pairs), experiment.note and f'{experiment.note}\n']
     if experiment.causes:
         parts.append(f'Likely causes of differences, not tested: {experiment.causes}\n')
     if experiment.tested:
@@ -92,34 +96,27 @@ def listed(choices: Sequence[OpenPoint]) -> str:
 class Section:
     """What the page shows of an experiment, stored beside its figure.
 
-    `rests` is the number of runs in words, `duration` the time of a run in words or '', and
-    `tables` are the texts of cells.
+    `rests` is the number of runs in words, `duration` the time of a run in words or '', and `cases`
+    and `pairs` are the cells of its tables.
     """
 
     rests: str
     duration: str
-    tables: list[list[list[str]]]
+    cases: dict[str, dict[str, str]]
+    pairs: list[list[str]]
 
-    def text(self) -> str:
-        """Return it as JSON, a row of a table on each line."""
-        text = json.dumps(asdict(self), ensure_ascii=False)
-        return text.replace('], [', '],\n [') + '\n'
+    def complete(self, earlier: Section) -> None:
+        """Add the rows of an earlier section that it does not have, marked."""
+        for name, cells in earlier.cases.items():
+            self.cases.setdefault(name, {**cells, 'runs': _earlier(cells['runs'])})
+        known = {tuple(row[:2]) for row in self.pairs}
+        for who, what, maps, gap in earlier.pairs:
+            if (who, what) not in known:
+                self.pairs.append([who, what, _earlier(maps), gap])
 
-    def completed(self, earlier: Section) -> Section:
-        """Return the section with the rows of an earlier one that it does not have, marked."""
-        tables = [list(table) for table in self.tables]
-        for old in earlier.tables:
-            new = next((table for table in tables if table[0] == old[0]), None)
-            if new is None:
-                new = old[:1]
-                tables.append(new)
-            keys = 1 if old[0][0] == 'case' else 2
-            known = {tuple(row[:keys]) for row in new}
-            for row in old[1:]:
-                if tuple(row[:keys]) not in known:
-                    runs = row[2].removesuffix(EARLIER_ROW) + EARLIER_ROW
-                    new.append([*row[:2], runs, *row[3:]])
-        return Section(self.rests, self.duration, tables)
+
+def _earlier(number: str) -> str:
+    return number.removesuffix(EARLIER_ROW) + EARLIER_ROW
 
 
 def section_of(results: Results, every: bool = True) -> Section:
@@ -135,7 +132,7 @@ def section_of(results: Results, every: bool = True) -> Section:
     times = np.concatenate([results.values(name, 'processor_time') for name in results.names()])
     times = times[~np.isnan(times)]
     duration = f' A run takes about {np.median(times):.1f} s on one core.' if len(times) else ''
-    return Section(rests, duration, table_cells(results))
+    return Section(rests, duration, case_cells(results), pair_cells(results))
 
 
 def page(sections: dict[str, Section]) -> str:
@@ -162,7 +159,7 @@ def page(sections: dict[str, Section]) -> str:
                 f'### {item.name}\n\n{item.title}.\nRests on {section.rests}.{section.duration}\n'
             )
             parts.append(f'![{item.title}](reproduction/{item.name}.png)\n')
-            parts += _described(item, section.tables)
+            parts += _described(item, section.cases, section.pairs)
             numbers = ', '.join(str(choices.index(choice) + 1) for choice in item.choices)
             parts.append(f'Open points of paper {paper}: {numbers}.\n' if numbers else '')
     return '\n'.join(filter(None, parts))
@@ -204,11 +201,12 @@ def write_document(file: Path, out: Path, seed: int = 1, small: bool = False) ->
             shown.append(name)
             section = section_of(results, every or earlier is None)
             if earlier is not None and not every:
-                section = section.completed(earlier)
+                section.complete(earlier)
             # A figure of all cases is not replaced by one of some.
             if every or not image.exists():
                 write_file(image, picture(results, _PICTURE_DPI))
-            write_file(store, section.text())
+            text = json.dumps(asdict(section), ensure_ascii=False, indent=1)
+            write_file(store, f'{text}\n')
             sections[name] = section
         elif earlier is not None:
             earlier.rests += EARLIER

@@ -20,6 +20,7 @@ from maasi_planner.settings import PLANNERS
 from maasi_sim.buildings.scenario import is_cuboid_scenario
 from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Quantity
 from maasi_sim.experiments.figures import draw_comparison
+from maasi_sim.experiments.tables import SearchTable
 from maasi_sim.machine import code_digest
 from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import (
@@ -284,7 +285,7 @@ def comparison_of(name: str, cases: Sequence[Case]) -> Experiment:
         cases=lambda small: list(cases),
         run=run_compared,
         quantities=(),
-        draw=lambda figure, results: draw_comparison(figure, [results]),
+        draw=lambda figure, results: draw_comparison(figure, [SearchTable(results)]),
         compared=True,
     )
 

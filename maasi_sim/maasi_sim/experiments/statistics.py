@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,16 +101,10 @@ def bootstrap_difference(first: ArrayLike, second: ArrayLike) -> Difference:
         return Difference(mean, math.nan, math.nan, median, 1, None)
     if np.ptp(gaps) == 0.0:
         return Difference(mean, mean, mean, median, len(gaps), None)
-    low, high = _bootstrap_interval(tuple(gaps))
-    return Difference(mean, low, high, median, len(gaps), pairs_needed(gaps))
-
-
-@lru_cache
-def _bootstrap_interval(gaps: tuple[float, ...]) -> tuple[float, float]:
     low, high = stats.bootstrap(
         (gaps,), np.mean, confidence_level=LEVEL, random_state=np.random.default_rng(0)
     ).confidence_interval
-    return float(low), float(high)
+    return Difference(mean, float(low), float(high), median, len(gaps), pairs_needed(gaps))
 
 
 def pairs_needed(gaps: ArrayLike) -> int | None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from maasi_sim.experiments.experiment import Published, Quantity, Results, plain
+from maasi_sim.experiments.experiment import Quantity, Results, plain
 from maasi_sim.experiments.runs import csv_text
 from maasi_sim.experiments.statistics import (
     LEVEL,
@@ -28,7 +28,6 @@ from maasi_sim.machine import code_digest, this_machine
 VERSION = 1
 # Bootstrap intervals of fewer pairs are too narrow.
 FEWEST = 10
-_NONE = mean_interval([])
 
 
 def interval(results: Results, case: str, quantity: Quantity) -> Interval:
@@ -60,10 +59,10 @@ def markdown_table(rows: Iterable[Sequence[str]]) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One number of ours beside the paper's, or a paired difference on the same maps.
+    """One number of ours beside the paper's.
 
     `finished` of the `runs` have the quantity; `median` counts the others as longest, and is nan
-    if they are half or more. `difference` is ours minus the paper's, or first minus second.
+    if they are half or more. `difference` is ours minus the paper's.
     """
 
     case: str
@@ -77,40 +76,47 @@ class Row:
     difference: Interval | None
     note: str
 
+    def cell(self) -> str:
+        """Return ours, the paper's and the difference as a cell in Markdown."""
+        # Without finished runs the restricted mean is the limit.
+        text = shown(self.ours) if self.finished else f'more than {number(self.ours.mean)}'
+        if self.quantity.kind == 'restricted' and self.runs > 2 and math.isfinite(self.median):
+            text += f' (median {number(self.median)})'
+        if 0 < self.finished < self.runs:
+            text += f', {self.finished} runs'
+        if self.paper is not None:
+            note = f' ({self.note})' if self.note else ''
+            text += f'<br>paper {shown(self.paper)}{note}'
+        if self.difference is not None:
+            text += f'<br>difference {shown(self.difference, sign=True)}'
+        return text
 
-def rows(results: Results) -> list[Row]:
-    """Return the table of an experiment: every quantity of every case."""
+
+def rows(results: Results) -> Iterator[Row]:
+    """Yield the table of an experiment: every quantity of every case."""
     experiment = results.experiment
     published = {(item.case, item.quantity): item for item in experiment.published}
-    table = []
     for name in results.names():
         preset = results.case(name).preset
         for quantity in experiment.quantities:
+            values = results.values(name, quantity.name)
+            finished = int((~np.isnan(values)).sum())
+            if not finished and quantity.kind != 'restricted':
+                continue
+            ours = interval(results, name, quantity)
+            middle = median(values, quantity) if finished else math.nan
             theirs = published.get((name, quantity.name))
-            row = _row(results, name, preset, quantity, theirs)
-            if row.finished or quantity.kind == 'restricted':
-                table.append(row)
-    return table
+            paper = gap = None
+            if theirs is not None:
+                paper = from_published(theirs.value, theirs.half_width, theirs.runs)
+                gap = independent_difference(ours, paper) if finished else None
+            note = theirs.note if theirs else ''
+            number = len(values)
+            yield Row(name, preset, quantity, number, finished, ours, middle, paper, gap, note)
 
 
-def _row(
-    results: Results, case: str, preset: str, quantity: Quantity, theirs: Published | None
-) -> Row:
-    values = results.values(case, quantity.name)
-    finished = int((~np.isnan(values)).sum())
-    ours = interval(results, case, quantity)
-    paper = difference = None
-    if theirs is not None:
-        paper = from_published(theirs.value, theirs.half_width, theirs.runs)
-        difference = independent_difference(ours, paper) if finished else None
-    middle = median(values, quantity) if finished else math.nan
-    note = theirs.note if theirs else ''
-    return Row(case, preset, quantity, len(values), finished, ours, middle, paper, difference, note)
-
-
-def paired_rows(results: Results) -> list[Row]:
-    """Return the paired differences of the experiment's comparisons."""
-    table = []
+def pairs(results: Results) -> Iterator[tuple[str, str, Quantity, Interval]]:
+    """Yield the paired differences of the experiment: two cases, first minus second."""
     for item in results.experiment.comparisons:
         quantity = results.experiment.quantity(item.quantity)
         both = results.pairs(item.first, item.second, item.quantity)
@@ -119,11 +125,7 @@ def paired_rows(results: Results) -> list[Row]:
         if quantity.kind == 'restricted':
             limit = float(np.min(results.pairs(item.first, item.second, quantity.limit)))
             both = [np.minimum(np.where(np.isnan(one), limit, one), limit) for one in both]
-        gap, who = paired_difference(*both), f'{item.first} minus {item.second}'
-        note = 'paired on the same maps'
-        row = Row(who, 'paired', quantity, gap.number, gap.number, _NONE, math.nan, None, gap, note)
-        table.append(row)
-    return table
+        yield item.first, item.second, quantity, paired_difference(*both)
 
 
 def number(value: float) -> str:
@@ -135,69 +137,57 @@ def number(value: float) -> str:
     return f'{value:.3g}' if value else '0'
 
 
-def shown(value: Interval | None, sign: bool = False) -> str:
+def shown(value: Interval, sign: bool = False) -> str:
     """Return a mean with its half width."""
-    if value is None or not math.isfinite(value.mean):
+    if not math.isfinite(value.mean):
         return '-'
     text = ('+' if sign and value.mean > 0.0 else '') + number(value.mean)
     return f'{text} ± {number(value.half_width)}' if math.isfinite(value.half_width) else text
 
 
-def table_cells(results: Results) -> list[list[list[str]]]:
-    """Return the tables of an experiment as text: of cases, and of paired differences."""
-    cases = [['case', 'measured', 'runs', 'ours', 'paper', 'difference']]
+def case_cells(results: Results) -> dict[str, dict[str, str]]:
+    """Return the cells of each case by the heads of their columns."""
+    cells: dict[str, dict[str, str]] = {}
     for row in rows(results):
-        restricted = row.quantity.kind == 'restricted'
-        runs = str(row.runs)
-        if restricted or row.finished < row.runs:
-            runs = f'{row.finished} of {row.runs}'
-        # Without finished runs the restricted mean is the limit.
-        ours = shown(row.ours) if row.finished else f'more than {number(row.ours.mean)}'
-        if restricted and row.runs > 2 and math.isfinite(row.median):
-            ours += f' (median {number(row.median)})'
-        paper = shown(row.paper) + (f' ({row.note})' if row.note else '')
         name = row.case if row.preset == 'paper' else f'{row.case} (recommended)'
-        gap = shown(row.difference, sign=True)
-        cases.append([name, row.quantity.title(), runs, ours, paper, gap])
-    pairs = [['paired on the same maps', 'measured', 'maps', 'difference']]
-    for row in paired_rows(results):
-        gap = shown(row.difference, sign=True)
-        pairs.append([row.case, row.quantity.title(), str(row.runs), gap])
-    return [table for table in (cases, pairs) if len(table) > 1]
+        cells.setdefault(name, {'runs': str(row.runs)})[row.quantity.title()] = row.cell()
+    return cells
 
 
-def by_case(table: Sequence[Sequence[str]]) -> list[list[str]]:
-    """Return the table of cases of `table_cells` with a row a case and a column a quantity."""
-    quantities = list(dict.fromkeys(row[1] for row in table[1:]))
-    found: dict[str, dict[str, str]] = {}
-    for case, quantity, runs, ours, paper, gap in table[1:]:
-        cells = found.setdefault(case, {'runs': runs.rpartition(' of ')[2]})
-        finished, _, total = runs.partition(' (')[0].partition(' of ')
-        parts = [ours if finished in (total, '0') or not total else f'{ours}, {finished} runs']
-        if paper != '-':
-            parts.append(f'paper {paper}')
-        if gap != '-':
-            parts.append(f'difference {gap}')
-        cells[quantity] = '<br>'.join(parts)
-    columns = ['runs', *quantities]
-    rows = [[case, *(cells.get(name, '-') for name in columns)] for case, cells in found.items()]
-    return [['case', *columns], *rows]
+def pair_cells(results: Results) -> list[list[str]]:
+    """Return the cells of each paired difference."""
+    return [
+        [f'{first} minus {second}', quantity.title(), str(gap.number), shown(gap, sign=True)]
+        for first, second, quantity, gap in pairs(results)
+    ]
+
+
+def beside_paper(cases: dict[str, dict[str, str]], paired: list[list[str]]) -> list[str]:
+    """Return the tables of `case_cells` and `pair_cells` in Markdown."""
+    heads = list(dict.fromkeys(head for cells in cases.values() for head in cells))
+    lines = [[name, *(cells.get(head, '-') for head in heads)] for name, cells in cases.items()]
+    tables = [
+        [['case', *heads], *lines],
+        [['paired on the same maps', 'measured', 'maps', 'difference'], *paired],
+    ]
+    return [markdown_table(table) for table in tables if len(table) > 1]
 
 
 def table_text(results: Results) -> str:
     """Return the table of ours against the paper's as CSV, in full precision."""
 
-    def pair(item: Interval | None) -> list[float | None]:
+    def numbers(item: Interval | None) -> list[float | None]:
         return [None, None] if item is None else [item.mean, item.half_width]
 
     head = 'case preset quantity unit runs finished ours ours_95 ours_median paper paper_95'
     table: list[list[object]] = [[*head.split(), 'difference', 'difference_95', 'note']]
-    for row in [*rows(results), *paired_rows(results)]:
+    for row in rows(results):
         first = [row.case, row.preset, row.quantity.name, row.quantity.unit, row.runs, row.finished]
-        if row.preset == 'paired':
-            first[0], first[-1] = row.case.replace(' minus ', ' - '), None
-        cells = [*pair(row.ours), row.median, *pair(row.paper), *pair(row.difference)]
+        cells = [*numbers(row.ours), row.median, *numbers(row.paper), *numbers(row.difference)]
         table.append([*first, *cells, row.note])
+    for one, other, quantity, gap in pairs(results):
+        cells = [f'{one} - {other}', 'paired', quantity.name, quantity.unit, gap.number]
+        table.append([*cells, *[None] * 6, *numbers(gap), 'paired on the same maps'])
     return csv_text(table)
 
 
@@ -225,30 +215,123 @@ QUANTITIES = (
 _SHORT = ('planning_time', 'filter_time')
 
 
-def share(results: Results, case: str) -> tuple[int, int, float, float]:
-    """Return complete searches, searches, and the bounds of Wilson's 95 % interval of the share."""
-    finished = results.values(case, COMPLETE.name)
-    complete = round(float(finished.sum()))
-    if not len(finished):
-        return 0, 0, math.nan, math.nan
-    low, high = stats.binomtest(complete, len(finished)).proportion_ci(LEVEL, method='wilson')
-    return complete, len(finished), float(low), float(high)
+@dataclass(frozen=True)
+class Share:
+    """Complete searches of all, with Wilson's 95 % interval of their share; nan without any."""
+
+    number: int
+    low: float
+    high: float
 
 
-def median_time(results: Results, case: str) -> float:
-    """Return the median of the time to find all [s]; nan if half of the searches did not."""
-    return median(results.values(case, _TIME_FOUND.name), _TIME_FOUND)
+class SearchTable:
+    """Means of each case of a comparison, and differences to the first one that has searches.
 
+    All are by case and name of the quantity; differences are on the seeds of both, `median_time` is
+    nan if half of the searches did not find all.
+    """
 
-def difference(results: Results, case: str, quantity: Quantity) -> Difference:
-    """Return the mean of a case minus the first one that has searches, on the seeds of both."""
-    return bootstrap_difference(*results.pairs(case, results.names()[0], quantity.name))
+    def __init__(self, results: Results) -> None:
+        self.results = results
+        self.name = results.experiment.name
+        self.cases = results.names()
+        self.means = {
+            case: {item.name: interval(results, case, item) for item in QUANTITIES}
+            for case in self.cases
+        }
+        self.differences = {
+            case: {
+                item.name: bootstrap_difference(*results.pairs(case, self.cases[0], item.name))
+                for item in QUANTITIES
+            }
+            for case in self.cases[1:]
+        }
+        self.complete = {case: self._share(case) for case in self.cases}
+        self.median_time = {
+            case: median(results.values(case, _TIME_FOUND.name), _TIME_FOUND) for case in self.cases
+        }
 
+    def _share(self, case: str) -> Share:
+        finished = self.results.values(case, COMPLETE.name)
+        complete = round(float(finished.sum()))
+        span = stats.binomtest(complete, len(finished)).proportion_ci(LEVEL, method='wilson')
+        return Share(complete, float(span.low), float(span.high))
 
-def verdicts(results: Results) -> list[str]:
-    """Return a sentence on the time to find all for each case but the first one."""
-    names = results.names()
-    return [verdict(name, names[0], difference(results, name, TIME)) for name in names[1:]]
+    def verdicts(self) -> list[str]:
+        """Return a sentence on the time to find all for each case but the first one."""
+        first = self.cases[:1]
+        return [verdict(case, *first, gaps[TIME.name]) for case, gaps in self.differences.items()]
+
+    def markdown(self) -> str:
+        """Return the tables: of cases, and of differences to the first one."""
+        heads = [item.title('ms' if item.name in _SHORT else None) for item in QUANTITIES]
+        table = [['case', 'seeds', 'complete', 'median time [s]', *heads[1:]]]
+        for case, means in self.means.items():
+            part = self.complete[case]
+            share = f'{part.number} ({100 * part.low:.0f} to {100 * part.high:.0f} %)'
+            cells = [case, str(means[COMPLETE.name].number), share]
+            spans = [_mean(means[item.name], item.name in _SHORT) for item in QUANTITIES[1:]]
+            table.append([*cells, _digits(self.median_time[case]), *spans])
+        text = markdown_table(table)
+        if self.differences:
+            table = [[f'minus {self.cases[0]}', 'seeds', *heads[: len(_COMPARED)]]]
+            for case, gaps in self.differences.items():
+                spans = [_gap(gaps[item.name]) for item in _COMPARED]
+                table.append([case, str(gaps[COMPLETE.name].number), *spans])
+            text += '\n' + markdown_table(table)
+        return text
+
+    def lines(self) -> Iterator[list[Any]]:
+        """Yield the rows of the CSV: scenario, case, minus, and of each quantity all numbers."""
+        for case in self.cases:
+            for item in QUANTITIES:
+                one = self.means[case][item.name]
+                bounds = [one.mean - one.half_width, one.mean + one.half_width]
+                middle = math.nan
+                if item is COMPLETE:
+                    bounds = [self.complete[case].low, self.complete[case].high]
+                if item is TIME:
+                    middle = self.median_time[case]
+                elif one.number:
+                    middle = median(self.results.values(case, item.name), item)
+                cells = [one.number, one.mean, *bounds, middle, None]
+                yield [self.name, case, '', item.name, item.unit, *cells]
+        for case, gaps in self.differences.items():
+            for item in QUANTITIES:
+                gap = gaps[item.name]
+                cells = [gap.number, gap.mean, gap.low, gap.high, gap.median, gap.needed]
+                yield [self.name, case, self.cases[0], item.name, item.unit, *cells]
+
+    def facts(self) -> dict[str, Any]:
+        """Return all of it as plain values."""
+        differences = []
+        for case, gaps in self.differences.items():
+            for item in QUANTITIES:
+                gap = gaps[item.name]
+                what = {'case': case, 'minus': self.cases[0]}
+                what |= {'quantity': item.name, 'unit': item.unit}
+                differences.append(what | asdict(gap) | {'told_from_zero': gap.told_from_zero})
+        cases = {case: self._facts_of(case) for case in self.cases}
+        return {'cases': cases, 'differences': differences, 'verdicts': self.verdicts()}
+
+    def _facts_of(self, case: str) -> dict[str, Any]:
+        settings = self.results.case(case).settings['scenario']
+        means = self.means[case]
+        return {
+            'planner': settings['planner']['name'],
+            'filter': settings['filter']['method'],
+            'time_limit': settings['limits']['time'],
+            'searches': means[COMPLETE.name].number,
+            'complete': asdict(self.complete[case]),
+            'median_time': self.median_time[case],
+            'means': {
+                item.name: asdict(means[item.name]) | {'unit': item.unit} for item in QUANTITIES[1:]
+            },
+            'runs': [
+                {'seed': run.seed, **{item.name: run.value(item.name) for item in QUANTITIES}}
+                for run in self.results.runs[case]
+            ],
+        }
 
 
 def verdict(case: str, other: str, gap: Difference) -> str:
@@ -276,9 +359,8 @@ def _digits(value: float, sign: str = '') -> str:
     return f'{value:{sign}.{0 if size >= 1000.0 else 1 if size >= 10.0 else 2}f}'
 
 
-def _mean(results: Results, case: str, quantity: Quantity) -> str:
-    mean = interval(results, case, quantity)
-    scale = 1e3 if quantity.name in _SHORT else 1.0
+def _mean(mean: Interval, short: bool) -> str:
+    scale = 1e3 if short else 1.0
     half = f' ± {_digits(scale * mean.half_width)}' if mean.number > 1 else ''
     return _digits(scale * mean.mean) + half
 
@@ -287,26 +369,7 @@ def _gap(gap: Difference) -> str:
     return f'{_digits(gap.mean, "+")} [{_digits(gap.low, "+")}, {_digits(gap.high, "+")}]'
 
 
-def compared_markdown(results: Results) -> str:
-    """Return the tables of a comparison: of cases, and of differences to the first one."""
-    heads = [item.title('ms' if item.name in _SHORT else None) for item in QUANTITIES]
-    table = [['case', 'seeds', 'complete', 'median time [s]', *heads[1:]]]
-    names = results.names()
-    for name in names:
-        complete, total, low, high = share(results, name)
-        cells = [name, str(total), f'{complete} ({100 * low:.0f} to {100 * high:.0f} %)']
-        means = [_mean(results, name, quantity) for quantity in QUANTITIES[1:]]
-        table.append([*cells, _digits(median_time(results, name)), *means])
-    tables = [table]
-    if len(names) > 1:
-        tables.append([[f'minus {names[0]}', 'seeds', *heads[: len(_COMPARED)]]])
-        for name in names[1:]:
-            gaps = [difference(results, name, item) for item in _COMPARED]
-            tables[1].append([name, str(gaps[0].number), *map(_gap, gaps)])
-    return '\n'.join(map(markdown_table, tables))
-
-
-def compared_page(every: Sequence[Results], seeds: Sequence[int]) -> str:
+def compared_page(tables: Sequence[SearchTable], seeds: Sequence[int]) -> str:
     """Return the page of a comparison in Markdown."""
     text = f"# Comparison of searches\n\nSeeds {seeds[0]} to {seeds[-1]}. Means with Student's "
     text += (
@@ -314,40 +377,19 @@ def compared_page(every: Sequence[Results], seeds: Sequence[int]) -> str:
         'seeds with bootstrap intervals. A search that did not\nfind all counts with the time '
         'limit.\n'
     )
-    for results in every:
-        text += f'\n## {results.experiment.name}\n\n{compared_markdown(results)}\n'
-        text += ''.join(f'- {line}\n' for line in verdicts(results))
+    for table in tables:
+        text += f'\n## {table.name}\n\n{table.markdown()}\n'
+        text += ''.join(f'- {line}\n' for line in table.verdicts())
     return text + '\n![Share of searches that miss targets, and differences](comparison.png)\n'
 
 
-def compared_text(every: Sequence[Results]) -> str:
+def compared_text(tables: Sequence[SearchTable]) -> str:
     """Return all means and differences as CSV, a row each, in full precision."""
     head = 'scenario case minus quantity unit seeds mean low high median needed'
-    table: list[list[Any]] = [head.split()]
-    for results in every:
-        scenario, names = results.experiment.name, results.names()
-        for name in names:
-            for item in QUANTITIES:
-                one = interval(results, name, item)
-                bounds = [one.mean - one.half_width, one.mean + one.half_width]
-                middle = math.nan
-                if item is COMPLETE:
-                    bounds = list(share(results, name)[2:])
-                if item is TIME:
-                    middle = median_time(results, name)
-                elif one.number:
-                    middle = median(results.values(name, item.name), item)
-                cells = [one.number, one.mean, *bounds, middle, None]
-                table.append([scenario, name, '', item.name, item.unit, *cells])
-        for name in names[1:]:
-            for item in QUANTITIES:
-                gap = difference(results, name, item)
-                cells = [gap.number, gap.mean, gap.low, gap.high, gap.median, gap.needed]
-                table.append([scenario, name, names[0], item.name, item.unit, *cells])
-    return csv_text(table)
+    return csv_text([head.split(), *(line for table in tables for line in table.lines())])
 
 
-def compared_facts(every: Sequence[Results], seeds: Sequence[int]) -> dict[str, Any]:
+def compared_facts(tables: Sequence[SearchTable], seeds: Sequence[int]) -> dict[str, Any]:
     """Return a comparison as plain values: searches, means, differences; none is infinite."""
     values: dict[str, Any] = plain(
         {
@@ -355,43 +397,7 @@ def compared_facts(every: Sequence[Results], seeds: Sequence[int]) -> dict[str, 
             'seeds': list(seeds),
             'code': code_digest(),
             'machine': this_machine(),
-            'scenarios': {results.experiment.name: _scenario(results) for results in every},
+            'scenarios': {table.name: table.facts() for table in tables},
         }
     )
     return values
-
-
-def _scenario(results: Results) -> dict[str, Any]:
-    names = results.names()
-    differences = []
-    for name in names[1:]:
-        for item in QUANTITIES:
-            gap = difference(results, name, item)
-            what = {'case': name, 'minus': names[0], 'quantity': item.name, 'unit': item.unit}
-            differences.append({**what, **asdict(gap), 'told_from_zero': gap.told_from_zero})
-    return {
-        'cases': {name: _case(results, name) for name in names},
-        'differences': differences,
-        'verdicts': verdicts(results),
-    }
-
-
-def _case(results: Results, name: str) -> dict[str, Any]:
-    complete, total, low, high = share(results, name)
-    settings = results.case(name).settings['scenario']
-    return {
-        'planner': settings['planner']['name'],
-        'filter': settings['filter']['method'],
-        'time_limit': settings['limits']['time'],
-        'searches': total,
-        'complete': {'number': complete, 'low': low, 'high': high},
-        'median_time': median_time(results, name),
-        'means': {
-            item.name: asdict(interval(results, name, item)) | {'unit': item.unit}
-            for item in QUANTITIES[1:]
-        },
-        'runs': [
-            {'seed': run.seed, **{item.name: run.value(item.name) for item in QUANTITIES}}
-            for run in results.runs[name]
-        ],
-    }
