@@ -32,9 +32,9 @@ setup(
         'scipy>=1.11.4',
     ],
     extras_require={
-        'experiments': ['distributed>=2024.1', 'matplotlib>=3.8', 'rich>=13'],
+        'experiments': ['distributed>=2024.1', 'matplotlib>=3.8'],
         'reports': ['matplotlib>=3.8', 'Pillow>=10'],
-        'runs': ['matplotlib>=3.8', 'rich>=13', 'setproctitle>=1.3'],
+        'runs': ['matplotlib>=3.8', 'setproctitle>=1.3'],
         'test': ['pytest>=7.4'],
     },
     zip_safe=True,

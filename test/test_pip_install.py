@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('config', 'maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_sim')
 BLOCKED = (
     *('ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'maasi_msgs', 'rclpy'),
-    *('std_msgs', 'distributed', 'matplotlib', 'PIL', 'pymavlink', 'pyparrot', 'rich'),
+    *('std_msgs', 'distributed', 'matplotlib', 'PIL', 'pymavlink', 'pyparrot'),
     'setproctitle',
 )
 BLOCK = 'raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)\n'

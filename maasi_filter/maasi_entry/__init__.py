@@ -13,7 +13,7 @@ from pkgutil import resolve_name
 from typing import Any
 
 # What the commands import at once, and only extras require.
-_OF_EXTRAS = ('distributed', 'matplotlib', 'rich', 'setproctitle')
+_OF_EXTRAS = ('distributed', 'matplotlib', 'setproctitle')
 
 
 def _run(target: str) -> Any:

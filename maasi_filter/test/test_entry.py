@@ -18,13 +18,13 @@ def test_what_an_extra_brings_is_named_where_it_is_missing(monkeypatch, capsys):
     from maasi_filter import filter_node
 
     def main():
-        raise ModuleNotFoundError("No module named 'rich'", name='rich')
+        raise ModuleNotFoundError("No module named 'matplotlib'", name='matplotlib')
 
     monkeypatch.setattr(signal, 'signal', lambda *_: None)
     monkeypatch.setattr(filter_node, 'main', main)
     monkeypatch.setattr(sys, 'argv', ['/opt/lib/maasi_filter/filter_node'])
     assert maasi_entry.filter_node() == 2
     assert capsys.readouterr().err == (
-        'error: filter_node: no module rich: it comes with an extra of the package '
+        'error: filter_node: no module matplotlib: it comes with an extra of the package '
         '(docs/install.md)\n'
     )

@@ -1,15 +1,13 @@
-"""P2 of 004 as it is printed, with its big-M rows and binaries, for general open solvers.
+"""P2 of 004 as it is printed, with its big-M rows and binaries, for SCIP.
 
-The oracle of the tests and the baseline of the benchmark. What the lean problem adds on request
-(segments that keep away from obstacles, a way to brake) is added here as rows, too. HiGHS solves
-mixed-integer *linear* problems only: the squares are approximated by tangents from outside, and
-tangents are added until the gap is closed.
+The oracle of the tests and the baseline of the benchmark. What the lean problem adds (segments that
+keep away from obstacles, a way to brake) is added here as rows, too.
 """
 
 import time
 
-import highspy
 import numpy as np
+import pyscipopt
 
 from maasi_planner.buildings.problem import TOUCH
 
@@ -257,82 +255,8 @@ class TightProblem(LiteralProblem):
                 self.row(faces, [1] * len(faces), -np.inf, len(faces) - 1)
 
 
-def solve_with_highs(literal, gap=1e-6, limit=60.0, rounds=60):
-    """Return (lower bound, value of the best point found, seconds) by tangents from outside."""
-    begun = time.perf_counter()
-    highs = highspy.Highs()
-    highs.setOptionValue('output_flag', False)
-    highs.setOptionValue('mip_rel_gap', 0.0)
-    highs.setOptionValue('mip_abs_gap', 0.25 * gap)
-    highs.setOptionValue('mip_feasibility_tolerance', 1e-9)
-    highs.setOptionValue('threads', 1)
-    number = len(literal.cost)
-    squares = literal.squares
-    # A column for each square.
-    lower = np.array([*literal.lower, *[0.0] * len(squares)])
-    upper = np.array([*literal.upper, *[np.inf] * len(squares)])
-    cost = np.array([*literal.cost, *[square[0] for square in squares]])
-    empty = np.array([], dtype=np.int32)
-    highs.addCols(len(cost), cost, lower, upper, 0, empty, empty, np.array([]))
-    kinds = [
-        highspy.HighsVarType.kInteger if kind else highspy.HighsVarType.kContinuous
-        for kind in literal.integer
-    ]
-    highs.changeColsIntegrality(number, np.arange(number, dtype=np.int32), np.array(kinds))
-    for columns, coefficients, low, high in literal.rows:
-        highs.addRow(
-            low,
-            high,
-            len(columns),
-            np.array(columns, dtype=np.int32),
-            np.array(coefficients, dtype=float),
-        )
-    cuts = 0
-
-    def tangent(index, at):
-        nonlocal cuts
-        _, columns, coefficients, constant = squares[index]
-        highs.addRow(
-            2.0 * at * constant - at * at,
-            np.inf,
-            len(columns) + 1,
-            np.array([number + index, *columns], dtype=np.int32),
-            np.array([1.0, *(-2.0 * at * np.array(coefficients))]),
-        )
-        cuts += 1
-
-    for index in range(len(squares)):
-        for at in (-60.0, -20.0, -7.0, -2.0, 2.0, 7.0, 20.0, 60.0):
-            tangent(index, at)
-    best = np.inf
-    bound = -np.inf
-    for _ in range(rounds):
-        left = limit - (time.perf_counter() - begun)
-        if left <= 0.0:
-            break
-        highs.setOptionValue('time_limit', left)
-        highs.run()
-        status = highs.getModelStatus()
-        if status == highspy.HighsModelStatus.kInfeasible:
-            return np.inf, np.inf, time.perf_counter() - begun
-        x = np.array(highs.getSolution().col_value)
-        bound = max(bound, highs.getInfo().mip_dual_bound)
-        if status != highspy.HighsModelStatus.kOptimal:
-            break
-        best = min(best, literal.value(x[:number]))
-        if best - bound <= gap:
-            break
-        for index, (weight, columns, coefficients, constant) in enumerate(squares):
-            at = float(np.dot(coefficients, x[columns])) + constant
-            if weight * (at * at - x[number + index]) > 0.1 * gap / len(squares):
-                tangent(index, at)
-    return bound, best, time.perf_counter() - begun
-
-
 def solve_with_scip(literal, gap=1e-6, limit=60.0):
-    """Return (lower bound, value, seconds) of SCIP."""
-    import pyscipopt
-
+    """Return (lower bound, value of the best point found, seconds) of SCIP."""
     begun = time.perf_counter()
     model = pyscipopt.Model()
     model.hideOutput()
@@ -340,34 +264,27 @@ def solve_with_scip(literal, gap=1e-6, limit=60.0):
     model.setParam('limits/absgap', gap)
     model.setParam('parallel/maxnthreads', 1)
     columns = [
-        model.addVar(
-            vtype='B' if kind else 'C',
-            lb=None if low == -np.inf else low,
-            ub=None if high == np.inf else high,
-        )
+        model.addVar(vtype='B' if kind else 'C', lb=low, ub=high)
         for low, high, kind in zip(literal.lower, literal.upper, literal.integer)
     ]
+
+    def total(indices, coefficients):
+        return pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients))
+
     for indices, coefficients, low, high in literal.rows:
-        total = pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients))
-        if low == high:
-            model.addCons(total == low)
-        else:
-            if low > -np.inf:
-                model.addCons(total >= low)
-            if high < np.inf:
-                model.addCons(total <= high)
+        value = total(indices, coefficients)
+        if low > -np.inf:
+            model.addCons(value >= low)
+        if high < np.inf:
+            model.addCons(value <= high)
     # A column for each square: as one row, its relaxation is far weaker.
     squares = []
     for weight, indices, coefficients, constant in literal.squares:
         inner = model.addVar(vtype='C', lb=None, ub=None)
-        total = pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients))
-        model.addCons(inner == total + constant)
-        top = model.addVar(vtype='C', lb=0.0, ub=None)
-        model.addCons(weight * inner * inner <= top)
-        squares.append(top)
-    linear = pyscipopt.quicksum(
-        cost * column for cost, column in zip(literal.cost, columns) if cost
-    )
+        model.addCons(inner == total(indices, coefficients) + constant)
+        squares.append(model.addVar(vtype='C', lb=0.0, ub=None))
+        model.addCons(weight * inner * inner <= squares[-1])
+    linear = total(range(len(columns)), literal.cost)
     model.setObjective(linear + pyscipopt.quicksum(squares), 'minimize')
     model.optimize()
     value = model.getObjVal() if model.getNSols() else np.inf

@@ -21,20 +21,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-
 from maasi_sim.arguments import count
 from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Results, Run
 from maasi_sim.experiments.runs import DamagedRun, NoRoom, load_run, run_of, to_text, write_file
 from maasi_sim.machine import code_digest, machine_difference, this_machine
+from maasi_sim.run.progress import ProgressDisplay
 
 Item = TypeVar('Item')
 
@@ -334,16 +325,28 @@ def carry_out_all(
     number = sum(len(work.tasks) for work in campaigns)
     problems: list[str] = []
     team = Workers()
+    display = ProgressDisplay(period=_QUIET_PERIOD)
+    made = 0
     begin = time.monotonic()
+
+    def advance(task: Task) -> None:
+        nonlocal made
+        made += 1
+        left = (time.monotonic() - begin) * (number - made) / made
+        what = f'{task.experiment} {task.case.name}'
+        display.show(f'{made} of {number} runs, about {left:.0f} s left ({what})', 0)
+
     try:
         if number:
             team = make_workers(number, workers, cluster)
         machine = one_machine(team, campaigns) if number and not mixed else None
-        with _progress(number) as (advance, say):
-            for work in campaigns:
-                problems += work.carry_out(team, advance, machine)
-                say(finished(work))
+        for work in campaigns:
+            problems += work.carry_out(team, advance, machine)
+            text = finished(work)
+            if text:
+                display.say(text)
     finally:
+        display.close()
         team.close()
     used = f' by {team.number} workers in {time.monotonic() - begin:.0f} s' if number else ''
     kept = sum(len(work.done) for work in campaigns)
@@ -351,35 +354,3 @@ def carry_out_all(
     for problem in problems:
         print(f'error: {problem}', file=sys.stderr)
     return problems
-
-
-@contextlib.contextmanager
-def _progress(total: int) -> Iterator[tuple[Callable[[Task], None], Callable[[str], None]]]:
-    """Yield functions that count a run, and that print a line: beside a bar on a terminal."""
-    bar = Progress(
-        *(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn()),
-        *(TimeElapsedColumn(), TextColumn('left'), TimeRemainingColumn()),
-        console=Console(stderr=True, soft_wrap=True),
-        disable=not (sys.stderr.isatty() and total),
-    )
-    shown = bar.add_task('', total=total)
-    begin = last = time.monotonic()
-    made = 0
-
-    def say(text: str) -> None:
-        if text:
-            bar.console.print(text, markup=False, highlight=False)
-
-    def advance(task: Task) -> None:
-        nonlocal made, last
-        made += 1
-        what = f'{task.experiment} {task.case.name}'
-        bar.update(shown, completed=made, description=what)
-        now = time.monotonic()
-        if bar.disable and now - last >= _QUIET_PERIOD:
-            last = now
-            left = (now - begin) * (total - made) / made
-            say(f'{made} of {total} runs, about {left:.0f} s left ({what})')
-
-    with bar:
-        yield advance, say

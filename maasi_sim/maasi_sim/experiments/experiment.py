@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -101,15 +101,15 @@ class Outcome:
     when a run is repeated.
     """
 
-    summary: dict[str, float | int | str | bool | None]
-    columns: Mapping[str, ArrayLike] = field(default_factory=dict)
+    summary: dict[str, Any]
+    columns: Mapping[str, Any] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
     timing: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass
-class Run:
-    """One run of one case on one map; see `Outcome`.
+@dataclass(kw_only=True)
+class Run(Outcome):
+    """The outcome of one run of one case on one map.
 
     `number` is that of the map, from 0, `digest` that of the case's settings, and `machine` what
     made it, see `this_machine`.
@@ -121,10 +121,6 @@ class Run:
     seed: int
     digest: str
     machine: dict[str, str]
-    summary: dict[str, Any]
-    columns: dict[str, NDArray[np.float64]]
-    details: dict[str, Any]
-    timing: dict[str, float]
 
     def identity(self) -> tuple[str, str, int, int, str]:
         """Return what tells it from other runs."""
@@ -151,28 +147,14 @@ def plain(value: Any) -> Any:
 class Experiment:
     """A figure or table of a paper.
 
-    Attributes
-    ----------
-    name, title : str
-        Such as '000-fig4', and one line.
-    cases : function of bool
-        Returns the cases; with True small ones that take a second, for tests and a first look.
-    run : function of settings and seed
-        Runs one case once. The seed is that of the map, the same for every case.
-    quantities : sequence of Quantity
-        Rows of the table for each case.
-    draw : function of an empty figure and the results
-        Draws a figure in the form of the paper's.
-    published, comparisons, choices : sequences
-        The paper's numbers, paired differences to report, and open points of the paper.
-    causes, tested, note : str
-        Causes of differences from the paper, likely ones and those that were tested; more to read.
-    runs, seconds : int, float
-        Maps in the paper, and the approximate time of a run on one core, for --list.
-    maps : str, optional
-        Experiments with the same value have the same maps; none: maps of its own.
-    compared : bool
-        Whether searches are compared: the seed is the number of the map.
+    `cases` returns the cases; with True small ones that take a second, for tests and a first look.
+    `run` runs a case once, from its settings and the seed of the map, the same for every case.
+    `quantities` are the columns of the table. `draw` draws a figure in the form of the paper's.
+    `published` are the paper's numbers, `comparisons` paired differences, and `choices` open points
+    of the paper. `causes` of differences from the paper are likely ones, `tested` are those that
+    were tested. `runs` are the maps in the paper, `seconds` the approximate time of a run on one
+    core. Experiments with the same `maps` have the same maps; None: maps of its own. `compared`:
+    searches are compared, and the seed is the number of the map.
     """
 
     name: str

@@ -36,16 +36,16 @@ def run_of(experiment: str, case: Case, number: int, seed: int, outcome: Outcome
     if len(lengths) > 1:
         raise ValueError(f'{experiment}: columns of {sorted(lengths)} rows, allowed is one')
     return Run(
-        experiment,
-        case.name,
-        number,
-        seed,
-        case.digest(),
-        this_machine(),
         plain(outcome.summary),
         columns,
         plain(outcome.details),
         plain(outcome.timing),
+        experiment=experiment,
+        case=case.name,
+        number=number,
+        seed=seed,
+        digest=case.digest(),
+        machine=this_machine(),
     )
 
 
