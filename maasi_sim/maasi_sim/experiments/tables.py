@@ -186,8 +186,8 @@ def table_text(results: Results) -> str:
         cells = [*numbers(row.ours), row.median, *numbers(row.paper), *numbers(row.difference)]
         table.append([*first, *cells, row.note])
     for one, other, quantity, gap in pairs(results):
-        cells = [f'{one} - {other}', 'paired', quantity.name, quantity.unit, gap.number]
-        table.append([*cells, *[None] * 6, *numbers(gap), 'paired on the same maps'])
+        first = [f'{one} - {other}', 'paired', quantity.name, quantity.unit, gap.number]
+        table.append([*first, *[None] * 6, *numbers(gap), 'paired on the same maps'])
     return csv_text(table)
 
 
@@ -259,8 +259,9 @@ class SearchTable:
 
     def verdicts(self) -> list[str]:
         """Return a sentence on the time to find all for each case but the first one."""
-        first = self.cases[:1]
-        return [verdict(case, *first, gaps[TIME.name]) for case, gaps in self.differences.items()]
+        return [
+            verdict(case, self.cases[0], gaps[TIME.name]) for case, gaps in self.differences.items()
+        ]
 
     def markdown(self) -> str:
         """Return the tables: of cases, and of differences to the first one."""
