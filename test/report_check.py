@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
+from importlib.resources import files
 from typing import Any
 
 import jsonschema
 
-from maasi_sim.run.report_schema import schema
+SCHEMA = files('maasi_sim.run').joinpath('report.schema.json')
 
 
 def _strict(part: Any) -> Any:
@@ -23,7 +25,7 @@ def _strict(part: Any) -> Any:
 
 @cache
 def _validators() -> dict[str, jsonschema.Draft202012Validator]:
-    whole = schema()
+    whole = json.loads(SCHEMA.read_text(encoding='utf-8'))
     jsonschema.Draft202012Validator.check_schema(whole)
     return {
         kind['properties']['mission']['const']: jsonschema.Draft202012Validator(_strict(kind))

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import runpy
 import sys
 from pathlib import Path
 
@@ -15,7 +16,6 @@ import yaml
 from small_field import SMALL_FIELD
 
 from maasi_filter.records import FoundTarget, Label
-from maasi_sim.run import report_schema
 from maasi_sim.run.node_plan import RunSettings
 from maasi_sim.scenario.base import OriginSettings
 from maasi_sim.scenario.layering import ScenarioError
@@ -120,5 +120,6 @@ def test_data_frame_without_pandas_says_what_is_missing(field, monkeypatch):
 
 
 def test_page_of_the_report_is_that_of_the_schema():
-    page = (Path(__file__).parents[2] / 'docs' / 'report.md').read_text()
-    assert report_schema.with_fields(page) == page
+    fields = runpy.run_path(str(Path(__file__).parents[2] / 'docs' / 'site' / 'report_fields.py'))
+    page = fields['PAGE'].read_text(encoding='utf-8')
+    assert fields['with_fields'](page) == page

@@ -12,34 +12,24 @@ from maasi_filter.arrays import FloatArray
 from maasi_sim.buildings.observer import CuboidRecord
 from maasi_sim.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, colours_of
 from maasi_sim.buildings.report import build_cuboid_report, reason_of_end
-from maasi_sim.run.report_panels import (
-    MARGIN,
-    MapView,
-    add_legend,
-    draw_start_and_end,
-    draw_way,
-    event_rows,
-    finish_figure,
-    make_panels,
-    step_plot,
-)
+from maasi_sim.run.report_panels import MARGIN, MapView, Plot, draw_report
 
 
 def plot_cuboid_report(record: CuboidRecord) -> Figure:
     """Return a figure: the mission from above and the sides, cuboids visited over time."""
-    colours = colours_of(record.scenario.names())
-    panels = make_panels(_area(record), len(colours), [0.7, 1.4])
     visited = {shot['cuboid'] for shot in record.snapshots}
-    for view in panels.views:
-        _draw_mission(view, record, visited)
-        for name, colour in colours.items():
-            draw_way(view, record.trajectories[name], colour, record.end_time, name)
-    draw_start_and_end(panels.views[0])
-    add_legend(panels)
-    over, _, active, _ = panels.plots
-    step_plot(over, '', lambda axes: _draw_visited(axes, record))
-    step_plot(active, 'time [s]', lambda axes: _draw_active(axes, record))
-    return finish_figure(panels, record, colours, 'Cuboids visited', _rows(record))
+    return draw_report(
+        record,
+        colours_of(record.scenario.names()),
+        _area(record),
+        lambda view: _draw_mission(view, record, visited),
+        [
+            Plot('', 1.0, lambda axes: _draw_visited(axes, record)),
+            Plot('time [s]', 0.7, lambda axes: _draw_active(axes, record)),
+        ],
+        'Cuboids visited',
+        _rows(record),
+    )
 
 
 def _area(record: CuboidRecord) -> FloatArray:
@@ -102,7 +92,7 @@ def _draw_active(axes: Axes, record: CuboidRecord) -> None:
 def _rows(record: CuboidRecord) -> list[tuple[str, str]]:
     report = build_cuboid_report(record)
     least, complete = report['least_detection_probability'], report['time_to_find_all']
-    rows = [
+    return [
         ('visited', f'{report["cuboids"]["visited"]} of {report["cuboids"]["total"]}'),
         ('all visited after', '-' if complete is None else f'{complete:.0f} s'),
         ('least p_d', '-' if least is None else f'{least:.3g} of a snapshot'),
@@ -110,4 +100,3 @@ def _rows(record: CuboidRecord) -> list[tuple[str, str]]:
         *((key, f'{number} decisions') for key, number in report['choices'].items()),
         ('ended', f'{reason_of_end(report)}, at {record.end_time:.1f} s'),
     ]
-    return rows + event_rows(record, 4, 0)

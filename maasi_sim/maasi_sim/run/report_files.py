@@ -79,11 +79,6 @@ def pace(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def title(record: RunRecord) -> str:
-    """Return the title of the figure."""
-    return f'{record.name}   seed {record.seed}   planner {record.scenario.planner.name}'
-
-
 def path_length(trajectory: FloatArray) -> float:
     """Return the length of a trajectory of rows time, x, y, z [m]."""
     return float(np.linalg.norm(np.diff(trajectory[:, 1:], axis=0), axis=1).sum())
@@ -107,29 +102,22 @@ def store_report(mission: Mission[Any], record: RunRecord, folder: Path) -> Stor
     The other one is a new folder below the first of these with space: that of temporary files, the
     home of the user, `/dev/shm`.
     """
-
-    def stored(report: dict[str, Any], place: Path | None, problem: str = '') -> StoredReport:
-        return StoredReport(report, mission.summary(report), place, problem)
-
-    try:
-        return stored(write_report(mission, record, folder), folder)
-    except (OSError, ResultsError) as error:
-        problem = f'{folder}: the report cannot be written: {_reason(error)}'
-    remove(folder / 'report.json')
-    for base in (Path(tempfile.gettempdir()), Path.home(), Path('/dev/shm')):
+    problem = ''
+    for base in (None, Path(tempfile.gettempdir()), Path.home(), Path('/dev/shm')):
         try:
-            place = Path(tempfile.mkdtemp(prefix='maasi_report_', dir=base))
+            place = Path(tempfile.mkdtemp(prefix='maasi_report_', dir=base)) if base else folder
         except OSError:
             continue
         try:
-            return stored(write_report(mission, record, place), place, problem)
-        except (OSError, ResultsError):
+            report = write_report(mission, record, place)
+            return StoredReport(report, mission.summary(report), place, problem)
+        except (OSError, ResultsError) as error:
+            cause = error.__cause__ or error
+            reason = getattr(cause, 'strerror', None) or str(error)
+            problem = problem or f'{folder}: the report cannot be written: {reason}'
             remove(place / 'report.json')
-            with contextlib.suppress(OSError):
-                place.rmdir()
-    return stored(mission.report(record), None, problem)
-
-
-def _reason(error: BaseException) -> str:
-    cause = error.__cause__ or error
-    return getattr(cause, 'strerror', None) or str(error)
+            if base is not None:
+                with contextlib.suppress(OSError):
+                    place.rmdir()
+    report = mission.report(record)
+    return StoredReport(report, mission.summary(report), None, problem)

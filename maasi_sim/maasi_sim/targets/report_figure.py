@@ -12,22 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Rectangle
 
 from maasi_filter.arrays import FloatArray
+from maasi_filter.models.detection import DetectionModel
+from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run.report_files import END_REASONS
-from maasi_sim.run.report_panels import (
-    COLOURS,
-    MARGIN,
-    PALE,
-    UNSEEN,
-    MapView,
-    add_legend,
-    draw_start_and_end,
-    draw_way,
-    event_rows,
-    finish_figure,
-    make_panels,
-    step_plot,
-)
+from maasi_sim.run.report_panels import COLOURS, MARGIN, PALE, UNSEEN, MapView, Plot, draw_report
 from maasi_sim.targets.report import build_report
 from maasi_sim.targets.tally import TargetRecord
 
@@ -41,44 +30,45 @@ _VIEW_GRID = 160
 
 def plot_report(record: TargetRecord) -> Figure:
     """Return a figure: the search from above, in 3D also from the sides, and its progress."""
-    bounds = record.scenario.environment.array()
-    names = record.scenario.names()
-    colours = {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(names)}
-    panels = make_panels(bounds, len(names), [1.0, 1.5])
-    explored = _explored(record)
-    for view in panels.views:
+    scenario = record.scenario
+    bounds = scenario.environment.array()
+    colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(scenario.names())}
+    detections = {
+        name: scenario.robots[name].sensor.build(name, scenario.dimension).detection
+        for name in colours
+    }
+    # After all measurements of the robots.
+    explored = UnexploredMap(bounds, scenario.filter.exploration_spacing)
+    for name, poses in record.measured_from.items():
+        for pose in poses:
+            explored.update(detections[name], pose)
+
+    def draw_map(view: MapView) -> None:
         _draw_explored(view, explored, bounds)
         _draw_obstacles(view, record, bounds)
         for name, colour in colours.items():
-            path = record.trajectories[name]
-            draw_way(view, path, colour, record.end_time, name)
-            view.axes.plot(*view.points(record.waypoints[name]), '+', color=colour, ms=8, mew=1.3)
-            _draw_field(view, record, name, colour, bounds)
+            waypoints = view.points(record.waypoints[name])
+            view.axes.plot(*waypoints, '+', color=colour, ms=8, mew=1.3)
+            if record.measured_from.get(name):
+                pose = record.measured_from[name][-1]
+                _draw_field(view, detections[name], pose, colour, bounds)
         _draw_targets(view, record, bounds)
-    first = panels.views[0]
-    first.axes.plot([], [], '+', color=PALE, ms=8, label='waypoint')
-    draw_start_and_end(first)
-    first.axes.plot([], [], ':', color=PALE, lw=1.5, label='field of view at the end')
-    add_legend(panels)
-    over_time, _, over_measurements, _ = panels.plots
-    step_plot(over_time, '', lambda axes: _draw_progress(axes, record, True))
-    step_plot(
-        over_measurements,
-        'measurements, all robots',
-        lambda axes: _draw_progress(axes, record, False),
+        view.axes.plot([], [], '+', color=PALE, ms=8, label='waypoint')
+        view.axes.plot([], [], ':', color=PALE, lw=1.5, label='field of view at the end')
+
+    label = 'measurements, all robots'
+    return draw_report(
+        record,
+        colours,
+        bounds,
+        draw_map,
+        [
+            Plot('', 1.0, lambda axes: _draw_progress(axes, record, True)),
+            Plot(label, 1.0, lambda axes: _draw_progress(axes, record, False)),
+        ],
+        'Targets found',
+        _rows(record),
     )
-    return finish_figure(panels, record, colours, 'Targets found', _rows(record))
-
-
-def _explored(record: TargetRecord) -> UnexploredMap:
-    """Return the exploration after all measurements of the robots."""
-    scenario = record.scenario
-    explored = UnexploredMap(scenario.environment.array(), scenario.filter.exploration_spacing)
-    for name, poses in record.measured_from.items():
-        detection = scenario.robots[name].sensor.build(name, scenario.dimension).detection
-        for pose in poses:
-            explored.update(detection, pose)
-    return explored
 
 
 def _draw_explored(view: MapView, explored: UnexploredMap, bounds: FloatArray) -> None:
@@ -115,30 +105,18 @@ def _draw_obstacles(view: MapView, record: TargetRecord, bounds: FloatArray) -> 
 
 
 def _draw_field(
-    view: MapView, record: TargetRecord, name: str, colour: str, bounds: FloatArray
+    view: MapView, detection: DetectionModel, pose: Pose, colour: str, bounds: FloatArray
 ) -> None:
-    """Draw where a robot's probability of detection is half its largest, from its last pose."""
-    if not record.measured_from.get(name):
-        return
-    pose = record.measured_from[name][-1]
-    dimension = record.scenario.dimension
-    detection = record.scenario.robots[name].sensor.build(name, dimension).detection
+    """Draw where a robot's probability of detection is half its largest."""
     right, up = (np.linspace(bounds[axis, 0], bounds[axis, 1], _VIEW_GRID) for axis in view.plane)
-    places = np.tile(pose.position[:dimension], (_VIEW_GRID**2, 1))
+    places = np.tile(pose.position[: len(bounds)], (_VIEW_GRID**2, 1))
     grid = np.meshgrid(right, up)
-    for axis, values in zip(view.plane, grid):
-        places[:, axis] = values.ravel()
+    for axis, coordinates in zip(view.plane, grid):
+        places[:, axis] = coordinates.ravel()
     values = detection.probability(places, pose).reshape(grid[0].shape)
     if values.max() > 0.0:
-        view.axes.contour(
-            *grid,
-            values,
-            levels=[0.5 * values.max()],
-            colors=[colour],
-            linewidths=1.5,
-            linestyles='dotted',
-            zorder=2,
-        )
+        style: dict[str, Any] = {'linewidths': 1.5, 'linestyles': 'dotted', 'zorder': 2}
+        view.axes.contour(*grid, values, levels=[0.5 * values.max()], colors=[colour], **style)
 
 
 def _draw_targets(view: MapView, record: TargetRecord, bounds: FloatArray) -> None:
@@ -203,16 +181,13 @@ def _draw_progress(axes: Axes, record: TargetRecord, by_time: bool) -> None:
     axes.set_ylabel('targets')
     if by_time:
         # Beside the title: inside the axes it would cover curves.
-        axes.legend(
-            loc='lower right',
-            bbox_to_anchor=(1.0, 1.0),
-            ncol=3,
-            columnspacing=1.2,
-            handlelength=1.6,
-            fontsize=8.5,
-            borderaxespad=0.1,
-            frameon=False,
-        )
+        above: dict[str, Any] = {
+            'loc': 'lower right',
+            'bbox_to_anchor': (1.0, 1.0),
+            'ncol': 3,
+            'handlelength': 1.6,
+        }
+        axes.legend(**above, fontsize=8.5, columnspacing=1.2, borderaxespad=0.1, frameon=False)
 
 
 def _rows(record: TargetRecord) -> list[tuple[str, str]]:
@@ -224,17 +199,16 @@ def _rows(record: TargetRecord) -> list[tuple[str, str]]:
             f'{report["measurements_to_find_all"]} measurements, {report["time_to_find_all"]:.1f} s'
         )
     found = f'{report["true_found"]} of {len(report["targets"])}'
-    rows = [
+    reason = END_REASONS.get(report['end_reason'], report['end_reason'])
+    return [
         ('found', f'{found}, {report["missed"]} missed, {report["false_found"]} false'),
         ('RMSE', rmse),
         ('GOSPA', f'{report["gospa"]["total"]:.3g} m (c = {report["scoring"]["c"]:.3g} m)'),
         ('all found after', complete),
         ('decisions', str(report['decisions'])),
+        *(
+            (name, f'{report["measurements"][name]} measurements, {report["distance"][name]:.1f} m')
+            for name in report['agents'][:4]
+        ),
+        ('ended', f'{reason}, at {record.end_time:.1f} s'),
     ]
-    rows += [
-        (name, f'{report["measurements"][name]} measurements, {report["distance"][name]:.1f} m')
-        for name in report['agents'][:4]
-    ]
-    reason = END_REASONS.get(report['end_reason'], report['end_reason'])
-    rows.append(('ended', f'{reason}, at {record.end_time:.1f} s'))
-    return rows + event_rows(record, 3, 1)

@@ -1,29 +1,23 @@
-"""The JSON Schema of `report.json`, and its page in the documents: docs/report.md."""
+"""Writes the fields of `report.json`, as its JSON Schema has them, into docs/report.md."""
 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / 'docs' / 'report.md'
+SCHEMA = ROOT / 'maasi_sim' / 'maasi_sim' / 'run' / 'report.schema.json'
 BEGIN, END = '<!-- fields: begin -->', '<!-- fields: end -->'
-
-
-def schema() -> dict[str, Any]:
-    """Return the schema."""
-    text = files('maasi_sim.run').joinpath('report.schema.json').read_text(encoding='utf-8')
-    loaded: dict[str, Any] = json.loads(text)
-    return loaded
 
 
 def with_fields(page: str) -> str:
     """Return a page in Markdown with tables of all fields between its marks."""
     before, rest = page.split(BEGIN)
     parts = []
-    for kind in schema()['oneOf']:
+    for kind in json.loads(SCHEMA.read_text(encoding='utf-8'))['oneOf']:
         parts.append(f'### {kind["description"]}\n\n| field | type | meaning |\n|---|---|---|')
         parts += [
             f'| `{name}` | {_type(part)} | {part.get("description", "")} |'
@@ -63,5 +57,4 @@ def _type(part: dict[str, Any]) -> str:
 
 
 if __name__ == '__main__':
-    file = Path(sys.argv[1])
-    file.write_text(with_fields(file.read_text(encoding='utf-8')), encoding='utf-8')
+    PAGE.write_text(with_fields(PAGE.read_text(encoding='utf-8')), encoding='utf-8')
