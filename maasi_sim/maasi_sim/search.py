@@ -27,7 +27,7 @@ from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
 from maasi_sim.search_result import SearchResult, SearchState
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
 from maasi_sim.targets.tally import numbered
-from maasi_sim.view.search_trace import SearchTrace
+from maasi_sim.view.live_view import SearchTrace
 from maasi_sim.world.simulation import simulated_robot, step_of_event
 from maasi_sim.world.world import World
 

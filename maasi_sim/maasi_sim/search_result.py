@@ -15,7 +15,7 @@ from maasi_sim.scenario.schema import Scenario
 from maasi_sim.targets.scoring import Scores
 from maasi_sim.targets.tables import columns, found_rows
 from maasi_sim.targets.tally import FoundCount
-from maasi_sim.view.search_trace import SearchTrace
+from maasi_sim.view.live_view import SearchTrace
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ from waiting import PATIENCE, wait_until
 
 from maasi_sim.view import control_node
 from maasi_sim.view.control_node import Control
-from maasi_sim.view.hub import Hub
-from maasi_sim.view.server import ViewServer
+from maasi_sim.view.server import Hub, ViewServer
 from maasi_sim.view.view_node import main
 
 

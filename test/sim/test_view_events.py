@@ -52,13 +52,20 @@ class Taken:
 
 def test_states_are_one_per_period_except_where_the_robot_says_something_else():
     taken = Taken()
+    # One that is not finite is left out.
+    broken = state(0.0)
+    broken.pose.pose.position.x = math.nan
+    taken.take('/rover/state', broken)
     for step in range(10):
-        taken.take('/rover/state', state(0.05 * step, goal_status=AgentState.MOVING))
-    assert len(taken.of('robot')) == 5
+        battery = math.inf if step == 0 else 0.5
+        moving = state(0.05 * step, goal_status=AgentState.MOVING, battery=battery)
+        taken.take('/rover/state', moving)
+    assert [event[4] for event in taken.of('robot')] == [-1.0] + 4 * [0.5]
     lost = state(0.5, goal_status=AgentState.UNAVAILABLE, reason='its link is lost')
     taken.take('/rover/state', lost)
     assert taken.of('robot')[-1][5:] == [AgentState.UNAVAILABLE, 'its link is lost']
     assert [event[5] for event in taken.of('log')] == ['cannot go on: its link is lost']
+    assert all(json.loads(line(event)) for event in taken.events)
 
 
 def step(seconds, *robots):
@@ -91,16 +98,6 @@ def test_robots_that_left_or_are_silent_are_not_on_the_way_and_none_is_at_the_en
     ]
 
 
-def test_a_state_that_is_not_finite_is_left_out():
-    taken = Taken()
-    broken = state(0.0)
-    broken.pose.pose.position.x = math.nan
-    taken.take('/rover/state', broken)
-    taken.take('/rover/state', state(0.1, battery=math.inf))
-    assert [event[4] for event in taken.of('robot')] == [-1.0]
-    assert all(json.loads(line(event)) for event in taken.events)
-
-
 def test_candidates_that_are_not_allowed_have_no_objective():
     taken = Taken()
     candidates = [Candidate(objective=-1e30), Candidate(objective=0.5, length=7, measurements=2)]
@@ -126,95 +123,75 @@ def test_bounds_are_learnt_from_the_exploration_function_without_a_scenario():
 def test_found_targets_are_scored_where_the_truth_is_known():
     scenario = load_mission('mambo_turtlebot').scenario
     taken = Taken(scene_of('demo', scenario))
-    truth = PoseArray()
-    targets = scenario.world(scenario.seed).targets
-    truth.poses = [Pose(position=Point(x=float(x), y=float(y))) for x, y in targets]
+    targets = [(float(x), float(y)) for x, y in scenario.world(scenario.seed).targets]
+    truth = PoseArray(poses=[Pose(position=Point(x=x, y=y)) for x, y in targets])
     taken.take('/ground_truth/targets', truth)
-    place = Point(x=float(targets[0][0]) + 0.01, y=float(targets[0][1]))
-    found = FoundTarget(id=1, position=place, robot='mambo')
-    taken.take('/found_targets', FoundTargetArray(targets=[found]))
-    assert taken.of('score')[-1][3:7] == [1, 11, 0, pytest.approx(0.01, abs=1e-4)]
-
-
-def test_a_filter_of_one_robot_counts_only_what_it_found_itself():
-    scenario = load_mission('mambo_turtlebot').scenario
-    taken = Taken(scene_of('demo', scenario))
-    both = [FoundTarget(id=1, robot='mambo'), FoundTarget(id=2, robot='turtlebot')]
+    place = Point(x=targets[0][0] + 0.01, y=targets[0][1])
+    both = [FoundTarget(id=1, robot='mambo', position=place), FoundTarget(id=2, robot='turtlebot')]
+    # A filter of one robot counts only what it found itself.
     taken.take('/mambo/found_targets', FoundTargetArray(targets=both))
     assert [item[0] for item in taken.of('found')[-1][3]] == [1]
+    assert taken.of('score')[-1][3:7] == [1, 11, 0, pytest.approx(0.01, abs=1e-4)]
     taken.take('/team/found_targets', FoundTargetArray(targets=both))
     assert [item[0] for item in taken.of('found')[-1][3]] == [1, 2]
 
 
 def test_time_that_jumps_back_begins_another_run():
-    events = []
-    made = []
+    taken = Taken(begin=None)
+    made = [taken.maker]
 
     def begin():
-        made.append(EventMaker(empty_scene(), events.append))
+        made.append(EventMaker(empty_scene(), taken.events.append))
         return made[-1]
 
-    messages = MessageEvents(begin(), None, begin)
-    messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(100.0))
-    messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(130.0))
+    taken.messages = MessageEvents(taken.maker, None, begin)
+    taken.take('/rover/state', state(100.0))
+    taken.take('/rover/state', state(130.0))
     # What another topic says late, as in a bag that is played fast, begins nothing.
-    messages.take(
-        '/lockstep/step',
-        'maasi_msgs/msg/LockstepStep',
-        LockstepStep(stamp=stamp_to_ros(102 * 10**9)),
-    )
+    taken.take('/lockstep/step', step(102.0))
     assert len(made) == 1
-    messages.take('/rover/state', 'maasi_msgs/msg/AgentState', state(101.0))
+    taken.take('/rover/state', state(101.0))
     assert len(made) == 2
-    assert [event[0] for event in events] == [0.0, 30.0, 0.0]
+    assert [event[0] for event in taken.events] == [0.0, 30.0, 0.0]
 
 
-@pytest.mark.parametrize(
-    ('topic', 'kind', 'shown'),
-    [
-        ('/team/rover/state', 'maasi_msgs/msg/AgentState', True),
-        ('/rover/plan', 'nav_msgs/msg/Path', True),
-        ('/rover/local_path', 'nav_msgs/msg/Path', False),
-        ('/found_targets/kept', 'maasi_msgs/msg/FoundTargetArray', False),
-        ('/search/_action/state', 'maasi_msgs/msg/AgentState', False),
-        ('/rover/odom', 'nav_msgs/msg/Odometry', False),
-    ],
-)
-def test_topics_are_known_by_type_and_name(topic, kind, shown):
-    assert is_shown(topic, kind) is shown
-
-
-def long_run(seconds):
-    rng = np.random.default_rng(1)
-    events = []
-    for step in range(seconds * 10):
-        place = [round(float(value), 4) for value in rng.normal(size=4)]
-        events.append([step / 10, 'robot', 'rover', place, 0.5, 1, ''])
-        if step % 100 == 0:
-            events.append([step / 10, 'log', '', 'found', 'rover', 'target'])
-    return EventLog({'name': 'long'}, events)
+def test_topics_are_known_by_type_and_name():
+    topics = {
+        '/team/rover/state': 'maasi_msgs/msg/AgentState',
+        '/rover/plan': 'nav_msgs/msg/Path',
+        '/rover/local_path': 'nav_msgs/msg/Path',
+        '/found_targets/kept': 'maasi_msgs/msg/FoundTargetArray',
+        '/search/_action/state': 'maasi_msgs/msg/AgentState',
+        '/rover/odom': 'nav_msgs/msg/Odometry',
+    }
+    shown = [topic for topic, kind in topics.items() if is_shown(topic, kind)]
+    assert shown == ['/team/rover/state', '/rover/plan']
 
 
 def test_a_long_run_is_thinned_until_it_fits_and_says_so():
-    log = long_run(2000)
-    whole = EventLog.unpacked(log.packed())
-    assert whole == log
+    rng = np.random.default_rng(1)
+    events = []
+    for number in range(20000):
+        place = [round(float(value), 4) for value in rng.normal(size=4)]
+        events.append([number / 10, 'robot', 'rover', place, 0.5, 1, ''])
+        if number % 100 == 0:
+            events.append([number / 10, 'log', '', 'found', 'rover', 'target'])
+    log = EventLog({'name': '</script><script>alert(1)</script>'}, events)
+    assert EventLog.unpacked(log.packed()) == log
+    # Names cannot end the script of a page.
+    assert replay_page(log).count('</script>') == empty_page().count('</script>')
     packed = log.packed(100_000)
     assert len(packed) <= 100_000
     thinned = EventLog.unpacked(packed)
     assert thinned.scene['thinned'] >= 0.2
-    assert thinned.events[-1] == log.events[-1]
-    lines = [event for event in log.events if event[1] == 'log']
-    assert [event for event in thinned.events if event[1] == 'log'] == lines
+    assert thinned.events[-1] == events[-1]
+    lines = [event for event in thinned.events if event[1] == 'log']
+    assert lines == [event for event in events if event[1] == 'log']
 
 
 def test_thinning_keeps_detections_and_the_end():
-    events = [
-        [0.0, 'seen', 'a', [0, 0, 0], []],
-        [0.1, 'seen', 'a', [0, 0, 0], []],
-        [0.2, 'seen', 'a', [0, 0, 0], [[1, 0, 0, 0, 0, 0]]],
-        [0.3, 'seen', 'a', [0, 0, 0], []],
-    ]
+    events = [[time, 'seen', 'a', [0, 0, 0], []] for time in (0.0, 0.1, 0.2, 0.3)]
+    events[2][4].append([1, 0, 0, 0, 0, 0])
     assert [event[0] for event in thin(events, 10.0)] == [0.0, 0.2, 0.3]
 
 
@@ -296,9 +273,3 @@ def test_the_page_is_one_file_without_addresses(result):
         assert 'http' not in page.replace('http-equiv', '')
         assert 'import ' not in page.partition('<script type="module">')[2]
         assert '/*RUN*/' not in page
-
-
-def test_names_cannot_end_the_script_of_a_page():
-    log = EventLog({'name': '</script><script>alert(1)</script>', 'robots': {}})
-    assert replay_page(log).count('</script>') == empty_page().count('</script>')
-    assert EventLog.unpacked(log.packed()) == log

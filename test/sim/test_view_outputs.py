@@ -11,6 +11,7 @@ from browsers import chromium, needs_chromium
 
 from maasi_sim.missions import load_mission
 from maasi_sim.run.bag import load_types
+from maasi_sim.run.rviz_view import shown_topics
 from maasi_sim.scenario.loading import config_folder
 from maasi_sim.search import search
 from maasi_sim.view import video
@@ -22,14 +23,19 @@ from maasi_sim.view.video import write_video
 from maasi_sim.view.view_run import main
 
 
-@pytest.fixture(scope='module')
-def log():
-    return search(load_mission('ranging_drone_3d').scenario, 1).trace.log('drone')
+def frames(log, path, speed=1e3):
+    """Return the pictures of a video, as whole numbers in the order blue, green, red."""
+    write_video(log, path, speed)
+    shown, pictures = cv2.VideoCapture(str(path)), []
+    while True:
+        read, picture = shown.read()
+        if not read:
+            return pictures
+        pictures.append(picture.astype(int))
 
 
-def planar():
-    """Return a run in the plane with one of each kind of events."""
-    scene = scene_of('plane', load_mission('mambo_turtlebot_obstacles').scenario)
+@pytest.mark.parametrize('suffix', ['.mp4', '.gif'])
+def test_a_video_shows_the_run_move(tmp_path, suffix):
     unit = [0.01, 0.0, 0.0, 0.02, 0.0, 0.0]
     events = [
         [0.0, 'map', '', [0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2, 2, 1], '0949', 0.4],
@@ -41,71 +47,51 @@ def planar():
         [1.0, 'found', '', [[1, 1.0, 1.0, 0.0, unit, 'mambo', 1.0]]],
         [2.0, 'robot', 'mambo', [2.0, 2.0, 1.0, 0.5], 1.0, 1, ''],
     ]
-    return EventLog(scene, events)
-
-
-def frames(path):
-    video = cv2.VideoCapture(str(path))
-    pictures = []
-    while True:
-        read, picture = video.read()
-        if not read:
-            return pictures
-        pictures.append(picture)
-
-
-@pytest.mark.parametrize('suffix', ['.mp4', '.gif'])
-def test_a_video_shows_the_run_move(tmp_path, suffix):
+    scene = scene_of('plane', load_mission('mambo_turtlebot_obstacles').scenario)
     path = tmp_path / f'run{suffix}'
-    write_video(planar(), path, speed=5.0)
-    pictures = frames(path)
+    pictures = frames(EventLog(scene, events), path, speed=5.0)
     assert len(pictures) >= 2
     assert pictures[0].std() > 5.0
-    assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 100
+    assert np.abs(pictures[0] - pictures[-1]).max() > 100
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
 
 
-def test_a_video_of_a_search_in_space(log, tmp_path):
-    write_video(log, tmp_path / 'run.mp4', speed=1e3)
-    assert frames(tmp_path / 'run.mp4')[0].shape == (576, 768, 3)
-
-
-def test_a_video_shows_geofences(tmp_path):
-    log = planar()
-    log.scene['robots']['mambo'].pop('fence', None)
-    write_video(log, tmp_path / 'without.mp4', speed=1e3)
-    log.scene['robots']['mambo']['fence'] = [[0.4, 2.0], [0.4, 2.0], [0.0, 2.0]]
-    write_video(log, tmp_path / 'with.mp4', speed=1e3)
-    without, fenced = (frames(tmp_path / f'{name}.mp4')[0] for name in ('without', 'with'))
-    assert np.abs(without.astype(int) - fenced).max() > 50
-
-
-def still(scene, yaw, folder):
-    """Return a picture of a robot at a yaw that is sent to a waypoint."""
-    row = ['mambo', 0, 0, [2.0, 0.5, 1.0], [], '']
-    events = [
-        [0.0, 'robot', 'mambo', [0.5, 0.5, 1.0, yaw], 1.0, 1, ''],
-        [0.0, 'plan', '', 'maasi', 0.0, 0.0, '', [row]],
-    ]
-    write_video(EventLog(scene, events), folder / 'still.mp4', speed=1e3)
-    return frames(folder / 'still.mp4')[0].astype(int)
+def test_a_video_of_a_search_in_space(tmp_path):
+    log = search(load_mission('ranging_drone_3d').scenario, 1).trace.log('drone')
+    assert frames(log, tmp_path / 'run.mp4')[0].shape == (576, 768, 3)
 
 
 def test_a_video_shows_where_a_robot_points_what_it_sees_and_where_it_goes(tmp_path):
     scene = scene_of('plane', load_mission('mambo').scenario)
-    whole = still(scene, 0.0, tmp_path)
-    view = scene['robots']['mambo'].pop('view')
-    assert view['kind'] == 'box'
-    unseeing = still(scene, 0.0, tmp_path)
+    robot = scene['robots']['mambo']
+
+    def still(yaw=0.0):
+        row = ['mambo', 0, 0, [2.0, 0.5, 1.0], [], '']
+        events = [
+            [0.0, 'robot', 'mambo', [0.5, 0.5, 1.0, yaw], 1.0, 1, ''],
+            [0.0, 'plan', '', 'maasi', 0.0, 0.0, '', [row]],
+        ]
+        return frames(EventLog(scene, events), tmp_path / 'still.mp4')[0]
+
+    whole = still()
+    assert robot.pop('view')['kind'] == 'box'
+    unseeing = still()
     assert np.abs(whole - unseeing).max() > 20
     # Not the same after a third of a turn.
-    assert np.abs(unseeing - still(scene, 2.0 * np.pi / 3.0, tmp_path)).max() > 50
-    # A robot and its waypoint in the robot's colour, which is blue; pictures are BGR.
-    blue = np.abs(unseeing - (178, 114, 0)).max(axis=2) < 40
-    columns = np.flatnonzero(blue.any(axis=0))
+    assert np.abs(unseeing - still(2.0 * np.pi / 3.0)).max() > 50
+    robot['fence'] = [[0.4, 2.0], [0.4, 2.0], [0.0, 2.0]]
+    assert np.abs(unseeing - still()).max() > 50
+    # A robot and its waypoint in the robot's colour, which is blue.
+    columns = np.flatnonzero(bluish(unseeing).any(axis=0))
     assert np.diff(columns).max() > 100
 
 
+def bluish(picture):
+    """Return which pixels have the robot's colour."""
+    return np.abs(picture.astype(int) - (178, 114, 0)).max(axis=2) < 40
+
+
+@pytest.fixture
 def departing():
     """Return a run whose robot is on its way at 1 s, and leaves at 2 s."""
     events = []
@@ -118,20 +104,14 @@ def departing():
     return EventLog(maker.scene, events)
 
 
-def bluish(picture):
-    """Return how many pixels have the robot's colour; pictures are BGR."""
-    return int((np.abs(picture.astype(int) - (178, 114, 0)).max(axis=2) < 40).sum())
-
-
-def test_a_robot_that_left_goes_nowhere_in_a_video(tmp_path):
-    write_video(departing(), tmp_path / 'run.mp4', speed=1.0)
-    pictures = frames(tmp_path / 'run.mp4')
-    assert bluish(pictures[25]) < 0.5 * bluish(pictures[15])
+def test_a_robot_that_left_goes_nowhere_in_a_video(departing, tmp_path):
+    pictures = frames(departing, tmp_path / 'run.mp4', speed=1.0)
+    assert bluish(pictures[25]).sum() < 0.5 * bluish(pictures[15]).sum()
 
 
 @needs_chromium
-def test_a_robot_that_left_goes_nowhere_on_the_page(tmp_path):
-    write_replay(departing(), tmp_path / 'page.html')
+def test_a_robot_that_left_goes_nowhere_on_the_page(departing, tmp_path):
+    write_replay(departing, tmp_path / 'page.html')
     with chromium() as shown:
         shown.open((tmp_path / 'page.html').as_uri())
         pixels = []
@@ -140,7 +120,7 @@ def test_a_robot_that_left_goes_nowhere_on_the_page(tmp_path):
             assert shown.page.inner_text('#robots tr[data-robot=mambo] td.text') == text
             address = shown.page.evaluate("document.getElementById('map').toDataURL()")
             data = np.frombuffer(base64.b64decode(address.partition(',')[2]), np.uint8)
-            pixels.append(bluish(cv2.imdecode(data, cv2.IMREAD_COLOR)))
+            pixels.append(bluish(cv2.imdecode(data, cv2.IMREAD_COLOR)).sum())
         assert pixels[1] < 0.5 * pixels[0]
 
 
@@ -149,9 +129,8 @@ def test_robots_have_the_colours_of_the_page():
     robots = re.search(r'const ROBOTS = (\[.*\]);', text).group(1)
     assert tuple(re.findall(r'#\w+', robots.upper())) == video._ROBOTS
     named = re.search(r'const NAMED = (\{.*\});', text).group(1)
-    assert {name: colour.upper() for name, colour in re.findall(r"(\w+): '(#\w+)'", named)} == (
-        video._NAMED
-    )
+    colours = {name: colour.upper() for name, colour in re.findall(r"(\w+): '(#\w+)'", named)}
+    assert colours == video._NAMED
 
 
 def test_a_video_of_another_kind_is_refused(tmp_path, capsys):
@@ -160,32 +139,17 @@ def test_a_video_of_another_kind_is_refused(tmp_path, capsys):
     assert 'allowed are FILE.mp4 and FILE.gif' in capsys.readouterr().err
 
 
-def layout():
-    return json.loads((config_folder() / 'foxglove' / 'search.json').read_text())
-
-
-def test_foxglove_shows_each_panel_once():
-    content = layout()
-    names = re.findall(r'"(\w+!\w+)"', json.dumps(content['layout']))
-    assert sorted(names) == sorted(content['configById'])
-
-
-def test_the_paths_of_foxglove_are_fields_of_our_messages():
+def test_foxglove_shows_each_panel_once_fields_of_our_messages_and_the_topics_of_rviz():
+    layout = json.loads((config_folder() / 'foxglove' / 'search.json').read_text())
+    panels = layout['configById']
+    assert sorted(re.findall(r'"(\w+!\w+)"', json.dumps(layout['layout']))) == sorted(panels)
     types = {'/filter_update': 'FilterUpdate', '/decisions': 'PlanDecision'}
-    store = load_types()
-    panels = layout()['configById']
     paths = [item['value'] for item in panels['Plot!found']['paths']]
     paths.append(panels['RawMessages!decisions']['topicPath'].removesuffix('[:]'))
     for path in paths:
         topic, _, field = path.partition('.')
-        fields = store.fielddefs[f'maasi_msgs/msg/{types[topic]}'][1]
+        fields = load_types().fielddefs[f'maasi_msgs/msg/{types[topic]}'][1]
         assert field in [name for name, _ in fields], path
-
-
-def test_the_topics_of_foxglove_are_those_of_rviz():
-    from maasi_sim.run.rviz_view import shown_topics
-
-    folder = config_folder() / 'rviz'
-    known = {topic for path in folder.glob('*.rviz') for topic in shown_topics(path)}
-    shown = set(layout()['configById']['3D!search']['topics'])
-    assert shown - {'/search_area'} <= known
+    files = (config_folder() / 'rviz').glob('*.rviz')
+    known = {topic for path in files for topic in shown_topics(path)}
+    assert set(panels['3D!search']['topics']) - {'/search_area'} <= known

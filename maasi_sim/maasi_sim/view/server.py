@@ -2,7 +2,8 @@
 
 GET / is the page, GET /events a stream of Server-Sent Events, POST /control a command. Commands
 need a token, and so does all else unless the server listens on this machine only. Everything else
-is refused. A browser is served by a thread of its own, which alone waits for it.
+is refused. A browser is served by a thread of its own, which alone waits for it: neither does the
+run wait for a browser, nor one browser for another.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from maasi_sim.view.hub import Hub
+from maasi_sim.view.event_log import STATE_PERIOD, Event, Scene, line, thin
 from maasi_sim.view.page_file import empty_page
 
 PORT = 8420
@@ -42,6 +43,88 @@ _EVERYWHERE = ('0.0.0.0', '::')
 # Period of portions, which bounds the load of a browser, and of signs of life [s].
 _PORTION_PERIOD = 0.1
 _BEAT = 5.0
+# Events that are kept; beyond them those that change gradually are thinned. And events at once.
+MOST_EVENTS = 200_000
+_MOST_AT_ONCE = 2000
+
+
+class Hub:
+    """Keeps the events of a run; nothing that puts an event waits for a browser.
+
+    With more than `most` events those that change gradually are thinned, and browsers start over.
+    """
+
+    def __init__(self, scene: Scene, most: int = MOST_EVENTS) -> None:
+        self._scene = dict(scene)
+        self._most = most
+        self._events: list[Event] = []
+        self._period = STATE_PERIOD
+        self._generation = 0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def put(self, event: Event) -> None:
+        """Add an event."""
+        with self._changed:
+            if event[1] == 'scene':
+                self._scene.update(event[3])
+            self._events.append(event)
+            if len(self._events) > self._most:
+                self._thin()
+            self._changed.notify_all()
+
+    def restart(self, scene: Scene) -> None:
+        """Forget all events: another run begins."""
+        with self._changed:
+            self._scene = dict(scene)
+            self._events.clear()
+            self._generation += 1
+
+    def close(self) -> None:
+        """Say that no event follows."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def next(
+        self, generation: int, position: int, patience: float
+    ) -> tuple[str, tuple[int, int], bool]:
+        """Return what follows a position, as Server-Sent Events.
+
+        And generation and position of the next portion, and whether nothing follows. A browser
+        begins with generation -1; where another one has begun it gets the scene, and starts over.
+        Nothing new within the patience [s] is a comment.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: (
+                    self._closed or generation != self._generation or position < len(self._events)
+                ),
+                patience,
+            )
+            text = ''
+            if generation != self._generation:
+                text, position = f'event: scene\ndata: {line(self._scene)}\n\n', 0
+            events = self._events[position : position + _MOST_AT_ONCE]
+            position += len(events)
+            closed = self._closed and position == len(self._events)
+            generation = self._generation
+        # Outside of the lock: a large portion takes a while.
+        if events:
+            text += f'event: events\ndata: [{",".join(map(line, events))}]\n\n'
+        if closed:
+            text += 'event: end\ndata:\n\n'
+        return text or ': \n\n', (generation, position), closed
+
+    def _thin(self) -> None:
+        """Halve what changes gradually, until a tenth of the room is free."""
+        while len(self._events) > 0.9 * self._most and self._period < 1e5:
+            self._period *= 2.0
+            self._events = thin(self._events, self._period)
+        # Where nothing can be thinned, the oldest go.
+        del self._events[: max(0, len(self._events) - self._most)]
+        self._scene['thinned'] = self._period
+        self._generation += 1
 
 
 class ViewServer(ThreadingHTTPServer):
