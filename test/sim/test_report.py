@@ -23,8 +23,8 @@ from maasi_msgs.msg import (
     PlanDecision,
     RobotDecision,
 )
-from maasi_sim.run.bag import Bag, BagWriter, load_types
-from maasi_sim.run.report_files import END_REASONS, path_length, write_report
+from maasi_sim.run.bag import load_types
+from maasi_sim.run.report_files import END_REASONS, write_report
 from maasi_sim.run.run_record import RunEnd
 from maasi_sim.run.topics import within
 from maasi_sim.scenario.loading import load_scenario
@@ -33,6 +33,8 @@ from maasi_sim.targets.observer import TargetObserver
 from maasi_sim.targets.report import build_report, summary
 from maasi_sim.targets.report_figure import plot_report
 from maasi_sim.targets.scoring import matching_radius, score
+
+TYPES = load_types()
 
 
 def write(record, folder):
@@ -43,24 +45,19 @@ def write(record, folder):
 class Run:
     """Messages of a run in which everything is put in by hand."""
 
-    def __init__(self, scenario, types, sink=None, namespace='', observer=None):
+    def __init__(self, scenario, namespace='', observer=None):
         self.scenario = scenario
-        self.observer = observer or TargetObserver('hand', scenario, 7, types)
+        self.observer = observer or TargetObserver('hand', scenario, 7, TYPES)
         self.namespace = namespace
-        self.sink = sink
         self.found = []
         self.batch = 0
 
-    def send(self, topic, message, time=None):
-        if time is not None:
+    def send(self, topic, message, time):
+        if hasattr(message, 'header'):
             message.header.stamp = stamp_to_ros(round(time * 1e9))
         if hasattr(message, 'step'):
-            message.step = round((time or 0.0) / self.scenario.step)
-        data = serialize_message(message)
-        self.observer.add(topic, data)
-        if self.sink is not None:
-            self.sink.add_topic(topic, f'maasi_msgs/msg/{type(message).__name__}')
-            self.sink.write(topic, 0, data)
+            message.step = round(time / self.scenario.step)
+        self.observer.add(topic, serialize_message(message))
 
     def of_team(self, topic, message, time):
         self.send(within(self.namespace, topic), message, time)
@@ -118,9 +115,8 @@ class Run:
         self.observer.settle()
 
     def step(self, time, robots):
-        stamp, step = stamp_to_ros(round(time * 1e9)), round(time / self.scenario.step)
-        message = LockstepStep(stamp=stamp, robots=robots, step=step)
-        self.observer.add('/lockstep/step', serialize_message(message))
+        message = LockstepStep(stamp=stamp_to_ros(round(time * 1e9)), robots=robots)
+        self.send('/lockstep/step', message, time)
 
     def record(self, reason='time_limit', time=1.0, wall=1.0, events=()):
         return self.observer.record(RunEnd(reason, time, wall, list(events)))
@@ -130,32 +126,20 @@ class Run:
 
 
 def point(position):
-    x, y, z = [*map(float, [0.0, 0.0] if position is None else position), 0.0, 0.0][:3]
+    x, y, z = [*map(float, position or ()), 0.0, 0.0, 0.0][:3]
     return Point(x=x, y=y, z=z)
 
 
-@pytest.fixture(scope='module')
-def types():
-    return load_types()
-
-
 def scenario_of(tmp_path, targets, **changes):
+    robot = {'type': 'mambo', 'candidates': {'grid': [6, 6], 'spacing': 0.34}}
     content = {
         'version': 1,
         'environment': {'bounds': [[0.0, 2.0], [0.0, 2.0]]},
         'step': 0.05,
         'targets': {'positions': targets} if targets else {'count': 0},
         'robots': {
-            'mambo': {
-                'type': 'mambo',
-                'start': [0.5, 0.5, 1.0],
-                'candidates': {'grid': [6, 6], 'spacing': 0.34},
-            },
-            'second': {
-                'type': 'mambo',
-                'start': [1.5, 1.5, 1.0],
-                'candidates': {'grid': [6, 6], 'spacing': 0.34},
-            },
+            'mambo': {**robot, 'start': [0.5, 0.5, 1.0]},
+            'second': {**robot, 'start': [1.5, 1.5, 1.0]},
         },
         'filter': {'removal_distance': 0.05},
         'stop': 'all_found' if targets else 'planner_done',
@@ -170,38 +154,23 @@ TARGETS = [[0.5, 0.5], [1.5, 0.5], [1.0, 1.5]]
 
 
 @pytest.fixture
-def run(types, tmp_path):
-    return Run(scenario_of(tmp_path, TARGETS), types)
+def run(tmp_path):
+    return Run(scenario_of(tmp_path, TARGETS))
 
 
-@pytest.mark.parametrize(
-    ('truth', 'radius'),
-    [
-        # Three times the removal distance, at most half the smallest distance of two targets.
-        (TARGETS, 0.15),
-        ([[0.0, 0.0], [0.2, 0.0], [1.0, 1.0]], 0.1),
-        ([[0.0, 0.0]], 0.15),
-        (np.zeros((0, 2)), 0.15),
-    ],
-)
-def test_radius_of_scoring(truth, radius):
-    assert matching_radius(0.05, truth) == pytest.approx(radius)
-
-
-@pytest.mark.parametrize(
-    'distance, truth, words',
-    [
+def test_radius_of_scoring_and_matching_within_it():
+    # Three times the removal distance, at most half the smallest distance of two targets.
+    near = [[0.0, 0.0], [0.2, 0.0], [1.0, 1.0]]
+    for truth, radius in ((TARGETS, 0.15), (near, 0.1), (near[:1], 0.15), (np.zeros((0, 2)), 0.15)):
+        assert matching_radius(0.05, truth) == pytest.approx(radius)
+    for distance, truth, words in (
         (math.nan, TARGETS, 'removal_distance'),
         (0.0, TARGETS, 'removal_distance'),
         (0.05, [[1.0, 1.0], [1.0, 1.0]], 'same place'),
-    ],
-)
-def test_radius_refuses(distance, truth, words):
-    with pytest.raises(ValueError, match=words):
-        matching_radius(distance, truth)
-
-
-def test_matching_is_one_to_one():
+    ):
+        with pytest.raises(ValueError, match=words):
+            matching_radius(distance, truth)
+    # One to one.
     scores = score([[0.5, 0.51], [0.5, 0.52], [1.5, 0.5]], TARGETS, 0.15)
     assert (scores.match.true_found, scores.match.false_found, scores.match.missed) == (2, 1, 1)
     assert not scores.complete
@@ -230,19 +199,22 @@ def test_report_of_a_complete_run(run, tmp_path):
         ('1.0', '2'),
     ]
     assert not (tmp_path / 'found_targets.geojson').exists()
-    assert report['true_found'] == 3
-    assert report['missed'] == 0
-    assert report['false_found'] == 1
-    assert report['rmse'] == pytest.approx(0.01)
-    assert report['measurements'] == {'mambo': 2, 'second': 2}
-    assert report['measurements_to_find_all'] == 4
-    assert report['time_to_find_all'] == pytest.approx(0.9)
-    assert report['decisions'] == 3
-    assert report['distance'] == {'mambo': pytest.approx(0.7), 'second': 0.0}
-    assert report['real_time_factor'] == pytest.approx(3.0)
+    expected = {
+        'true_found': 3,
+        'missed': 0,
+        'false_found': 1,
+        'rmse': pytest.approx(0.01),
+        'measurements': {'mambo': 2, 'second': 2},
+        'measurements_to_find_all': 4,
+        'time_to_find_all': pytest.approx(0.9),
+        'decisions': 3,
+        'distance': {'mambo': pytest.approx(0.7), 'second': 0.0},
+        'real_time_factor': pytest.approx(3.0),
+        'scoring': {'radius': pytest.approx(0.15), 'c': pytest.approx(0.15), 'p': 2.0},
+    }
+    assert {name: report[name] for name in expected} == expected
     assert report['found'][1]['agent'] == 'second'
     assert report['found'][1]['covariance'][0][0] == pytest.approx(1e-4)
-    assert report['scoring']['radius'] == pytest.approx(0.15)
     gospa = report['gospa']
     assert gospa['false'] == pytest.approx(0.5 * 0.15**2)
     assert gospa['missed'] == 0.0
@@ -250,12 +222,12 @@ def test_report_of_a_complete_run(run, tmp_path):
 
 
 @pytest.fixture
-def two_filters(types, tmp_path):
+def two_filters(tmp_path):
     """Return a run of each robot, with one observer: each has a filter of its own."""
     planner = {'name': 'maas', 'coordination': 'independent'}
     scenario = scenario_of(tmp_path, TARGETS, planner=planner)
-    first = Run(scenario, types, namespace='mambo')
-    return first, Run(scenario, types, namespace='second', observer=first.observer)
+    first = Run(scenario, namespace='mambo')
+    return first, Run(scenario, namespace='second', observer=first.observer)
 
 
 @pytest.mark.parametrize('turned', [False, True])
@@ -313,22 +285,16 @@ def test_planner_without_a_robot_is_not_waited_for(two_filters):
     one, two = two_filters
     one.step(0.0, ['mambo', 'second'])
     one.give_up(1.0)
-    one.step(1.2, ['mambo', 'second'])
-    assert one.observer.settled is None
+    # Without any robot, not everything is searched.
+    for time, robots in ((1.2, ['mambo', 'second']), (1.3, []), (1.4, ['mambo', 'second'])):
+        one.step(time, robots)
+        assert one.observer.settled is None
     one.step(1.5, ['mambo'])
     assert one.observer.settled == 'nothing left for mambo'
     # A robot that comes back does not take the ending back.
     one.step(2.0, ['mambo', 'second'])
     two.give_up(2.5)
     assert one.observer.end_step == 30
-
-
-def test_team_without_robots_has_not_searched_everything(two_filters):
-    one, _ = two_filters
-    one.step(0.0, ['mambo', 'second'])
-    one.give_up(1.0)
-    one.step(1.5, [])
-    assert one.observer.settled is None
 
 
 def test_planner_of_a_robot_that_cannot_go_on_is_not_waited_for(two_filters):
@@ -361,24 +327,18 @@ def test_what_comes_after_the_end_does_not_count(run):
     assert record.end_time == pytest.approx(0.7)
 
 
-def test_refined_positions_win_over_those_first_declared(run):
+def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
     run.declare(0.5, [0.6, 0.5])
-    run.update(0.5)
+    run.update(0.5, latched=False)
+    assert run.observer.found == 1 and run.record().scores().match.true_found == 1
     run.found[0].position.x = 0.501
     run.update(0.6)
     (found,) = run.record().found
     assert found.position[0] == pytest.approx(0.501)
 
 
-def test_updates_alone_tell_what_was_found(run):
-    run.declare(0.5, [0.5, 0.5])
-    run.update(0.5, latched=False)
-    assert run.observer.found == 1
-    assert run.observer.progress[-1].true_found == 1
-
-
-def test_completeness_that_is_lost_again_does_not_count(types, tmp_path):
-    run = Run(scenario_of(tmp_path, TARGETS[:1], stop='planner_done'), types)
+def test_completeness_that_is_lost_again_does_not_count(tmp_path):
+    run = Run(scenario_of(tmp_path, TARGETS[:1], stop='planner_done'))
     run.declare(0.5, [0.5, 0.5])
     run.update(0.5)
     run.found[0].position.x = 1.9
@@ -389,23 +349,16 @@ def test_completeness_that_is_lost_again_does_not_count(types, tmp_path):
     assert report['measurements_to_find_all'] == 3
 
 
-def test_report_without_targets(types, tmp_path):
-    run = Run(scenario_of(tmp_path, []), types)
+def test_report_without_targets_and_of_a_run_in_which_nothing_happened(run, tmp_path):
+    report = write(run.record('interrupted', 0.0, 0.0), tmp_path)
+    assert (report['true_found'], report['missed'], report['real_time_factor']) == (0, 3, None)
+    assert (tmp_path / 'report.png').stat().st_size > 10_000
+    run = Run(scenario_of(tmp_path, []))
     run.decide(0.0, {'mambo': [0.5, 0.5]}, explored=0.99)
     run.update(0.5)
     report = write(run.record('planner_done', 1.0, 1.0), tmp_path)
-    assert report['targets'] == []
-    assert report['rmse'] is None
-    assert report['measurements_to_find_all'] is None
-    assert report['gospa']['total'] == 0.0
-
-
-def test_report_of_a_run_in_which_nothing_happened(run, tmp_path):
-    report = write(run.record('interrupted', 0.0, 0.0), tmp_path)
-    assert report['true_found'] == 0
-    assert report['missed'] == 3
-    assert report['real_time_factor'] is None
-    assert (tmp_path / 'report.png').stat().st_size > 10_000
+    assert report['targets'] == [] and report['gospa']['total'] == 0.0
+    assert report['rmse'] is None and report['measurements_to_find_all'] is None
 
 
 def test_robots_that_leave_and_come_back_are_events(run):
@@ -433,45 +386,30 @@ def test_robots_that_say_they_cannot_go_on_are_events_without_lockstep(run):
     ]
 
 
-def test_a_recording_gives_the_same_report(types, tmp_path):
-    scenario = scenario_of(tmp_path, TARGETS)
-    with BagWriter(tmp_path / 'bag', types) as writer:
-        run = Run(scenario, types, writer)
-        for time, position in zip((0.5, 0.6, 0.7), TARGETS):
-            run.decide(time, {'mambo': position})
-            run.state(time, 'mambo', [*position, 1.0])
-            run.declare(time, position)
-            run.update(time)
-    live = run.report('all_found', 1.0, 0.5)
-    with Bag(tmp_path) as bag:
-        observer = TargetObserver('hand', scenario, 7, types)
-        for topic, _, _, data in bag.raw(observer.topics):
-            observer.add(topic, data)
-            if topic in observer.update_topics:
-                observer.settle()
-        assert build_report(observer.record(RunEnd('all_found', 1.0, 0.5))) == live
-
-
-def test_written_files_can_be_read(run, tmp_path):
+def test_written_files_can_be_read_and_the_summary_says_what_matters(run, tmp_path):
     run.declare(0.5, [0.5, 0.52])
     run.declare(0.5, [1.9, 1.9])
     run.update(0.5)
-    report = write(run.record(), tmp_path)
+    report = write(run.record('time_limit', 1.0, 0.5), tmp_path)
     assert json.loads((tmp_path / 'report.json').read_text()) == report
     picture = cv2.imread(str(tmp_path / 'report.png'))
     assert picture.shape[0] > 600 and picture.shape[1] > 1000
     # Something of every kind of mark is there: found (red) and false (violet).
     for colour in ((0x28, 0x27, 0xD6), (0x94, 0x32, 0x7B)):
         assert (np.abs(picture.astype(int) - colour).max(axis=2) < 12).sum() > 20
+    text = summary(report)
+    assert '1 of 3 targets found, 1 false' in text
+    assert END_REASONS['time_limit'] in text
+    assert '2.0 times real time' in text
 
 
-def test_picture_in_space(types, tmp_path):
+def test_picture_in_space(tmp_path):
     scenario = load_scenario('ranging_pair_3d')
-    run = Run(scenario, types)
+    run = Run(scenario)
     for name in scenario.names():
         run.state(0.0, name, [1.0, 1.0, 1.0])
         run.state(1.0, name, [100.0, 50.0, 30.0])
-    run.declare(0.5, run.observer.world.targets[0] + 0.5, 'drone1', deviation=1.0)
+    run.declare(0.5, list(run.observer.world.targets[0] + 0.5), 'drone1', deviation=1.0)
     run.update(0.5, ['drone1', 'drone2'])
     record = run.record()
     figure = plot_report(record)
@@ -483,7 +421,7 @@ def test_picture_in_space(types, tmp_path):
 def labels_of(figure):
     """Return the labels of a figure's legend, which must be whole."""
     figure.canvas.draw()
-    (legend,) = [axes.get_legend() for axes in figure.axes if not axes.axison and axes.get_legend()]
+    (legend,) = figure.legends
     box, whole = legend.get_window_extent(), figure.bbox
     assert whole.x0 <= box.x0 and box.x1 <= whole.x1
     assert whole.y0 <= box.y0 and box.y1 <= whole.y1
@@ -509,44 +447,20 @@ def test_picture_shows_missed_and_false_targets_and_ellipses_that_can_be_seen(ru
     assert sorted(zip(*missed.get_data())) == [(1.0, 1.5), (1.5, 0.5)]
 
 
-def test_legend_of_many_robots_is_whole(types, tmp_path):
+def test_legend_of_many_robots_and_obstacles_is_whole(tmp_path):
     robot = {'type': 'mambo', 'radius': 0.05, 'candidates': {'grid': [6, 6], 'spacing': 0.34}}
     robots = {
         f'a_robot_with_a_long_name_{n}': {**robot, 'start': [0.1 + 0.18 * n, 0.5, 1.0]}
         for n in range(10)
     }
-    run = Run(scenario_of(tmp_path, TARGETS, robots=robots), types)
-    labels = labels_of(plot_report(run.record()))
-    assert set(robots) <= set(labels)
-
-
-def test_picture_with_obstacles_names_them(types, tmp_path):
     obstacles = [{'centre': [1.0, 1.0], 'radius': 0.1}]
     environment = {'bounds': [[0.0, 2.0], [0.0, 2.0]], 'obstacles': obstacles}
-    run = Run(scenario_of(tmp_path, TARGETS, environment=environment), types)
-    figure = plot_report(run.record())
-    assert 'obstacle' in labels_of(figure)
+    run = Run(scenario_of(tmp_path, TARGETS, robots=robots, environment=environment))
+    assert {*robots, 'obstacle'} <= set(labels_of(plot_report(run.record())))
 
 
-def test_summary_says_what_matters(run):
-    run.declare(0.5, [0.5, 0.5])
-    run.declare(0.5, [1.9, 1.9])
-    run.update(0.5)
-    text = summary(run.report('time_limit', 1.0, 0.5))
-    assert '1 of 3 targets found, 1 false' in text
-    assert END_REASONS['time_limit'] in text
-    assert '2.0 times real time' in text
-
-
-def test_length_of_a_path():
-    path = np.array([[0.0, 0, 0, 0], [1.0, 3, 4, 0], [2.0, 3, 4, 12]])
-    assert path_length(path) == pytest.approx(17.0)
-    assert path_length(path[:1]) == 0.0
-    assert path_length(np.zeros((0, 4))) == 0.0
-
-
-def test_radius_of_the_scenario_wins(types, tmp_path):
-    run = Run(scenario_of(tmp_path, TARGETS, scoring={'radius': 0.3}), types)
+def test_radius_of_the_scenario_wins(tmp_path):
+    run = Run(scenario_of(tmp_path, TARGETS, scoring={'radius': 0.3}))
     run.declare(0.5, [0.5, 0.75])
     run.update(0.5)
     report = run.report()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,8 +12,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_planner.buildings.agent import Activity
 from maasi_planner.buildings.preplanning import CoveragePlan
 from maasi_sim.buildings.scenario import CuboidScenario
-from maasi_sim.run.run_record import RunEnd, RunRecord, TeamLog, rows
-from maasi_sim.run.topics import STEP
+from maasi_sim.run.run_record import Observer, RunEnd, RunRecord, rows
 
 
 class Moment(NamedTuple):
@@ -43,107 +41,56 @@ class CuboidRecord(RunRecord):
     completed: Moment | None = None
 
 
-class CuboidObserver:
+class CuboidObserver(Observer):
     """Gathers the data of a report from serialised messages, in the order of arrival."""
 
-    #: There are no filters.
-    update_topics: Sequence[str] = ()
-
     def __init__(self, name: str, scenario: CuboidScenario, seed: int, types: Typestore) -> None:
-        self.name = name
-        self.scenario = scenario
-        self.seed = seed
+        self._decisions: dict[str, list[Any]] = {
+            f'/{name}/decision': [] for name in scenario.names()
+        }
+        super().__init__(name, scenario, seed, types, list(self._decisions))
         self.mission = scenario.mission()
-        self._team = TeamLog(types)
-        self._decision_topics = {f'/{name}/decision': name for name in scenario.names()}
-        self._state_topics = {f'/{name}/state': name for name in scenario.names()}
-        self._decisions: dict[str, list[Any]] = {name: [] for name in scenario.names()}
-        self._states: dict[str, list[bytes]] = {name: [] for name in scenario.names()}
+        self.total = len(self.mission.cells)
         self._visited_at: dict[int, Moment] = {}
         self._done: dict[str, int] = {}
-        self.news = False
-        #: Number of cuboids, and snapshots so far.
-        self.total = len(self.mission.cells)
-        self.measurements = 0
-        #: Topics that it needs.
-        self.topics = [STEP, *self._decision_topics, *self._state_topics]
-
-    @property
-    def found(self) -> int:
-        """Cuboids visited so far."""
-        return len(self._visited_at)
-
-    @property
-    def explored(self) -> float:
-        """Share of the cuboids visited."""
-        return self.found / self.total
-
-    @property
-    def completed(self) -> Moment | None:
-        """When the last cuboid was visited, if `stop` asks for that."""
-        if self.scenario.stop != 'all_found' or self.found < self.total:
-            return None
-        return max(self._visited_at.values())
-
-    @property
-    def settled(self) -> str | None:
-        """The reason, once all planners report that all cuboids are visited."""
-        if len(self._done) < len(self._decision_topics):
-            return None
-        return 'every planner knows that all cuboids are visited'
-
-    @property
-    def end_step(self) -> int | None:
-        """Step at which the search ended by itself, if it has."""
-        if self.completed is not None:
-            return self.completed.step
-        return max(self._done.values()) if self.settled is not None else None
 
     def add(self, topic: str, data: bytes) -> None:
-        """Add a serialised message; one of another topic is ignored."""
-        if topic in self._decision_topics:
-            self._take(self._decision_topics[topic], self._team.decode(data, 'CuboidDecision'))
-        elif topic in self._state_topics:
-            self._states[self._state_topics[topic]].append(data)
-        elif topic == STEP and self.completed is None:
-            self._team.note(self._team.decode(data, 'LockstepStep'))
-
-    def settle(self) -> None:
-        """Do nothing: messages are evaluated in `add`."""
-
-    def _take(self, name: str, decision: Any) -> None:
-        self._decisions[name].append(decision)
-        moment = Moment(self._team.time(decision.header.stamp), int(decision.step))
+        """See `Observer.add`."""
+        super().add(topic, data)
+        if topic not in self._decisions:
+            return
+        decision = self.decode(data, 'CuboidDecision')
+        self._decisions[topic].append(decision)
+        moment = Moment(self.time(decision.header.stamp), int(decision.step))
         for shot in decision.snapshots:
             self.measurements += 1
             known = self._visited_at.get(int(shot.cuboid))
             self.news = self.news or known is None
             if known is None or moment.step < known.step:
                 self._visited_at[int(shot.cuboid)] = moment
+        self.found = len(self._visited_at)
+        self.explored = self.found / self.total
         if decision.done:
-            self._done.setdefault(name, moment.step)
+            self._done.setdefault(topic, moment.step)
+        if len(self._done) == len(self._decisions):
+            self.settled = 'every planner knows that all cuboids are visited'
+            self.end_step = max(self._done.values())
+        if self.scenario.stop == 'all_found' and self.found == self.total:
+            self.completed = max(self._visited_at.values())
+            self.end_step = self.completed.step
 
     def record(self, end: RunEnd) -> CuboidRecord:
-        """Return the record of the run; one that is complete ends where it became so."""
-        completed = self.completed
-        end_time = end.time if completed is None else completed.time
-        record = CuboidRecord(
-            self.name,
-            self.scenario,
-            self.seed,
-            self.mission,
-            end_reason=end.reason,
-            end_time=end_time,
-            wall_time=end.wall_time,
-        )
+        """See `Observer.record`."""
+        end_time = end.time if self.completed is None else self.completed.time
+        record = CuboidRecord(self.name, self.scenario, self.seed, self.mission, end_time=end_time)
         if self.found == self.total:
             record.completed = max(self._visited_at.values())
         active: dict[float, int] = {}
         times = []
-        for name, decisions in self._decisions.items():
+        for name, decisions in zip(self.scenario.names(), self._decisions.values()):
             activity = Activity.SEARCHING
             for item in decisions:
-                time = self._team.time(item.header.stamp)
+                time = self.time(item.header.stamp)
                 if time > end_time:
                     continue
                 record.choices[item.how] = record.choices.get(item.how, 0) + 1
@@ -158,12 +105,7 @@ class CuboidObserver:
         record.snapshots.sort(key=lambda shot: (shot['time'], shot['agent'], shot['cuboid']))
         record.active = rows(sorted(active.items()), 2)
         record.solve_times = np.array(times)
-        for name, raw in self._states.items():
-            states = (self._team.decode(data, 'AgentState') for data in raw)
-            record.trajectories[name] = self._team.trajectory(
-                state for state in states if self._team.time(state.header.stamp) <= end_time
-            )
-        record.add_events(self._team.events, end.events)
+        self._complete(record, end)
         return record
 
     def _snapshot(self, shot: Any, agent: str, time: float) -> dict[str, Any]:

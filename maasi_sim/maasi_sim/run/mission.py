@@ -2,71 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from rosbags.typesys.store import Typestore
 
 from maasi_sim.run.node_plan import NodePlan, RunSettings
-from maasi_sim.run.run_record import RunEnd, RunRecord
+from maasi_sim.run.run_record import Observer, RunRecord
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Record = TypeVar('Record', bound=RunRecord)
-RecordOut = TypeVar('RecordOut', bound=RunRecord, covariant=True)
-
-
-class Observer(Protocol[RecordOut]):
-    """Gathers the data of the report from serialised messages, and detects the end of the run."""
-
-    #: Whether something was found since the caller last reset it.
-    news: bool
-
-    @property
-    def topics(self) -> Sequence[str]:
-        """Topics that it needs."""
-
-    @property
-    def update_topics(self) -> Sequence[str]:
-        """Of these, filter updates: taken before, and added after, the messages they refer to."""
-
-    @property
-    def found(self) -> int:
-        """Number of targets or cuboids found so far."""
-
-    @property
-    def total(self) -> int:
-        """Number of targets or cuboids there are."""
-
-    @property
-    def measurements(self) -> int:
-        """Number of measurements so far, of all robots."""
-
-    @property
-    def explored(self) -> float:
-        """Share of the environment explored."""
-
-    @property
-    def completed(self) -> object | None:
-        """Time and step at which all was found, where the scenario stops then."""
-
-    @property
-    def settled(self) -> str | None:
-        """The reason, once all planners report that nothing is left to gain."""
-
-    @property
-    def end_step(self) -> int | None:
-        """Step at which the search ended by itself; None before."""
-
-    def add(self, topic: str, data: bytes) -> None:
-        """Add a serialised message; one of another topic is ignored."""
-
-    def settle(self) -> None:
-        """Evaluate the messages added since the last call."""
-
-    def record(self, end: RunEnd) -> RecordOut:
-        """Return the record of the run."""
+Record = TypeVar('Record', bound=RunRecord, contravariant=True)
 
 
 class Mission(Protocol[Record]):
@@ -101,7 +47,7 @@ class Mission(Protocol[Record]):
         """Return a warning about the scenario, or an empty text; takes a while."""
         return ''
 
-    def observer(self, types: Typestore) -> Observer[Record]:
+    def observer(self, types: Typestore) -> Observer:
         """Return the observer of a run."""
 
     def report(self, record: Record) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, reader_of
 from maasi_msgs.msg import LockstepDone, LockstepStep
 from maasi_sim.run.bag import BagError, BagWriter, topic_qos
-from maasi_sim.run.mission import Observer
+from maasi_sim.run.run_record import Observer
 from maasi_sim.run.topics import CLOCK, STEP, message_class, stamp_of, time_at, within
 from maasi_sim.view.messages import is_shown
 
@@ -79,7 +79,7 @@ class Recorder:
     def __init__(
         self,
         domain: int,
-        observer: Observer[Any],
+        observer: Observer,
         step_length: float,
         bag: BagWriter | None,
         team: str = '',

@@ -1,8 +1,8 @@
-"""The record of a run, and the part of it that all observers gather."""
+"""The record of a run, and what gathers it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +10,10 @@ import numpy as np
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.arrays import FloatArray
-from maasi_sim.run.topics import seconds
+from maasi_sim.run.topics import STEP, seconds
+
+# Goal status of `AgentState`.
+UNAVAILABLE = 5
 
 
 @dataclass(frozen=True)
@@ -44,21 +47,66 @@ class RunRecord:
     end_time: float = field(default=0.0, kw_only=True)
     wall_time: float = field(default=0.0, kw_only=True)
 
-    def add_events(self, *events: Iterable[dict[str, Any]]) -> None:
-        """Merge events in order of time."""
-        every = [*self.events, *(event for some in events for event in some)]
-        self.events = sorted(every, key=lambda event: float(event['time']))
 
+class Observer:
+    """Gathers the data of a report from serialised messages, and detects the end of the run.
 
-class TeamLog:
-    """Robots that take part, by the messages of the simulation, and the start of the run."""
+    Attributes
+    ----------
+    topics, update_topics : sequence of str
+        That it needs; of these, filter updates: added after the messages they refer to.
+    total, found, measurements : int
+        Targets or cuboids there are, and found so far; measurements so far, of all robots.
+    explored : float
+        Share of the environment explored.
+    news : bool
+        Whether something was found since the caller last reset it.
+    completed : object or None
+        Time and step at which all was found, where the scenario stops then.
+    settled : str or None
+        The reason, once all planners report that nothing is left to gain.
+    end_step : int or None
+        Step at which the search ended by itself; None before.
+    begin : float or None
+        Time of the first step [s]: a clock that the run follows may start at any time.
+    robots : list of str or None
+        That take part, as the simulation says.
+    """
 
-    def __init__(self, types: Typestore) -> None:
+    update_topics: Sequence[str] = ()
+    total = found = measurements = 0
+    explored = 0.0
+    news = False
+    completed: Any = None
+    settled: str | None = None
+    end_step: int | None = None
+    begin: float | None = None
+    robots: list[str] | None = None
+
+    def __init__(
+        self, name: str, scenario: Any, seed: int, types: Typestore, topics: Sequence[str]
+    ) -> None:
+        self.name = name
+        self.scenario = scenario
+        self.seed = seed
         self._types = types
-        # A clock that the run follows may start at any time.
-        self.begin: float | None = None
-        self.robots: list[str] | None = None
-        self.events: list[dict[str, Any]] = []
+        self._events: list[dict[str, Any]] = []
+        self._states: dict[str, list[bytes]] = {f'/{name}/state': [] for name in scenario.names()}
+        self.topics = [STEP, *topics, *self._states]
+
+    def add(self, topic: str, data: bytes) -> None:
+        """Add a serialised message; one of another topic is ignored."""
+        if topic in self._states:
+            self._states[topic].append(data)
+        elif topic == STEP and self.completed is None:
+            self._note_step(self.decode(data, 'LockstepStep'))
+
+    def settle(self) -> None:
+        """Evaluate the messages added since the last call."""
+
+    def record(self, end: RunEnd) -> Any:
+        """Return the record of the run, up to the step at which all was found."""
+        raise NotImplementedError
 
     def decode(self, data: bytes, name: str) -> Any:
         """Return a message of `maasi_msgs`."""
@@ -68,24 +116,41 @@ class TeamLog:
         """Return the time since the first step [s]."""
         return seconds(stamp) - (self.begin or 0.0)
 
-    def note(self, step: Any) -> bool:
-        """Note the robots of a `LockstepStep`; return whether they have changed."""
+    def _note_step(self, step: Any) -> None:
+        """Note the robots that take part."""
         if self.begin is None:
             self.begin = seconds(step.stamp)
         before, self.robots = self.robots, list(step.robots)
         if before is not None:
-            lost, joined = set(before) - set(self.robots), set(self.robots) - set(before)
-            for word, names in (('lost', lost), ('joined', joined)):
+            now, time = set(self.robots), self.time(step.stamp)
+            for word, names in (('lost', set(before) - now), ('joined', now - set(before))):
                 for name in sorted(names):
-                    self.events.append(
-                        {'time': self.time(step.stamp), 'agent': name, 'event': word}
-                    )
-        return before != self.robots
+                    self._events.append({'time': time, 'agent': name, 'event': word})
 
-    def trajectory(self, states: Iterable[Any]) -> FloatArray:
-        """Return time [s], x, y, z [m] of a robot's `AgentState` messages, (n, 4)."""
-        places = [(self.time(state.header.stamp), state.pose.pose.position) for state in states]
-        return rows([(time, place.x, place.y, place.z) for time, place in places], 4)
+    def _until(self, kind: str, messages: Iterable[bytes], end: float) -> Iterator[Any]:
+        """Yield messages up to a time [s]; all at once would take much memory."""
+        for data in messages:
+            item = self.decode(data, kind)
+            if self.time(item.header.stamp) <= end:
+                yield item
+
+    def _complete(self, record: RunRecord, end: RunEnd) -> None:
+        """Add how the run ended, ways and events to a record; the time of its end is set."""
+        record.end_reason, record.wall_time = end.reason, end.wall_time
+        events = [*record.events, *self._events]
+        for name, messages in zip(self.scenario.names(), self._states.values()):
+            way, away = [], False
+            for state in self._until('AgentState', messages, record.end_time):
+                time, place = self.time(state.header.stamp), state.pose.pose.position
+                way.append((time, place.x, place.y, place.z))
+                if self.robots is None and (state.goal_status == UNAVAILABLE) != away:
+                    away = not away
+                    word = 'lost' if away else 'joined'
+                    events.append({'time': time, 'agent': name, 'event': word})
+                    if away and state.reason:
+                        events[-1]['reason'] = state.reason
+            record.trajectories[name] = rows(way, 4)
+        record.events = sorted([*events, *end.events], key=lambda event: float(event['time']))
 
 
 def rows(values: list[Any], width: int) -> FloatArray:

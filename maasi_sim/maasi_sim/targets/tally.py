@@ -12,7 +12,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import FoundTarget, Label
-from maasi_sim.run.run_record import RunRecord, TeamLog
+from maasi_sim.run.run_record import Observer, RunRecord
 from maasi_sim.run.topics import seconds
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.targets.scoring import Scores, score, scoring_radius
@@ -92,14 +92,14 @@ def found_target(item: Any, begin: float, dimension: int = 3) -> FoundTarget:
 class Tally:
     """Counts what the filters have found, update by update."""
 
-    def __init__(self, scenario: Scenario, world: World, team: TeamLog) -> None:
+    def __init__(self, scenario: Scenario, world: World, run: Observer) -> None:
         self.scenario = scenario
         self.world = world
         self.truth = np.asarray(world.targets, dtype=float)
         self.measurements = dict.fromkeys(scenario.names(), 0)
         self.progress: list[FoundCount] = []
         self.completed: FoundCount | None = None
-        self._team = team
+        self._run = run
         self._radius = scoring_radius(scenario, self.truth)
         # By namespace of the filter.
         self._found: dict[str, dict[int, FoundTarget]] = {
@@ -135,7 +135,7 @@ class Tally:
             order = self.scenario.scoring.order
             self._scores = score(self.found, self.truth, self._radius, order)
         now = FoundCount(
-            self._team.time(message.header.stamp),
+            self._run.time(message.header.stamp),
             int(message.step),
             sum(self.measurements.values()),
             sum(map(len, self._found.values())),
@@ -150,7 +150,7 @@ class Tally:
 
     def _own(self, space: str, targets: Iterable[Any]) -> dict[int, FoundTarget]:
         """Return the targets that a filter found itself, not those that others told it."""
-        begin, dimension = self._team.begin or 0.0, self.scenario.dimension
+        begin, dimension = self._run.begin or 0.0, self.scenario.dimension
         return {
             int(item.id): found_target(item, begin, dimension)
             for item in targets
