@@ -18,19 +18,15 @@ def test_a_turtlebot3_reports_per_cent_between_two_voltages(voltage, charge):
     assert charge_of(0.01 * int(100.0 * percent + 1e-6), 'percent') == pytest.approx(charge)
 
 
-@pytest.mark.parametrize(('reading', 'charge'), [(0.0, 0.0), (0.9, 0.9), (1.0, 1.0), (1.1, 1.0)])
-def test_a_fraction_is_a_fraction(reading, charge):
+@pytest.mark.parametrize(
+    ('reading', 'charge'),
+    [
+        *[(0.0, 0.0), (0.9, 0.9), (1.0, 1.0), (1.1, 1.0)],
+        *[(value, -1.0) for value in (math.nan, math.inf, -math.inf, -0.1, 1e308, 55.0)],
+    ],
+)
+def test_a_fraction_is_a_fraction_and_what_is_no_charge_is_unknown(reading, charge):
     assert charge_of(reading, 'fraction') == charge
-
-
-@pytest.mark.parametrize('reading', [math.nan, math.inf, -math.inf, -0.1, 1e308])
-@pytest.mark.parametrize('unit', ['fraction', 'percent'])
-def test_what_is_no_charge_is_unknown(reading, unit):
-    assert charge_of(reading, unit) == -1.0
-
-
-def test_per_cent_are_no_fraction():
-    assert charge_of(55.0, 'fraction') == -1.0
 
 
 @pytest.mark.parametrize('order', [(0, 1, 2), (2, 0, 1), (1, 2, 0)])

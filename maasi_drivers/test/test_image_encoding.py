@@ -13,9 +13,8 @@ CHANNELS = {'rgb8': 'RGB', 'bgr8': 'BGR', 'rgba8': 'RGBA', 'bgra8': 'BGRA'}
 
 def _message(encoding, padding, height=3, width=5):
     """Bytes of an image whose channel c at (row, column) is 40 c + 8 row + column."""
-    order = {'R': 0, 'G': 1, 'B': 2, 'A': 3}
     rows, columns = np.mgrid[:height, :width]
-    planes = [40 * order[name] + 8 * rows + columns for name in CHANNELS[encoding]]
+    planes = [40 * 'RGBA'.index(name) + 8 * rows + columns for name in CHANNELS[encoding]]
     pixels = np.stack(planes, axis=2).astype(np.uint8).reshape(height, -1)
     padded = np.pad(pixels, ((0, 0), (0, padding)), constant_values=255)
     return padded.shape[1], padded.tobytes()
@@ -23,15 +22,14 @@ def _message(encoding, padding, height=3, width=5):
 
 @pytest.mark.parametrize('encoding', CHANNELS)
 @pytest.mark.parametrize('padding', [0, 7])
-@pytest.mark.parametrize('container', [bytes, bytearray, memoryview, lambda b: array('B', b)])
+@pytest.mark.parametrize('container', [bytes, memoryview, lambda b: array('B', b)])
 def test_channels_come_out_in_rgb_order_without_the_padding(encoding, padding, container):
     step, data = _message(encoding, padding)
     image = image_to_array(3, 5, encoding, step, container(data))
     rows, columns = np.mgrid[:3, :5]
-    assert image.shape == (3, 5, 3)
+    expected = np.stack([40 * channel + 8 * rows + columns for channel in range(3)], axis=2)
     assert image.dtype == np.uint8
-    for channel in range(3):
-        np.testing.assert_array_equal(image[..., channel], 40 * channel + 8 * rows + columns)
+    np.testing.assert_array_equal(image, expected)
 
 
 # A smooth picture: what subsampling loses is little.
@@ -78,34 +76,20 @@ def test_what_cameras_of_small_computers_send_is_decoded(encoding, padding):
 
 
 @pytest.mark.parametrize(
-    ('encoding', 'height', 'width'), [('yuyv', 4, 5), ('nv12', 5, 4), ('nv21', 4, 5)]
-)
-def test_odd_sizes_of_subsampled_colours_are_refused(encoding, height, width):
-    with pytest.raises(ValueError, match=r'image size: got .* allowed are even numbers'):
-        image_to_array(height, width, encoding, 2 * width, bytes(2 * width * height))
-
-
-@pytest.mark.parametrize(
-    'encoding', ['mono8', 'mono16', '16UC1', 'bayer_rggb16', 'nv24', '', 'RGB8']
-)
-def test_encodings_without_colour_or_unknown_are_refused_by_name(encoding):
-    with pytest.raises(ValueError, match=f"encoding: got '{encoding}', allowed rgb8, bgr8"):
-        image_to_array(3, 5, encoding, 15, bytes(45))
-
-
-@pytest.mark.parametrize(
-    ('height', 'width', 'step', 'size', 'word'),
+    ('encoding', 'height', 'width', 'step', 'size', 'text'),
     [
-        (0, 5, 15, 0, 'height'),
-        (3, 0, 0, 0, 'width'),
-        (3, -1, 15, 45, 'width'),
-        (100_000, 5, 15, 45, 'height'),
-        (3, 5, 14, 42, 'step'),
-        (3, 5, 15, 44, 'data'),
-        (3, 5, 15, 46, 'data'),
-        (3, 5, 15, 0, 'data'),
+        ('yuyv', 4, 5, 10, 40, 'size: got .* allowed are even numbers'),
+        ('nv12', 5, 4, 8, 40, 'size: got .* allowed are even numbers'),
+        ('mono8', 3, 5, 15, 45, "encoding: got 'mono8', allowed rgb8, bgr8"),
+        ('RGB8', 3, 5, 15, 45, "encoding: got 'RGB8', allowed rgb8, bgr8"),
+        ('rgb8', 0, 5, 15, 0, 'height: got .* allowed'),
+        ('rgb8', 3, -1, 15, 45, 'width: got .* allowed'),
+        ('rgb8', 100_000, 5, 15, 45, 'height: got .* allowed'),
+        ('rgb8', 3, 5, 14, 42, 'step: got .* allowed'),
+        ('rgb8', 3, 5, 15, 44, 'data: got .* allowed'),
+        ('rgb8', 3, 5, 15, 46, 'data: got .* allowed'),
     ],
 )
-def test_sizes_that_do_not_fit_are_refused(height, width, step, size, word):
-    with pytest.raises(ValueError, match=f'image {word}: got .* allowed'):
-        image_to_array(height, width, 'rgb8', step, bytes(size))
+def test_what_does_not_fit_is_refused(encoding, height, width, step, size, text):
+    with pytest.raises(ValueError, match=f'image {text}'):
+        image_to_array(height, width, encoding, step, bytes(size))

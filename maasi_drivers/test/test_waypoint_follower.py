@@ -59,18 +59,16 @@ def test_a_flying_robot_holds_the_waypoint_that_it_has_reached():
     assert command[0] > 0.05
 
 
-@pytest.mark.parametrize(('tolerance', 'status'), [(0.0, 'MOVING'), (0.2, 'REACHED')])
-def test_a_goal_may_bring_its_own_tolerance(tolerance, status):
+@pytest.mark.parametrize(
+    ('tolerance', 'place', 'status'),
+    # The height of a waypoint is nothing to a ground robot.
+    [(0.0, at(0.85), 'MOVING'), (0.2, at(0.85), 'REACHED'), (0.1, at(0.95, z=0.0), 'REACHED')],
+)
+def test_a_goal_may_bring_its_own_tolerance(tolerance, place, status):
     follower = follower_of()
     follower.take(goal(1.0, tolerance=tolerance))
-    follower.update(at(0.85))
+    follower.update(place)
     assert follower.status.name == status
-
-
-def test_the_height_of_a_waypoint_is_nothing_to_a_ground_robot():
-    follower = follower_of()
-    follower.take(Goal(1, 0, np.array([1.0, 0.0, 0.7]), 0.1))
-    assert follower.update(at(0.95, z=0.0))[1] is not None
 
 
 def test_a_goal_of_a_step_acts_from_the_next_one_on():
@@ -103,24 +101,21 @@ def test_a_goal_that_did_not_act_yet_can_be_ended():
     assert follower.status == GoalStatus.CANCELED and target.reason == 'cancelled'
 
 
-def test_a_flying_robot_stops_where_its_goal_is_cancelled():
-    follower = follower_of('constant_speed')
-    follower.take(goal(1.0))
-    follower.update(at(0.2))
-    follower.end(GoalStatus.CANCELED, 'cancelled')
-    assert_allclose(follower.update(at(0.4))[0], np.zeros(4), atol=1e-12)
-    assert follower.update(at(0.5))[0][0] < 0.0
-
-
-def test_where_it_goes_or_stays_is_known():
+def test_a_flying_robot_holds_where_its_goal_is_cancelled_or_where_it_is_told():
     follower = follower_of('constant_speed')
     assert follower.target is None
-    follower.update(at(1.0))
+    follower.update(at(0.0))
+    follower.take(goal(1.0))
+    follower.update(at(0.2))
     assert_array_equal(follower.target, [1.0, 0.0, 1.0])
+    follower.end(GoalStatus.CANCELED, 'cancelled')
+    assert_allclose(follower.update(at(0.4))[0], np.zeros(4), atol=1e-12)
+    assert_array_equal(follower.target, [0.4, 0.0, 1.0])
+    assert follower.update(at(0.5))[0][0] < 0.0
+    # `let_go` lets a robot that has reached its waypoint hold that, `stay` does not.
     follower.take(goal(3.0))
-    follower.update(at(1.0))
-    assert_array_equal(follower.target, [3.0, 0.0, 1.0])
     follower.update(at(3.0))
-    follower.stay()
-    follower.update(at(2.5))
-    assert_array_equal(follower.target, [2.5, 0.0, 1.0])
+    for tell, held in ((follower.let_go, 3.0), (follower.stay, 2.5)):
+        tell()
+        follower.update(at(2.5))
+        assert_array_equal(follower.target, [held, 0.0, 1.0])

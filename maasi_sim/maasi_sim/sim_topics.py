@@ -202,12 +202,14 @@ def publish_truth(node: Node, world: World, frame: str) -> None:
     targets = node.create_publisher(PoseArray, 'ground_truth/targets', LATCHED)
     markers = node.create_publisher(MarkerArray, 'ground_truth/markers', LATCHED)
     targets.publish(
-        PoseArray(header=header, poses=[pose_to_ros(Pose(target)) for target in world.targets_3d])
+        PoseArray(
+            header=header, poses=[pose_to_ros(Pose(target)) for target in world.targets_3d_at(0)]
+        )
     )
     size = 0.01 * float((world.bounds[:, 1] - world.bounds[:, 0]).max())
     shapes = [
         sphere_marker(header, 'truth', number, target, size, colour(0.0, 0.3, 1.0, 0.7))
-        for number, target in enumerate(world.targets_3d, start=1)
+        for number, target in enumerate(world.targets_3d_at(0), start=1)
     ]
     obstacles = world.obstacles
     for number, (centre, radius, sphere) in enumerate(

@@ -50,50 +50,39 @@ def test_sweeps_are_keyed_and_what_happens_to_one_target_leaves_the_others_alone
         assert kept <= {tuple(row) for row in first.measure(POSE, step)[0]}
 
 
-def test_the_order_tells_nothing():
-    targets = POSE.position + np.array([[10.0, 0, 0], [0, 20.0, 0]])
+def test_the_order_tells_nothing_and_values_stay_in_their_ranges():
+    targets = POSE.position + np.array(
+        [[10.0, 0, 0], [0, 20.0, 0], [-0.01, 0, 0], [-5.0, 1e-3, 4.0]]
+    )
     detection = {'kind': 'box', 'probability': 1.0, 'lower': [-50] * 3, 'upper': [50] * 3}
     played = RangingSensor(sensor(detection=detection), targets, 1, 'drone')
-    nearest_first = [played.measure(POSE, step)[0][:, 0].argmin() == 0 for step in range(200)]
-    assert 60 < sum(nearest_first) < 140
-
-
-def test_clutter_comes_at_its_intensity():
-    settings = {'clutter': 0.002, 'detection': {'probability': 0.0}}
-    played = RangingSensor(sensor(**settings), np.zeros((3, 3)), 1, 'drone', reach=100.0)
-    sweeps = [played.measure(POSE, step)[0] for step in range(400)]
-    assert_allclose(
-        np.mean([len(sweep) for sweep in sweeps]), 0.002 * 100 * 2 * np.pi * np.pi, rtol=0.1
+    sweeps = [played.measure(POSE, step) for step in range(300)]
+    assert (
+        60 < sum(causes.tolist().index(0) < causes.tolist().index(1) for _, causes in sweeps) < 240
     )
-    values = np.concatenate(sweeps)
-    assert values[:, 0].min() > 0
-    assert values[:, 0].max() < 100
-    assert np.abs(values[:, 1]).max() <= np.pi
-    assert np.abs(values[:, 2]).max() <= np.pi / 2
+    in_range(np.concatenate([values for values, _ in sweeps]))
+    empty = RangingSensor(sensor(), np.zeros((0, 3)), 1, 'drone')
+    assert empty.measure(POSE, 0)[0].shape == (0, 3)
 
 
-def test_values_stay_in_their_ranges():
-    targets = POSE.position + np.array([[-0.01, 0.0, 0.0], [-5.0, 1e-3, 0.0], [0.0, 0.0, 4.0]])
-    played = RangingSensor(sensor(), targets, 1, 'drone')
-    values = np.concatenate([played.measure(POSE, step)[0] for step in range(300)])
+def in_range(values):
     assert (values[:, 0] > 0).all()
     assert np.abs(values[:, 1]).max() <= np.pi
     assert np.abs(values[:, 2]).max() <= np.pi / 2
 
 
-def test_no_targets_no_returns():
-    assert RangingSensor(sensor(), np.zeros((0, 3)), 1, 'drone').measure(POSE, 0)[0].shape == (0, 3)
-
-
-def test_each_return_says_which_target_caused_it():
+def test_clutter_comes_at_its_intensity_and_each_return_says_what_caused_it():
     targets = POSE.position + np.array([[10.0, 0.0, 0.0], [0.0, 20.0, 5.0], [-15.0, 8.0, -3.0]])
     played = RangingSensor(sensor(clutter=0.002), targets, 3, 'drone', reach=100.0)
-    model, seen, clutter = played.sensor.measurement, 0, 0
-    for step in range(100):
+    model, seen, clutter = played.sensor.measurement, 0, []
+    for step in range(400):
         values, causes = played.measure(POSE, step)
         true = causes >= 0
         errors = model.residual(values[true], model.measure(targets[causes[true]], POSE))
         assert (np.abs(errors) < 6.0 * np.sqrt(np.diagonal(played.sensor.covariance))).all()
-        seen, clutter = seen + int(true.sum()), clutter + int((~true).sum())
-    assert seen > 100
-    assert clutter > 100
+        seen += int(true.sum())
+        clutter.append(values[~true])
+    assert seen > 400
+    assert_allclose(np.mean(list(map(len, clutter))), 0.002 * 100 * 2 * np.pi * np.pi, rtol=0.1)
+    in_range(np.concatenate(clutter))
+    assert np.concatenate(clutter)[:, 0].max() < 100

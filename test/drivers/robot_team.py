@@ -5,6 +5,7 @@ import math
 import numpy as np
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist, TwistStamped
+from marker_view import one_image
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
 from rclpy.node import Node
@@ -14,14 +15,11 @@ from std_srvs.srv import Trigger
 from waiting import wait_until
 
 from maasi_drivers.drivers import MamboDriver, RangingDriver, TurtlebotDriver
-from maasi_drivers.guard_node import GuardNode
 from maasi_drivers.settings.driver import DriverSettings
-from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose, compose, inverse
 from maasi_filter.ros.conversions import pose_to_ros, stamp_to_ros
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE
-from maasi_filter.settings import EnvironmentSettings
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import (
     AgentState,
@@ -33,9 +31,6 @@ from maasi_msgs.msg import (
     RangeArray,
 )
 from maasi_planner.motion import RobotState, make_motion
-from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor import RenderSettings, scene_of
-from maasi_sim.world.world import TargetSettings, World
 
 STEP = 0.05
 NANOSECONDS = round(STEP * 1e9)
@@ -78,19 +73,6 @@ KINDS = {
 }
 
 
-def start_guard(context, team, lockstep=False):
-    """Return the active guard of the team's robot."""
-    guard = GuardNode(
-        context=context,
-        namespace='/rover',
-        parameter_overrides=[Parameter('lockstep', value=lockstep)],
-    )
-    team.executor_used.add_node(guard)
-    assert guard.trigger_configure().name == 'SUCCESS'
-    assert guard.trigger_activate().name == 'SUCCESS'
-    return guard
-
-
 class Team(Node):
     """The robot, its camera, and whoever the driver talks to."""
 
@@ -120,8 +102,9 @@ class Team(Node):
         self.images = self.create_publisher(Image, 'camera/image_raw', RELIABLE)
         self.calibrations = self.create_publisher(CameraInfo, 'camera/camera_info', RELIABLE)
         self.ranges = self.create_publisher(RangeArray, 'ranges', RELIABLE)
-        self.used = [self.battery, self.batches]
-        self.used += [self.odometry] if self.settings.poses == 'odometry' else []
+        self.used = [self.batches, *([] if deaf else [self.battery])]
+        if not deaf and self.settings.poses == 'odometry':
+            self.used.append(self.odometry)
         topic = self.settings.image_source == 'topic'
         self.used += [self.images] * topic if self.settings.camera else [self.ranges]
         if lockstep:
@@ -272,13 +255,7 @@ def parameters_of(settings):
 
 def rendered(team, targets, pose):
     """Return what the robot's camera sees, as an image message without its stamp."""
-    floor = RenderSettings.ideal()
-    world = World.from_settings(
-        EnvironmentSettings(bounds=BOUNDS), TargetSettings(positions=targets), 1
-    )
-    camera = Camera.from_settings(team.settings.camera)
-    image = CameraRenderer(camera, floor, scene_of(world, floor, 1), 1, 'rover').render(pose, 0, 0)
-    return image_message(image)
+    return image_message(one_image(team.settings.camera, targets, pose))
 
 
 def image_message(image, stamp=0):

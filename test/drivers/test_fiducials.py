@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from marker_view import drone_camera
 from numpy.testing import assert_allclose
 
 from maasi_drivers.agent.odometry import StampedPose
@@ -39,8 +40,8 @@ def photograph(camera, pose, markers, dictionary):
 
 
 @pytest.mark.parametrize('dictionary', ['4X4_50', 'APRILTAG_36h11'])
-def test_markers_are_located_and_named(drone, dictionary):
-    settings = drone(
+def test_markers_are_located_and_named(dictionary):
+    settings = drone_camera(
         width=640,
         height=480,
         focal_length=[520.0, 520.0],
@@ -63,8 +64,8 @@ def test_markers_are_located_and_named(drone, dictionary):
         assert_allclose(seen[f'{dictionary}:{number}'], centre, atol=0.001)
 
 
-def test_a_floor_without_markers_shows_none(drone):
-    settings = drone(segmentation={'rule': 'aruco'})
+def test_a_floor_without_markers_shows_none():
+    settings = drone_camera(segmentation={'rule': 'aruco'})
     noise = np.random.default_rng(1).integers(90, 160, (settings.height, settings.width, 3))
     seen = MarkerDetector(settings).detect(noise.astype(np.uint8), Pose([0.0, 0.0, 1.0]))
     assert len(seen.values) == 0 and seen.labels == ()

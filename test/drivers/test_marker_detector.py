@@ -2,31 +2,20 @@
 
 import numpy as np
 import pytest
+from marker_view import drone_camera, hard_floor, one_image, score
 from numpy.testing import assert_allclose
 
 from maasi_drivers.vision.marker_detector import MarkerDetector
 from maasi_filter.models.pose import Pose
-from maasi_filter.settings import EnvironmentSettings
-from maasi_sim.world.camera import CameraRenderer
-from maasi_sim.world.floor import RenderSettings, scene_of
-from maasi_sim.world.world import TargetSettings, World
+from maasi_sim.world.floor import RenderSettings
 
-
-def one_image(settings, targets, pose, floor=None, seed=1):
-    floor = floor or RenderSettings.ideal()
-    world = World.from_settings(
-        EnvironmentSettings(bounds=[[-1, 1], [-1, 1]]), TargetSettings(positions=targets), seed
-    )
-    renderer = CameraRenderer(
-        MarkerDetector(settings).camera, floor, scene_of(world, floor, seed), seed, 'drone'
-    )
-    return renderer.render(pose, 0, 0.0)
+PAPER = drone_camera(segmentation={'rule': 'paper'})
 
 
 @pytest.mark.parametrize('rule', ['paper', 'robust'])
 @pytest.mark.parametrize('dimension', [2, 3])
-def test_a_marker_is_measured_to_millimetres(drone, rule, dimension):
-    settings = drone(segmentation={'rule': rule})
+def test_a_marker_is_measured_to_millimetres(rule, dimension):
+    settings = drone_camera(segmentation={'rule': rule})
     pose = Pose.from_yaw([0.1, 0.2, 1.0], 0.8)
     target = np.array([0.16, 0.11, 0.0])
     seen = MarkerDetector(settings, dimension).detect(
@@ -44,41 +33,41 @@ def test_a_marker_is_measured_to_millimetres(drone, rule, dimension):
 
 
 @pytest.mark.parametrize('seed', range(900, 908))
-def test_the_robust_rule_on_hard_sequences(hard_score, seed):
-    result = hard_score('robust', seed, 30)
+def test_the_robust_rule_on_hard_sequences(seed):
+    result = score(drone_camera(), hard_floor(seed), seed, 30)
     assert result.recall >= 0.98
     assert result.false_per_frame <= 0.2
     assert result.rmse <= 0.005
 
 
-def test_the_papers_rule_on_hard_sequences_sees_what_is_not_there(hard_score):
-    assert hard_score('paper', 900, 15).false_per_frame > 1.0
+def test_the_papers_rule_on_hard_sequences_sees_what_is_not_there():
+    assert score(PAPER, hard_floor(900), 900, 15).false_per_frame > 1.0
 
 
 @pytest.mark.parametrize('rule', ['paper', 'robust'])
-def test_both_rules_on_a_moderate_floor(drone, rendered_score, rule):
-    result = rendered_score(drone(segmentation={'rule': rule}), RenderSettings(), 31, 60)
+def test_both_rules_on_a_moderate_floor(rule):
+    result = score(drone_camera(segmentation={'rule': rule}), RenderSettings(), 31, 60)
     assert result.recall >= 0.98
     assert result.false_per_frame <= 0.02
     assert result.rmse <= 0.001
 
 
 @pytest.mark.parametrize('noise', [6.0, 9.0, 12.0])
-def test_covariances_are_honest_about_image_noise(drone, rendered_score, noise):
+def test_covariances_are_honest_about_image_noise(noise):
     floor = RenderSettings.ideal(read_noise=noise, blur=0.5)
-    result = rendered_score(drone(pixel_noise=0.03), floor, 32, 150)
+    result = score(drone_camera(pixel_noise=0.03), floor, 32, 150)
     # Two coordinates: the mean is 2 where the covariance says what the error is.
     assert 1.2 < result.nees < 3.0
 
 
-def test_covariances_cover_jpeg(drone, rendered_score):
+def test_covariances_cover_jpeg():
     floor = RenderSettings.ideal(jpeg_quality=90, blur=0.5)
-    assert rendered_score(drone(), floor, 33, 80).nees < 3.0
+    assert score(drone_camera(), floor, 33, 80).nees < 3.0
 
 
-def test_a_cut_marker_is_kept_with_more_covariance_or_dropped(drone):
+def test_a_cut_marker_is_kept_with_more_covariance_or_dropped():
     pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
-    settings = drone(distortion=[])
+    settings = drone_camera(distortion=[])
     edge = MarkerDetector(settings).camera.back_project([[80.0, 0.5]], pose)[0][0]
     image = one_image(settings, [edge.tolist(), [0.0, 0.0]], pose)
     detector = MarkerDetector(settings)
@@ -87,25 +76,25 @@ def test_a_cut_marker_is_kept_with_more_covariance_or_dropped(drone):
     assert kept.covariances[0, 0, 0] > 50 * kept.covariances[1, 0, 0]
     error = kept.values[0, 0] - np.linalg.norm(edge)
     assert error**2 < 9.0 * kept.covariances[0, 0, 0]
-    dropped = MarkerDetector(drone(distortion=[], cut_blobs='drop')).detect(image, pose)
+    dropped = MarkerDetector(drone_camera(distortion=[], cut_blobs='drop')).detect(image, pose)
     assert len(dropped.values) == 1
     assert dropped.dropped == {'not on the floor': 0, 'size': 0, 'cut by the border': 1}
 
 
-def test_markers_of_the_wrong_size_are_dropped_and_counted(drone):
+def test_markers_of_the_wrong_size_are_dropped_and_counted():
     pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
-    image = one_image(drone(), [[0.0, 0.0]], pose, RenderSettings.ideal(marker_diameter=0.08))
-    seen = MarkerDetector(drone()).detect(image, pose)
+    image = one_image(
+        drone_camera(), [[0.0, 0.0]], pose, RenderSettings.ideal(marker_diameter=0.08)
+    )
+    seen = MarkerDetector(drone_camera()).detect(image, pose)
     assert len(seen.values) == 0
     assert seen.dropped['size'] == 1
-    assert (
-        len(MarkerDetector(drone(segmentation={'rule': 'paper'})).detect(image, pose).values) == 1
-    )
+    assert len(MarkerDetector(PAPER).detect(image, pose).values) == 1
 
 
-def test_the_edge_of_something_large_is_no_cut_marker(drone):
+def test_the_edge_of_something_large_is_no_cut_marker():
     pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
-    settings = drone(distortion=[])
+    settings = drone_camera(distortion=[])
     view = MarkerDetector(settings).camera
     large = RenderSettings.ideal(marker_diameter=0.065)
     for row in (-0.5, -0.8, -1.2):
@@ -117,26 +106,28 @@ def test_the_edge_of_something_large_is_no_cut_marker(drone):
         assert seen.dropped['size'] == 1
 
 
-def test_the_pose_covariance_of_the_message_wins_over_the_settings(drone):
+def test_the_pose_covariance_of_the_message_wins_over_the_settings():
     pose = Pose.from_yaw([0.0, 0.0, 1.0], 0.0)
-    image = one_image(drone(), [[0.1, 0.0]], pose)
-    none = MarkerDetector(drone()).detect(image, pose)
-    own = MarkerDetector(drone(position_noise=0.02)).detect(image, pose)
-    given = MarkerDetector(drone(position_noise=0.02)).detect(image, pose, 0.05**2 * np.eye(6))
+    image = one_image(drone_camera(), [[0.1, 0.0]], pose)
+    none = MarkerDetector(drone_camera()).detect(image, pose)
+    own = MarkerDetector(drone_camera(position_noise=0.02)).detect(image, pose)
+    given = MarkerDetector(drone_camera(position_noise=0.02)).detect(
+        image, pose, 0.05**2 * np.eye(6)
+    )
     variances = [result.covariances[0, 0, 0] for result in (none, own, given)]
     assert_allclose(variances[1], variances[0] + 0.02**2 * (1 + 0.1**2), rtol=0.01)
     assert variances[2] > 0.05**2
 
 
-def test_an_image_of_another_size_is_refused(drone):
+def test_an_image_of_another_size_is_refused():
     with pytest.raises(ValueError, match='image: got 80 x 60 px, allowed is the size'):
-        MarkerDetector(drone()).detect(
+        MarkerDetector(drone_camera()).detect(
             np.zeros((60, 80, 3), np.uint8), Pose.from_yaw([0, 0, 1.0], 0.0)
         )
 
 
-def test_blobs_above_the_horizon_are_no_detections(drone):
-    settings = drone(mount={'position': [0, 0, 0.2], 'rpy': [0, 0, 0]}, distortion=[])
+def test_blobs_above_the_horizon_are_no_detections():
+    settings = drone_camera(mount={'position': [0, 0, 0.2], 'rpy': [0, 0, 0]}, distortion=[])
     image = np.full((120, 160, 3), 120, dtype=np.uint8)
     image[20:26, 40:46] = (20, 45, 160)
     seen = MarkerDetector(settings).detect(image, Pose.from_yaw([0, 0, 0.0], 0.0))

@@ -5,14 +5,14 @@ import json
 import math
 import socket
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from numpy.testing import assert_allclose
-from rclpy.executors import SingleThreadedExecutor
-from robot_team import Team, parameters_of, rendered, stamped
+from robot_team import rendered, stamped
 
 from maasi_drivers.agent.agent_driver import AgentDriver
 from maasi_drivers.settings.driver import DriverSettings
@@ -29,8 +29,8 @@ PARAMETERS = yaml.safe_load(FILE.with_name('rover.yaml').read_text())['/**']['ro
 class Rover:
     """The robot: a body that moves in real time, behind a socket."""
 
-    def __init__(self, team):
-        self.start, self.body = team.start, team.body
+    def __init__(self):
+        self.start = self.body = None
         self.link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.link.bind(('127.0.0.1', 0))
         self.link.setblocking(False)
@@ -64,33 +64,18 @@ class Rover:
 
 
 @pytest.fixture
-def rover_and_team(context):
+def rover_and_team(play):
     spec = importlib.util.spec_from_file_location('my_robot_driver', FILE)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    executor = SingleThreadedExecutor(context=context)
-    settings = unflatten(DriverSettings, PARAMETERS)
-    driver = AgentDriver(
-        {'topics': module.RoverLink},
-        CameraInput,
-        context=context,
-        namespace='/rover',
-        parameter_overrides=parameters_of(settings),
-    )
-    executor.add_node(driver)
-    team = Team(context, settings, executor, deaf=True)
-    team.used = [team.batches, team.images]
-    rover = Rover(team)
+    rover = Rover()
     module.ROVER = rover.link.getsockname()
-    assert driver.trigger_configure().name == 'SUCCESS'
-    assert driver.trigger_activate().name == 'SUCCESS'
-    team.connect()
+    made = partial(AgentDriver, {'topics': module.RoverLink}, CameraInput)
+    driver, team = play((made, unflatten(DriverSettings, PARAMETERS)), deaf=True)
+    rover.start, rover.body = team.start, team.body
     team.until(lambda: rover.live() or team.states, 'the rover was not heard')
     yield rover, team, driver
     driver.halt()
-    driver.destroy_node()
-    team.destroy_node()
-    executor.shutdown()
     rover.link.close()
 
 

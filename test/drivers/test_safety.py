@@ -16,8 +16,7 @@ from action_msgs.msg import GoalStatus
 from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import Twist
 from numpy.testing import assert_array_equal
-from rclpy.executors import SingleThreadedExecutor
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, image_message, numbers, start_guard
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, image_message, numbers
 from sensor_msgs.msg import BatteryState
 
 from maasi_drivers.agent.watchdog import PERIOD as WATCH_PERIOD
@@ -164,9 +163,9 @@ def test_a_camera_that_hangs_stops_the_robot(play, fault):
     assert team.takes([1.0, 1.0, 0.0], live=team.move)
 
 
-def test_a_guard_that_has_gone_is_reported(play, context, capfd):
+def test_a_guard_that_has_gone_is_reported(play, start_guard, capfd):
     driver, team = play()
-    guard = start_guard(context, team)
+    guard = start_guard()
     team.until(lambda: team.move() or driver.link.status() == {'guard': 'is there'})
     assert 'guard' not in driver._warned
     guard.destroy_node()
@@ -240,22 +239,22 @@ def test_the_type_of_the_commands_is_found_out_or_given(play, options):
     assert np.any(team.command != 0.0)
 
 
-def test_it_is_said_that_nobody_listens(context, process, capfd):
+def test_it_is_said_that_nobody_listens(make_team, process, capfd):
     """The robot is a process of its own: one process cannot have two types under one name."""
     driver = process(command_type='stamped')
-    executor = SingleThreadedExecutor(context=context)
-    team = Team(context, TURTLEBOT, executor, wants=Twist, deaf=True)
-    end = time.monotonic() + 30.0
-    said = ''
-    while 'see the parameter command_type' not in said and time.monotonic() < end:
+    team = make_team(TURTLEBOT, wants=Twist, deaf=True)
+    said = []
+
+    def heard():
         team.step += 1
         team.odometry.publish(team.odometry_message())
-        team.executor_used.spin_once(timeout_sec=0.05)
-        said += capfd.readouterr().err
-    assert 'no subscription of this type; the robot wants geometry_msgs/msg/Twist' in said
+        said.append(capfd.readouterr().err)
+        return 'see the parameter command_type' in ''.join(said)
+
+    team.until(heard)
+    wanted = 'no subscription of this type; the robot wants geometry_msgs/msg/Twist'
+    assert wanted in ''.join(said)
     assert driver.poll() is None
-    executor.shutdown()
-    team.destroy_node()
 
 
 # ---- the driver's process, and the guard of its robot ----------------------------------------
@@ -279,9 +278,9 @@ def is_stopped(team):
     assert not np.any([numbers(item) for item in team.commands[known:]])
 
 
-def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(context, process, team):
+def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(start_guard, process, team):
     """One that hangs lives on with its middleware: only its executor thread does not."""
-    guard = start_guard(context, team)
+    guard = start_guard()
     driver = process(program=[sys.executable, str(HANGING)])
     team.connect()
     team.awaken()
@@ -322,12 +321,13 @@ def test_the_guard_stops_the_robot_of_a_driver_that_hangs_or_is_killed(context, 
     assert not guard.active and not guard.status()['stopping']
     assert guard.trigger_activate().name == 'SUCCESS'
     is_stopped(team)
-    guard.destroy_node()
 
 
 @pytest.mark.parametrize('lockstep', [False, True])
-def test_in_lockstep_the_guard_waits_for_a_driver_that_is_slow(context, process, team, lockstep):
-    guard = start_guard(context, team, lockstep)
+def test_in_lockstep_the_guard_waits_for_a_driver_that_is_slow(
+    start_guard, process, team, lockstep
+):
+    guard = start_guard(lockstep)
     driver = process()
     team.connect()
     team.awaken()
@@ -339,7 +339,6 @@ def test_in_lockstep_the_guard_waits_for_a_driver_that_is_slow(context, process,
     stopped = guard.status()['stopping']
     driver.send_signal(signal.SIGCONT)
     assert stopped != lockstep
-    guard.destroy_node()
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

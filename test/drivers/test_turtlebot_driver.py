@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from numpy.testing import assert_allclose, assert_array_equal
-from rclpy.executors import SingleThreadedExecutor
-from robot_team import NANOSECONDS, STEP, TURTLEBOT, Team, numbers, parameters_of, start_guard
+from robot_team import NANOSECONDS, STEP, TURTLEBOT, numbers, parameters_of
 from sensor_msgs.msg import LaserScan
 
 from maasi_drivers.drivers import TurtlebotDriver
@@ -191,18 +190,14 @@ def nav2(context, with_nav2):
 
 
 @pytest.fixture
-def driven(nav2, with_nav2, process, context):
+def driven(nav2, with_nav2, process, team):
     """Start a driver that hands its waypoints to Nav2; return the team, Nav2, and the driver."""
     driver = process(
         environment=with_nav2, navigation='nav2', pose_source='odometry', odometry_timeout=0.5
     )
-    executor = SingleThreadedExecutor(context=context)
-    team = Team(context, TURTLEBOT, executor)
     team.connect()
     team.awaken()
-    yield team, *nav2, driver
-    executor.shutdown()
-    team.destroy_node()
+    return team, *nav2, driver
 
 
 def stand(team):
@@ -323,9 +318,9 @@ def test_nav2_drives_to_the_waypoints(driven):
     assert 'no answer or feedback of Nav2 for' in reason or 'Nav2 is' in reason
 
 
-def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, context):
+def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, start_guard):
     team, said, _, driver = driven
-    guard = start_guard(context, team)
+    guard = start_guard()
     send_first(team, [0.7, 0.8, 0.0])
     heard(team, said, 'goal')
     # No odometry.
@@ -343,14 +338,12 @@ def test_lost_odometry_and_a_dead_driver_cancel_the_goals_of_nav2(driven, contex
     assert said.get()['event'] == 'cancelled'
     team.until(lambda: len(team.commands) >= known + 3)
     assert not np.any([numbers(item) for item in team.commands[known:]])
-    guard.destroy_node()
 
 
-def test_nav2_does_not_drive_a_robot_whose_pose_is_not_known(nav2, with_nav2, process, context):
+def test_nav2_does_not_drive_a_robot_whose_pose_is_not_known(nav2, with_nav2, process, make_team):
     said, _ = nav2
     process(environment=with_nav2, navigation='nav2')
-    executor = SingleThreadedExecutor(context=context)
-    team = Team(context, TURTLEBOT | {'navigation': 'nav2'}, executor)
+    team = make_team(TURTLEBOT | {'navigation': 'nav2'})
     team.connect()
     reasons = []
     team.until(
@@ -360,15 +353,12 @@ def test_nav2_does_not_drive_a_robot_whose_pose_is_not_known(nav2, with_nav2, pr
     )
     assert reasons[-1] == 'no pose on tf yet'
     assert said.empty()
-    executor.shutdown()
-    team.destroy_node()
 
 
-def test_nav2_that_is_not_installed_is_said(context, monkeypatch):
+def test_nav2_that_is_not_installed_is_said(start_node, monkeypatch):
     # None stands for a module that cannot be imported, also where Nav2 is installed.
     monkeypatch.setitem(sys.modules, 'nav2_msgs', None)
     settings = TURTLEBOT | {'navigation': 'nav2', 'pose_source': 'odometry'}
-    driver = TurtlebotDriver(context=context, parameter_overrides=parameters_of(settings))
+    driver = start_node(TurtlebotDriver, parameter_overrides=parameters_of(settings))
     assert driver.trigger_configure().name == 'FAILURE'
     assert 'the package nav2_msgs is not installed' in driver.problem
-    driver.destroy_node()

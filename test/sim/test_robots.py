@@ -76,6 +76,10 @@ def test_the_covariance_of_odometry_is_honest_about_noise_and_drift():
     nees = []
     for seed in range(120):
         model = OdometryModel(settings, start, seed, 'robot')
+        # At rest it does not drift.
+        for step in range(-50, 0):
+            reading = model.step(RobotState(start), step % 1000)
+        assert np.abs(reading.pose.position).max() < 0.02
         for step in range(1, 60):
             angle = 0.03 * step
             place = start.position + np.array([np.sin(angle), 1 - np.cos(angle), 0.0])
@@ -89,16 +93,6 @@ def test_the_covariance_of_odometry_is_honest_about_noise_and_drift():
         planar = placed.covariance[np.ix_([0, 1, 5], [0, 1, 5])]
         nees.append(error @ np.linalg.solve(planar, error))
     assert 2.5 < np.mean(nees) < 3.5
-
-
-def test_a_robot_at_rest_does_not_drift():
-    settings = OdometrySettings(
-        position_noise=0.0, heading_noise=0.0, position_drift=1.0, heading_drift=1.0
-    )
-    model = OdometryModel(settings, GROUND, 1, 'robot')
-    for step in range(50):
-        reading = model.step(RobotState(GROUND), step)
-    assert_allclose(reading.pose.position, np.zeros(3), atol=1e-12)
 
 
 def test_height_and_attitude_do_not_drift():
@@ -122,23 +116,15 @@ def test_two_runs_are_the_same_to_the_bit_and_another_robot_is_not():
     assert_array_equal(runs[0].image(40, 2.0), runs[1].image(40, 2.0))
 
 
-def test_the_last_command_holds():
+@pytest.mark.parametrize('command', [(np.nan, 0, 0, 0), (np.inf, 0, 0, 0), (0.1, 0.2)])
+def test_an_unfit_command_is_refused_and_the_last_one_holds(command):
     one = robot('unicycle', GROUND)
     drive(one, 40, (0.2, 0.0, 0.0, 0.0))
-    before = one.state.pose.position[0]
-    one.step(41, 0.05)
-    assert one.state.pose.position[0] - before > 0.005
-
-
-@pytest.mark.parametrize('command', [(np.nan, 0, 0, 0), (np.inf, 0, 0, 0), (0.1, 0.2)])
-def test_an_unfit_command_is_refused_and_the_old_one_stays(command):
-    one = robot('unicycle', GROUND)
-    drive(one, 20, (0.2, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match='velocity command: got'):
         one.command(command)
     before = one.state.pose.position[0]
-    one.step(21, 0.05)
-    assert one.state.pose.position[0] > before
+    one.step(41, 0.05)
+    assert one.state.pose.position[0] - before > 0.005
 
 
 def test_an_obstacle_stops_a_robot_short_of_it():
@@ -152,12 +138,8 @@ def test_an_obstacle_stops_a_robot_short_of_it():
     # It can leave again.
     drive(one, 100, (-0.2, 0.0, 0.0, 0.0), first=401)
     assert one.state.pose.position[0] < 0.6
-
-
-def test_a_start_inside_an_obstacle_is_refused():
-    place = world(obstacles=[{'centre': [0.2, 0.3], 'radius': 0.2}])
     with pytest.raises(ValueError, match='robot: got start'):
-        robot('unicycle', GROUND, place=place)
+        robot('unicycle', Pose.from_yaw([0.9, 0.3, 0.0], 0.0), place=place)
 
 
 def test_a_battery_drains_faster_in_motion_and_stops_the_robot_when_empty():
@@ -180,12 +162,6 @@ def test_a_drone_with_an_empty_battery_comes_down_and_stays():
     where = one.state.pose.position.copy()
     drive(one, 20, (0.3, 0.0, 0.5, 0.0), first=401)
     assert_array_equal(one.state.pose.position, where)
-
-
-def test_the_camera_shows_the_markers_where_they_are():
-    one = robot()
-    seen = MarkerDetector(one.equipment.camera).detect(one.image(0, 0.0), one.state.pose)
-    assert_allclose(seen.positions, [[1.1, 1.05]], atol=0.002)
 
 
 def test_moving_and_tilting_the_camera_still_shows_them():

@@ -86,7 +86,7 @@ class AgentDriver(RobotNode):
     # ---- life cycle --------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Make link, sensor, controller and parts."""
+        """Make link, sensor and controller."""
         settings = self.settings
         if settings.link not in self._links:
             raise SettingsError(
@@ -102,17 +102,10 @@ class AgentDriver(RobotNode):
         self._motion = self.link.make_motion()
         self.follower = WaypointFollower(self._motion)
         self._pose_speed = PoseSpeed()
-        self._state = StatePublisher(self)
-        self._watchdog = Watchdog(self, self.link, self.sensor_input, self._state)
-        self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
-        self._frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
-        self._goals = GoalServer(self, self.link, self._frames)
         # Stamps of the step that is awaited, answered, or has no usable odometry [ns].
         self._awaited: int | None = None
         self._answered: int | None = None
         self._unusable: int | None = None
-        if self._stop_latched:
-            self.health.begin(STOP, STOPPED)
 
     @property
     def goals(self) -> GoalServer:
@@ -121,20 +114,23 @@ class AgentDriver(RobotNode):
         return self._goals
 
     def set_up(self) -> None:
-        """Compile and connect."""
+        """Compile, make the parts and connect."""
         settings = self.settings
         ahead = self.start_pose.position + np.array([0.1, 0.1, 0.0])
         self._motion.command(RobotState(self.start_pose), ahead)
         nowhere = np.zeros((1, self.dimension))
         self.sensor.detection.probability(nowhere, self.start_pose)
-        self._state.set_up()
-        self._responder.set_up()
+        self._state = StatePublisher(self)
+        self._watchdog = Watchdog(self, self.link, self.sensor_input, self._state)
+        self._responder = MeasurementResponder(self, self.sensor_input, self._watchdog)
+        self._frames = RobotFrames(self, self.robot, partial(self._take_localised, 'tf'))
+        self._goals = GoalServer(self, self.link, self._frames)
+        if self._stop_latched:
+            self.health.begin(STOP, STOPPED)
         self._opened.append(self.link)
         self.link.connect()
-        self.goals.offer()
         self.offer_service('stop', self._on_stop)
         self.offer_service('release', self._on_release)
-        self._frames.set_up()
         if settings.poses == 'pose':
             PoseTopic(self, partial(self._take_localised, 'pose'))
         self.sensor_input.set_up()

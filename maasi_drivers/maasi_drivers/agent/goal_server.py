@@ -36,13 +36,10 @@ class GoalServer:
         # Goals that have ended, until their results are sent.
         self._ended: dict[bytes, Goal] = {}
         self._feedback_at = 0
-
-    def offer(self) -> None:
-        """Offer the action; without configuration goals are refused."""
-        driver = self._driver
         server = driver.permanent(
             'go_to', lambda: ActionServer(driver, GoToWaypoint, 'go_to', self._conclude)
         )
+        # Without configuration goals are refused.
         server.register_goal_callback(
             lambda _: GoalResponse.ACCEPT if driver.configured else GoalResponse.REJECT
         )

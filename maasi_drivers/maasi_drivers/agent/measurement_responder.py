@@ -125,10 +125,6 @@ class MeasurementResponder:
         self._queue = MeasurementQueue(driver.history, sensor.offset)
         self._answer: DetectionArray | None = None
         self.left_out: Counter[str] = Counter()
-
-    def set_up(self) -> None:
-        """Create publisher and subscription."""
-        driver = self._driver
         self._publisher = driver.create_publisher(DetectionArray, 'detections', RELIABLE)
         driver.create_subscription(
             MeasurementBatch, driver.team_topic('measurement_batch'), self._on_batch, RELIABLE

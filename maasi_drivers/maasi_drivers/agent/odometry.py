@@ -133,9 +133,6 @@ class PoseHistory:
         self._stamps: list[int] = []
         self._poses: list[StampedPose] = []
 
-    def __len__(self) -> int:
-        return len(self._stamps)
-
     @property
     def latest(self) -> StampedPose | None:
         """The last pose added, or None."""
@@ -146,15 +143,14 @@ class PoseHistory:
         """The earliest stamp kept [ns], or None."""
         return self._stamps[0] if self._stamps else None
 
-    def add(self, pose: StampedPose) -> bool:
-        """Add a pose; False, and nothing added, where its stamp is not after the last one's."""
+    def add(self, pose: StampedPose) -> None:
+        """Add a pose, unless its stamp is not after the last one's."""
         if self._stamps and pose.stamp <= self._stamps[-1]:
-            return False
+            return
         self._stamps.append(pose.stamp)
         self._poses.append(pose)
         if len(self._stamps) > self.length:
             del self._stamps[0], self._poses[0]
-        return True
 
     def clear(self) -> None:
         """Discard everything, as after a jump of the clock."""

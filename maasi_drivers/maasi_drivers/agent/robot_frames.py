@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -33,18 +33,13 @@ _OPTICAL = (-0.5 * math.pi, 0.0, -0.5 * math.pi)
 _NOWHERE = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class FixedFrame:
+class FixedFrame(NamedTuple):
     """A frame that is fixed on a robot: its place in its parent [m], turned by `rpy` [rad]."""
 
     parent: str
     name: str
-    position: tuple[float, ...]
-    rpy: tuple[float, ...]
-
-    def pose(self) -> Pose:
-        """Return the pose of the frame in its parent."""
-        return Pose.from_rpy(self.position, self.rpy)
+    position: Sequence[float]
+    rpy: Sequence[float]
 
 
 def base_frame(robot: str, settings: DriverSettings) -> str:
@@ -58,16 +53,14 @@ def sensor_frames(robot: str, settings: DriverSettings) -> list[FixedFrame]:
     frames: list[FixedFrame] = []
     if settings.camera is not None:
         mount, camera = settings.camera.mount, f'{robot}/camera'
-        frames.append(FixedFrame(base, camera, tuple(mount.position), tuple(mount.rpy)))
+        frames.append(FixedFrame(base, camera, mount.position, mount.rpy))
         frames.append(FixedFrame(camera, f'{robot}/camera_optical', _NOWHERE, _OPTICAL))
     if settings.scan is not None:
-        scan = settings.scan
-        place = (*scan.position, 0.0)
-        frames.append(FixedFrame(base, f'{robot}/base_scan', place, (0.0, 0.0, scan.yaw)))
+        place, turn = (*settings.scan.position, 0.0), (0.0, 0.0, settings.scan.yaw)
+        frames.append(FixedFrame(base, f'{robot}/base_scan', place, turn))
     ranging = settings.ranging
     if ranging.frame == 'body':
-        place, rpy = tuple(ranging.position), tuple(ranging.rpy)
-        frames.append(FixedFrame(base, f'{robot}/ranging', place, rpy))
+        frames.append(FixedFrame(base, f'{robot}/ranging', ranging.position, ranging.rpy))
     return frames
 
 
@@ -87,9 +80,8 @@ def robot_description(robot: str, settings: DriverSettings) -> str:
         joint = ElementTree.SubElement(root, 'joint', name=f'{frame.name}_joint', type='fixed')
         ElementTree.SubElement(joint, 'parent', link=frame.parent)
         ElementTree.SubElement(joint, 'child', link=frame.name)
-        numbers = {'xyz': frame.position, 'rpy': frame.rpy}
-        text = {key: ' '.join(map(repr, map(float, value))) for key, value in numbers.items()}
-        ElementTree.SubElement(joint, 'origin', text)
+        xyz, rpy = (' '.join(map(str, map(float, item))) for item in (frame.position, frame.rpy))
+        ElementTree.SubElement(joint, 'origin', xyz=xyz, rpy=rpy)
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding='unicode') + '\n'
 
@@ -127,7 +119,6 @@ class RobotFrames:
         self._buffer = TransformBuffer()
         self._static: list[TransformStamped] = []
         self._map_from_odom: Pose | None = None
-        self._odom_from_map = Pose(np.zeros(3))
         self._slot: int | None = None
         self._taken: int | None = None
         self._publisher: Publisher | None = None
@@ -136,6 +127,7 @@ class RobotFrames:
         self._moving.header.frame_id = self._odom
         self._type = self._message_type()
         self._message = None if self._type is None else self._type(transforms=[self._moving])
+        self._connect()
 
     def _message_type(self) -> Any:
         """Return tf2_msgs/TFMessage, or None where it is not installed."""
@@ -151,8 +143,8 @@ class RobotFrames:
             return None
         return TFMessage
 
-    def set_up(self) -> None:
-        """Connect, and publish what does not change, in *configure*."""
+    def _connect(self) -> None:
+        """Connect, and publish what does not change."""
         node, settings, kind = self._node, self._settings, self._type
         if settings.tf_rate:
             description = node.create_publisher(String, 'robot_description', LATCHED)
@@ -160,19 +152,17 @@ class RobotFrames:
         if kind is None:
             return
         if settings.tf_rate:
-            self._static_publisher = node.create_publisher(
-                kind, node.team_topic('tf_static'), LATCHED
-            )
+            static = node.team_topic('tf_static')
+            self._static_publisher = node.create_publisher(kind, static, LATCHED)
             if settings.poses != 'tf':
                 self._publisher = node.create_publisher(kind, node.team_topic('tf'), TRANSFORMS)
         for frame in sensor_frames(self._robot, settings):
-            self._add_static(frame.parent, frame.name, frame.pose())
+            self._add_static(frame.parent, frame.name, Pose.from_rpy(frame.position, frame.rpy))
         self._publish_static()
         if not settings.lockstep:
-            node.create_subscription(kind, node.team_topic('tf'), self._on_moving, TRANSFORMS)
-            node.create_subscription(
-                kind, node.team_topic('tf_static'), self._on_static, LATCHED_ALL
-            )
+            for topic, quality in (('tf', TRANSFORMS), ('tf_static', LATCHED_ALL)):
+                heard = partial(self._read, topic)
+                node.create_subscription(kind, node.team_topic(topic), heard, quality)
 
     def clear(self) -> None:
         """Discard what moves, as after a jump of the clock."""
@@ -192,10 +182,10 @@ class RobotFrames:
             return
         self._slot = slot
         if map_from_odom != self._map_from_odom:
-            self._map_from_odom, self._odom_from_map = map_from_odom, inverse(map_from_odom)
+            self._map_from_odom = map_from_odom
             self._add_static(settings.frame, self._odom, map_from_odom)
             self._publish_static()
-        pose = compose(self._odom_from_map, placed.pose)
+        pose = compose(inverse(map_from_odom), placed.pose)
         self._know(self._odom, self._base, pose, placed.stamp)
         self._moving.header.stamp = stamp_to_ros(placed.stamp)
         _fill(self._moving, pose)
@@ -225,15 +215,7 @@ class RobotFrames:
 
     # ---- what others publish -----------------------------------------------------------------
 
-    def _on_static(self, message: Any) -> None:
-        self._read('tf_static', message, static=True)
-
-    def _on_moving(self, message: Any) -> None:
-        self._read('tf', message, static=False)
-        if self._settings.poses == 'tf':
-            self._take_pose()
-
-    def _read(self, topic: str, message: Any, *, static: bool) -> None:
+    def _read(self, topic: str, message: Any) -> None:
         for item in message.transforms:
             try:
                 if (problem := stamp_problem(item)) is not None:
@@ -246,7 +228,7 @@ class RobotFrames:
                     item.child_frame_id.strip('/'),
                     Pose(point_from_ros(place), np.array([turn.w, turn.x, turn.y, turn.z])),
                     stamp_from_ros(item.header.stamp),
-                    static=static,
+                    static=topic == 'tf_static',
                 )
             except ValueError as error:
                 self._node.drop(
@@ -254,6 +236,8 @@ class RobotFrames:
                     f'{topic}: {item.header.frame_id[:40]!r} to {item.child_frame_id[:40]!r}: '
                     f'{error}',
                 )
+        if topic == 'tf' and self._settings.poses == 'tf':
+            self._take_pose()
 
     def _take_pose(self) -> None:
         """Take the robot's pose if tf has a newer one that is not stale."""

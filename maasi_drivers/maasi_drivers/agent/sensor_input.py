@@ -114,21 +114,11 @@ class RangingMount:
         by_sweep = turn @ slopes
         spread = by_sweep @ self._noise @ by_sweep.transpose(0, 2, 1)
         # A small rotation about the map's axes moves a target by its cross product with the arm.
-        by_turn = _cross(-arms)
+        by_turn = np.cross(np.eye(3), arms[:, None]).transpose(0, 2, 1)
         spread = spread + by_turn @ pose.covariance[3:, 3:] @ by_turn.transpose(0, 2, 1)
         positions = (pose.pose.position + arms)[:, :d]
         values, covariances = measured(self._model, positions, spread[:, :d, :d], pose.pose)
         return values, covariances, positions
-
-
-def _cross(vectors: FloatArray) -> FloatArray:
-    """Return the matrices (n, 3, 3) with which vectors (n, 3) take cross products."""
-    out = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    out[:, 0, 1], out[:, 0, 2] = -z, y
-    out[:, 1, 0], out[:, 1, 2] = z, -x
-    out[:, 2, 0], out[:, 2, 1] = -y, x
-    return out
 
 
 class RangingInput(SensorInput[Sweep]):

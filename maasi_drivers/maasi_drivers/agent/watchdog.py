@@ -28,12 +28,9 @@ class StatePublisher:
         self._state = AgentState(robot=driver.robot, battery=-1.0)
         self._state.header.frame_id = driver.settings.frame
         self._state.pose.pose = pose_to_ros(driver.start_pose)
-
-    def set_up(self) -> None:
-        """Create the publisher."""
-        self._publisher = self._driver.create_publisher(AgentState, 'state', LIVELY)
-        self._driver.create_wall_timer(LIVELINESS_PERIOD, self._publisher.assert_liveliness)
-        self._driver.expect_subscribers(self._publisher, names={'planner_node'})
+        self._publisher = driver.create_publisher(AgentState, 'state', LIVELY)
+        driver.create_wall_timer(LIVELINESS_PERIOD, self._publisher.assert_liveliness)
+        driver.expect_subscribers(self._publisher, names={'planner_node'})
 
     @property
     def goal_id(self) -> int:

@@ -260,42 +260,31 @@ class DriverSettings(NodeSettings):
 
     @model_validator(mode='after')
     def _consistent(self) -> DriverSettings:
-        external = self.pose_source in ('tf', 'pose')
-        if external and (self.lockstep or self.link not in ('topics', 'mavlink')):
-            raise ValueError(
-                f'pose_source: got {self.pose_source!r}, allowed with link {self.link!r}'
-                f'{" in lockstep" if self.lockstep else ""} is odometry'
-            )
-        if self.lockstep and self.link != 'topics':
-            raise ValueError(
-                f'link: got {self.link!r}, which runs in real time; allowed is topics in lockstep'
-            )
-        if self.lockstep and self.image_source != 'topic':
-            raise ValueError(
-                f'image_source: got {self.image_source!r}, which runs in real time; allowed is '
-                'topic in lockstep'
-            )
+        def wrong(name: str, allowed: str) -> ValueError:
+            return ValueError(f'{name}: got {getattr(self, name)!r}, allowed {allowed}')
+
+        lockstep = self.lockstep
+        if self.pose_source in ('tf', 'pose') and (
+            lockstep or self.link not in ('topics', 'mavlink')
+        ):
+            where = ' in lockstep' if lockstep else ''
+            raise wrong('pose_source', f'with link {self.link!r}{where} is odometry')
+        if lockstep and self.link != 'topics':
+            raise wrong('link', 'in lockstep is topics: others run in real time')
+        if lockstep and self.image_source != 'topic':
+            raise wrong('image_source', 'in lockstep is topic: others run in real time')
         if (self.image_source == 'video') != bool(self.video):
-            raise ValueError(
-                f'video: got {self.video!r}, allowed is a source with image_source video, and '
-                'nothing with another one'
-            )
-        if self.lockstep and self.command_type == 'twist':
-            raise ValueError(
-                f'command_type: got {self.command_type!r}, allowed is stamped (or auto) in lockstep'
-            )
-        if self.lockstep and (self.scan is not None or self.navigation != 'own'):
-            name = 'navigation' if self.scan is None else 'scan'
-            raise ValueError(
-                f'{name}: got {self.navigation if self.scan is None else "settings"}, allowed in '
-                'lockstep is that the driver drives by the known obstacles alone'
-            )
-        if self.scan is not None and self.motion.model != 'unicycle':
+            raise wrong('video', 'is a source with image_source video, and nothing with others')
+        if lockstep and self.command_type == 'twist':
+            raise wrong('command_type', 'is stamped (or auto) in lockstep')
+        if lockstep and self.navigation != 'own':
+            raise wrong('navigation', 'in lockstep is that the driver drives by known obstacles')
+        if self.scan is not None and (lockstep or self.motion.model != 'unicycle'):
             raise ValueError(
                 f"scan: got settings, allowed with motion.model 'unicycle', not "
-                f'{self.motion.model!r}'
+                f'{self.motion.model!r}, and not in lockstep'
             )
-        if self.lockstep and self.camera is not None and self.camera.stamp_offset > 0.0:
+        if lockstep and self.camera is not None and self.camera.stamp_offset > 0.0:
             raise ValueError(
                 f'camera.stamp_offset: got {self.camera.stamp_offset}, allowed is at most 0 in '
                 'lockstep: the pose after an image is not awaited there'

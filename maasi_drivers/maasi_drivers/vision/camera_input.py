@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 from zlib import crc32
 
@@ -40,10 +38,6 @@ _EXPOSURE_STRIDE = 4
 _MOST_CLIPPED = 0.01
 
 
-def _known(blobs: Blobs) -> Blobs:
-    return blobs
-
-
 class CameraInput(SensorInput[Picture]):
     """A camera that sees markers on the floor.
 
@@ -67,7 +61,6 @@ class CameraInput(SensorInput[Picture]):
         self._feed: FeedReceiver | None = None
         self._calibration: tuple[object, ...] | None = None
         self._checksum: int | None = None
-        self._counted: Counter[str] = Counter()
 
     def prepare(self) -> None:
         """Open the image source, and make the detector."""
@@ -169,7 +162,8 @@ class CameraInput(SensorInput[Picture]):
         peer = self.driver.feed_peer
         address, port = self.driver.settings.feed_address, self.driver.settings.feed_port
         try:
-            self._feed = FeedReceiver(port, address, None if peer is None else peer.address)
+            sender = None if peer is None else peer.address
+            self._feed = FeedReceiver(port, address, sender, self._drop_packets)
         except OSError as error:
             raise OSError(
                 f'feed_address, feed_port: UDP port {port} of {address}: {error.strerror}, allowed '
@@ -215,12 +209,10 @@ class CameraInput(SensorInput[Picture]):
                 continue
             if packet.pose is not None and peer is not None:
                 peer.on_pose(stamp, packet.pose)
-            self.driver.take_frame('feed', stamp, partial(_known, packet.blobs))
-        for reason, number in feed.counts.items():
-            new = number - self._counted[reason]
-            if new and reason != 'received':
-                self._counted[reason] = number
-                self.driver.drop(f'feed: {reason}', f'feed: {feed.problem or reason}', new)
+            self.driver.take_frame('feed', stamp, lambda blobs=packet.blobs: blobs)
+
+    def _drop_packets(self, reason: str, text: str, number: int) -> None:
+        self.driver.drop(f'feed: {reason}', f'feed: {text}', number)
 
     # ---- image source: topic ------------------------------------------------------------------
 
@@ -258,11 +250,9 @@ class CameraInput(SensorInput[Picture]):
         )
 
     def _on_compressed(self, message: CompressedImage) -> None:
-        topic = 'camera/image_raw/compressed'
-        stamp = stamp_from_ros(message.header.stamp)
         self.driver.take_frame(
-            topic,
-            stamp,
+            'camera/image_raw/compressed',
+            stamp_from_ros(message.header.stamp),
             lambda: decode_image(message.data, message.format),
             repeated=self._is_repeated(message.data),
         )

@@ -10,7 +10,7 @@ import socket
 import struct
 import time
 import zlib
-from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -203,12 +203,20 @@ class ReceivedPacket:
 
 
 class FeedReceiver:
-    """Receives a feed; poll it often."""
+    """Receives a feed; poll it often.
 
-    def __init__(self, port: int, address: str = '127.0.0.1', sender: str | None = None) -> None:
+    `on_drop` takes the reason, a text, and the number of packets that are refused or lost.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        address: str = '127.0.0.1',
+        sender: str | None = None,
+        on_drop: Callable[[str, str, int], None] = lambda *_: None,
+    ) -> None:
         self.sender = sender
-        self.counts: Counter[str] = Counter()
-        self.problem = ''
+        self._on_drop = on_drop
         self._last: int | None = None
         self._heard_at = -1e9
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -233,34 +241,29 @@ class FeedReceiver:
             except BlockingIOError:
                 break
             if self.sender not in (None, host):
-                self._refuse('foreign sender', f'sender: read {host}, allowed is {self.sender}')
+                text = f'sender: read {host}, allowed is {self.sender}'
+                self._on_drop('foreign sender', text, 1)
                 continue
             now = time.monotonic()
             try:
                 packet = decode(data)
             except FeedError as error:
-                self._refuse('bad packet', str(error))
+                self._on_drop('bad packet', str(error), 1)
                 continue
             if self._is_new(packet.sequence, now):
-                self.counts['received'] += 1
                 packets.append(ReceivedPacket(packet, now - packet.age))
         return packets
-
-    def _refuse(self, reason: str, text: str) -> None:
-        self.counts[reason] += 1
-        self.problem = text
 
     def _is_new(self, sequence: int, now: float) -> bool:
         last, silent = self._last, now - self._heard_at
         if last is not None and silent < _SILENCE:
             # As a signed difference, so that it may wrap.
             ahead = (sequence - last + 2**31) % 2**32 - 2**31
+            text = f'sequence: read {sequence}, allowed is what follows {last}'
             if -_FAR_BEHIND < ahead <= 0:
-                self._refuse(
-                    'old packet', f'sequence: read {sequence}, allowed is what follows {last}'
-                )
+                self._on_drop('old packet', text, 1)
                 return False
             if 1 < ahead < _FAR_BEHIND:
-                self.counts['lost packet'] += ahead - 1
+                self._on_drop('lost packet', text, ahead - 1)
         self._last, self._heard_at = sequence, now
         return True

@@ -193,7 +193,9 @@ class SimulatedRobot:
         if equipment.sensor is not None:
             size = world.bounds[:, 1] - world.bounds[:, 0]
             reach = float(np.sqrt((size * size).sum()))
-            self.ranging = RangingSensor(equipment.sensor, world.targets_3d, seed, name, reach)
+            self.ranging = RangingSensor(
+                equipment.sensor, world.targets_3d_at(0), seed, name, reach
+            )
 
     def command(self, velocity: ArrayLike) -> None:
         """Set the velocity command (4,), which holds until the next one.

@@ -24,9 +24,6 @@ def noise_stream(
     Independent of the streams of other keys, and equal for equal keys, in every process. Noise of
     the world has no robot.
     """
-    for name, value in (('seed', seed), ('step', step)):
-        if value < 0:
-            raise ValueError(f'{name}: got {value}, allowed are whole numbers of at least 0')
     key = (seed, crc32(robot.encode()), step, crc32(purpose.encode()))
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
 
@@ -114,11 +111,6 @@ class World:
         """2 or 3."""
         return len(self.bounds)
 
-    @property
-    def targets_3d(self) -> FloatArray:
-        """Targets with three coordinates, shape (n, 3); those of a floor have z = 0 [m]."""
-        return self.targets_3d_at(0)
-
     def targets_at(self, step: int) -> FloatArray:
         """Return target positions at a discrete step, (n, d) [m], reflected at the bounds."""
         if self.walk == 0.0:
@@ -134,7 +126,7 @@ class World:
         return self._way[step]
 
     def targets_3d_at(self, step: int) -> FloatArray:
-        """Return the same with three coordinates, (n, 3)."""
+        """Return the same with three coordinates, (n, 3); targets on a floor have z = 0."""
         return np.pad(self.targets_at(step), ((0, 0), (0, 3 - self.dimension)))
 
     @classmethod
