@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from maasi_msgs.msg import FoundTarget
 from maasi_sim.run.domain import Domain
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import NodeProcess, stop
@@ -43,7 +42,7 @@ class _FilterError(Exception):
     """A filter does not answer: text and process."""
 
 
-def differences(recorded: list[FoundTarget], found: list[FoundTarget]) -> list[str]:
+def differences(recorded: list[Any], found: list[Any]) -> list[str]:
     """Return in words how two lists of found targets differ; empty if they are equal to the bit."""
     lines = []
     if len(recorded) != len(found):

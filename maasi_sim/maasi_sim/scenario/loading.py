@@ -184,8 +184,11 @@ def _with_candidates(layer: Layer) -> Layer:
 def _with_types(layer: Layer, path: Path) -> Layer:
     """Return a layer over those of the types of its robots."""
     robots = layer.data.get('robots')
-    types: list[Layer] = []
-    for name, own in robots.items() if isinstance(robots, dict) else ():
+    if not isinstance(robots, dict):
+        return layer
+    # In the order of the file.
+    types = [Layer({'robots': {name: {} for name in robots}})]
+    for name, own in robots.items():
         if isinstance(own, dict):
             key: Key = ('robots', name)
             types += [under(key, item) for item in _type_layers(own, path, layer, key)]
