@@ -140,10 +140,8 @@ class RecordedRobot:
     ) -> None:
         self.settings = settings
         self.left_out = 0
-        if not bag.exists():
-            raise CalibrationError(f'{bag}: there is no such recording')
         self._bag = bag
-        with self._open() as reader:
+        with BagReader(bag) as reader:
             self._types = reader.types
             self.recovered = reader.recovered
         wanted = {'images': _IMAGES, 'detections': (_DETECTIONS,)}
@@ -184,14 +182,8 @@ class RecordedRobot:
     def _topic(self, name: str) -> str:
         return f'/{self.robot}/{name}' if self.robot else f'/{name}'
 
-    def _open(self) -> BagReader:
-        try:
-            return BagReader(self._bag)
-        except BagError as error:
-            raise CalibrationError(str(error)) from error
-
     def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
-        with self._open() as reader:
+        with BagReader(self._bag) as reader:
             try:
                 for item in reader.messages(topics):
                     yield item.topic, item.message
@@ -260,7 +252,6 @@ class RecordedRobot:
         kind = self._types[self.poses].rpartition('/')[2]
         odometry: MapOdometry | None = None
         start = Pose.from_yaw(settings.start, settings.yaw)
-        nothing = np.zeros((6, 6)), np.zeros(3), np.zeros(3)
         for _, message in self._messages(self.poses):
             pose = _pose(message.pose if kind == 'PoseStamped' else message.pose.pose)
             if pose is None:
@@ -271,7 +262,7 @@ class RecordedRobot:
                     odometry = MapOdometry(start, pose if first else None)
                 placed.append(odometry.apply(_stamp(message), pose))
             else:
-                placed.append(StampedPose(_stamp(message), pose, *nothing))
+                placed.append(StampedPose(_stamp(message), pose))
         history = PoseHistory(max(len(placed), 2))
         for item in placed:
             history.add(item)
@@ -334,7 +325,7 @@ def main(arguments: list[str] | None = None) -> int:
         recorded = RecordedRobot(options.bag, settings, options.robot, options.use, options.poses)
         sensor = settings.sensor.build(recorded.robot, settings.environment.dimension)
         noise = sensor_noise(recorded.observations(), sensor, options.target, options.least_range)
-    except ValueError as error:
+    except (ValueError, BagError) as error:
         if recorded is not None and recorded.recovered:
             print(f'warning: {recorded.recovered}', file=sys.stderr)
         print(f'error: {error}', file=sys.stderr)

@@ -1,6 +1,5 @@
 """Which image answers which batch."""
 
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
@@ -10,9 +9,7 @@ from maasi_filter.models.pose import Pose
 
 
 def pose(stamp):
-    return StampedPose(
-        stamp, Pose.from_yaw([0.01 * stamp, 0.0, 0.0], 0.0), np.zeros((6, 6)), *np.zeros((2, 3))
-    )
+    return StampedPose(stamp, Pose.from_yaw([0.01 * stamp, 0.0, 0.0], 0.0))
 
 
 def queue_of(*stamps, **options):

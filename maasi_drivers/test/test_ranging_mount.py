@@ -19,7 +19,7 @@ TARGETS = np.array([[9.0, 1.0, 5.0], [-3.0, -9.0, 2.0], [4.5, -2.5, 30.0]])
 
 def stamped(pose=POSE, attitude=0.0):
     covariance = np.diag([0.0, 0.0, 0.0, *[attitude**2] * 3])
-    return StampedPose(0, pose, covariance, np.zeros(3), np.zeros(3))
+    return StampedPose(0, pose, covariance)
 
 
 def mount(dimension=3):

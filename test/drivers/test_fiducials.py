@@ -55,9 +55,7 @@ def test_markers_are_located_and_named(dictionary):
     sensor = SensorSettings(
         detection={'kind': 'box', 'lower': [-0.5] * 2, 'upper': [0.5] * 2, 'probability': 0.9}
     ).build('drone', 2)
-    reading = read_markers(
-        picture, StampedPose(0, pose, np.zeros((6, 6)), np.zeros(3), np.zeros(3)), detector, sensor
-    )
+    reading = read_markers(picture, StampedPose(0, pose), detector, sensor)
     seen = {label.identity: position for label, position in zip(reading.labels, reading.positions)}
     assert sorted(seen) == sorted(f'{dictionary}:{number}' for number in markers)
     for number, centre in markers.items():

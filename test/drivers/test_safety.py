@@ -5,6 +5,7 @@ Where time counts it is that of the odometry's stamps, or a setting: see `LATEST
 """
 
 import math
+import re
 import signal
 import sys
 import time
@@ -68,7 +69,7 @@ def test_what_is_waited_for_is_short_enough():
 
 @pytest.mark.parametrize('fault', ['silent', 'repeats itself', 'not finite'])
 def test_without_odometry_the_robot_is_stopped(play, fault):
-    driver, team = play(odometry_timeout=0.3)
+    driver, team = play(odometry_timeout=0.5)
     team.move()
     _, result = team.send_accepted([1.5, 1.5, 0.0])
     team.move(20)
@@ -85,7 +86,8 @@ def test_without_odometry_the_robot_is_stopped(play, fault):
         return team.state.goal_status == AgentState.UNAVAILABLE
 
     team.until(stopped)
-    assert 'no odometry for' in team.state.reason
+    first = next(item for item in team.states if item.goal_status == AgentState.UNAVAILABLE)
+    assert 0.5 <= float(re.fullmatch('no odometry for (.*) s', first.reason)[1]) < 2.0
     assert (driver.dropped['odometry'] > 3) == (fault == 'not finite')
     team.until(result.done)
     assert result.result().status == GoalStatus.STATUS_ABORTED

@@ -24,13 +24,8 @@ BOUNDS = np.array([[-1.0, 3.0], [-1.0, 3.0]])
 
 
 def stamped(x=0.0, y=0.0, yaw=0.0, velocity=(0.0, 0.0, 0.0), turn=0.0):
-    return StampedPose(
-        0,
-        Pose.from_yaw([x, y, 0.0], yaw),
-        np.zeros((6, 6)),
-        np.array(velocity),
-        np.array([0.0, 0.0, turn]),
-    )
+    pose, turning = Pose.from_yaw([x, y, 0.0], yaw), np.array([0.0, 0.0, turn])
+    return StampedPose(0, pose, velocity=np.array(velocity), angular_velocity=turning)
 
 
 def points(ranges, placed, increment=0.0, mount=(0.0, 0.0, 0.0)):
@@ -63,9 +58,8 @@ def drive(goal, centres, radii, seconds=60.0, start=(0.0, 0.0), yaw=0.0):
         state = body.robot_state()
         if step % 4 == 0:
             ranges = scanner.scan(state.pose, step)
-            placed = StampedPose(
-                0, state.pose, np.zeros((6, 6)), state.velocity, state.angular_velocity
-            )
+            motion = {'velocity': state.velocity, 'angular_velocity': state.angular_velocity}
+            placed = StampedPose(0, state.pose, **motion)
             model.see(
                 scan_points(
                     ranges, (0.0, 2.0 * math.pi / 360), (0.12, 3.5), 0.0, placed, [0.0, 0.0, 0.0]

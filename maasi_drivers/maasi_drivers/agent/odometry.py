@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,9 +33,9 @@ class StampedPose:
 
     stamp: int
     pose: Pose
-    covariance: FloatArray
-    velocity: FloatArray
-    angular_velocity: FloatArray
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    velocity: FloatArray = field(default_factory=lambda: np.zeros(3))
+    angular_velocity: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 class MapOdometry:
@@ -202,4 +202,4 @@ class PoseSpeed:
             turning = change[1:] * (angle / half if half > 0.0 else 2.0) / period
             if max(np.linalg.norm(velocity), np.linalg.norm(turning)) > _FASTEST:
                 velocity, turning = np.zeros(3), np.zeros(3)
-        return StampedPose(stamp, pose, np.zeros((6, 6)), velocity, turning)
+        return StampedPose(stamp, pose, velocity=velocity, angular_velocity=turning)

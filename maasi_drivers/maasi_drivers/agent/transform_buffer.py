@@ -45,8 +45,7 @@ class _Edge:
             return
         if self.last is not None and abs(stamp - self.last) > _JUMP:
             self.history.clear()
-        zero = np.zeros(3)
-        self.history.add(StampedPose(stamp, pose, np.zeros((6, 6)), zero, zero))
+        self.history.add(StampedPose(stamp, pose))
 
 
 class TransformBuffer:
