@@ -140,12 +140,7 @@ def _expected_end(
 class Clairvoyant(Planner):
     """Sends the robots along the best routes over the true targets that are not found yet.
 
-    Parameters
-    ----------
-    settings : PlannerSettings
-        Of the scenario.
-    missing : function
-        Returns the true targets that are not found yet, (n, 3) [m].
+    `missing` returns these, (n, 3) [m].
     """
 
     def __init__(self, settings: PlannerSettings, missing: Callable[[], FloatArray]) -> None:

@@ -29,6 +29,7 @@ from maasi_filter import warm_up
 from maasi_filter.metrics import match_targets
 from maasi_filter.vector_math import squared_distance
 from maasi_sim.experiments.campaign import run_command
+from maasi_sim.experiments.searches import merged
 from maasi_sim.experiments.statistics import paired_difference
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
@@ -55,19 +56,9 @@ HEAD = (
 class Run:
     """What one search came to.
 
-    Attributes
-    ----------
-    seed : int
-        Of all random numbers.
-    found, targets, false_found : int
-        True targets that were found, true targets, and found targets that are none.
-    squares, normalised : float
-        Sums of the squared errors of the found ones, square metres, and of the same normalised
-        with their covariances.
-    measurements : int
-        Taken in all.
-    step : float
-        Mean wall time of a filter step, seconds; on a busy machine it means little.
+    `found` are true targets that were found, of `targets`; `squares` and `normalised` are sums of
+    their squared errors [m^2], and of the same normalised with their covariances; `step` is the
+    mean wall time of a filter step [s].
     """
 
     seed: int
@@ -84,6 +75,10 @@ class Run:
         """Whether all were found."""
         return self.found == self.targets
 
+    def counted(self, cap: int) -> int:
+        """Return its measurements; `cap` if it did not finish."""
+        return self.measurements if self.finished else cap
+
 
 @cache
 def _content(scenario: str) -> dict[str, Any]:
@@ -98,15 +93,16 @@ def prepared(
     condition: str, method: str, seed: int, settings: dict[str, Any] | None = None
 ) -> Scenario:
     """Return the scenario of one run, with no limit but the number of measurements."""
-    content: dict[str, Any] = json.loads(json.dumps(_content(SCENARIOS.get(condition, CUBE))))
-    content['planner'] = {**content['planner'], **PERSISTENT}
-    content['filter']['method'] = method
-    content['limits'] = {**content.get('limits', {}), 'time': 1e4}
-    if condition not in SCENARIOS:
-        content['scoring'] = {**content.get('scoring', {}), 'radius': RADIUS}
+    ours = {'planner': PERSISTENT, 'filter': {'method': method}, 'limits': {'time': 1e4}}
+    scoring = {'scoring': {'radius': RADIUS}} if condition not in SCENARIOS else {}
+    content = merged(_content(SCENARIOS.get(condition, CUBE)), ours, scoring)
     for change in CONDITIONS[condition]:
-        change(content, seed)
-    content['filter'].update(settings or {})
+        content = change(content, seed) if callable(change) else merged(content, change)
+        common = content.pop('every_robot', {})
+        content['robots'] = {
+            name: merged(robot, common) for name, robot in content['robots'].items()
+        }
+    content = merged(content, {'filter': settings or {}})
     return Scenario.model_validate(content)
 
 
@@ -155,60 +151,40 @@ def restricted_mean(times: np.ndarray, ended: np.ndarray, cap: float) -> tuple[f
     return float(area), math.sqrt(variance * len(times) / max(len(times) - 1, 1))
 
 
-def summary(runs: Sequence[Run], cap: int) -> dict[str, Any]:
-    """Return the figures of a row, with 95 % intervals.
+def row(runs: Sequence[Run], others: Sequence[Run] | None, cap: int) -> list[str]:
+    """Return the cells of a row, with 95 % intervals; `others` are those of the reference.
 
     Complete runs: Clopper and Pearson. False found targets: Poisson. Measurements: restricted
-    mean, Kaplan and Meier, for runs that did not finish.
+    mean, Kaplan and Meier, for runs that did not finish; their difference is paired by seed.
     """
     number = len(runs)
     complete = sum(run.finished for run in runs)
+    low, high = binomtest(complete, number).proportion_ci()
     false = sum(run.false_found for run in runs)
+    least = chi2.ppf(0.025, 2 * false) / 2 / number if false else 0.0
+    most = chi2.ppf(0.975, 2 * false + 2) / 2 / number
     found = max(sum(run.found for run in runs), 1)
-    measurements = np.array([float(run.measurements) for run in runs])
-    ended = np.array([run.finished for run in runs], np.bool_)
-    mean, error = restricted_mean(measurements, ended, cap)
-    return {
-        'runs': number,
-        'complete': complete,
-        'complete_interval': [*map(float, binomtest(complete, number).proportion_ci())],
-        'false_per_run': false / number,
-        'false_interval': [
-            float(chi2.ppf(0.025, 2 * false)) / 2 / number if false else 0.0,
-            float(chi2.ppf(0.975, 2 * false + 2)) / 2 / number,
-        ],
-        'rmse': math.sqrt(sum(run.squares for run in runs) / found),
-        'nees': sum(run.normalised for run in runs) / found,
-        'measurements': mean,
-        'measurements_half_width': 1.96 * error,
-        'step_ms': 1e3 * float(np.median([run.step for run in runs])),
-    }
-
-
-def difference(runs: Sequence[Run], others: Sequence[Run], cap: int) -> tuple[float, float]:
-    """Return the mean difference in measurements on the same seeds, and half its 95 % interval.
-
-    A run that did not finish counts as `cap`.
-    """
-    theirs = {run.seed: run.measurements if run.finished else cap for run in others}
-    paired = [run for run in runs if run.seed in theirs]
-    gap = paired_difference(
-        [run.measurements if run.finished else cap for run in paired],
-        [theirs[run.seed] for run in paired],
+    mean, error = restricted_mean(
+        np.array([float(run.measurements) for run in runs]),
+        np.array([run.finished for run in runs], np.bool_),
+        cap,
     )
-    return gap.mean, gap.half_width
-
-
-def show(condition: str, method: str, row: dict[str, Any], gap: tuple[float, float] | None) -> str:
-    """Return a row of the table in Markdown."""
-    low, high = row['complete_interval']
-    text = f'| {condition} | {method} | {row["complete"]}/{row["runs"]} ({low:.2f} to {high:.2f})'
-    low, high = row['false_interval']
-    text += f' | {row["false_per_run"]:.2f} ({low:.2f} to {high:.2f})'
-    text += f' | {row["rmse"]:.2f} | {row["nees"]:.2f}'
-    text += f' | {row["measurements"]:.0f} +- {row["measurements_half_width"]:.0f}'
-    text += ' | -' if gap is None else f' | {gap[0]:+.0f} +- {gap[1]:.0f}'
-    return text + f' | {row["step_ms"]:.1f} |'
+    difference = '-'
+    if others is not None:
+        theirs = {run.seed: run.counted(cap) for run in others}
+        both = [run for run in runs if run.seed in theirs]
+        ours = [run.counted(cap) for run in both]
+        gap = paired_difference(ours, [theirs[run.seed] for run in both])
+        difference = f'{gap.mean:+.0f} +- {gap.half_width:.0f}'
+    return [
+        f'{complete}/{number} ({low:.2f} to {high:.2f})',
+        f'{false / number:.2f} ({least:.2f} to {most:.2f})',
+        f'{math.sqrt(sum(run.squares for run in runs) / found):.2f}',
+        f'{sum(run.normalised for run in runs) / found:.2f}',
+        f'{mean:.0f} +- {1.96 * error:.0f}',
+        difference,
+        f'{1e3 * float(np.median([run.step for run in runs])):.1f}',
+    ]
 
 
 def runs_in(path: Path | None) -> dict[tuple[str, str], dict[int, Run]]:
@@ -285,12 +261,9 @@ def main(arguments: list[str] | None = None) -> int:
                     there[run.seed] = run
                     keep(options.json, condition, method, run)
                 done[method] = [there[seed] for seed in seeds]
-                gap = None
-                if method != 'ic_phd' and 'ic_phd' in done:
-                    gap = difference(done[method], done['ic_phd'], _cap(condition))
-                print(
-                    show(condition, method, summary(done[method], _cap(condition)), gap), flush=True
-                )
+                others = done.get('ic_phd') if method != 'ic_phd' else None
+                cells = [condition, method, *row(done[method], others, _cap(condition))]
+                print(f'| {" | ".join(cells)} |', flush=True)
     print(f'{time.perf_counter() - begin:.0f} s', file=sys.stderr)
     return 0
 

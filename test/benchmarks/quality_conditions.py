@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
-from functools import partial
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -32,89 +31,66 @@ SIDE = 260.0
 SPACE = SIDE * math.sqrt(3.0) * 2.0 * math.pi * math.pi
 
 Content = dict[str, Any]
-Change = Callable[[Content, int], None]
+# A layer over the scenario, its `every_robot` over each robot; or what makes other content of it.
+Change = Content | Callable[[Content, int], Content]
 # In place of `RangingSensor.measure`, from it.
 Measure = Callable[..., tuple[Any, Any]]
 
-
-def robots(*keys: str, **values: Any) -> Change:
-    """Other settings of each robot, in the part at these keys."""
-
-    def change(content: Content, seed: int) -> None:
-        for robot in content['robots'].values():
-            part = robot
-            for key in keys:
-                part = part.setdefault(key, {})
-            part.update(values)
-
-    return change
+# That of the cube's robot, as it is known.
+ODOMETRY = {'position_noise': 0.05, 'heading_noise': 0.001}
 
 
-def part(name: str, **values: Any) -> Change:
-    """Other settings of a part of the scenario."""
-
-    def change(content: Content, seed: int) -> None:
-        content[name] = {**content.get(name, {}), **values}
-
-    return change
+def robots(**values: Any) -> Content:
+    """Other settings of each robot: `odometry` is what it reports, `simulated` what is true."""
+    return {'every_robot': values}
 
 
-targets, filter_settings = partial(part, 'targets'), partial(part, 'filter')
-# Errors of the robots' positions, which they report; and what is true apart from what is believed.
-odometry, simulated = partial(robots, 'odometry'), partial(robots, 'simulated')
-
-
-def noise(name: str) -> Change:
+def noise(name: str) -> Content:
     """The sensor's noise, as believed and true."""
-    return robots('sensor', noise=NOISES[name].model_dump(by_alias=True))
+    return robots(sensor={'noise': NOISES[name].model_dump(by_alias=True)})
 
 
-def clutter(per_scan: float, told: bool) -> Change:
+def clutter(per_scan: float, told: bool) -> Content:
     """False detections, which the filter knows of or not."""
-    believed = robots('sensor', clutter=per_scan / SPACE)
-    return both(simulated(clutter_per_scan=per_scan), *([believed] if told else []))
+    believed = {'sensor': {'clutter': per_scan / SPACE}} if told else {}
+    return robots(simulated={'clutter_per_scan': per_scan}, **believed)
 
 
-def both(*changes: Change) -> Change:
-    """One change after the other."""
-
-    def change(content: Content, seed: int) -> None:
-        for item in changes:
-            item(content, seed)
-
-    return change
+def simulated(**values: Any) -> Content:
+    """What is true apart from what is believed."""
+    return robots(simulated=values)
 
 
-def untold(**values: Any) -> Change:
+def untold(**values: Any) -> Content:
     """Errors of the robots' positions that are not in the covariances they report."""
+    return simulated(odometry=ODOMETRY | values)
 
-    def change(content: Content, seed: int) -> None:
-        for robot in content['robots'].values():
-            true = {**robot.get('odometry', {}), **values}
-            robot.setdefault('simulated', {})['odometry'] = true
 
-    return change
+def pmb(**values: Any) -> Content:
+    """Other settings of the multi-Bernoulli filter."""
+    return {'filter': {'pmb': values}}
+
+
+def walk(deviation: float, told: bool = True) -> Content:
+    """Targets that walk, of which the filter is told or not."""
+    return {'targets': {'walk': deviation}, **(pmb(walk=deviation) if told else {})}
+
+
+def targets(**values: Any) -> Content:
+    """Other true targets."""
+    return {'targets': values}
 
 
 def pairs(distance: float) -> Change:
     """Six pairs of targets, `distance` metres apart."""
 
-    def change(content: Content, seed: int) -> None:
+    def change(content: Content, seed: int) -> Content:
         generator = np.random.default_rng([seed, 77])
         centres = generator.uniform(10.0, SIDE - 10.0, (6, 3))
         way = generator.standard_normal((6, 3))
         way *= 0.5 * distance / np.linalg.norm(way, axis=1, keepdims=True)
         positions = np.concatenate([centres + way, centres - way])
-        content['targets'] = {'positions': positions.tolist()}
-
-    return change
-
-
-def pmb(**values: Any) -> Change:
-    """Other settings of the multi-Bernoulli filter."""
-
-    def change(content: Content, seed: int) -> None:
-        content['filter'].setdefault('pmb', {}).update(values)
+        return content | {'targets': {'positions': positions.tolist()}}
 
     return change
 
@@ -122,17 +98,12 @@ def pmb(**values: Any) -> Change:
 def two(name: str, start: list[float], **values: Any) -> Change:
     """A second robot of the same kind that starts elsewhere."""
 
-    def change(content: Content, seed: int) -> None:
+    def change(content: Content, seed: int) -> Content:
         robot = content['robots'][name]
-        other = {**json.loads(json.dumps(robot)), 'start': start, **values}
-        content['robots'] = {f'{name}1': robot, f'{name}2': other}
+        other = {**deepcopy(robot), 'start': start, **values}
+        return content | {'robots': {f'{name}1': robot, f'{name}2': other}}
 
     return change
-
-
-def walk(deviation: float, told: bool = True) -> Change:
-    """Targets that walk, of which the filter is told or not."""
-    return both(targets(walk=deviation), *([pmb(walk=deviation)] if told else []))
 
 
 def duplicates(share: float, apart: float) -> Callable[[Measure], Measure]:
@@ -189,12 +160,12 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
     },
     'pi 0.7 of believed': (DEGREES, simulated(probability_factor=0.7)),
     'pi 0.9 of believed': (DEGREES, simulated(probability_factor=0.9)),
-    'positions off by 1 m': (DEGREES, odometry(position_noise=1.0)),
-    'positions off by 3 m': (DEGREES, odometry(position_noise=3.0)),
+    'positions off by 1 m': (DEGREES, robots(odometry={'position_noise': 1.0})),
+    'positions off by 3 m': (DEGREES, robots(odometry={'position_noise': 3.0})),
     **{
         f'{drones}{errors}{", estimated" if estimated else ""}': (
             DEGREES,
-            odometry(**change),
+            robots(odometry=change),
             *((two('drone', [250.0, 250.0, 250.0]),) if drones else ()),
             *((pmb(offset=told),) if estimated else ()),
         )
@@ -213,8 +184,8 @@ CONDITIONS: dict[str, tuple[Change, ...]] = {
     '40 targets': (DEGREES, targets(count=40)),
     '100 targets': (DEGREES, targets(count=100)),
     'radians, 40 targets': (RADIANS, targets(count=40)),
-    'N0 ten times too small': (DEGREES, filter_settings(expected_targets=1.2)),
-    'N0 ten times too large': (DEGREES, filter_settings(expected_targets=120.0)),
+    'N0 ten times too small': (DEGREES, {'filter': {'expected_targets': 1.2}}),
+    'N0 ten times too large': (DEGREES, {'filter': {'expected_targets': 120.0}}),
     'four tight groups of three': (
         DEGREES,
         targets(distribution='clustered', clusters=4, spread=4.0, separation=3.0),

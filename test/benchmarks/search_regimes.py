@@ -23,16 +23,9 @@ PAPER = {'objective': 'paper', 'alpha': 0.75, 'beta': 0.75, 'control_weight': 0.
 class Regime:
     """A kind of search.
 
-    Attributes
-    ----------
-    scenario : str
-        Name of its scenario.
-    limit : float
-        Time that a run has, and counts if not all is found [s].
-    change : dict
-        Merged over the scenario; `robots` replaces all robots, types come with the first one.
-    neighbours : dict
-        Candidates of planners that measure at waypoints only.
+    `limit` is the time that a run has, and counts if not all is found [s]; `change` is merged over
+    the scenario, where `robots` replaces all robots and types come with the first one; `neighbours`
+    are candidates of planners that measure at waypoints only.
     """
 
     scenario: str
@@ -45,18 +38,9 @@ class Regime:
 class Kind:
     """A planner as it is compared.
 
-    Attributes
-    ----------
-    change : dict
-        Settings of the planner.
-    runs : int
-        Most seeds: fewer where runs take long.
-    stops : bool
-        Whether robots stop at every waypoint.
-    neighbours : bool
-        Whether it chooses among a regime's `neighbours`.
-    maker : str, optional
-        Function that makes the planner, as of `search`, in place of the scenario's.
+    `change` are settings of the planner; `runs` most seeds, fewer where runs take long; `stops`
+    whether robots stop at every waypoint; `neighbours` whether it chooses among a regime's; `maker`
+    the function that makes the planner, as of `search`, in place of the scenario's.
     """
 
     change: dict[str, Any]

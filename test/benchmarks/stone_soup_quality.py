@@ -15,10 +15,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t
 from stonesoup.base import Property
 from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
 from stonesoup.dataassociator.probability import JPDA
@@ -41,6 +41,7 @@ from stonesoup.updater.kalman import ExtendedKalmanUpdater
 from maasi_filter import AgentMeasurement, Pose, Sensor, make_filter
 from maasi_filter.metrics import gospa
 from maasi_filter.pmb.filter import PmbFilter
+from maasi_sim.experiments.statistics import mean_interval
 from maasi_sim.scenario.schema import Scenario
 from maasi_sim.search import search
 
@@ -99,14 +100,8 @@ class MissedDeleter(Deleter):
 class StoneSoup:
     """A JPDA tracker with extended Kalman filters.
 
-    Parameters
-    ----------
-    scan : AgentMeasurement
-        The first one.
-    bounds : (3, 2) array
-        Of the environment, metres.
-    walk : float
-        Deviation of the targets' walk, m/sqrt(s).
+    `scan` is the first one, `bounds` (3, 2) those of the environment [m], `walk` the deviation of
+    the targets' walk [m/sqrt(s)].
     """
 
     def __init__(self, scan: AgentMeasurement, bounds: FloatArray, walk: float) -> None:
@@ -175,13 +170,11 @@ class StoneSoup:
         means = StateVectors([state.state_vector for state in states])
         covariances = np.stack([state.covar for state in states], axis=2)
         mean, covariance = gm_reduce_single(means, covariances, np.array(weights))
-        prediction = hypotheses[0].prediction
+        now = hypotheses[0].prediction.timestamp
         if used:
-            track.append(
-                GaussianStateUpdate(mean, covariance, hypotheses, timestamp=prediction.timestamp)
-            )
+            track.append(GaussianStateUpdate(mean, covariance, hypotheses, timestamp=now))
         else:
-            track.append(GaussianState(mean, covariance, timestamp=prediction.timestamp))
+            track.append(GaussianState(mean, covariance, timestamp=now))
         return used
 
     def estimates(self) -> FloatArray:
@@ -199,11 +192,8 @@ def recorded(scenario: Scenario, seed: int) -> list[tuple[list[AgentMeasurement]
         batches.append((list(measurements), gone, now))
         return true_step(self, measurements, gone, now)
 
-    PmbFilter.step = step  # type: ignore[method-assign]
-    try:
+    with patch.object(PmbFilter, 'step', step):
         search(scenario, seed)
-    finally:
-        PmbFilter.step = true_step  # type: ignore[method-assign]
     return batches
 
 
@@ -237,16 +227,13 @@ def print_table(
     """Print a table of both on the same detections; means with 95 % half widths."""
     print('| condition | runs | | mean GOSPA [m] | at the end [m] | step [ms] |')
     print('|---|---|---|---|---|---|')
-    count = len(seeds)
     for name in conditions:
-        both = np.array([compare(prepare(name, 'pmb', seed), seed) for seed in seeds])
-        mean = both.mean(axis=0)
-        half = np.full_like(mean, np.nan)
-        if count > 1:
-            half = t.ppf(0.975, count - 1) * both.std(axis=0, ddof=1) / count**0.5
+        every = [compare(prepare(name, 'pmb', seed), seed) for seed in seeds]
         for row, method in enumerate(('pmb', 'Stone Soup JPDA')):
+            cells = [mean_interval([both[row, column] for both in every]) for column in range(3)]
+            spans = [f'{cell.mean:.2f} ± {cell.half_width:.2f}' for cell in cells[:2]]
             print(
-                f'| {name} | {count} | {method} | {mean[row, 0]:.2f} ± {half[row, 0]:.2f} | '
-                f'{mean[row, 1]:.2f} ± {half[row, 1]:.2f} | {1e3 * mean[row, 2]:.1f} |',
+                f'| {name} | {len(seeds)} | {method} | {spans[0]} | {spans[1]} | '
+                f'{1e3 * cells[2].mean:.1f} |',
                 flush=True,
             )

@@ -1,9 +1,13 @@
-"""What the benchmarks share: the median time of a call, and an entry of their results."""
+"""What the benchmarks share: the median time of a call, whole runs, an entry of their results."""
 
 from __future__ import annotations
 
+import json
 import statistics
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -19,6 +23,27 @@ def median_time(
         function()
         times.append(perf_counter() - start)
     return statistics.median(times)
+
+
+def run_scenario(
+    name: str,
+    folder: Path,
+    seconds: float,
+    *options: str,
+    hear: Callable[[str], object] = lambda line: None,
+) -> float:
+    """Run a scenario in lockstep, recorded; return its real-time factor. `hear` gets its output."""
+    command = [sys.executable, '-m', 'maasi_sim.run.run_scenario', name, '--lockstep', '--seed']
+    command += ['1', '--out', str(folder), '--time-limit', str(seconds), *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        hear(line)
+    if process.wait() not in (0, 1):
+        raise RuntimeError(f'{name} ended with {process.returncode}:\n{"".join(lines)}')
+    return float(json.loads((folder / 'report.json').read_text())['real_time_factor'])
 
 
 def entry(

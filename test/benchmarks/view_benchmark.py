@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import queue
-import subprocess
 import sys
 import tempfile
 import threading
@@ -16,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from timing import entry
+from timing import entry, run_scenario
 
 from maasi_sim.missions import load_mission
 from maasi_sim.view.event_log import Event, EventLog
@@ -33,25 +31,16 @@ EVENTS, SEEKS = 100_000, 60
 
 
 def demo(folder: Path, watch: Callable[[str], Any] | None, seconds: float = SECONDS) -> float:
-    """Run the demo as users do, recorded; watched from its address. Return its real-time factor."""
-    options = ['--view', '--port', '0'] if watch is not None else []
-    process = subprocess.Popen(
-        [
-            *(sys.executable, '-m', 'maasi_sim.run.run_scenario', 'mambo_turtlebot'),
-            *('--lockstep', '--seed', '1', '--out', str(folder)),
-            *('--time-limit', str(seconds), *options),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    assert process.stdout is not None
-    for line in process.stdout:
-        if watch is not None and line.startswith('view: '):
+    """Run the demo, watched from its address; return its real-time factor."""
+    if watch is None:
+        return run_scenario('mambo_turtlebot', folder, seconds)
+
+    def hear(line: str) -> None:
+        if line.startswith('view: '):
             watch(line.split()[1])
-    if process.wait() not in (0, 1):
-        raise RuntimeError(f'the demo ended with {process.returncode}')
-    return float(json.loads((folder / 'report.json').read_text())['real_time_factor'])
+
+    options = ('--view', '--port', '0')
+    return run_scenario('mambo_turtlebot', folder, seconds, *options, hear=hear)
 
 
 def read_stream(address: str) -> None:
