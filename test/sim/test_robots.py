@@ -177,18 +177,6 @@ def test_moving_and_tilting_the_camera_still_shows_them():
     assert max(errors) < 0.003
 
 
-def test_each_sensor_is_there_only_where_it_is_fitted():
-    one = robot('unicycle', GROUND, laser=LaserSettings())
-    assert one.scan(0).shape == (360,)
-    for read in (lambda: one.image(0, 0.0), lambda: one.sweep(0)):
-        with pytest.raises(ValueError, match='robot: has no'):
-            read()
-    flying = robot('constant_speed', DRONE, sensor=SensorSettings().build('ranging', 2))
-    assert flying.sweep(0).values.shape[1] == 2
-    with pytest.raises(ValueError, match='robot: has no laser'):
-        flying.scan(0)
-
-
 def test_warming_up_changes_nothing():
     one, other = robot(laser=LaserSettings()), robot(laser=LaserSettings())
     one.warm_up()

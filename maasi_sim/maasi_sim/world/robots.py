@@ -247,8 +247,7 @@ class SimulatedRobot:
 
     def image(self, step: int, time: float) -> NDArray[np.uint8]:
         """Return what the camera sees now, (h, w, 3) uint8 in R, G, B."""
-        if self.camera is None:
-            raise ValueError(f'{self.name}: has no camera')
+        assert self.camera is not None, 'no camera'
         state = self.state
         return self.camera.render(state.pose, step, time, state.velocity, state.angular_velocity)
 
@@ -256,14 +255,12 @@ class SimulatedRobot:
         self, step: int, centres: ArrayLike = (), radii: ArrayLike = ()
     ) -> NDArray[np.float32]:
         """Return a laser scan (beams,) [m]; `centres` (n, 2) and `radii` (n,) of other robots."""
-        if self.laser is None:
-            raise ValueError(f'{self.name}: has no laser scanner')
+        assert self.laser is not None, 'no laser scanner'
         return self.laser.scan(self.state.pose, step, centres, radii)
 
     def sweep(self, step: int) -> Sweep:
         """Return a sweep of the ranging sensor."""
-        if self.ranging is None:
-            raise ValueError(f'{self.name}: has no ranging sensor')
+        assert self.ranging is not None, 'no ranging sensor'
         world = self.world
         values, causes = self.ranging.measure(self.state.pose, step, world.targets_3d_at(step))
         if not world.labels:
