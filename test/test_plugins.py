@@ -180,8 +180,16 @@ def test_bad_plugin_is_named(folder, file, name, message):
 @pytest.mark.parametrize(
     ('before', 'after', 'message'),
     [
-        ('stride: 3', 'stride: 0', 'planner.settings.stride: read 0, allowed is at least 1'),
-        ('stride: 3', "stride: '3'", "planner.settings.stride: read '3', allowed is a whole"),
+        (
+            'stride: 3',
+            'stride: 0',
+            'planner.settings.stride: read 0, allowed is greater than or equal to 1',
+        ),
+        (
+            'stride: 3',
+            "stride: '3'",
+            "planner.settings.stride: read '3', allowed is a valid integer",
+        ),
         ('stride: 3', 'strid: 3', "planner.settings.strid: unknown key 'strid' .*known are stride"),
         ('one_by_one:OneByOne', 'lawnmower', "settings: planner 'lawnmower' has no settings of"),
     ],
@@ -302,7 +310,7 @@ def test_detector_of_ones_own(folder):
     image = np.zeros((120, 160, 3), np.uint8)
     image[40, 100] = 255
     seen = MarkerDetector(settings).detect(image, Pose.from_yaw([1.0, 1.0, 1.0], 0.0))
-    assert len(seen) == 1
+    assert len(seen.positions) == 1
     # The camera looks down from 1 m, the image's top to the front (260 px focal length).
     assert seen.positions[0] == pytest.approx([1.0 + 19.5 / 260, 1.0 - 20.5 / 260], abs=1e-6)
 

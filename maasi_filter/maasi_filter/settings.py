@@ -6,7 +6,14 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.detection import (
@@ -419,6 +426,13 @@ class FilterSettings(Settings):
         description='pmb: whether covariances of detections replace that of the sensor',
     )
     pmb: PmbSettings = Field(default_factory=PmbSettings, description='pmb: what only it has')
+
+    @field_validator('preset', mode='before')
+    @classmethod
+    def _gone(cls, value: Any) -> Any:
+        if value == 'recommended':
+            raise ValueError("'recommended' is gone, write method: pmb in its place")
+        return value
 
     def resolved(self) -> FilterSettings:
         """Return a copy with None replaced by the value of the method or preset."""
